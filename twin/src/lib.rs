@@ -1,0 +1,21 @@
+//! Digital twin of a ring: exact maps, closed orbit, orbit response and everything differentiable about it, in `f64`.
+//!
+//! A machine file becomes a [`Ring`]; [`Optics::of`] finds its closed orbit and linearises about it; the response of
+//! any place to any kick, and its derivative with respect to any gradient, follow from the closed-orbit Green's
+//! function. Symbols, signs and sources: `docs/model.md`.
+//!
+//! ```
+//! use twin::{Hold, Optics, Ring};
+//! let ring = Ring::booster();
+//! let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 })?;
+//! assert!((optics.tunes()?.x - 4.83).abs() < 1e-6);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+pub mod lattice;
+pub mod map;
+pub mod orbit;
+pub mod response;
+
+pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
+pub use orbit::{ClosedOrbit, Hold, OrbitError};
+pub use response::{Observer, Optics, Place, Source, Tunes};

@@ -1,0 +1,195 @@
+//! Closed orbit of a ring, at fixed momentum or at fixed RF frequency.
+
+use nalgebra::{Matrix5, Matrix6, Vector5};
+
+use crate::lattice::Ring;
+use crate::map::{DELTA, PATH, Phase};
+
+/// What the machine holds constant while the orbit changes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Hold {
+    /// The momentum, at `1 + delta` times the reference.
+    Momentum {
+        /// Relative momentum deviation [1].
+        delta: f64,
+    },
+    /// The revolution frequency, at `1 + offset` times that of the reference particle on the reference orbit; the
+    /// momentum follows the path length.
+    Frequency {
+        /// Relative frequency deviation [1].
+        offset: f64,
+    },
+}
+
+/// Why there is no closed orbit, or no stable motion about it.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OrbitError {
+    /// The linear motion is unstable.
+    #[error("unstable motion: half trace {half_trace:.6} of normal mode {mode}, stable within -1..1")]
+    Unstable {
+        /// `x` or `y`, the plane that the mode belongs to without coupling.
+        mode: char,
+        /// Half the trace of the mode's one-turn matrix, the cosine of its phase advance.
+        half_trace: f64,
+    },
+    /// The coupled motion lies on a sum resonance: its eigenvalues leave the unit circle in pairs.
+    #[error("unstable motion: coupling opens a sum resonance, discriminant {discriminant:.3e} below 0")]
+    SumResonance {
+        /// Square of half the difference of the modes' traces [1].
+        discriminant: f64,
+    },
+    /// The one-turn matrix has an eigenvalue 1: every kick drives an infinite orbit.
+    #[error("integer resonance: determinant {determinant:.3e} of (1 - one-turn matrix), half traces {half_traces:.6?}")]
+    Integer {
+        /// Determinant of the closure equations.
+        determinant: f64,
+        /// Half traces of the horizontal and vertical blocks.
+        half_traces: [f64; 2],
+    },
+    /// Newton's steps did not settle.
+    #[error("closed orbit not found: residual {residual:.3e} m after {steps} steps")]
+    NotConverged {
+        /// Largest component of the residual.
+        residual: f64,
+        /// Steps taken.
+        steps: usize,
+    },
+}
+
+/// The closed orbit at the start of the ring, and the linear map from there to the entrance of every element.
+#[derive(Debug, Clone)]
+pub struct ClosedOrbit {
+    /// Orbit at the entrance of every element, and once more at the end of the ring.
+    pub at: Vec<Phase<f64>>,
+    /// Linear map from the start to the entrance of every element, and to the end of the ring (the one-turn matrix).
+    pub transfer: Vec<Matrix6<f64>>,
+}
+
+/// Newton converges quadratically; from a reference orbit a few millimetres off it takes three or four steps.
+const STEPS: usize = 20;
+
+/// Largest residual of a closed orbit [m, rad]; the maps round at about 1e-15.
+const TOLERANCE: f64 = 1e-12;
+
+impl ClosedOrbit {
+    /// Find it by Newton's method.
+    ///
+    /// # Errors
+    /// [`OrbitError::Integer`] or [`OrbitError::NotConverged`].
+    pub fn find(ring: &Ring, hold: Hold) -> Result<Self, OrbitError> {
+        let mut start = Phase::<f64>::zeros();
+        if let Hold::Momentum { delta } = hold {
+            start[DELTA] = delta;
+        }
+        let mut residual = f64::INFINITY;
+        for _ in 0..STEPS {
+            let turn = Self::trace(ring, start);
+            let miss = hold.miss(ring, &start, turn.end());
+            residual = miss.abs().max();
+            if residual < TOLERANCE {
+                return Ok(turn);
+            }
+            if !residual.is_finite() {
+                break;
+            }
+            let step = invert(&hold.closure(ring, start[DELTA], turn.one_turn()), turn.one_turn())? * miss;
+            for (z, step) in start.iter_mut().zip(&step) {
+                *z += step;
+            }
+        }
+        Err(OrbitError::NotConverged { residual, steps: STEPS })
+    }
+
+    /// Carry one ray around the ring.
+    fn trace(ring: &Ring, start: Phase<f64>) -> Self {
+        let (mut z, mut map) = (start, Matrix6::identity());
+        let (mut at, mut transfer) = (vec![z], vec![map]);
+        for element in &ring.elements {
+            map = element.linearise(&mut z) * map;
+            at.push(z);
+            transfer.push(map);
+        }
+        Self { at, transfer }
+    }
+
+    /// Linear map of the whole turn.
+    pub fn one_turn(&self) -> &Matrix6<f64> {
+        &self.transfer[self.transfer.len() - 1]
+    }
+
+    /// Orbit after the whole turn; differs from the start in its path only.
+    pub fn end(&self) -> &Phase<f64> {
+        &self.at[self.at.len() - 1]
+    }
+}
+
+impl Hold {
+    /// How far a ray misses closing on itself, and on the time of a turn: `(dx, dpx, dy, dpy, dpath)`.
+    fn miss(&self, ring: &Ring, start: &Phase<f64>, end: &Phase<f64>) -> Vector5<f64> {
+        let fifth = match self {
+            Hold::Momentum { .. } => 0.0,
+            Hold::Frequency { offset } => {
+                let p = &ring.particle;
+                let speed = p.beta(start[DELTA]) / p.beta(0.0);
+                end[PATH] + ring.circumference * (1.0 - speed / (1.0 + offset))
+            }
+        };
+        Vector5::new(end[0] - start[0], end[1] - start[1], end[2] - start[2], end[3] - start[3], fifth)
+    }
+
+    /// Matrix `A` of the closure equations `A (z, delta) = M c` for a kick `c`, rows as in [`Hold::miss`].
+    ///
+    /// A turn takes the time path/speed, and `d(speed)/speed = d(delta)/(gamma^2 (1 + delta))`.
+    pub(crate) fn closure(&self, ring: &Ring, delta: f64, one_turn: &Matrix6<f64>) -> Matrix5<f64> {
+        let mut a = -one_turn.fixed_view::<5, 5>(0, 0).into_owned();
+        for i in 0..4 {
+            a[(i, i)] += 1.0;
+        }
+        match self {
+            Hold::Momentum { .. } => a.set_row(4, &nalgebra::RowVector5::new(0.0, 0.0, 0.0, 0.0, 1.0)),
+            Hold::Frequency { offset } => {
+                let p = &ring.particle;
+                let gamma = p.gamma(delta);
+                let length = ring.circumference * p.beta(delta) / p.beta(0.0) / (1.0 + offset);
+                a.set_row(4, &-one_turn.fixed_view::<1, 5>(PATH, 0));
+                a[(4, 4)] += length / (gamma * gamma * (1.0 + delta));
+            }
+        }
+        a
+    }
+}
+
+/// Inverse of the closure equations, or the resonance that forbids it.
+pub(crate) fn invert(closure: &Matrix5<f64>, one_turn: &Matrix6<f64>) -> Result<Matrix5<f64>, OrbitError> {
+    let half_traces = [0, 2].map(|i| 0.5 * (one_turn[(i, i)] + one_turn[(i + 1, i + 1)]));
+    let determinant = closure.determinant();
+    // Rounding of a product of a few hundred maps; at a determinant of 1e-10 a 0.2 mrad kick drives metres.
+    if determinant.is_nan() || determinant.abs() < 1e-10 {
+        return Err(OrbitError::Integer { determinant, half_traces });
+    }
+    closure.try_inverse().ok_or(OrbitError::Integer { determinant, half_traces })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frequency_step_moves_the_momentum_by_the_slip_factor() {
+        let ring = Ring::booster();
+        let optics = crate::Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
+        let eta = optics.momentum_compaction() - ring.particle.gamma(0.0).powi(-2);
+        assert!((eta + 0.106).abs() < 1e-3, "slip factor {eta}");
+        let orbit = ClosedOrbit::find(&ring, Hold::Frequency { offset: 1e-6 }).unwrap();
+        // second order in the offset: 1e-6 relative
+        assert!((orbit.at[0][DELTA] * eta / -1e-6 - 1.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_ring_without_focusing_is_refused() {
+        let ring = Ring::booster();
+        let error = crate::Optics::of(&ring.with_vars(&[0.0; 48]), Hold::Momentum { delta: 0.0 }).unwrap_err();
+        assert!(error.to_string().contains("half traces"), "{error}");
+    }
+}
