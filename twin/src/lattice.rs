@@ -285,7 +285,8 @@ impl Ring {
     /// [`LatticeError`], naming the element and the numbers that disagree.
     pub fn read(path: &Path) -> Result<Self, LatticeError> {
         let shown = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|source| LatticeError::Read { path: shown.clone(), source })?;
+        let text =
+            std::fs::read_to_string(path).map_err(|source| LatticeError::Read { path: shown.clone(), source })?;
         Self::parse(&text, &shown)
     }
 
@@ -434,7 +435,9 @@ impl ElementEntry {
             "marker" => Kind::Marker,
             "bpm" => Kind::Monitor { plane: self.plane()? },
             "corrector" => Kind::Corrector { plane: self.plane()?, kick: [0.0; 2] },
-            "quadrupole" => Kind::Quadrupole { k1: self.finite("k1, or a family in the file's k1", self.k1.or(family))? },
+            "quadrupole" => {
+                Kind::Quadrupole { k1: self.finite("k1, or a family in the file's k1", self.k1.or(family))? }
+            }
             "sextupole" => Kind::Sextupole { k2: or_zero("k2", self.k2)? },
             "multipole" => Kind::Multipole {
                 k1l: or_zero("k1l", self.k1l)?,
@@ -473,7 +476,11 @@ impl ElementEntry {
     }
 
     fn plane(&self) -> Result<Plane, LatticeError> {
-        self.plane.ok_or_else(|| LatticeError::Field { name: self.name.clone(), field: "plane", found: "nothing".into() })
+        self.plane.ok_or_else(|| LatticeError::Field {
+            name: self.name.clone(),
+            field: "plane",
+            found: "nothing".into(),
+        })
     }
 }
 
@@ -501,7 +508,13 @@ fn close(elements: &mut Vec<Element>, circumference: f64) -> Result<(), LatticeE
 
 fn fill(elements: &mut Vec<Element>, s: f64, length: f64) {
     if length > ROUNDING * 1e-3 {
-        elements.push(Element { name: String::new(), kind: Kind::Drift, s, length, misalignment: Misalignment::default() });
+        elements.push(Element {
+            name: String::new(),
+            kind: Kind::Drift,
+            s,
+            length,
+            misalignment: Misalignment::default(),
+        });
     }
 }
 
@@ -514,7 +527,11 @@ mod tests {
         let ring = Ring::booster();
         let length: f64 = ring.elements.iter().map(|e| e.length).sum();
         assert!((length - 201.78).abs() < 1e-8, "{length}"); // nine decimals in the file, 240 elements
-        let angle: f64 = ring.elements.iter().filter_map(|e| if let Kind::Bend(b) = &e.kind { Some(b.curvature * e.length) } else { None }).sum();
+        let angle: f64 = ring
+            .elements
+            .iter()
+            .filter_map(|e| if let Kind::Bend(b) = &e.kind { Some(b.curvature * e.length) } else { None })
+            .sum();
         assert!((angle - std::f64::consts::TAU).abs() < 1e-12);
         assert_eq!((ring.quadrupoles.len(), ring.correctors.len(), ring.read_monitors.len()), (48, 48, 33));
         assert_eq!(ring.var_names()[0], "A2");
@@ -532,14 +549,23 @@ mod tests {
     #[test]
     fn a_bad_machine_file_says_what_disagrees() {
         let cases = [
-            (r#"{"name":"Q","type":"quadrupole","s_start":0,"length":1}"#, "element Q: expected a finite k1, or a family in the file's k1, found nothing"),
+            (
+                r#"{"name":"Q","type":"quadrupole","s_start":0,"length":1}"#,
+                "element Q: expected a finite k1, or a family in the file's k1, found nothing",
+            ),
             (r#"{"name":"U","type":"undulator","s_start":0,"length":1}"#, "element U: unknown type \"undulator\""),
             (
                 r#"{"name":"A","type":"marker","s_start":0,"length":1},{"name":"B","type":"marker","s_start":0.5,"length":0}"#,
                 "element B starts at 0.5 m, before A ends at 1 m",
             ),
-            (r#"{"name":"A","type":"marker","s_start":2.5,"length":1}"#, "elements end at 3.5 m, beyond the circumference of 3 m"),
-            (r#"{"name":"C","type":"corrector","s_start":0,"length":0}"#, "element C: expected a finite plane, found nothing"),
+            (
+                r#"{"name":"A","type":"marker","s_start":2.5,"length":1}"#,
+                "elements end at 3.5 m, beyond the circumference of 3 m",
+            ),
+            (
+                r#"{"name":"C","type":"corrector","s_start":0,"length":0}"#,
+                "element C: expected a finite plane, found nothing",
+            ),
         ];
         for (elements, message) in cases {
             assert_eq!(Ring::parse(&machine(elements), "toy.json").unwrap_err().to_string(), message);

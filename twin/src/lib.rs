@@ -11,11 +11,13 @@
 //! assert!((optics.tunes()?.x - 4.83).abs() < 1e-6);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
+pub mod effects;
 pub mod lattice;
 pub mod map;
 pub mod orbit;
 pub mod response;
 
+pub use effects::{Effect, EffectError, EffectKind, Machine, MachineResponse};
 pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Observer, Optics, Place, Source, Tunes};

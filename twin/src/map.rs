@@ -177,7 +177,8 @@ fn quadrupole<T: Scalar>(z: &mut Phase<T>, k1: f64, length: f64) {
         z[slope_at] = (c * slope - k * s * x) * p;
         // half the integral of x'^2
         let cs = c * s;
-        z[PATH] += (k * x * x * (cs * -1.0 + length) - k * x * slope * s * s * 2.0 + slope * slope * (cs + length)) * 0.25;
+        z[PATH] +=
+            (k * x * x * (cs * -1.0 + length) - k * x * slope * s * s * 2.0 + slope * slope * (cs + length)) * 0.25;
     }
 }
 
@@ -407,7 +408,14 @@ mod tests {
         let m = bend(0.0, 0.0).linearise(&mut Phase::<f64>::zeros());
         let (s, c) = 0.09_f64.sin_cos();
         let rho = 10.0;
-        let known = [((X, X), c), ((X, PX), rho * s), ((X, DELTA), rho * (1.0 - c)), ((PX, DELTA), s), ((Y, PY), 0.9), ((PATH, X), s)];
+        let known = [
+            ((X, X), c),
+            ((X, PX), rho * s),
+            ((X, DELTA), rho * (1.0 - c)),
+            ((PX, DELTA), s),
+            ((Y, PY), 0.9),
+            ((PATH, X), s),
+        ];
         for (at, value) in known {
             assert!((m[at] - value).abs() < 1e-13, "{at:?}: {} of {value}", m[at]);
         }

@@ -175,7 +175,12 @@ impl<'r> Optics<'r> {
     }
 
     /// Derivative of [`Optics::response`] with respect to each gradient, same shape each.
-    pub fn response_jacobian(&self, observers: &[Observer], sources: &[Source], gradients: &[Gradient]) -> Vec<DMatrix<f64>> {
+    pub fn response_jacobian(
+        &self,
+        observers: &[Observer],
+        sources: &[Source],
+        gradients: &[Gradient],
+    ) -> Vec<DMatrix<f64>> {
         let seen = self.seen_rows(observers);
         let far = self.closed + Matrix6::identity();
         gradients
@@ -399,7 +404,9 @@ mod tests {
         for hold in [ON_MOMENTUM, Hold::Frequency { offset: 0.0 }] {
             let optics = Optics::of(&ring, hold).unwrap();
             let (observers, sources) = (both_planes(&optics), optics.correctors());
-            for (n, &element) in ring.quadrupoles.iter().enumerate().filter(|(n, _)| n % 7 == 0 || ring.quadrupoles[*n] == rolled) {
+            for (n, &element) in
+                ring.quadrupoles.iter().enumerate().filter(|(n, _)| n % 7 == 0 || ring.quadrupoles[*n] == rolled)
+            {
                 let exact = &optics.response_jacobian(&observers, &sources, &[optics.gradient(element)])[0];
                 let at = |factor: f64| {
                     let mut vars = [1.0; 48];
@@ -411,7 +418,8 @@ mod tests {
                 let k1 = ring.gradients()[n];
                 let h = 1e-4;
                 // five-point difference: truncation (5e-4)^4 and rounding 1e-12/h are both below 1e-7
-                let numeric = ((at(1.0 + h) - at(1.0 - h)) * 8.0 - (at(1.0 + 2.0 * h) - at(1.0 - 2.0 * h))) / (12.0 * h * k1);
+                let numeric =
+                    ((at(1.0 + h) - at(1.0 - h)) * 8.0 - (at(1.0 + 2.0 * h) - at(1.0 - 2.0 * h))) / (12.0 * h * k1);
                 let error = (exact - &numeric).abs().max() / exact.abs().max();
                 assert!(error < 1e-7, "{}: {error:e}", ring.elements[element].name);
             }
@@ -427,8 +435,10 @@ mod tests {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         let observers = optics.monitor_places(Plane::X);
-        let (exact, compaction) =
-            (optics.dispersion_jacobian(&observers, &optics.quadrupoles()), optics.compaction_jacobian(&optics.quadrupoles()));
+        let (exact, compaction) = (
+            optics.dispersion_jacobian(&observers, &optics.quadrupoles()),
+            optics.compaction_jacobian(&optics.quadrupoles()),
+        );
         for n in [0, 5, 30] {
             let at = |factor: f64| {
                 let mut vars = [1.0; 48];
@@ -442,7 +452,11 @@ mod tests {
             let (up, down) = (at(1.0 + h), at(1.0 - h));
             for i in 0..observers.len() {
                 let numeric = (up.0[i] - down.0[i]) / (2.0 * h * k1);
-                assert!((numeric - exact[(i, n)]).abs() < 1e-5 * exact.column(n).abs().max(), "{numeric} {}", exact[(i, n)]);
+                assert!(
+                    (numeric - exact[(i, n)]).abs() < 1e-5 * exact.column(n).abs().max(),
+                    "{numeric} {}",
+                    exact[(i, n)]
+                );
             }
             let numeric = (up.1 - down.1) / (2.0 * h * k1);
             assert!((numeric - compaction[n]).abs() < 1e-5 * compaction[n].abs(), "{numeric} {}", compaction[n]);
