@@ -1,1 +1,7 @@
-//! placeholder
+//! Surrogate tables made from the twin, and their measured errors.
+
+pub mod check;
+pub mod green;
+
+pub use check::{SurrogateError, check};
+pub use green::{BoosterGreen, TrainingError};

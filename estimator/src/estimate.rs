@@ -1,0 +1,85 @@
+//! What leaves the core each cycle: plain data.
+
+use crate::prior::{Marginal, Prior};
+
+/// How a monitor is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
+pub enum MonitorState {
+    /// As expected.
+    #[default]
+    Ok = 0,
+    /// Its repeats scatter more than 1.5 times the expected noise.
+    Noisy = 1,
+    /// It jumps now and then.
+    Jumps = 2,
+    /// It does not report, or repeats one value.
+    Dead = 3,
+}
+
+/// State of one monitor.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Health {
+    /// How it is doing.
+    pub state: MonitorState,
+    /// Noise of one reading, as weighted [m].
+    pub sigma: f32,
+    /// Readings that were not used.
+    pub rejected: u32,
+}
+
+/// The vars and the state of the instruments after a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate<const B: usize, const N: usize> {
+    /// Sequence number of the frame.
+    pub sequence: u32,
+    /// Time of the frame [us].
+    pub time_us: u64,
+    /// Frames used so far.
+    pub frames: u32,
+    /// Frames refused so far: corrupted, repeated, out of order.
+    pub rejected_frames: u32,
+    /// Mean of each var [1].
+    pub mean: [f32; N],
+    /// Standard deviation of each var [1].
+    pub sigma: [f32; N],
+    /// MAP of each `theta = ln var`.
+    pub map_params: [f32; N],
+    /// Centre of each theta's normal before truncation; equals the MAP unless a param sits at a bound.
+    pub centre: [f32; N],
+    /// Its standard deviation.
+    pub params_sigma: [f32; N],
+    /// Bit `i` is 1 if param `i` is clipped to the prior's range.
+    pub clipped: u64,
+    /// Joint normalised innovation squared of the readings used.
+    pub nis: f32,
+    /// Bit `b` is 1 if the reading of monitor `b` was used.
+    pub accepted: u64,
+    /// Bit `b` is 1 if monitor `b` reported and its reading was not used.
+    pub rejected: u64,
+    /// Bit `b` is 1 if this reading confirmed the one before in the same setting, which is now used as well.
+    pub confirmed: u64,
+    /// Bit `b` is 1 if this reading and the one before outvoted all earlier ones in the same setting.
+    pub restarted: u64,
+    /// The setting that the frame repeats, if it is kept as one.
+    pub setting: Option<u16>,
+    /// `ln` of the evidence of all readings under the model.
+    pub log_evidence: f32,
+    /// The model was linearised anew after this frame.
+    pub linearised: bool,
+    /// State of every monitor.
+    pub health: [Health; B],
+}
+
+impl<const B: usize, const N: usize> Estimate<B, N> {
+    /// Marginal posterior of param `i`; none beyond the last.
+    pub fn marginal(&self, i: usize, prior: &Prior) -> Option<Marginal> {
+        Some(Marginal {
+            mean: *self.centre.get(i)?,
+            sigma: *self.params_sigma.get(i)?,
+            lower: prior.lower,
+            upper: prior.upper,
+        })
+    }
+}

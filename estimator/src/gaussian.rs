@@ -1,0 +1,596 @@
+//! A Gaussian over the params and the unknown baseline of every monitor, and its best point within the prior's range.
+//!
+//! Readings obey `innovation = h . delta + baseline_b + noise`, `delta = theta - origin`. The baselines are eliminated as
+//! readings arrive: given the params, `baseline_b = mean_b - slope_b . delta +- covariance`, and what a reading says of
+//! the params alone is
+//!
+//! `d = h - slope_b`, `e = innovation - mean_b`, `s = noise^2 + covariance_bb`:
+//! `information += d d^T/s`, `vector += d e/s`, `cost += e^2/s`.
+//!
+//! With constant params the covariance stays diagonal and `slope`, `mean` are running weighted means.
+//!
+//! Source: the square completion behind the Schur complement, e.g. A. Gelb, Applied Optimal Estimation (1974), ch. 4.
+
+use nalgebra::{SMatrix, SVector};
+
+use crate::linear::{add, column, dot};
+use crate::prior::Prior;
+
+/// A sum of many small terms, compensated, so that months of frames lose nothing.
+///
+/// Source: A. Neumaier, ZAMM 54 (1974) 39.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Sum {
+    total: f32,
+    lost: f32,
+}
+
+impl Sum {
+    /// Add a term.
+    pub fn add(&mut self, term: f32) {
+        let total = self.total + term;
+        self.lost +=
+            if self.total.abs() >= term.abs() { (self.total - total) + term } else { (term - total) + self.total };
+        self.total = total;
+    }
+
+    /// The sum.
+    pub fn value(&self) -> f32 {
+        self.total + self.lost
+    }
+}
+
+/// The logarithm of a product of many factors near 1, with few logarithms taken.
+#[derive(Debug, Clone, Copy)]
+struct LogProduct {
+    taken: Sum,
+    product: f32,
+}
+
+impl LogProduct {
+    const ONE: Self = Self { taken: Sum { total: 0.0, lost: 0.0 }, product: 1.0 };
+
+    fn multiply(&mut self, factor: f32) {
+        self.product *= factor;
+        if !(1e-15..1e15).contains(&self.product) {
+            self.taken.add(libm::logf(self.product));
+            self.product = 1.0;
+        }
+    }
+
+    fn value(&self) -> f32 {
+        self.taken.value() + libm::logf(self.product)
+    }
+}
+
+/// Variance against which the product of variances is kept, that of 0.15 mm [m^2].
+const USUAL: f32 = 2.25e-8;
+/// `ln(2 pi)` of that.
+const LN_USUAL: f32 = -15.771_873;
+
+/// Readings of one monitor that say nothing of the params, merged: a mean innovation [m] and its precision [1/m^2].
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Level {
+    mean: f32,
+    precision: f32,
+}
+
+/// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
+const BASELINE: f32 = 0.02;
+
+/// Information on `N` params and `B` baselines.
+#[derive(Debug, Clone)]
+pub struct Gaussian<const B: usize, const N: usize> {
+    /// Params at which the readings were linearised.
+    origin: [f32; N],
+    /// Information matrix of the params, baselines eliminated; lower triangle.
+    information: SMatrix<f32, N, N>,
+    /// Information vector of `theta - origin`.
+    vector: SVector<f32, N>,
+    /// Baselines at the origin [m].
+    baseline: [f32; B],
+    /// How much less baseline a unit of a param leaves [m], one column a monitor.
+    slope: SMatrix<f32, N, B>,
+    /// Covariance of the baselines, params given [m^2].
+    covariance: SMatrix<f32, B, B>,
+    /// Chi-square of everything at the origin.
+    cost: Sum,
+    /// `ln` of the product of `s` over the usual variance, readings and prior.
+    volume: LogProduct,
+    /// Readings in the volume.
+    readings: Sum,
+}
+
+impl<const B: usize, const N: usize> Gaussian<B, N> {
+    /// The prior alone.
+    pub fn prior(prior: &Prior) -> Self {
+        let precision = 1.0 / (prior.sigma * prior.sigma);
+        let mut gaussian = Self {
+            origin: [prior.mean; N],
+            information: SMatrix::from_diagonal_element(precision),
+            vector: SVector::zeros(),
+            baseline: [0.0; B],
+            slope: SMatrix::zeros(),
+            covariance: SMatrix::from_diagonal_element(BASELINE * BASELINE),
+            cost: Sum::default(),
+            volume: LogProduct::ONE,
+            readings: Sum::default(),
+        };
+        gaussian.volume.taken.add(-(N as f32) * libm::logf(precision));
+        gaussian
+    }
+
+    /// Params at which innovations are to be formed.
+    pub fn origin(&self) -> &[f32; N] {
+        &self.origin
+    }
+
+    /// Chi-square at the origin, prior included, baselines at their best.
+    pub fn cost(&self) -> f32 {
+        self.cost.value()
+    }
+
+    /// Rms of the baselines of monitors `from..to` [m].
+    pub fn orbit(&self, from: usize, to: usize) -> f32 {
+        let baselines = self.baseline.get(from..to).unwrap_or_default();
+        libm::sqrtf(dot(baselines, baselines) / baselines.len().max(1) as f32)
+    }
+
+    /// Baseline of a monitor at the origin [m].
+    pub fn baseline(&self, b: usize) -> f32 {
+        self.baseline.get(b).copied().unwrap_or(0.0)
+    }
+
+    /// Add readings of monitor `b`: their mean innovation [m], its variance [m^2], and `h` [m].
+    pub fn condition(&mut self, b: usize, innovation: f32, variance: f32, h: &[f32]) {
+        let Some(&mean) = self.baseline.get(b) else { return };
+        let (d, baseline_variance) = self.effective(b, h);
+        let s = variance + baseline_variance;
+        let e = innovation - mean;
+        add_square(&mut self.information, &d, 1.0 / s);
+        add(self.vector.as_mut_slice(), e / s, &d);
+        self.cost.add(e * e / s);
+        self.volume.multiply(s / USUAL);
+        self.readings.add(1.0);
+        self.learn_baselines(b, &d, e, s);
+    }
+
+    /// Gain of every baseline that is correlated with baseline `b`; without process noise that is `b` alone.
+    fn learn_baselines(&mut self, b: usize, d: &[f32; N], e: f32, s: f32) {
+        let mut column = [0.0; B];
+        column.iter_mut().zip(self.covariance.column(b).iter()).for_each(|(to, v)| *to = *v);
+        let each = self.baseline.iter_mut().zip(self.slope.as_mut_slice().chunks_exact_mut(N)).zip(&column);
+        for ((mean, slope), covariance) in each.filter(|(_, covariance)| **covariance != 0.0) {
+            let gain = covariance / s;
+            *mean += gain * e;
+            add(slope, gain, d);
+        }
+        for (to, covariance) in self.covariance.as_mut_slice().chunks_exact_mut(B).zip(&column) {
+            if *covariance != 0.0 {
+                add(to, -covariance / s, &column);
+            }
+        }
+    }
+
+    /// Merge a reading that says nothing of the params into a level.
+    pub fn merge(&mut self, level: &mut Level, innovation: f32, variance: f32) {
+        if level.precision > 0.0 {
+            let (distance, s) = (innovation - level.mean, variance + 1.0 / level.precision);
+            self.cost.add(distance * distance / s);
+            self.volume.multiply(s / USUAL);
+            self.readings.add(1.0);
+        }
+        level.precision += 1.0 / variance;
+        level.mean += (innovation - level.mean) / (variance * level.precision);
+    }
+
+    /// Add the merged readings of monitor `b`.
+    pub fn condition_level(&mut self, b: usize, level: &Level) {
+        if level.precision > 0.0 {
+            self.condition(b, level.mean, 1.0 / level.precision, &[0.0; N]);
+        }
+    }
+
+    /// Normalisation of `n` repeats that entered as one mean: what the mean's own density leaves out.
+    pub fn add_repeats(&mut self, n: u32, variance: f32) {
+        self.volume.multiply(n as f32);
+        if variance != USUAL {
+            self.volume.taken.add((n as f32 - 1.0) * libm::logf(variance / USUAL));
+        }
+        self.readings.add(n as f32 - 1.0);
+    }
+
+    /// Squared deviations of repeats from their means, over their variance.
+    pub fn add_scatter(&mut self, chi_square: f32) {
+        self.cost.add(chi_square);
+    }
+
+    /// Move the origin without changing the distribution.
+    pub fn recentre(&mut self, origin: &[f32; N]) {
+        let mut step = SVector::<f32, N>::zeros();
+        step.iter_mut().zip(origin.iter().zip(&self.origin)).for_each(|(s, (to, from))| *s = to - from);
+        let moved = times(&self.information, &step);
+        self.cost.add(step.dot(&moved) - 2.0 * step.dot(&self.vector));
+        self.vector -= moved;
+        for (mean, slope) in self.baseline.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
+            *mean -= dot(slope, step.as_slice());
+        }
+        self.origin = *origin;
+    }
+
+    /// Let every param walk at random by `sigma`: `P += sigma^2`, baselines stay.
+    ///
+    /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.
+    /// `solution` is that of this Gaussian and serves as work space.
+    pub fn walk(&mut self, sigma: f32, solution: &mut Solution<N>) {
+        let variance = sigma * sigma;
+        let mean = solution.delta;
+        let k = &mut solution.factor;
+        *k = self.information * variance;
+        for i in 0..N {
+            k[(i, i)] += 1.0;
+        }
+        if cholesky(k).is_none() {
+            return; // 1 + a positive matrix; only a NaN could fail, and none can enter
+        }
+        symmetrise(&mut self.information);
+        for column in self.information.as_mut_slice().chunks_exact_mut(N) {
+            solve(k, column);
+        }
+        let before = self.slope;
+        for column in self.slope.as_mut_slice().chunks_exact_mut(N) {
+            solve(k, column);
+        }
+        self.covariance += before.tr_mul(&self.slope) * variance;
+        let shift = (self.slope - before).tr_mul(&mean);
+        self.baseline.iter_mut().zip(shift.iter()).for_each(|(mean, s)| *mean += s);
+        // the best point and its chi-square stay
+        let best = self.cost.value() - self.vector.dot(&mean);
+        self.vector = times(&self.information, &mean);
+        self.cost = Sum::default();
+        self.cost.add(best + self.vector.dot(&mean));
+    }
+}
+
+/// The best point of a [`Gaussian`], and its spread.
+#[derive(Debug, Clone)]
+pub struct Solution<const N: usize> {
+    /// Best point without bounds, relative to the origin.
+    pub delta: SVector<f32, N>,
+    /// Best point within the prior's range: the MAP params.
+    pub map_params: [f32; N],
+    /// Standard deviation of each param.
+    pub sigma: [f32; N],
+    /// Bit `i` is 1 if param `i` sits at a bound.
+    pub clipped: u64,
+    /// Chi-square at the best point without bounds.
+    pub cost: f32,
+    /// `ln` of the evidence: the density of all readings under the model.
+    pub log_evidence: f32,
+    /// Lower Cholesky factor of the information.
+    factor: SMatrix<f32, N, N>,
+    /// Inverse of the factor.
+    inverse: SMatrix<f32, N, N>,
+}
+
+impl<const N: usize> Default for Solution<N> {
+    fn default() -> Self {
+        Self {
+            delta: SVector::zeros(),
+            map_params: [0.0; N],
+            sigma: [0.0; N],
+            clipped: 0,
+            cost: 0.0,
+            log_evidence: 0.0,
+            factor: SMatrix::zeros(),
+            inverse: SMatrix::zeros(),
+        }
+    }
+}
+
+impl<const N: usize> Solution<N> {
+    /// Solve a Gaussian. If rounding has made its information singular, the last solution stays and this is false.
+    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N>, prior: &Prior) -> bool {
+        const { assert!(N <= 64, "clipped params are counted in one u64") };
+        self.factor.copy_from(&gaussian.information);
+        let Some(log_determinant) = cholesky(&mut self.factor) else { return false };
+        self.delta = gaussian.vector;
+        solve(&self.factor, self.delta.as_mut_slice());
+        invert_lower(&self.factor, &mut self.inverse);
+        for (sigma, column) in self.sigma.iter_mut().zip(self.inverse.as_slice().chunks_exact(N)) {
+            *sigma = libm::sqrtf(dot(column, column));
+        }
+        self.cost = gaussian.cost.value() - gaussian.vector.dot(&self.delta);
+        let volume = gaussian.volume.value() + LN_USUAL * gaussian.readings.value();
+        self.log_evidence = -0.5 * (self.cost + volume + log_determinant);
+        self.bound(gaussian, prior);
+        true
+    }
+
+    /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
+    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N>, prior: &Prior) {
+        let bounded = |theta: f32| theta.clamp(prior.lower, prior.upper);
+        let mut outside = false;
+        for ((map, delta), origin) in self.map_params.iter_mut().zip(self.delta.iter()).zip(&gaussian.origin) {
+            *map = bounded(origin + delta);
+            outside |= *map != origin + delta;
+        }
+        self.clipped = 0;
+        if !outside {
+            return;
+        }
+        // Each sweep minimises over one param at a time; the error falls by the coupling, about a half, each sweep.
+        for _ in 0..30 {
+            for i in 0..N {
+                let pull = gaussian.pull(i, &self.map_params);
+                if let Some(map) = self.map_params.get_mut(i) {
+                    *map = bounded(*map + pull / gaussian.information[(i, i)]);
+                }
+            }
+        }
+        for (i, &map) in self.map_params.iter().enumerate() {
+            self.clipped |= u64::from(map == prior.lower || map == prior.upper) << i;
+        }
+    }
+
+    /// Covariance of two params.
+    pub fn covariance(&self, i: usize, j: usize) -> f32 {
+        // P = X^T X with X the inverse of the lower factor: rows above the later of i and j are zero
+        dot(column(self.inverse.as_slice(), N, i), column(self.inverse.as_slice(), N, j))
+    }
+
+    /// Variance of a prediction with derivative `h`: `h^T P h`.
+    pub fn variance_of(&self, h: &[f32]) -> f32 {
+        // P = X^T X, so the variance is |X h|^2
+        let mut image = [0.0; N];
+        for (column, h) in self.inverse.as_slice().chunks_exact(N).zip(h) {
+            add(&mut image, *h, column);
+        }
+        dot(&image, &image)
+    }
+}
+
+impl<const B: usize, const N: usize> Gaussian<B, N> {
+    /// Downhill pull on param `i` at a point: minus half the derivative of chi-square.
+    fn pull(&self, i: usize, at: &[f32; N]) -> f32 {
+        let mut pull = self.vector.as_slice().get(i).copied().unwrap_or(0.0);
+        for (j, (at, origin)) in at.iter().zip(&self.origin).enumerate() {
+            let y = if j <= i { self.information[(i, j)] } else { self.information[(j, i)] };
+            pull -= y * (at - origin);
+        }
+        pull
+    }
+
+    /// Derivative of the difference between a reading and its baseline, and the variance of the baseline.
+    pub fn effective(&self, b: usize, h: &[f32]) -> ([f32; N], f32) {
+        let mut d = [0.0; N];
+        let slope = column(self.slope.as_slice(), N, b);
+        d.iter_mut().zip(h).zip(slope).for_each(|((d, h), slope)| *d = h - slope);
+        (d, if b < B { self.covariance[(b, b)] } else { 0.0 })
+    }
+}
+
+/// Add `weight d d^T`. Whole columns: their length is known to the compiler, which is worth more than the half that the
+/// lower triangle would save.
+fn add_square<const N: usize>(a: &mut SMatrix<f32, N, N>, d: &[f32; N], weight: f32) {
+    for (column, factor) in a.as_mut_slice().as_chunks_mut::<N>().0.iter_mut().zip(d) {
+        let factor = weight * factor;
+        column.iter_mut().zip(d).for_each(|(to, d)| *to += factor * d);
+    }
+}
+
+/// Product of a symmetric matrix, kept as its lower triangle, with a vector.
+fn times<const N: usize>(a: &SMatrix<f32, N, N>, x: &SVector<f32, N>) -> SVector<f32, N> {
+    let mut product = SVector::<f32, N>::zeros();
+    for j in 0..N {
+        for i in j..N {
+            product[i] += a[(i, j)] * x[j];
+            if i != j {
+                product[j] += a[(i, j)] * x[i];
+            }
+        }
+    }
+    product
+}
+
+fn symmetrise<const N: usize>(a: &mut SMatrix<f32, N, N>) {
+    for j in 0..N {
+        for i in j + 1..N {
+            a[(j, i)] = a[(i, j)];
+        }
+    }
+}
+
+/// Cholesky factor of a lower triangle, in place, and the logarithm of the determinant; none if it is not positive.
+/// nalgebra's own takes the matrix by value, 9 kB of stack.
+fn cholesky<const N: usize>(a: &mut SMatrix<f32, N, N>) -> Option<f32> {
+    let mut determinant = LogProduct::ONE;
+    for j in 0..N {
+        let (done, rest) = a.as_mut_slice().split_at_mut(j * N);
+        let from = j & !7;
+        let column = rest.get_mut(from..N)?;
+        for before in done.chunks_exact(N) {
+            add(column, -*before.get(j)?, before.get(from..)?);
+        }
+        let column = column.get_mut(j - from..)?;
+        let pivot = *column.first()?;
+        if pivot.is_nan() || pivot <= 0.0 {
+            return None;
+        }
+        let scale = 1.0 / libm::sqrtf(pivot);
+        column.iter_mut().for_each(|v| *v *= scale);
+        determinant.multiply(pivot);
+    }
+    Some(determinant.value())
+}
+
+/// Solve `L L^T x = b`, in place.
+fn solve<const N: usize>(factor: &SMatrix<f32, N, N>, x: &mut [f32]) {
+    for (k, column) in factor.as_slice().chunks_exact(N).enumerate() {
+        if let (Some((top, under)), Some([pivot, below @ ..])) =
+            (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
+        {
+            *top /= pivot;
+            add(under, -*top, below);
+        }
+    }
+    for (k, column) in factor.as_slice().chunks_exact(N).enumerate().rev() {
+        if let (Some((top, under)), Some([pivot, below @ ..])) =
+            (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
+        {
+            *top = (*top - dot(under, below)) / pivot;
+        }
+    }
+}
+
+/// Inverse of a lower triangle.
+fn invert_lower<const N: usize>(factor: &SMatrix<f32, N, N>, inverse: &mut SMatrix<f32, N, N>) {
+    inverse.fill(0.0);
+    for (j, x) in inverse.as_mut_slice().chunks_exact_mut(N).enumerate() {
+        if let Some(one) = x.get_mut(j) {
+            *one = 1.0;
+        }
+        for (k, column) in factor.as_slice().chunks_exact(N).enumerate().skip(j) {
+            if let (Some((top, under)), Some([pivot, below @ ..])) =
+                (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
+            {
+                *top /= pivot;
+                add(under, -*top, below);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use std::vec::Vec;
+
+    use nalgebra::{Matrix4, Vector4};
+
+    use super::*;
+
+    const WIDE: Prior = Prior { mean: 0.0, sigma: 0.03, lower: -0.06, upper: 0.06 };
+
+    /// Readings of two monitors of a ring with two params.
+    fn readings() -> Vec<(usize, f32, [f32; 2])> {
+        (0..40)
+            .map(|i| {
+                let t = i as f32;
+                let h = [0.05 * libm::sinf(t), 0.04 * libm::cosf(1.7 * t)];
+                let noise = 1.5e-4 * libm::sinf(12.9 * t);
+                (i % 2, 3e-3 + 0.02 * h[0] - 0.01 * h[1] + noise, h)
+            })
+            .collect()
+    }
+
+    const VARIANCE: f32 = 1.5e-4 * 1.5e-4;
+
+    fn conditioned() -> Gaussian<2, 2> {
+        let mut gaussian = Gaussian::prior(&WIDE);
+        for (b, innovation, h) in readings() {
+            gaussian.condition(b, innovation, VARIANCE, &h);
+        }
+        gaussian
+    }
+
+    /// The same by brute force: params and baselines as four unknowns, in f64.
+    fn batch(walks: &[usize], walk: f64) -> (Vector4<f64>, Matrix4<f64>) {
+        let (prior, base) = (f64::from(WIDE.sigma).powi(2), f64::from(BASELINE).powi(2));
+        let mut p = Matrix4::from_diagonal(&Vector4::new(prior, prior, base, base));
+        let mut x = Vector4::zeros();
+        for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
+            if walks.contains(&i) {
+                p[(0, 0)] += walk * walk;
+                p[(1, 1)] += walk * walk;
+            }
+            let mut row = Vector4::new(f64::from(h[0]), f64::from(h[1]), 0.0, 0.0);
+            row[2 + b] = 1.0;
+            let gain = p * row / ((row.transpose() * p * row)[0] + f64::from(VARIANCE));
+            x += gain * (f64::from(innovation) - row.dot(&x));
+            p -= gain * (row.transpose() * p);
+        }
+        (x, p)
+    }
+
+    fn assert_equal(gaussian: &Gaussian<2, 2>, walks: &[usize], walk: f64) {
+        let mut solution = Solution::default();
+        assert!(solution.solve(gaussian, &WIDE));
+        let (x, p) = batch(walks, walk);
+        for i in 0..2 {
+            let sigma = p[(i, i)].sqrt();
+            let theta = f64::from(gaussian.origin[i] + solution.delta[i]);
+            assert!((theta - x[i]).abs() < 1e-3 * sigma, "{theta} {}", x[i]); // f32 rounding
+            assert!((f64::from(solution.sigma[i]) / sigma - 1.0).abs() < 1e-4);
+        }
+        assert!((f64::from(solution.covariance(0, 1)) - p[(0, 1)]).abs() < 1e-4 * p[(0, 0)]);
+    }
+
+    #[test]
+    fn eliminated_baselines_leave_the_joint_answer() {
+        assert_equal(&conditioned(), &[], 0.0);
+    }
+
+    #[test]
+    fn recentring_changes_nothing() {
+        let mut gaussian = conditioned();
+        let (mut before, mut after) = (Solution::default(), Solution::default());
+        before.solve(&gaussian, &WIDE);
+        gaussian.recentre(&[0.01, -0.02]);
+        after.solve(&gaussian, &WIDE);
+        assert_equal(&gaussian, &[], 0.0);
+        assert!((before.log_evidence - after.log_evidence).abs() < 1e-2); // cancellation of chi-squares of 1e4 in f32
+    }
+
+    #[test]
+    fn a_walk_is_a_kalman_prediction() {
+        let mut gaussian = Gaussian::prior(&WIDE);
+        let mut solution = Solution::default();
+        for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
+            if i == 10 || i == 25 {
+                solution.solve(&gaussian, &WIDE);
+                gaussian.walk(2e-3, &mut solution);
+            }
+            gaussian.condition(b, innovation, VARIANCE, &h);
+        }
+        assert_equal(&gaussian, &[10, 25], 2e-3);
+    }
+
+    /// The evidence is the product of the predictive densities of the readings, one after another.
+    #[test]
+    fn evidence_is_the_product_of_predictions() {
+        let (mut gaussian, mut solution) = (Gaussian::<2, 2>::prior(&WIDE), Solution::default());
+        let mut log_density = 0.0;
+        for (b, innovation, h) in readings() {
+            solution.solve(&gaussian, &WIDE);
+            let (d, baseline) = gaussian.effective(b, &h);
+            let s = VARIANCE + baseline + solution.variance_of(&d);
+            let e = innovation - gaussian.baseline(b) - d[0] * solution.delta[0] - d[1] * solution.delta[1];
+            log_density -= 0.5 * (e * e / s + libm::logf(core::f32::consts::TAU * s));
+            gaussian.condition(b, innovation, VARIANCE, &h);
+        }
+        solution.solve(&gaussian, &WIDE);
+        assert!((solution.log_evidence - log_density).abs() < 0.02, "{} {log_density}", solution.log_evidence); // f32
+    }
+
+    #[test]
+    fn a_param_beyond_its_range_is_clipped_and_the_other_follows() {
+        let narrow = Prior { upper: 0.005, ..WIDE };
+        let gaussian = conditioned();
+        let mut solution = Solution::default();
+        solution.solve(&gaussian, &narrow);
+        assert_eq!(solution.clipped, 0b01);
+        assert_eq!(solution.map_params[0], narrow.upper);
+        // at the constrained best point nothing pulls on the free param
+        let pull = gaussian.pull(1, &solution.map_params) / gaussian.information[(1, 1)];
+        assert!(pull.abs() < 1e-6, "{pull}");
+    }
+
+    #[test]
+    fn compensated_sums_lose_nothing() {
+        let mut sum = Sum::default();
+        sum.add(1e8);
+        (0..1_000_000).for_each(|_| sum.add(1.0));
+        assert_eq!(sum.value(), 1.01e8);
+    }
+}

@@ -1,0 +1,41 @@
+//! The loops that everything else is made of, over plain slices. Sums run in a fixed order, so that host and chip agree
+//! to the bit.
+
+/// `to += factor * from`.
+#[inline]
+pub fn add(to: &mut [f32], factor: f32, from: &[f32]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * from);
+}
+
+/// Scalar product, summed in eight lanes.
+#[inline]
+pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    let mut lanes = [0.0; 8];
+    for (a, b) in a.iter().zip(b) {
+        lanes.iter_mut().zip(a.iter().zip(b)).for_each(|(lane, (a, b))| *lane += a * b);
+    }
+    let rest: f32 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
+    lanes.iter().sum::<f32>() + rest
+}
+
+/// Column `index` of a matrix of `rows` rows stored by columns; empty beyond the last.
+pub fn column(matrix: &[f32], rows: usize, index: usize) -> &[f32] {
+    matrix.get(index * rows..(index + 1) * rows).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_entry_counts_once() {
+        let a: [f32; 19] = core::array::from_fn(|i| i as f32);
+        assert_eq!(dot(&a, &[1.0; 19]), 171.0);
+        let mut b = [1.0; 19];
+        add(&mut b, 2.0, &a);
+        assert!(b.iter().enumerate().all(|(i, b)| *b == 1.0 + 2.0 * i as f32));
+        assert_eq!(column(&a, 5, 2), [10.0, 11.0, 12.0, 13.0, 14.0]);
+        assert!(column(&a, 5, 3).is_empty());
+    }
+}

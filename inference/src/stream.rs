@@ -1,0 +1,201 @@
+//! A recording as the core sees it: wire frames, and a model made of its header.
+
+use estimator::{
+    Calibration, CurrentCode, Estimate, Estimator, Frame, FrameError, Gate, IngestError, MagnetCurrents, Model,
+    PositionCode, Prior, RfCode, TuneCode,
+};
+use training::BoosterGreen;
+use twin::Ring;
+
+use crate::recording::{Header, Layout, Recording, Row};
+
+/// The core for the Booster: 33 monitors, 48 correctors, 48 params, room for 112 settings.
+pub type Booster = Estimator<BoosterGreen, 33, 48, 48, 112>;
+/// Its frame.
+pub type BoosterFrame = Frame<33, 48>;
+/// Its estimate.
+pub type BoosterEstimate = Estimate<33, 48>;
+
+/// Width of the prior of a var, the paper's.
+pub const PRIOR_WIDTH: f32 = 0.03;
+/// Read-back above which a corrector counts as powered [A]: 50 times its scatter, a twentieth of its setting.
+const POWERED: f32 = 1.0;
+
+/// Why a recording cannot be put on the wire.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StreamError {
+    /// The recording is of another machine than the frames.
+    #[error("{recording} has {found} {what}; a frame of this machine has {expected}")]
+    Count {
+        /// The recording.
+        recording: String,
+        /// What was counted.
+        what: &'static str,
+        /// How many a frame holds.
+        expected: usize,
+        /// How many the recording has.
+        found: usize,
+    },
+    /// A value that no frame can carry.
+    #[error("{recording}, frame {sequence}: {what} {value} is beyond what a frame can carry")]
+    Range {
+        /// The recording.
+        recording: String,
+        /// The frame.
+        sequence: u32,
+        /// Which value.
+        what: &'static str,
+        /// The value, SI.
+        value: f64,
+    },
+    /// The header's transfer polynomial is longer than the core's.
+    #[error("{recording}: quad_transfer has {found} coefficients, at most 6 are used")]
+    Transfer {
+        /// The recording.
+        recording: String,
+        /// How many it has.
+        found: usize,
+    },
+    /// Encoding failed.
+    #[error("{recording}, frame {sequence}: {source}")]
+    Encode {
+        /// The recording.
+        recording: String,
+        /// The frame.
+        sequence: u32,
+        /// Why.
+        source: FrameError,
+    },
+    /// The core refused a frame.
+    #[error("{recording}, frame {sequence}: {source}")]
+    Ingest {
+        /// The recording.
+        recording: String,
+        /// The frame.
+        sequence: u32,
+        /// Why.
+        source: IngestError,
+    },
+    /// No tables for this ring.
+    #[error(transparent)]
+    Training(#[from] training::TrainingError),
+}
+
+/// The columns that a ring's recordings have.
+pub fn layout(ring: &Ring) -> Layout {
+    Layout { monitors: ring.monitor_names(), correctors: ring.cells(&ring.correctors) }
+}
+
+/// What a header says of currents, for the core.
+///
+/// # Errors
+/// [`StreamError::Transfer`].
+pub fn calibration(recording: &Recording) -> Result<Calibration, StreamError> {
+    let Header { kick_per_ampere, nominal, quad_transfer, .. } = &recording.header;
+    let mut transfer = [0.0; 6];
+    if quad_transfer.len() > transfer.len() {
+        return Err(StreamError::Transfer { recording: recording.name.clone(), found: quad_transfer.len() });
+    }
+    transfer.iter_mut().zip(quad_transfer).for_each(|(to, from)| *to = *from as f32);
+    Ok(Calibration {
+        kick_per_ampere: *kick_per_ampere as f32,
+        nominal: [nominal.dipole, nominal.qh, nominal.qv].map(|a| a as f32),
+        transfer,
+        powered: POWERED,
+    })
+}
+
+/// The core at its prior, for a recording of a ring. Boxed: its state is some 300 kB.
+///
+/// # Errors
+/// [`StreamError`] if the ring or the recording do not fit the core.
+pub fn estimator(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Box<Booster>, StreamError> {
+    let model = Model {
+        surrogate: training::green::tables(ring)?,
+        prior: Prior::lognormal(PRIOR_WIDTH),
+        calibration: calibration(recording)?,
+        noise: recording.header.bpm_sigma as f32,
+        gate: Gate::default(),
+        process_noise,
+    };
+    Ok(Box::new(Booster::try_new(model).expect("tables of a stable ring have a design")))
+}
+
+/// A row as a frame.
+///
+/// # Errors
+/// [`StreamError::Count`] or [`StreamError::Range`].
+pub fn frame(recording: &Recording, row: &Row) -> Result<BoosterFrame, StreamError> {
+    let beyond =
+        |what, value| StreamError::Range { recording: recording.name.clone(), sequence: row.sequence, what, value };
+    let count = |what, expected, found| {
+        let wrong = StreamError::Count { recording: recording.name.clone(), what, expected, found };
+        if found == expected { Ok(()) } else { Err(wrong) }
+    };
+    let current = |value| CurrentCode::nearest(value).ok_or_else(|| beyond("current", value));
+    count("monitors", 33, row.reading.len())?;
+    count("correctors", 48, row.corrector_current.len())?;
+    let mut frame = BoosterFrame {
+        sequence: row.sequence,
+        time_us: (row.time * 1e6).round() as u64,
+        cycle_time_us: (row.cycle_time * 1e6).round() as u32,
+        corrector: [CurrentCode::default(); 48],
+        magnets: MagnetCurrents {
+            dipole: current(row.currents.dipole)?,
+            qh: current(row.currents.qh)?,
+            qv: current(row.currents.qv)?,
+            sh: current(row.currents.sh)?,
+            sv: current(row.currents.sv)?,
+        },
+        rf_offset: RfCode::nearest(row.rf_offset).ok_or_else(|| beyond("rf offset", row.rf_offset))?,
+        reading: [PositionCode::default(); 33],
+        tune: row.tune.map(|t| t.and_then(TuneCode::nearest)),
+        valid: 0,
+    };
+    for (to, &from) in frame.corrector.iter_mut().zip(&row.corrector_current) {
+        *to = current(from)?;
+    }
+    for (b, (to, from)) in frame.reading.iter_mut().zip(&row.reading).enumerate() {
+        if let Some(position) = *from {
+            *to = PositionCode::nearest(position).ok_or_else(|| beyond("reading", position))?;
+            frame.valid |= 1 << b;
+        }
+    }
+    Ok(frame)
+}
+
+/// A row as wire bytes.
+///
+/// # Errors
+/// As [`frame`], and [`StreamError::Encode`].
+pub fn wire(recording: &Recording, row: &Row) -> Result<Vec<u8>, StreamError> {
+    let mut bytes = vec![0; BoosterFrame::MAX_WIRE_BYTES];
+    let n = frame(recording, row)?.encode(&mut bytes).map_err(|source| StreamError::Encode {
+        recording: recording.name.clone(),
+        sequence: row.sequence,
+        source,
+    })?;
+    bytes.truncate(n);
+    Ok(bytes)
+}
+
+/// Stream a whole recording through a core; `hear` gets every row and its estimate.
+///
+/// # Errors
+/// [`StreamError`]; a recording that was read without error holds no frame that a core refuses.
+pub fn replay(
+    core: &mut Booster,
+    recording: &Recording,
+    mut hear: impl FnMut(&Row, &BoosterEstimate),
+) -> Result<(), StreamError> {
+    for row in &recording.rows {
+        let estimate = core.ingest(&mut wire(recording, row)?).map_err(|source| StreamError::Ingest {
+            recording: recording.name.clone(),
+            sequence: row.sequence,
+            source,
+        })?;
+        hear(row, &estimate);
+    }
+    Ok(())
+}
