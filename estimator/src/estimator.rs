@@ -117,11 +117,13 @@ struct Screened {
 
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f32 = 0.5;
+/// Growth of chi-square that counts as uphill: more than rounding of a chi-square of 1e5.
+const UPHILL: f32 = 1.0;
 /// Halvings of a step that leads uphill or to an unstable ring.
 const HALVINGS: u32 = 4;
-/// A setting whose information is less than this share of the prior's tells of its monitor's baseline only. A thousand
-/// of them together leave a hundredth of the prior's information unused.
-const QUIET: f32 = 1e-5;
+/// A setting whose information on all params together is less than this share of the prior's on one tells of its
+/// monitor's baseline only. A thousand of them leave less than a hundredth of the prior's information unused.
+const QUIET: f32 = 2e-4;
 /// While the params have walked less than this share of an error bar, the past still counts as one ring.
 const WALKED: f32 = 0.1;
 
@@ -342,6 +344,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                 self.loose.condition(b, innovation, variance, slope);
             }
         }
+        self.gaussian.settle();
+        self.loose.settle();
         // Readings confirmed late or outvoted are counted when the past is weighted anew, and so is an error that repeats
         // share.
         self.stale |= screened.confirmed != 0 || screened.restarted != 0 || frame.rf_offset.steps() != 0;
@@ -368,18 +372,19 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     fn linearise_anew(&mut self) -> bool {
         let from = *self.gaussian.origin();
         let mut to = self.solution.map_params;
-        let uphill = self.gaussian.cost() + 1.0;
+        // A past that is weighted anew has another chi-square; the step is then judged with the next one.
+        let uphill = if self.stale || !self.is_still() { f32::MAX } else { self.gaussian.cost() + UPHILL };
         self.stale = false;
         for _ in 0..HALVINGS {
-            if self.linearise_at(&to) && (!self.is_still() || self.gaussian.cost() <= uphill) {
+            if self.linearise_at(&to) && self.gaussian.cost() <= uphill {
                 self.solve();
                 return true;
             }
             to.iter_mut().zip(&from).for_each(|(to, from)| *to = 0.5 * (*to + from));
         }
-        self.linearise_at(&from);
+        let back = self.linearise_at(&from);
         self.solve();
-        false
+        back
     }
 
     fn linearise_at(&mut self, params: &[f32; N]) -> bool {
@@ -435,6 +440,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             self.gaussian.condition_level(b, level);
             self.gaussian.add_scatter(self.campaign.scatter(b) / self.noise_variance(b));
         }
+        self.gaussian.settle();
     }
 
     /// Information below which a setting says nothing of the params: that of the stray currents of idle correctors.

@@ -13,7 +13,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use crate::linear::{add, column, dot};
+use crate::linear::{BLOCK, add, block_start, column, combine, dot};
 use crate::prior::Prior;
 
 /// A sum of many small terms, compensated, so that months of frames lose nothing.
@@ -83,16 +83,21 @@ const BASELINE: f32 = 0.02;
 pub struct Gaussian<const B: usize, const N: usize> {
     /// Params at which the readings were linearised.
     origin: [f32; N],
-    /// Information matrix of the params, baselines eliminated; lower triangle.
+    /// Information matrix of the params, baselines eliminated; lower triangle, see [`Gaussian::mirror`].
     information: SMatrix<f32, N, N>,
+    /// Rows that wait to enter the information, with their weights.
+    staged: [[f32; N]; 4],
+    staged_weight: [f32; 4],
+    staged_rows: usize,
     /// Information vector of `theta - origin`.
     vector: SVector<f32, N>,
     /// Baselines at the origin [m].
     baseline: [f32; B],
     /// How much less baseline a unit of a param leaves [m], one column a monitor.
     slope: SMatrix<f32, N, B>,
-    /// Covariance of the baselines, params given [m^2].
+    /// Covariance of the baselines, params given [m^2]; diagonal until the params walk.
     covariance: SMatrix<f32, B, B>,
+    walked: bool,
     /// Chi-square of everything at the origin.
     cost: Sum,
     /// `ln` of the product of `s` over the usual variance, readings and prior.
@@ -108,10 +113,14 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         let mut gaussian = Self {
             origin: [prior.mean; N],
             information: SMatrix::from_diagonal_element(precision),
+            staged: [[0.0; N]; 4],
+            staged_weight: [0.0; 4],
+            staged_rows: 0,
             vector: SVector::zeros(),
             baseline: [0.0; B],
             slope: SMatrix::zeros(),
             covariance: SMatrix::from_diagonal_element(BASELINE * BASELINE),
+            walked: false,
             cost: Sum::default(),
             volume: LogProduct::ONE,
             readings: Sum::default(),
@@ -147,7 +156,7 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         let (d, baseline_variance) = self.effective(b, h);
         let s = variance + baseline_variance;
         let e = innovation - mean;
-        add_square(&mut self.information, &d, 1.0 / s);
+        self.stage(&d, 1.0 / s);
         add(self.vector.as_mut_slice(), e / s, &d);
         self.cost.add(e * e / s);
         self.volume.multiply(s / USUAL);
@@ -155,20 +164,51 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         self.learn_baselines(b, &d, e, s);
     }
 
-    /// Gain of every baseline that is correlated with baseline `b`; without process noise that is `b` alone.
-    fn learn_baselines(&mut self, b: usize, d: &[f32; N], e: f32, s: f32) {
-        let mut column = [0.0; B];
-        column.iter_mut().zip(self.covariance.column(b).iter()).for_each(|(to, v)| *to = *v);
-        let each = self.baseline.iter_mut().zip(self.slope.as_mut_slice().chunks_exact_mut(N)).zip(&column);
-        for ((mean, slope), covariance) in each.filter(|(_, covariance)| **covariance != 0.0) {
-            let gain = covariance / s;
-            *mean += gain * e;
-            add(slope, gain, d);
+    fn stage(&mut self, d: &[f32; N], weight: f32) {
+        let at = self.staged_rows.min(3);
+        if let (Some(row), Some(to)) = (self.staged.get_mut(at), self.staged_weight.get_mut(at)) {
+            (*row, *to) = (*d, weight);
         }
-        for (to, covariance) in self.covariance.as_mut_slice().chunks_exact_mut(B).zip(&column) {
-            if *covariance != 0.0 {
-                add(to, -covariance / s, &column);
+        self.staged_rows = at + 1;
+        if self.staged_rows == 4 {
+            self.settle();
+        }
+    }
+
+    /// Let the last readings enter the information; to be called after a frame's.
+    pub fn settle(&mut self) {
+        let weights = self.staged_weight.iter().take(self.staged_rows);
+        for (j, to) in self.information.as_mut_slice().chunks_exact_mut(N).enumerate() {
+            let from = block_start(j);
+            let terms = self.staged.iter().zip(weights.clone()).map(|(row, weight)| {
+                (weight * row.get(j).copied().unwrap_or(0.0), row.get(from..).unwrap_or_default())
+            });
+            combine(to.get_mut(from..).unwrap_or_default(), terms);
+        }
+        self.staged_rows = 0;
+    }
+
+    /// Copy the lower triangle of the information to the upper one.
+    fn mirror(&mut self) {
+        for j in 0..N {
+            for i in j + 1..N {
+                self.information[(j, i)] = self.information[(i, j)];
             }
+        }
+    }
+
+    /// Move the baselines: without process noise that of monitor `b` alone, else all, for they are correlated.
+    fn learn_baselines(&mut self, b: usize, d: &[f32; N], e: f32, s: f32) {
+        let mut gain = [0.0; B];
+        gain.iter_mut().zip(column(self.covariance.as_slice(), B, b)).for_each(|(to, v)| *to = v / s);
+        let (from, to) = if self.walked { (0, B) } else { (b, b + 1) };
+        let slopes = self.slope.as_mut_slice().chunks_exact_mut(N);
+        let covariances = self.covariance.as_mut_slice().chunks_exact_mut(B);
+        let each = self.baseline.iter_mut().zip(slopes).zip(covariances).zip(&gain);
+        for (((mean, slope), covariance), g) in each.skip(from).take(to - from) {
+            *mean += g * e;
+            add(slope, *g, d);
+            add(covariance, -g * s, &gain);
         }
     }
 
@@ -207,9 +247,10 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
 
     /// Move the origin without changing the distribution.
     pub fn recentre(&mut self, origin: &[f32; N]) {
+        self.mirror();
         let mut step = SVector::<f32, N>::zeros();
         step.iter_mut().zip(origin.iter().zip(&self.origin)).for_each(|(s, (to, from))| *s = to - from);
-        let moved = times(&self.information, &step);
+        let moved = self.information * step;
         self.cost.add(step.dot(&moved) - 2.0 * step.dot(&self.vector));
         self.vector -= moved;
         for (mean, slope) in self.baseline.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
@@ -223,6 +264,7 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
     /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.
     /// `solution` is that of this Gaussian and serves as work space.
     pub fn walk(&mut self, sigma: f32, solution: &mut Solution<N>) {
+        self.mirror();
         let variance = sigma * sigma;
         let mean = solution.delta;
         let k = &mut solution.factor;
@@ -233,7 +275,6 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         if cholesky(k).is_none() {
             return; // 1 + a positive matrix; only a NaN could fail, and none can enter
         }
-        symmetrise(&mut self.information);
         for column in self.information.as_mut_slice().chunks_exact_mut(N) {
             solve(k, column);
         }
@@ -242,11 +283,12 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
             solve(k, column);
         }
         self.covariance += before.tr_mul(&self.slope) * variance;
+        self.walked = true;
         let shift = (self.slope - before).tr_mul(&mean);
         self.baseline.iter_mut().zip(shift.iter()).for_each(|(mean, s)| *mean += s);
         // the best point and its chi-square stay
         let best = self.cost.value() - self.vector.dot(&mean);
-        self.vector = times(&self.information, &mean);
+        self.vector = self.information * mean;
         self.cost = Sum::default();
         self.cost.add(best + self.vector.dot(&mean));
     }
@@ -269,8 +311,8 @@ pub struct Solution<const N: usize> {
     pub log_evidence: f32,
     /// Lower Cholesky factor of the information.
     factor: SMatrix<f32, N, N>,
-    /// Inverse of the factor.
-    inverse: SMatrix<f32, N, N>,
+    /// Rows of the factor's inverse.
+    inverse: [[f32; N]; N],
 }
 
 impl<const N: usize> Default for Solution<N> {
@@ -283,7 +325,7 @@ impl<const N: usize> Default for Solution<N> {
             cost: 0.0,
             log_evidence: 0.0,
             factor: SMatrix::zeros(),
-            inverse: SMatrix::zeros(),
+            inverse: [[0.0; N]; N],
         }
     }
 }
@@ -297,9 +339,12 @@ impl<const N: usize> Solution<N> {
         self.delta = gaussian.vector;
         solve(&self.factor, self.delta.as_mut_slice());
         invert_lower(&self.factor, &mut self.inverse);
-        for (sigma, column) in self.sigma.iter_mut().zip(self.inverse.as_slice().chunks_exact(N)) {
-            *sigma = libm::sqrtf(dot(column, column));
+        // P = X^T X, X the inverse of the factor
+        let mut variance = [0.0; N];
+        for row in &self.inverse {
+            variance.iter_mut().zip(row).for_each(|(v, x)| *v += x * x);
         }
+        self.sigma = variance.map(libm::sqrtf);
         self.cost = gaussian.cost.value() - gaussian.vector.dot(&self.delta);
         let volume = gaussian.volume.value() + LN_USUAL * gaussian.readings.value();
         self.log_evidence = -0.5 * (self.cost + volume + log_determinant);
@@ -335,30 +380,25 @@ impl<const N: usize> Solution<N> {
 
     /// Covariance of two params.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
-        // P = X^T X with X the inverse of the lower factor: rows above the later of i and j are zero
-        dot(column(self.inverse.as_slice(), N, i), column(self.inverse.as_slice(), N, j))
+        self.inverse.iter().filter_map(|row| Some(row.get(i)? * row.get(j)?)).sum()
     }
 
     /// Variance of a prediction with derivative `h`: `h^T P h`.
     pub fn variance_of(&self, h: &[f32]) -> f32 {
-        // P = X^T X, so the variance is |X h|^2
-        let mut image = [0.0; N];
-        for (column, h) in self.inverse.as_slice().chunks_exact(N).zip(h) {
-            add(&mut image, *h, column);
-        }
-        dot(&image, &image)
+        let image = |row: &[f32; N]| {
+            let x = dot(row, h);
+            x * x
+        };
+        self.inverse.iter().map(image).sum()
     }
 }
 
 impl<const B: usize, const N: usize> Gaussian<B, N> {
     /// Downhill pull on param `i` at a point: minus half the derivative of chi-square.
     fn pull(&self, i: usize, at: &[f32; N]) -> f32 {
-        let mut pull = self.vector.as_slice().get(i).copied().unwrap_or(0.0);
-        for (j, (at, origin)) in at.iter().zip(&self.origin).enumerate() {
-            let y = if j <= i { self.information[(i, j)] } else { self.information[(j, i)] };
-            pull -= y * (at - origin);
-        }
-        pull
+        let information = |j: usize| self.information[(i.max(j), i.min(j))];
+        let steps = at.iter().zip(&self.origin).enumerate().map(|(j, (at, origin))| information(j) * (at - origin));
+        self.vector.as_slice().get(i).copied().unwrap_or(0.0) - steps.sum::<f32>()
     }
 
     /// Derivative of the difference between a reading and its baseline, and the variance of the baseline.
@@ -370,55 +410,25 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
     }
 }
 
-/// Add `weight d d^T`. Whole columns: their length is known to the compiler, which is worth more than the half that the
-/// lower triangle would save.
-fn add_square<const N: usize>(a: &mut SMatrix<f32, N, N>, d: &[f32; N], weight: f32) {
-    for (column, factor) in a.as_mut_slice().as_chunks_mut::<N>().0.iter_mut().zip(d) {
-        let factor = weight * factor;
-        column.iter_mut().zip(d).for_each(|(to, d)| *to += factor * d);
-    }
-}
-
-/// Product of a symmetric matrix, kept as its lower triangle, with a vector.
-fn times<const N: usize>(a: &SMatrix<f32, N, N>, x: &SVector<f32, N>) -> SVector<f32, N> {
-    let mut product = SVector::<f32, N>::zeros();
-    for j in 0..N {
-        for i in j..N {
-            product[i] += a[(i, j)] * x[j];
-            if i != j {
-                product[j] += a[(i, j)] * x[i];
-            }
-        }
-    }
-    product
-}
-
-fn symmetrise<const N: usize>(a: &mut SMatrix<f32, N, N>) {
-    for j in 0..N {
-        for i in j + 1..N {
-            a[(j, i)] = a[(i, j)];
-        }
-    }
-}
-
-/// Cholesky factor of a lower triangle, in place, and the logarithm of the determinant; none if it is not positive.
-/// nalgebra's own takes the matrix by value, 9 kB of stack.
+/// Cholesky factor `L` of a symmetric matrix, in place, and the logarithm of its determinant; none if it is not
+/// positive. nalgebra's own takes the matrix by value, 9 kB of stack.
 fn cholesky<const N: usize>(a: &mut SMatrix<f32, N, N>) -> Option<f32> {
     let mut determinant = LogProduct::ONE;
     for j in 0..N {
-        let (done, rest) = a.as_mut_slice().split_at_mut(j * N);
-        let from = j & !7;
+        let from = block_start(j);
+        let (done, rest) = a.as_mut_slice().split_at_mut_checked(j * N)?;
         let column = rest.get_mut(from..N)?;
-        for before in done.chunks_exact(N) {
-            add(column, -*before.get(j)?, before.get(from..)?);
-        }
-        let column = column.get_mut(j - from..)?;
-        let pivot = *column.first()?;
+        combine(
+            column,
+            done.chunks_exact(N).map(|before| (-before.get(j).unwrap_or(&0.0), before.get(from..).unwrap_or_default())),
+        );
+        let lower = column.get_mut(j - from..)?;
+        let pivot = *lower.first()?;
         if pivot.is_nan() || pivot <= 0.0 {
             return None;
         }
         let scale = 1.0 / libm::sqrtf(pivot);
-        column.iter_mut().for_each(|v| *v *= scale);
+        lower.iter_mut().for_each(|v| *v *= scale);
         determinant.multiply(pivot);
     }
     Some(determinant.value())
@@ -443,21 +453,24 @@ fn solve<const N: usize>(factor: &SMatrix<f32, N, N>, x: &mut [f32]) {
     }
 }
 
-/// Inverse of a lower triangle.
-fn invert_lower<const N: usize>(factor: &SMatrix<f32, N, N>, inverse: &mut SMatrix<f32, N, N>) {
-    inverse.fill(0.0);
-    for (j, x) in inverse.as_mut_slice().chunks_exact_mut(N).enumerate() {
-        if let Some(one) = x.get_mut(j) {
+/// Rows of the inverse of a lower triangle: `row_i = (e_i - sum over k < i of L_ik row_k)/L_ii`.
+fn invert_lower<const N: usize>(factor: &SMatrix<f32, N, N>, rows: &mut [[f32; N]; N]) {
+    for i in 0..N {
+        let Some((done, [row, ..])) = rows.split_at_mut_checked(i) else { return };
+        let entry = |k: usize| column(factor.as_slice(), N, k).get(i).copied().unwrap_or(0.0);
+        row.fill(0.0);
+        // in blocks of the rows above: each is zero beyond its own diagonal
+        for (block, before) in done.chunks(BLOCK).enumerate() {
+            let length = (BLOCK * (block + 1)).min(N);
+            let terms = before.iter().enumerate();
+            let terms = terms.map(|(k, before)| (-entry(BLOCK * block + k), before.as_slice()));
+            combine(row.get_mut(..length).unwrap_or_default(), terms);
+        }
+        if let Some(one) = row.get_mut(i) {
             *one = 1.0;
         }
-        for (k, column) in factor.as_slice().chunks_exact(N).enumerate().skip(j) {
-            if let (Some((top, under)), Some([pivot, below @ ..])) =
-                (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
-            {
-                *top /= pivot;
-                add(under, -*top, below);
-            }
-        }
+        let scale = 1.0 / entry(i);
+        row.iter_mut().for_each(|v| *v *= scale);
     }
 }
 
@@ -491,6 +504,7 @@ mod tests {
         for (b, innovation, h) in readings() {
             gaussian.condition(b, innovation, VARIANCE, &h);
         }
+        gaussian.settle();
         gaussian
     }
 
@@ -552,6 +566,7 @@ mod tests {
                 gaussian.walk(2e-3, &mut solution);
             }
             gaussian.condition(b, innovation, VARIANCE, &h);
+            gaussian.settle();
         }
         assert_equal(&gaussian, &[10, 25], 2e-3);
     }
@@ -568,6 +583,7 @@ mod tests {
             let e = innovation - gaussian.baseline(b) - d[0] * solution.delta[0] - d[1] * solution.delta[1];
             log_density -= 0.5 * (e * e / s + libm::logf(core::f32::consts::TAU * s));
             gaussian.condition(b, innovation, VARIANCE, &h);
+            gaussian.settle();
         }
         solution.solve(&gaussian, &WIDE);
         assert!((solution.log_evidence - log_density).abs() < 0.02, "{} {log_density}", solution.log_evidence); // f32

@@ -7,6 +7,34 @@ pub fn add(to: &mut [f32], factor: f32, from: &[f32]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * from);
 }
 
+/// `to += sum of factor * row`, four rows at a time: loads and stores of `to` are what costs. Rows are at least as long.
+#[inline]
+pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>) {
+    let mut terms = terms.fuse();
+    while let Some((a, first)) = terms.next() {
+        let none = (0.0, first);
+        let (b, second) = terms.next().unwrap_or(none);
+        let (c, third) = terms.next().unwrap_or(none);
+        let (d, fourth) = terms.next().unwrap_or(none);
+        // one length for all, so that the loop below has no bounds to check and becomes vector code
+        let n = to.len();
+        let rows = (first.get(..n), second.get(..n), third.get(..n), fourth.get(..n));
+        let (Some(first), Some(second), Some(third), Some(fourth)) = rows else { return };
+        for i in 0..n {
+            to[i] += (a * first[i] + b * second[i]) + (c * third[i] + d * fourth[i]);
+        }
+    }
+}
+
+/// Length of the blocks in which triangles are worked on: whole vectors, and not much beyond the triangle.
+pub const BLOCK: usize = 16;
+
+/// The start of the block that holds `i`.
+#[inline]
+pub fn block_start(i: usize) -> usize {
+    i - i % BLOCK
+}
+
 /// Scalar product, summed in eight lanes.
 #[inline]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
@@ -35,6 +63,10 @@ mod tests {
         let mut b = [1.0; 19];
         add(&mut b, 2.0, &a);
         assert!(b.iter().enumerate().all(|(i, b)| *b == 1.0 + 2.0 * i as f32));
+        let rows = [[1.0; 3], [2.0; 3], [3.0; 3], [4.0; 3], [5.0; 3]];
+        let mut sum = [0.5; 3];
+        combine(&mut sum, rows.iter().map(|row| (2.0, row.as_slice())));
+        assert_eq!(sum, [30.5; 3]);
         assert_eq!(column(&a, 5, 2), [10.0, 11.0, 12.0, 13.0, 14.0]);
         assert!(column(&a, 5, 3).is_empty());
     }

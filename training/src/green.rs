@@ -152,7 +152,9 @@ fn spurious(ring: &Ring, optics: &Optics) -> Result<[f32; 2], OrbitError> {
             }
         }
     }
-    Ok([0, 1].map(|plane| f64::sqrt(change[plane] / orbit[plane]) as f32))
+    // An offset and its opposite share the change with opposite signs; the core takes them for independent, so each is
+    // given twice the variance.
+    Ok([0, 1].map(|plane| f64::sqrt(2.0 * change[plane] / orbit[plane]) as f32))
 }
 
 /// The ring with its quadrupoles shifted at random, uniformly, seeded.
