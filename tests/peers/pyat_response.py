@@ -96,7 +96,7 @@ def response(ring, monitors, correctors):
 
 
 def analytic(ring, monitors, correctors):
-    """x at the monitors to the H correctors, y to the V correctors [m/rad], shape (2, monitors, correctors of a plane)."""
+    """x at monitors to H correctors, y to V correctors [m/rad], shape (2, monitors, half the correctors)."""
     order = np.argsort(monitors)
     answer = np.empty((2, len(monitors), len(correctors) // 2))
     for i, (plane, name) in enumerate((("x", "DCH"), ("y", "DCV"))):

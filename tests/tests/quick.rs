@@ -54,6 +54,27 @@ fn quick() {
         let p = nalgebra::DMatrix::from_fn(48, 48, |i, j| core.covariance(i, j) as f64);
         let nees = (d.transpose() * p.try_inverse().unwrap() * &d)[0] / 48.0;
         let f = core.fit_quality();
+        if q == 0.0 && std::env::var("FIT").is_ok() {
+            let t0 = std::time::Instant::now();
+            match BatchFit::of(&ring, &r, |_| ()) {
+                Err(e) => println!("   fit: {e}"),
+                Ok(fit) => {
+                    let shift = (0..48)
+                        .map(|i| ((fit.map_params[i] - e.map_params[i] as f64) / fit.covariance[(i, i)].sqrt()).abs())
+                        .fold(0.0, f64::max);
+                    let ratio = (0..48)
+                        .map(|i| (e.params_sigma[i] as f64 / fit.covariance[(i, i)].sqrt() - 1.0).abs())
+                        .fold(0.0, f64::max);
+                    println!(
+                        "   fit: shift {shift:.3} sigma, ratio off {ratio:.4}, chi2 {:.4}, steps {}, tunes {:?} {:?}",
+                        fit.chi2_per_dof,
+                        fit.steps,
+                        fit.tunes,
+                        t0.elapsed()
+                    );
+                }
+            }
+        }
         let mut lt: Vec<f64> = times.iter().filter(|t| t.1).map(|t| t.0).collect();
         lt.sort_by(f64::total_cmp);
         let mut t: Vec<f64> = times.iter().map(|t| t.0).collect();

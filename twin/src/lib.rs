@@ -20,4 +20,4 @@ pub mod response;
 pub use effects::{Effect, EffectError, EffectKind, Machine, MachineResponse};
 pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
-pub use response::{Observer, Optics, Place, Source, Tunes};
+pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
