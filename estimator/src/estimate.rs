@@ -23,8 +23,10 @@ pub enum MonitorState {
 pub struct Health {
     /// How it is doing.
     pub state: MonitorState,
-    /// Noise of one reading, as weighted [m].
-    pub sigma: f32,
+    /// Noise of one reading [m].
+    pub noise: f32,
+    /// Noise as which a reading is weighted: more than its noise for a monitor that jumps [m].
+    pub weighted_as: f32,
     /// Readings that were not used.
     pub rejected: u32,
 }

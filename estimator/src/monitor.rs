@@ -44,8 +44,10 @@ const ONE_SIGMA: f32 = 0.682_689_5;
 /// Standard error of `ln sigma` from one sigma's quantile of n differences is this over `sqrt(n)`:
 /// `sqrt(p (1 - p))/(2 phi(1))` = 0.96, and 1.2 times that since neighbouring differences share a reading.
 const QUANTILE_ERROR: f32 = 1.15;
-/// Standard errors by which the repeats must contradict the noise in use before it is revised.
+/// Standard errors by which the repeats must contradict the expected noise before it is given up.
 const CONTRADICTION: f32 = 4.0;
+/// Standard errors by which they must contradict a noise that was learnt already.
+const REVISION: f32 = 0.5;
 /// Differences needed before the noise is revised at all.
 const ENOUGH: u32 = 8;
 
@@ -113,7 +115,8 @@ impl Noise {
     /// Take over what was learnt if it contradicts the noise in use; true if the noise changed.
     pub fn revise(&mut self) -> bool {
         let Some(learnt) = self.learnt() else { return false };
-        let error = CONTRADICTION * QUANTILE_ERROR / libm::sqrtf(self.total as f32);
+        let errors = if self.sigma == self.expected { CONTRADICTION } else { REVISION };
+        let error = errors * QUANTILE_ERROR / libm::sqrtf(self.total as f32);
         if libm::logf(learnt / self.sigma).abs() <= error {
             return false;
         }
@@ -141,6 +144,7 @@ pub struct Monitor {
     /// Its noise.
     pub noise: Noise,
     state: MonitorState,
+    jumps: bool,
     reported: u32,
     rejected: u32,
     silent: u32,
@@ -154,6 +158,7 @@ impl Monitor {
         Self {
             noise: Noise::expecting(sigma),
             state: MonitorState::Ok,
+            jumps: false,
             reported: 0,
             rejected: 0,
             silent: 0,
@@ -188,29 +193,34 @@ impl Monitor {
 
     /// Judge the monitor anew; true if readings so far have to be weighted differently.
     pub fn judge(&mut self) -> bool {
-        let before = self.state == MonitorState::Jumps;
-        let noise_changed = self.noise.revise();
+        let (jumped, noise_changed) = (self.jumps, self.noise.revise());
+        self.jumps = self.rejected >= FEWEST_JUMPS && self.rejected as f32 > JUMPY * self.reported as f32;
         self.state = if self.silent >= SILENCE {
             MonitorState::Dead
         } else if self.noise.sigma > NOISY * self.noise.expected {
             MonitorState::Noisy
-        } else if self.rejected >= FEWEST_JUMPS && self.rejected as f32 > JUMPY * self.reported as f32 {
+        } else if self.jumps {
             MonitorState::Jumps
         } else {
             MonitorState::Ok
         };
-        noise_changed || before != (self.state == MonitorState::Jumps)
+        noise_changed || jumped != self.jumps
     }
 
     /// Variance of one reading, as weighted [m^2].
     pub fn variance(&self) -> f32 {
         let variance = self.noise.sigma * self.noise.sigma;
-        if self.state == MonitorState::Jumps { JUMPING * variance } else { variance }
+        if self.jumps { JUMPING * variance } else { variance }
     }
 
     /// For the outside.
     pub fn health(&self) -> Health {
-        Health { state: self.state, sigma: libm::sqrtf(self.variance()), rejected: self.rejected }
+        Health {
+            state: self.state,
+            noise: self.noise.sigma,
+            weighted_as: libm::sqrtf(self.variance()),
+            rejected: self.rejected,
+        }
     }
 }
 

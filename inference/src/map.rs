@@ -230,7 +230,7 @@ impl<'r> Problem<'r> {
         for b in 0..monitors {
             let plane = usize::from(b >= split);
             let health = &self.screened.health[b];
-            let noise = f64::from(health.sigma).powi(2);
+            let noise = f64::from(health.weighted_as).powi(2);
             let (mut weight, mut sum, mut slope) = (0.0, 0.0, DVector::zeros(n));
             let (mut square, mut count, mut plain, mut plain_square) = (0.0, 0.0, 0.0, 0.0);
             for (i, drive) in self.drives.iter().enumerate() {

@@ -1,8 +1,21 @@
-//! What the system tests share: other codes' numbers, and where they lie.
+//! What the system tests share: where the repository's files lie, and the truth behind its recordings.
 
 use std::path::{Path, PathBuf};
+
+use twin::Ring;
 
 /// A file or folder of the repository.
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// True vars of a recording, in the order of the ring's quadrupoles [N].
+///
+/// # Panics
+/// If the recording has no `truth.json` with every var.
+pub fn truth(recording: &str, ring: &Ring) -> Vec<f64> {
+    let text = std::fs::read_to_string(repository(recording).join("truth.json")).expect("a recording with its truth");
+    let truth: serde_json::Value = serde_json::from_str(&text).expect("truth is JSON");
+    let var = |name: &String| truth["vars"][name].as_f64().expect("a number for every var");
+    ring.var_names().iter().map(var).collect()
 }

@@ -216,7 +216,7 @@ fn assert_cases_equal(code: &str, tolerance: impl Fn(&str) -> [f64; 2]) {
     assert_eq!(cases.len(), 7);
     for (name, answers) in cases {
         let effects: Vec<Effect> = answers["effects"].as_array().unwrap().iter().map(effect).collect();
-        let ours = Machine::new(Ring::booster(), ON_MOMENTUM, &effects).unwrap().response().unwrap();
+        let ours = Machine::new(Ring::booster(), twin::Rf::FixedMomentum, &effects).unwrap().response().unwrap();
         let (x, y) = (matrix(&answers["response_x_m_per_rad"]), matrix(&answers["response_y_m_per_rad"]));
         let tolerance = tolerance(name);
         assert_near(&format!("{code} {name} x"), ours.x.as_slice(), x.as_slice(), tolerance[0]);

@@ -49,7 +49,7 @@ kinds! {
     CorrectorRoll = "corrector_roll",
     /// A quadrupole is rotated [rad].
     QuadRoll = "quad_roll",
-    /// A monitor reads x (1 + a x^2), a in [1/mm^2].
+    /// A monitor reads x (1 + a x^2), a in [1/mm^2]; a response, the limit of small kicks, shows it on a displaced orbit.
     BpmCubic = "bpm_cubic",
     /// Two monitors' names are exchanged.
     BpmSwap = "bpm_swap",
@@ -65,7 +65,7 @@ kinds! {
     DipoleGradient = "dipole_gradient",
     /// Edge angle of one dipole, or of all without a place [rad].
     DipoleEdge = "dipole_edge",
-    /// A sextupole field, K2L [1/m^2].
+    /// A sextupole field, K2L [1/m^2]; a response shows it on a displaced orbit.
     SextupoleError = "sextupole_error",
     /// The beam is off momentum.
     MomentumOffset = "momentum_offset",
@@ -108,9 +108,6 @@ pub enum EffectError {
     /// A place that the ring lacks.
     #[error(transparent)]
     Lattice(#[from] LatticeError),
-    /// The ring with the effect has no stable closed orbit.
-    #[error(transparent)]
-    Orbit(#[from] OrbitError),
 }
 
 impl FromStr for Effect {
@@ -130,11 +127,21 @@ impl FromStr for Effect {
     }
 }
 
+/// What the RF system holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rf {
+    /// The momentum.
+    FixedMomentum,
+    /// The frequency; the momentum follows the path length.
+    FixedFrequency,
+}
+
 /// A ring with effects applied.
 #[derive(Debug, Clone)]
 pub struct Machine {
     ring: Ring,
-    hold: Hold,
+    /// Momentum of the beam.
+    delta: f64,
     /// Share of the answer that is given at fixed RF frequency.
     frequency_share: f64,
     /// Monitors (indices among the places) whose mean is held, and the share.
@@ -168,12 +175,13 @@ pub struct MachineResponse {
 }
 
 impl Machine {
-    /// Apply effects to a ring whose momentum or frequency is held.
+    /// Apply effects to a ring whose momentum (on average) is the reference's, and is held, or the frequency.
     ///
     /// # Errors
     /// [`EffectError`] if an effect names a place that the ring lacks or that its kind cannot act on.
-    pub fn new(ring: Ring, hold: Hold, effects: &[Effect]) -> Result<Self, EffectError> {
-        let mut machine = Self { ring, hold, frequency_share: 0.0, radial_loop: None, instruments: Vec::new() };
+    pub fn new(ring: Ring, rf: Rf, effects: &[Effect]) -> Result<Self, EffectError> {
+        let frequency_share = if rf == Rf::FixedFrequency { 1.0 } else { 0.0 };
+        let mut machine = Self { ring, delta: 0.0, frequency_share, radial_loop: None, instruments: Vec::new() };
         effects.iter().try_for_each(|effect| machine.apply(effect))?;
         Ok(machine)
     }
@@ -210,10 +218,19 @@ impl Machine {
                 bend.e2 += a;
             })?,
             EffectKind::SextupoleError => self.sextupole(effect)?,
-            EffectKind::MomentumOffset => self.hold = Hold::Momentum { delta: a },
-            EffectKind::FixedRfFrequency => self.frequency_share = a,
+            EffectKind::MomentumOffset => {
+                effect.everywhere()?;
+                self.delta += a;
+            }
+            EffectKind::FixedRfFrequency => {
+                effect.everywhere()?;
+                self.frequency_share = a;
+            }
             EffectKind::RadialLoop => {
-                let [(_, one), (_, other)] = self.monitor_pair(effect)?;
+                let [(plane, one), (_, other)] = self.monitor_pair(effect)?;
+                if plane != Plane::X {
+                    return Err(effect.wrong("two horizontal monitors such as x_D8,x_E6"));
+                }
                 self.radial_loop = Some(([one, other], a));
             }
             // Neither moves the half difference of two signs, averaged over a run.
@@ -227,11 +244,11 @@ impl Machine {
     /// # Errors
     /// [`OrbitError`] if the machine is unstable.
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
-        let optics = Optics::of(&self.ring, self.hold)?;
+        let optics = Optics::of(&self.ring, Hold::Momentum { delta: self.delta })?;
         let (mut x, mut y) = planes(&optics);
         if self.frequency_share != 0.0 {
-            let offset = Hold::Frequency { offset: 0.0 };
-            let (fixed_x, fixed_y) = planes(&Optics::of(&self.ring, offset)?);
+            let offset = optics.frequency_offset();
+            let (fixed_x, fixed_y) = planes(&Optics::of(&self.ring, Hold::Frequency { offset })?);
             x += (fixed_x - &x) * self.frequency_share;
             y += (fixed_y - &y) * self.frequency_share;
         }
@@ -291,8 +308,12 @@ impl Machine {
             "y" => Plane::Y,
             _ => return Err(wrong()),
         };
-        // a monitor of either plane may be rolled into view, so the half-cell decides
-        let place = self.ring.monitors.iter().position(|&i| self.ring.elements[i].cell() == cell).ok_or_else(wrong)?;
+        // the monitor of that plane, or the other one of the half-cell, whose roll shows in that plane
+        let of = |own: bool| {
+            let is = |e: &crate::Element| e.cell() == cell && (!own || e.kind == Kind::Monitor { plane });
+            self.ring.monitors.iter().position(|&i| is(&self.ring.elements[i]))
+        };
+        let place = of(true).or_else(|| of(false)).ok_or_else(wrong)?;
         Ok((plane, place))
     }
 
@@ -318,14 +339,16 @@ impl Machine {
     }
 
     fn stray(&mut self, effect: &Effect, k1l: f64, k1sl: f64) -> Result<(), EffectError> {
-        let at = self.ring.element(&effect.place)?;
+        let straight = |e: &crate::Element| matches!(e.kind, Kind::Marker | Kind::Multipole { .. });
+        let named = |e: &crate::Element| e.name == effect.place || e.cell() == effect.place;
+        let at = self.ring.elements.iter().position(|e| straight(e) && named(e));
+        let at = at.ok_or_else(|| effect.wrong("a free straight such as SLOT_F6"))?;
         match &mut self.ring.elements[at].kind {
             Kind::Multipole { k1l: normal, k1sl: skew, .. } => {
                 *normal += k1l;
                 *skew += k1sl;
             }
-            kind @ Kind::Marker => *kind = Kind::Multipole { k1l, k1sl, k2l: 0.0 },
-            _ => return Err(effect.wrong("a free straight such as SLOT_F6")),
+            kind => *kind = Kind::Multipole { k1l, k1sl, k2l: 0.0 },
         }
         Ok(())
     }
@@ -357,14 +380,19 @@ impl Machine {
 }
 
 impl Effect {
+    /// An effect on the whole ring takes no place.
+    fn everywhere(&self) -> Result<(), EffectError> {
+        if self.place.is_empty() { Ok(()) } else { Err(self.wrong("no place")) }
+    }
+
     fn wrong(&self, expected: &'static str) -> EffectError {
         EffectError::Place { kind: self.kind.word(), expected, found: self.place.clone() }
     }
 }
 
-/// The half-cell of a place that may carry a prefix.
+/// The half-cell of a place that may carry a prefix: `D8` of `QH_D8`.
 fn cell(place: &str) -> &str {
-    place.rsplit('_').next().unwrap_or(place)
+    place.split_once('_').map_or(place, |(_, cell)| cell)
 }
 
 fn planes(optics: &Optics) -> (DMatrix<f64>, DMatrix<f64>) {
@@ -389,7 +417,7 @@ mod tests {
 
     fn respond(effects: &[&str]) -> MachineResponse {
         let effects: Vec<Effect> = effects.iter().map(|e| e.parse().unwrap()).collect();
-        Machine::new(Ring::booster(), Hold::Momentum { delta: 0.0 }, &effects).unwrap().response().unwrap()
+        Machine::new(Ring::booster(), Rf::FixedMomentum, &effects).unwrap().response().unwrap()
     }
 
     #[test]
@@ -407,8 +435,7 @@ mod tests {
             "bpm_gain@x_E4=nan".parse::<Effect>().unwrap_err().to_string(),
             "effect bpm_gain: expected a finite amplitude, found \"nan\""
         );
-        let astray =
-            Machine::new(Ring::booster(), Hold::Momentum { delta: 0.0 }, &["stray_gradient@QH_A2".parse().unwrap()]);
+        let astray = Machine::new(Ring::booster(), Rf::FixedMomentum, &["stray_gradient@QH_A2".parse().unwrap()]);
         assert_eq!(
             astray.unwrap_err().to_string(),
             "effect stray_gradient: expected a free straight such as SLOT_F6, found \"QH_A2\""
@@ -428,6 +455,20 @@ mod tests {
         // an H corrector rolled by 90 degrees kicks (0, 1)
         let turned = respond(&["corrector_roll@H_A2=1.5707963267948966"]);
         assert!(turned.x.column(0).abs().max() < 1e-9 && turned.y.column(0).abs().max() > 1.0);
+    }
+
+    #[test]
+    fn a_held_frequency_stays_with_the_momentum_offset() {
+        let both = respond(&["momentum_offset=0.003", "fixed_rf_frequency"]);
+        let (offset, held) = (respond(&["momentum_offset=0.003"]), respond(&["fixed_rf_frequency"]));
+        assert!((&both.x - &offset.x).abs().max() > 0.01 && (&both.x - &held.x).abs().max() > 0.01);
+        assert!(
+            (&both.y - &offset.y).abs().max() < 1e-9,
+            "no vertical dispersion, so the frequency does not matter in y"
+        );
+        let far =
+            Machine::new(Ring::booster(), Rf::FixedFrequency, &["momentum_offset=0.003".parse().unwrap()]).unwrap();
+        assert_eq!(far.response().unwrap().x, both.x);
     }
 
     #[test]

@@ -189,7 +189,7 @@ pub enum LatticeError {
         circumference: f64,
     },
     /// A field that this type of element needs is missing or not finite.
-    #[error("element {name}: expected a finite {field}, found {found}")]
+    #[error("{name}: expected {field}, found {found}")]
     Field {
         /// The element.
         name: String,
@@ -197,6 +197,24 @@ pub enum LatticeError {
         field: &'static str,
         /// What stands there.
         found: String,
+    },
+    /// Two elements of one name.
+    #[error("element {name}: a second element of this name, at {s} m")]
+    Duplicate {
+        /// The name.
+        name: String,
+        /// Where the second one starts [m].
+        s: f64,
+    },
+    /// A length that this type of element cannot have.
+    #[error("element {name}: expected {expected}, found a length of {found} m")]
+    Length {
+        /// The element.
+        name: String,
+        /// What it can have.
+        expected: &'static str,
+        /// What stands there [m].
+        found: f64,
     },
     /// An unknown element type.
     #[error("element {name}: unknown type {found:?}")]
@@ -242,6 +260,7 @@ struct MonitorLists {
 }
 
 #[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct ElementEntry {
     name: String,
     #[serde(rename = "type")]
@@ -264,6 +283,10 @@ struct ElementEntry {
     dx: Option<f64>,
     dy: Option<f64>,
     roll: Option<f64>,
+    #[serde(rename = "note")]
+    _note: Option<String>,
+    #[serde(rename = "valid_in_paper")]
+    _valid_in_paper: Option<bool>,
 }
 
 /// Rest energies of the particles that a machine file may name [GeV] (CODATA 2018).
@@ -300,16 +323,21 @@ impl Ring {
         let rest_energy = REST_ENERGY.iter().find(|(name, _)| *name == file.reference.particle).map(|p| p.1);
         let rest_energy = rest_energy.ok_or_else(|| LatticeError::Field {
             name: file.name.clone(),
-            field: "reference.particle (proton, electron)",
+            field: "reference.particle proton or electron",
             found: file.reference.particle.clone(),
         })?;
+        let energy = file.reference.kinetic_energy;
+        if !(energy > 0.0 && energy.is_finite()) {
+            let field = "a reference.kinetic_energy_GeV above 0";
+            return Err(LatticeError::Field { name: file.name, field, found: energy.to_string() });
+        }
         let mut elements = Vec::new();
         for entry in &file.elements {
             append(&mut elements, entry.element(&file.k1)?)?;
         }
         close(&mut elements, file.circumference_m)?;
         let mut ring = Self {
-            particle: Particle { rest_energy, kinetic_energy: file.reference.kinetic_energy },
+            particle: Particle { rest_energy, kinetic_energy: energy },
             name: file.name,
             circumference: file.circumference_m,
             elements,
@@ -416,6 +444,9 @@ impl Ring {
     }
 
     /// The same ring with each quadrupole's gradient multiplied by its factor (shape `[N]`, order of [`Ring::quadrupoles`]).
+    ///
+    /// # Panics
+    /// If there is not one var for each quadrupole.
     pub fn with_vars(&self, vars: &[f64]) -> Self {
         assert_eq!(vars.len(), self.quadrupoles.len(), "one var for each quadrupole");
         let mut ring = self.clone();
@@ -428,7 +459,8 @@ impl Ring {
 
 impl ElementEntry {
     fn element(&self, families: &std::collections::BTreeMap<String, f64>) -> Result<Element, LatticeError> {
-        let length = self.finite("length", Some(self.length))?;
+        let length = self.finite("a finite length", Some(self.length))?;
+        self.check_length(length)?;
         let family = self.family.as_ref().and_then(|f| families.get(f)).copied();
         let or_zero = |field, value: Option<f64>| self.finite(field, Some(value.unwrap_or(0.0)));
         let kind = match self.kind.as_str() {
@@ -436,33 +468,33 @@ impl ElementEntry {
             "bpm" => Kind::Monitor { plane: self.plane()? },
             "corrector" => Kind::Corrector { plane: self.plane()?, kick: [0.0; 2] },
             "quadrupole" => {
-                Kind::Quadrupole { k1: self.finite("k1, or a family in the file's k1", self.k1.or(family))? }
+                Kind::Quadrupole { k1: self.finite("a finite k1, or a family in the file's k1", self.k1.or(family))? }
             }
-            "sextupole" => Kind::Sextupole { k2: or_zero("k2", self.k2)? },
+            "sextupole" => Kind::Sextupole { k2: or_zero("a finite k2", self.k2)? },
             "multipole" => Kind::Multipole {
-                k1l: or_zero("k1l", self.k1l)?,
-                k1sl: or_zero("k1sl", self.k1sl)?,
-                k2l: or_zero("k2l", self.k2l)?,
+                k1l: or_zero("a finite k1l", self.k1l)?,
+                k1sl: or_zero("a finite k1sl", self.k1sl)?,
+                k2l: or_zero("a finite k2l", self.k2l)?,
             },
-            "solenoid" => Kind::Solenoid { ks: self.finite("ks", self.ks)? },
+            "solenoid" => Kind::Solenoid { ks: self.finite("a finite ks", self.ks)? },
             "sbend" => Kind::Bend(Bend {
-                curvature: self.finite("angle", self.angle)? / length,
-                k1: or_zero("k1", self.k1)?,
-                e1: or_zero("e1", self.e1)?,
-                e2: or_zero("e2", self.e2)?,
-                fringe: 2.0 * or_zero("fint", self.fint)? * or_zero("hgap", self.hgap)?,
+                curvature: self.finite("a finite angle", self.angle)? / length,
+                k1: or_zero("a finite k1", self.k1)?,
+                e1: or_zero("a finite e1", self.e1)?,
+                e2: or_zero("a finite e2", self.e2)?,
+                fringe: 2.0 * or_zero("a finite fint", self.fint)? * or_zero("a finite hgap", self.hgap)?,
             }),
             found => return Err(LatticeError::Type { name: self.name.clone(), found: found.into() }),
         };
         Ok(Element {
             name: self.name.clone(),
             kind,
-            s: self.finite("s_start", Some(self.s_start))?,
+            s: self.finite("a finite s_start", Some(self.s_start))?,
             length,
             misalignment: Misalignment {
-                dx: or_zero("dx", self.dx)?,
-                dy: or_zero("dy", self.dy)?,
-                roll: or_zero("roll", self.roll)?,
+                dx: or_zero("a finite dx", self.dx)?,
+                dy: or_zero("a finite dy", self.dy)?,
+                roll: or_zero("a finite roll", self.roll)?,
             },
         })
     }
@@ -475,10 +507,20 @@ impl ElementEntry {
         })
     }
 
+    fn check_length(&self, length: f64) -> Result<(), LatticeError> {
+        let expected = match self.kind.as_str() {
+            "sbend" | "quadrupole" | "solenoid" if length <= 0.0 => "a length above 0",
+            "multipole" if length != 0.0 => "a thin element",
+            _ if length < 0.0 => "a length of 0 or more",
+            _ => return Ok(()),
+        };
+        Err(LatticeError::Length { name: self.name.clone(), expected, found: length })
+    }
+
     fn plane(&self) -> Result<Plane, LatticeError> {
         self.plane.ok_or_else(|| LatticeError::Field {
             name: self.name.clone(),
-            field: "plane",
+            field: "a plane H or V",
             found: "nothing".into(),
         })
     }
@@ -490,6 +532,9 @@ fn append(elements: &mut Vec<Element>, element: Element) -> Result<(), LatticeEr
     let gap = element.s - end;
     if gap < -ROUNDING {
         return Err(LatticeError::Overlap { name: element.name, start: element.s, before, end });
+    }
+    if elements.iter().any(|e| e.name == element.name) {
+        return Err(LatticeError::Duplicate { name: element.name, s: element.s });
     }
     fill(elements, end, gap);
     elements.push(element);
@@ -551,7 +596,7 @@ mod tests {
         let cases = [
             (
                 r#"{"name":"Q","type":"quadrupole","s_start":0,"length":1}"#,
-                "element Q: expected a finite k1, or a family in the file's k1, found nothing",
+                "Q: expected a finite k1, or a family in the file's k1, found nothing",
             ),
             (r#"{"name":"U","type":"undulator","s_start":0,"length":1}"#, "element U: unknown type \"undulator\""),
             (
@@ -562,14 +607,17 @@ mod tests {
                 r#"{"name":"A","type":"marker","s_start":2.5,"length":1}"#,
                 "elements end at 3.5 m, beyond the circumference of 3 m",
             ),
-            (
-                r#"{"name":"C","type":"corrector","s_start":0,"length":0}"#,
-                "element C: expected a finite plane, found nothing",
-            ),
+            (r#"{"name":"C","type":"corrector","s_start":0,"length":0}"#, "C: expected a plane H or V, found nothing"),
         ];
         for (elements, message) in cases {
             assert_eq!(Ring::parse(&machine(elements), "toy.json").unwrap_err().to_string(), message);
         }
+    }
+
+    #[test]
+    fn a_mistyped_key_is_refused() {
+        let text = machine(r#"{"name":"B","type":"sbend","s_start":0,"length":1,"angle":0.1,"E1":0.1}"#);
+        assert!(Ring::parse(&text, "toy.json").unwrap_err().to_string().starts_with("toy.json: unknown field `E1`"));
     }
 
     #[test]

@@ -17,7 +17,7 @@ pub mod map;
 pub mod orbit;
 pub mod response;
 
-pub use effects::{Effect, EffectError, EffectKind, Machine, MachineResponse};
+pub use effects::{Effect, EffectError, EffectKind, Machine, MachineResponse, Rf};
 pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};

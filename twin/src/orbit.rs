@@ -39,8 +39,11 @@ pub enum OrbitError {
         /// Square of half the difference of the modes' traces [1].
         discriminant: f64,
     },
-    /// The one-turn matrix has an eigenvalue 1: every kick drives an infinite orbit.
-    #[error("integer resonance: determinant {determinant:.3e} of (1 - one-turn matrix), half traces {half_traces:.6?}")]
+    /// The closure equations are singular: at an integer tune every kick drives an infinite orbit, and with a fixed
+    /// frequency at transition every path drives an infinite momentum.
+    #[error(
+        "integer resonance or transition: determinant {determinant:.3e} of (1 - one-turn matrix), half traces {half_traces:.6?}"
+    )]
     Integer {
         /// Determinant of the closure equations.
         determinant: f64,
@@ -82,14 +85,15 @@ impl ClosedOrbit {
         if let Hold::Momentum { delta } = hold {
             start[DELTA] = delta;
         }
-        let mut residual = f64::INFINITY;
-        for _ in 0..STEPS {
+        let (mut residual, mut steps) = (f64::INFINITY, 0);
+        while steps < STEPS {
             let turn = Self::trace(ring, start);
             let miss = hold.miss(ring, &start, turn.end());
             residual = miss.abs().max();
             if residual < TOLERANCE {
                 return Ok(turn);
             }
+            steps += 1;
             if !residual.is_finite() {
                 break;
             }
@@ -98,7 +102,7 @@ impl ClosedOrbit {
                 *z += step;
             }
         }
-        Err(OrbitError::NotConverged { residual, steps: STEPS })
+        Err(OrbitError::NotConverged { residual, steps })
     }
 
     /// Carry one ray around the ring.

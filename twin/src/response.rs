@@ -11,12 +11,14 @@
 //! `dG/dk = -a (W + step) Q (W + step) c`, `Q` = integral over the element of `T^-1 E T ds`,
 //!
 //! which is `dG/dk = - integral G(s_i, s) G(s, s_j) ds`, coupled. The step and the hold (fixed momentum or frequency)
-//! enter through `W` alone, so the formula is the same for all of them. The shift of the orbit itself inside dipoles
-//! and sextupoles (feed-down) is left out; on the reference orbit there is none.
+//! enter through `W` alone, so the formula is the same for all of them. Observers and sources stand outside the element
+//! that changes. Derivatives are exact on the reference orbit; elsewhere the gradient also moves the orbit, and with it
+//! the linear maps of what is not linear (feed-down), which is left out: at delta = 0.003 it makes up to 0.4 % of the
+//! response's derivative, 9 % of the dispersion's and 4 % of the compaction's.
 //!
 //! Source: S. Y. Lee, Accelerator Physics, ch. 2; J. Safranek, NIM A 388 (1997) 27 for the use.
 
-use nalgebra::{DMatrix, Matrix4, Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, Matrix4, Matrix5, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y};
@@ -75,6 +77,8 @@ pub struct Optics<'r> {
     orbit: ClosedOrbit,
     /// Closed orbit at the start for a source, `W`.
     closed: Matrix6<f64>,
+    /// The same with the momentum held.
+    closed_at_momentum: Matrix6<f64>,
     /// Closed orbit at the start for a unit of momentum deviation.
     dispersive: Vector6<f64>,
 }
@@ -96,22 +100,15 @@ impl<'r> Optics<'r> {
     pub fn of(ring: &'r Ring, hold: Hold) -> Result<Self, OrbitError> {
         let orbit = ClosedOrbit::find(ring, hold)?;
         let (turn, delta) = (*orbit.one_turn(), orbit.at[0][DELTA]);
-        let inverse = invert(&hold.closure(ring, delta, &turn), &turn)?;
-        let mut closed = Matrix6::zeros();
-        // Rows 0..4 of M c drive the orbit; for a fixed frequency the path of the kick drives the momentum.
-        let driven = match hold {
-            Hold::Momentum { .. } => 4,
-            Hold::Frequency { .. } => 5,
+        let at_momentum = invert(&Hold::Momentum { delta }.closure(ring, delta, &turn), &turn)?;
+        let closed_at_momentum = closed_orbits(&at_momentum, &turn, 4);
+        let closed = match hold {
+            Hold::Momentum { .. } => closed_at_momentum,
+            Hold::Frequency { .. } => closed_orbits(&invert(&hold.closure(ring, delta, &turn), &turn)?, &turn, 5),
         };
-        for (row, from) in [0, 1, 2, 3, PATH].into_iter().take(driven).enumerate() {
-            let column = inverse.column(row) * turn.row(from);
-            let mut into = closed.fixed_view_mut::<5, 6>(0, 0);
-            into += column;
-        }
-        let at_momentum = Hold::Momentum { delta };
-        let unit = invert(&at_momentum.closure(ring, delta, &turn), &turn)?.column(4).into_owned();
+        let unit = at_momentum.column(4);
         let dispersive = Vector6::new(unit[0], unit[1], unit[2], unit[3], 1.0, 0.0);
-        Ok(Self { ring, orbit, closed, dispersive })
+        Ok(Self { ring, orbit, closed, closed_at_momentum, dispersive })
     }
 
     /// The closed orbit at a place.
@@ -119,13 +116,15 @@ impl<'r> Optics<'r> {
         &self.orbit.at[element]
     }
 
-    /// Linear map from the start to a place.
+    /// Linear map from the start to a place: at an entrance in the ring's frame, inside in the element's own.
     fn transfer(&self, place: Place) -> Matrix6<f64> {
-        let entrance = self.orbit.transfer[place.element];
-        if place.depth == 0.0 {
-            return entrance;
-        }
-        self.ring.elements[place.element].linearise_into(&self.orbit.at[place.element], place.depth) * entrance
+        if place.depth == 0.0 { self.orbit.transfer[place.element] } else { self.transfer_into(place) }
+    }
+
+    /// Linear map from the start into the element's own (shifted, rolled) frame.
+    fn transfer_into(&self, place: Place) -> Matrix6<f64> {
+        let inside = self.ring.elements[place.element].linearise_into(&self.orbit.at[place.element], place.depth);
+        inside * self.orbit.transfer[place.element]
     }
 
     /// An observer of x or y at a place.
@@ -149,7 +148,7 @@ impl<'r> Optics<'r> {
         let nodes: &[(f64, f64)] = if length == 0.0 { &[(0.0, 1.0)] } else { &NODES };
         let mut kernel = Matrix6::zeros();
         for (node, weight) in nodes {
-            let transfer = self.transfer(Place { element, depth: node * length });
+            let transfer = self.transfer_into(Place { element, depth: node * length });
             let back = inverse(&transfer);
             let weight = if length == 0.0 { *weight } else { weight * length };
             kernel += (back.column(PX) * transfer.row(X) - back.column(PY) * transfer.row(Y)) * weight;
@@ -181,7 +180,7 @@ impl<'r> Optics<'r> {
         sources: &[Source],
         gradients: &[Gradient],
     ) -> Vec<DMatrix<f64>> {
-        let seen = self.seen_rows(observers);
+        let seen = seen_rows(observers, &self.closed);
         let far = self.closed + Matrix6::identity();
         gradients
             .iter()
@@ -189,7 +188,7 @@ impl<'r> Optics<'r> {
                 // what each source sends into the gradient, and what that sends to each observer
                 let sent: Vec<Vector6<f64>> = sources
                     .iter()
-                    .map(|s| if s.place < gradient.place { far * s.column } else { self.closed * s.column })
+                    .map(|s| if s.place <= gradient.place { far * s.column } else { self.closed * s.column })
                     .collect();
                 let mut derivative = DMatrix::zeros(observers.len(), sources.len());
                 for (i, row) in seen.iter().enumerate() {
@@ -203,23 +202,14 @@ impl<'r> Optics<'r> {
             .collect()
     }
 
-    /// Rows `a W` and `a (W + 1)` of each observer.
-    fn seen_rows(&self, observers: &[Observer]) -> Vec<[RowVector6<f64>; 2]> {
-        let rows = |o: &Observer| {
-            let near = o.row * self.closed;
-            [near, near + o.row]
-        };
-        observers.iter().map(rows).collect()
-    }
-
     /// Dispersion seen by an observer [m], momentum deviations closed at any hold.
     pub fn dispersion(&self, observer: &Observer) -> f64 {
         (observer.row * self.dispersive)[0]
     }
 
-    /// Derivative of [`Optics::dispersion`], rows observers, columns gradients; holds only at fixed momentum.
+    /// Derivative of [`Optics::dispersion`], rows observers, columns gradients.
     pub fn dispersion_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
-        let seen = self.seen_rows(observers);
+        let seen = seen_rows(observers, &self.closed_at_momentum);
         let sent: Vec<_> = gradients.iter().map(|g| g.kernel * self.dispersive).collect();
         DMatrix::from_fn(observers.len(), gradients.len(), |i, q| {
             -(seen[i][usize::from(gradients[q].place < observers[i].place)] * sent[q])[0]
@@ -236,13 +226,19 @@ impl<'r> Optics<'r> {
     /// The path driven by a kick equals the dispersion at the kick, so `d(alpha)/dk = -integral(D_x^2 - D_y^2) ds / C`.
     pub fn compaction_jacobian(&self, gradients: &[Gradient]) -> Vec<f64> {
         // a unit source's path: row PATH of the turn, of its closed orbit and of itself
-        let path = self.orbit.one_turn().row(PATH) * (self.closed + Matrix6::identity());
+        let path = self.orbit.one_turn().row(PATH) * (self.closed_at_momentum + Matrix6::identity());
         gradients.iter().map(|g| -(path * g.kernel * self.dispersive)[0] / self.ring.circumference).collect()
     }
 
     /// Transition energy over the rest energy.
     pub fn gamma_transition(&self) -> f64 {
         self.momentum_compaction().powf(-0.5)
+    }
+
+    /// Revolution frequency on this orbit, relative to that of the reference particle, less 1.
+    pub fn frequency_offset(&self) -> f64 {
+        let (p, length) = (&self.ring.particle, self.ring.circumference + self.orbit.end()[PATH]);
+        p.beta(self.orbit.at[0][DELTA]) / p.beta(0.0) * self.ring.circumference / length - 1.0
     }
 
     /// Slip factor `alpha_c - 1/gamma^2` [1].
@@ -298,7 +294,8 @@ impl<'r> Optics<'r> {
         for transfer in &self.orbit.transfer {
             let (m11, m12) = (transfer[(i, i)], transfer[(i, i + 1)]);
             let phase = m12.atan2(beta * m11 - alpha * m12) / std::f64::consts::TAU;
-            turns += (phase - last).rem_euclid(1.0);
+            let step = phase - last;
+            turns += step - step.round(); // no element advances by half a turn
             last = phase;
         }
         turns
@@ -344,6 +341,26 @@ impl<'r> Optics<'r> {
     pub fn quadrupoles(&self) -> Vec<Gradient> {
         self.ring.quadrupoles.iter().map(|&i| self.gradient(i)).collect()
     }
+}
+
+/// The matrix `W` of closed orbits at the start, from the inverse of the closure equations. A source drives their first
+/// `driven` rows: four for the orbit, and with a fixed frequency a fifth, where its path drives the momentum.
+fn closed_orbits(inverse: &Matrix5<f64>, turn: &Matrix6<f64>, driven: usize) -> Matrix6<f64> {
+    let mut closed = Matrix6::zeros();
+    for (row, from) in [0, 1, 2, 3, PATH].into_iter().take(driven).enumerate() {
+        let mut into = closed.fixed_view_mut::<5, 6>(0, 0);
+        into += inverse.column(row) * turn.row(from);
+    }
+    closed
+}
+
+/// Rows `a W` and `a (W + 1)` of each observer.
+fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[RowVector6<f64>; 2]> {
+    let rows = |o: &Observer| {
+        let near = o.row * closed;
+        [near, near + o.row]
+    };
+    observers.iter().map(rows).collect()
 }
 
 /// Direction of a corrector's kick: `(cos, sin)` of its roll for H, `(-sin, cos)` for V.
@@ -395,7 +412,7 @@ mod tests {
         }
     }
 
-    /// Against central differences of the exact maps, at both holds and with a rolled quadrupole and a momentum offset.
+    /// Against five-point differences of the exact maps, at both holds and with a rolled quadrupole.
     #[test]
     fn thick_gradients_are_exact() {
         let mut ring = Ring::booster();
@@ -433,7 +450,8 @@ mod tests {
     #[test]
     fn dispersion_and_compaction_follow_their_derivatives() {
         let ring = Ring::booster();
-        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        // whatever the hold: both are slopes in momentum
+        let optics = Optics::of(&ring, Hold::Frequency { offset: 0.0 }).unwrap();
         let observers = optics.monitor_places(Plane::X);
         let (exact, compaction) = (
             optics.dispersion_jacobian(&observers, &optics.quadrupoles()),
@@ -469,6 +487,36 @@ mod tests {
         let strong = ring.with_vars(&[2.2; 48]);
         let error = Optics::of(&strong, ON_MOMENTUM).unwrap().tunes().unwrap_err();
         assert!(matches!(error, OrbitError::Unstable { half_trace, .. } if half_trace.abs() > 1.0), "{error}");
+    }
+
+    #[test]
+    fn a_rolled_corrector_leaves_the_tunes_alone() {
+        for i in 1..40 {
+            let mut ring = Ring::booster();
+            let at = ring.correctors[i];
+            ring.elements[at].misalignment.roll = 1.37e-3 * i as f64;
+            let tunes = Optics::of(&ring, ON_MOMENTUM).unwrap().tunes().unwrap();
+            assert!((tunes.x - 4.83).abs() < 1e-9 && (tunes.y - 4.665).abs() < 1e-9, "{tunes:?}");
+        }
+    }
+
+    #[test]
+    fn a_thin_rolled_gradient_and_a_kick_at_its_entrance_are_exact() {
+        let mut ring = Ring::booster();
+        let at = ring.element("SLOT_F6").unwrap();
+        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0 };
+        ring.elements[at].misalignment.roll = 0.3;
+        let respond = |k1l: f64| {
+            let mut ring = ring.clone();
+            ring.elements[at].kind = Kind::Multipole { k1l, k1sl: 0.0, k2l: 0.0 };
+            let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+            optics.response(&both_planes(&optics), &[optics.kick(at, [1.0, 0.0])])
+        };
+        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        let kick = [optics.kick(at, [1.0, 0.0])];
+        let exact = &optics.response_jacobian(&both_planes(&optics), &kick, &[optics.gradient(at)])[0];
+        let numeric = (respond(1e-5) - respond(-1e-5)) / 2e-5;
+        assert!((exact - numeric).abs().max() < 1e-6 * exact.abs().max()); // differences: (1e-5)^2 and 1e-13/1e-5
     }
 
     #[test]

@@ -1,0 +1,53 @@
+# The one door for people and machines. `make demo` runs the main job, `make test` passes every test; both install what
+# they need: a C linker from Debian if there is none, and the Cortex-M target of the toolchain.
+
+TARGET := thumbv7em-none-eabihf
+RECORDING ?= recordings/paper-vars
+ORBITCAL := target/release/orbitcal
+export CARGO_TERM_COLOR ?= auto
+
+.PHONY: help demo test build setup train bench docs fuzz clean
+
+help: ## this list
+	@grep -E '^[a-z]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
+
+demo: build ## the main job on a recording that ships with the repository
+	$(ORBITCAL) replay $(RECORDING)
+
+build: setup ## the program, at target/release/orbitcal
+	cargo build --release --locked -p host-bridge
+
+setup:
+	@command -v cargo >/dev/null || { echo "cargo not found: install Rust from https://rustup.rs"; exit 1; }
+	@command -v cc >/dev/null || { apt-get update && apt-get install -y build-essential; }
+	@rustup target list --installed | grep -q $(TARGET) || rustup target add $(TARGET) || { sleep 5; rustup target add $(TARGET); }
+
+test: setup ## format, lint, tests in debug and release, docs, and the core for the chip
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	cargo test --locked --workspace
+	cargo test --locked --workspace --release
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
+	cargo build --locked --release -p estimator -p firmware-sim --target $(TARGET)
+	cargo build --locked --release -p estimator --features defmt --target $(TARGET)
+
+train: build ## the surrogate's tables from the twin, and their measured errors
+	$(ORBITCAL) surrogate check
+
+bench: setup .venv ## medians of the hot paths, and pyAT on the same response
+	cargo bench --locked -p system-tests
+	.venv/bin/python tests/peers/pyat_response.py
+
+.venv:
+	python3 -m venv .venv
+	.venv/bin/pip install --quiet numpy accelerator-toolbox==0.9.0
+
+docs: ## documentation of all crates, in target/doc
+	cargo doc --locked --workspace --no-deps
+
+fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
+	RUSTC_BOOTSTRAP=1 cargo fuzz run ingest -- -max_total_time=600
+
+clean: ## remove what was built
+	cargo clean
+	rm -rf .venv

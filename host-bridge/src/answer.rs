@@ -1,0 +1,228 @@
+//! The answer to a recording, the same from the core and from the batch fit: as JSON and as a table.
+
+use comfy_table::{CellAlignment, Table, presets};
+use estimator::{FitQuality, Health, Marginal, MonitorState};
+use inference::stream::{Booster, BoosterEstimate};
+use inference::{BatchFit, Recording};
+use serde::Serialize;
+use twin::{Hold, Optics, Ring};
+
+/// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
+#[derive(Debug, Clone, Serialize)]
+#[allow(missing_docs)] // docs/json.md describes them for readers of the file
+pub struct Answer {
+    pub recording: String,
+    pub method: &'static str,
+    pub model: &'static str,
+    pub frames: usize,
+    pub rejected_frames: u32,
+    pub vars: Vec<Var>,
+    pub covariance: Vec<Vec<f64>>,
+    pub chi2_per_dof: f64,
+    pub tunes: Option<Tunes>,
+    pub monitors: Vec<Monitor>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_evidence: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub timing: Option<Timing>,
+}
+
+/// One quadrupole factor: mean, standard deviation and quantiles of its truncated posterior [1].
+#[derive(Debug, Clone, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Var {
+    pub name: String,
+    pub mean: f64,
+    pub sigma: f64,
+    pub q025: f64,
+    pub q16: f64,
+    pub q84: f64,
+    pub q975: f64,
+    /// At a bound of the prior's range.
+    pub clipped: bool,
+}
+
+/// Tunes of the twin at the means.
+#[derive(Debug, Clone, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Tunes {
+    pub x: f64,
+    pub y: f64,
+}
+
+/// State of one monitor.
+#[derive(Debug, Clone, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Monitor {
+    pub name: String,
+    pub state: &'static str,
+    pub sigma_mm: f64,
+    pub rejected: u32,
+}
+
+/// Time from wire bytes to estimate [us].
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Timing {
+    pub update_us_p50: f64,
+    pub update_us_p99: f64,
+    pub update_us_max: f64,
+}
+
+impl Answer {
+    /// What the core says after its last frame.
+    pub fn of_core(
+        ring: &Ring,
+        recording: &Recording,
+        core: &Booster,
+        last: &BoosterEstimate,
+        quality: FitQuality,
+        timing: Timing,
+    ) -> Self {
+        let marginals: Vec<Marginal> = (0..48).filter_map(|i| last.marginal(i, &core.model().prior)).collect();
+        let vars = vars(ring, &marginals, |i| last.clipped >> i & 1 == 1);
+        Self {
+            recording: recording.name.clone(),
+            method: "laplace",
+            model: "green",
+            frames: last.frames as usize,
+            rejected_frames: last.rejected_frames,
+            covariance: covariance(&vars, |i, j| f64::from(core.covariance(i, j))),
+            tunes: tunes(ring, &vars),
+            vars,
+            chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),
+            monitors: monitors(ring, &last.health),
+            log_evidence: Some(f64::from(last.log_evidence)),
+            timing: Some(timing),
+        }
+    }
+
+    /// What the batch fit says.
+    pub fn of_fit(ring: &Ring, recording: &Recording, fit: &BatchFit) -> Self {
+        let bounds = |m: &Marginal| m.mean <= m.lower || m.mean >= m.upper;
+        let vars = vars(ring, &fit.marginals, |i| bounds(&fit.marginals[i]));
+        Self {
+            recording: recording.name.clone(),
+            method: "map",
+            model: "twin",
+            frames: recording.rows.len(),
+            rejected_frames: 0,
+            covariance: covariance(&vars, |i, j| fit.covariance[(i, j)]),
+            vars,
+            chi2_per_dof: fit.chi2_per_dof,
+            tunes: Some(Tunes { x: fit.tunes.x, y: fit.tunes.y }),
+            monitors: monitors(ring, &fit.health),
+            log_evidence: None,
+            timing: None,
+        }
+    }
+
+    /// The answer for a person.
+    pub fn print(&self) {
+        println!("{}: {} frames, method {}, model {}\n", self.recording, self.frames, self.method, self.model);
+        println!("{}", self.table());
+        let faulty = self.monitors.iter().filter(|m| m.state != "ok");
+        let faulty: Vec<String> = faulty
+            .map(|m| format!("{} {} ({:.2} mm, {} readings refused)", m.name, m.state, m.sigma_mm, m.rejected))
+            .collect();
+        println!("monitors: {}", if faulty.is_empty() { "all ok".into() } else { faulty.join("; ") });
+        let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
+        if !clipped.is_empty() {
+            println!("at a bound of 0.94..1.06: {}", clipped.join(", "));
+        }
+        print!("chi2/dof {:.4}", self.chi2_per_dof);
+        if let Some(tunes) = &self.tunes {
+            print!(", tunes {:.4} {:.4}", tunes.x, tunes.y);
+        }
+        if self.rejected_frames > 0 {
+            print!(", {} frames refused", self.rejected_frames);
+        }
+        println!();
+        if let Some(t) = &self.timing {
+            println!(
+                "frame to estimate: median {:.0} us, 99 % within {:.0} us, slowest {:.0} us",
+                t.update_us_p50, t.update_us_p99, t.update_us_max
+            );
+        }
+    }
+
+    /// Both families side by side, 24 rows.
+    fn table(&self) -> Table {
+        let mut table = Table::new();
+        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        let head = ["var", "mean", "sigma/%", "95 % interval"];
+        table.set_header(head.iter().chain(&head));
+        let half = self.vars.len().div_ceil(2);
+        for (left, right) in self.vars.iter().take(half).zip(self.vars.iter().skip(half)) {
+            table.add_row([left, right].iter().flat_map(|v| v.cells()));
+        }
+        for (i, column) in table.column_iter_mut().enumerate() {
+            column.set_cell_alignment(if i % 4 == 0 { CellAlignment::Left } else { CellAlignment::Right });
+        }
+        table
+    }
+}
+
+impl Var {
+    fn cells(&self) -> [String; 4] {
+        let mark = if self.clipped { "*" } else { "" };
+        [
+            format!("{}{mark}", self.name),
+            format!("{:.4}", self.mean),
+            format!("{:.2}", 100.0 * self.sigma),
+            format!("{:.4}..{:.4}", self.q025, self.q975),
+        ]
+    }
+}
+
+fn vars(ring: &Ring, marginals: &[Marginal], clipped: impl Fn(usize) -> bool) -> Vec<Var> {
+    let var = |(i, (name, marginal)): (usize, (String, &Marginal))| {
+        let (mean, sigma) = marginal.moments();
+        let quantile = |p| f64::from(marginal.quantile(p));
+        Var {
+            name,
+            mean: f64::from(mean),
+            sigma: f64::from(sigma),
+            q025: quantile(0.025),
+            q16: quantile(0.16),
+            q84: quantile(0.84),
+            q975: quantile(0.975),
+            clipped: clipped(i),
+        }
+    };
+    ring.var_names().into_iter().zip(marginals).enumerate().map(var).collect()
+}
+
+/// Covariance of the vars, `mean_i mean_j` times that of their logarithms.
+fn covariance(vars: &[Var], of_params: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {
+    let row = |i: usize| (0..vars.len()).map(|j| vars[i].mean * vars[j].mean * of_params(i, j)).collect();
+    (0..vars.len()).map(row).collect()
+}
+
+/// Tunes of the twin at the means; none if that ring is unstable.
+fn tunes(ring: &Ring, vars: &[Var]) -> Option<Tunes> {
+    let means: Vec<f64> = vars.iter().map(|v| v.mean).collect();
+    let ring = ring.with_vars(&means);
+    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
+    Some(Tunes { x: tunes.x, y: tunes.y })
+}
+
+fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
+    let monitor = |(name, health): (String, &Health)| Monitor {
+        name,
+        state: word(health.state),
+        sigma_mm: f64::from(health.noise) * 1e3,
+        rejected: health.rejected,
+    };
+    ring.monitor_names().into_iter().zip(health).map(monitor).collect()
+}
+
+/// The word for a state in tables and JSON.
+pub fn word(state: MonitorState) -> &'static str {
+    match state {
+        MonitorState::Ok => "ok",
+        MonitorState::Noisy => "noisy",
+        MonitorState::Jumps => "jumps",
+        MonitorState::Dead => "dead",
+    }
+}

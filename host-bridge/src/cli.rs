@@ -1,0 +1,247 @@
+//! The command line.
+
+use core::str::FromStr;
+use core::time::Duration;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use twin::Effect;
+
+use crate::publish::SERVICE;
+
+/// Real-time Bayesian calibration of an accelerator's digital twin.
+#[derive(Debug, Parser)]
+#[command(name = "orbitcal", version, about)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What the program can do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Stream a recording through the core as wire bytes, publish every estimate, print the final table
+    Replay(Replay),
+    /// Subscribe to published estimates and show them live
+    Watch(Watch),
+    /// Orbit response, tunes and dispersion of the twin
+    Response(Response),
+    /// The host's batch answer for a recording, with the exact twin
+    Fit(Fit),
+    /// Surrogates and their measured errors
+    Surrogate(Surrogate),
+}
+
+/// Options that every command has.
+#[derive(Debug, Args)]
+pub struct Common {
+    /// Write the answer as JSON to FILE, `-` for stdout
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Machine file; the built-in AGS Booster without it
+    #[arg(long, value_name = "FILE")]
+    pub machine: Option<PathBuf>,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
+}
+
+/// `orbitcal replay`.
+#[derive(Debug, Args)]
+pub struct Replay {
+    /// Folder with header.toml and frames.csv
+    pub recording: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// Random walk of each ln var, standard deviation per sqrt(frame)
+    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
+    pub process_noise: f32,
+    /// One CSV row a frame
+    #[arg(long, value_name = "FILE")]
+    pub trace: Option<PathBuf>,
+    /// Frames a second, or `max`
+    #[arg(long, value_name = "HZ", default_value = "max")]
+    pub rate: Rate,
+    /// Which prediction
+    #[arg(long, value_enum, default_value_t = CoreModel::Green)]
+    pub model: CoreModel,
+    /// Name of the shared-memory service
+    #[arg(long, default_value = SERVICE)]
+    pub service: String,
+}
+
+/// `orbitcal watch`.
+#[derive(Debug, Args)]
+pub struct Watch {
+    /// Name of the shared-memory service
+    #[arg(long, default_value = SERVICE)]
+    pub service: String,
+    /// Machine file, for the names of vars and monitors
+    #[arg(long, value_name = "FILE")]
+    pub machine: Option<PathBuf>,
+    /// One CSV row an estimate
+    #[arg(long, value_name = "FILE")]
+    pub trace: Option<PathBuf>,
+    /// Stop after this many estimates
+    #[arg(long, value_name = "N")]
+    pub count: Option<u64>,
+    /// Stop after this many seconds without an estimate
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub idle: Option<Duration>,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
+}
+
+/// `orbitcal response`.
+#[derive(Debug, Args)]
+pub struct Response {
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// Quadrupole factors, such as {"D8": 0.958}; the others are 1
+    #[arg(long, value_name = "FILE.json")]
+    pub vars: Option<PathBuf>,
+    /// KIND[@PLACE][=AMPLITUDE], repeatable, such as quad_roll@D8=0.01
+    #[arg(long = "effect", value_name = "EFFECT")]
+    pub effects: Vec<Effect>,
+    /// What the machine holds
+    #[arg(long, value_enum, default_value_t = Rf::FixedMomentum)]
+    pub rf: Rf,
+}
+
+/// `orbitcal fit`.
+#[derive(Debug, Args)]
+pub struct Fit {
+    /// Folder with header.toml and frames.csv
+    pub recording: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// How to fit
+    #[arg(long, value_enum, default_value_t = Method::Map)]
+    pub method: Method,
+    /// Which prediction
+    #[arg(long, value_enum, default_value_t = FitModel::Twin)]
+    pub model: FitModel,
+}
+
+/// `orbitcal surrogate`.
+#[derive(Debug, Args)]
+pub struct Surrogate {
+    /// What to do with the surrogates.
+    #[command(subcommand)]
+    pub action: SurrogateAction,
+}
+
+/// What can be done with surrogates.
+#[derive(Debug, Subcommand)]
+pub enum SurrogateAction {
+    /// Make the tables and measure their error against the twin, on Sobol points within the tune cut
+    Check {
+        #[command(flatten)]
+        #[allow(missing_docs)] // flattened options carry their own docs
+        common: Common,
+        /// Number of points
+        #[arg(long, default_value_t = 2000)]
+        samples: usize,
+        /// Seed of the scrambled sequence
+        #[arg(long, default_value_t = 1)]
+        seed: u32,
+    },
+}
+
+/// Predictions that the core can make.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum CoreModel {
+    /// Quantised Green's function
+    Green,
+}
+
+/// Predictions that the batch fit can make.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FitModel {
+    /// The exact twin
+    Twin,
+}
+
+/// Ways to fit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Method {
+    /// Damped Gauss-Newton to the maximum a posteriori, Laplace covariance
+    Map,
+}
+
+/// What the RF does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Rf {
+    /// The momentum is held
+    FixedMomentum,
+    /// The frequency is held, the momentum follows the path length
+    FixedFrequency,
+}
+
+impl From<Rf> for twin::Rf {
+    fn from(rf: Rf) -> Self {
+        match rf {
+            Rf::FixedMomentum => Self::FixedMomentum,
+            Rf::FixedFrequency => Self::FixedFrequency,
+        }
+    }
+}
+
+/// Frames a second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Rate {
+    /// As fast as possible.
+    Max,
+    /// This many a second [Hz].
+    Hertz(f64),
+}
+
+impl FromStr for Rate {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "max" {
+            return Ok(Self::Max);
+        }
+        positive(text).map(Self::Hertz)
+    }
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    positive(text).map(Duration::from_secs_f64)
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let wrong = || format!("expected a number above 0 and below 1e9, found {text:?}");
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v < 1e9).ok_or_else(wrong)
+}
+
+fn walk(text: &str) -> Result<f32, String> {
+    let wrong = || format!("expected a number from 0 to 0.1, found {text:?}");
+    text.parse().ok().filter(|v: &f32| (0.0..=0.1).contains(v)).ok_or_else(wrong)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        use clap::CommandFactory;
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn rates_are_numbers_or_max() {
+        assert_eq!("max".parse(), Ok(Rate::Max));
+        assert_eq!("1000".parse(), Ok(Rate::Hertz(1000.0)));
+        for wrong in ["0", "-1", "nan", "inf", "fast"] {
+            assert!(wrong.parse::<Rate>().is_err(), "{wrong}");
+        }
+    }
+}

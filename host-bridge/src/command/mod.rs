@@ -1,0 +1,66 @@
+//! The commands, one file each.
+
+pub mod fit;
+pub mod replay;
+pub mod response;
+pub mod surrogate;
+pub mod watch;
+
+use std::path::Path;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use inference::{Recording, RecordingError, stream};
+use twin::{LatticeError, Ring};
+
+use crate::output::OutputError;
+
+/// Why a command ended: bad arguments or input (exit 2), or anything else (exit 1), in one line.
+#[derive(Debug)]
+pub enum CommandError {
+    /// Arguments or input.
+    Input(String),
+    /// Anything else.
+    Other(String),
+}
+
+impl From<LatticeError> for CommandError {
+    fn from(error: LatticeError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<RecordingError> for CommandError {
+    fn from(error: RecordingError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<stream::StreamError> for CommandError {
+    fn from(error: stream::StreamError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<OutputError> for CommandError {
+    fn from(error: OutputError) -> Self {
+        Self::Other(error.to_string())
+    }
+}
+
+/// The machine that was asked for, or the built-in one.
+fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
+    path.map_or_else(|| Ok(Ring::booster()), Ring::read)
+}
+
+fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
+    Recording::read(path, &stream::layout(ring))
+}
+
+/// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.
+fn progress(length: usize, what: &'static str, quiet: bool) -> ProgressBar {
+    if quiet {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {eta}").expect("the template is tested by use");
+    ProgressBar::new(length as u64).with_style(style).with_message(what)
+}

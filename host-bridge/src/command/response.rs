@@ -1,0 +1,119 @@
+//! `orbitcal response`: what the twin answers to every corrector.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use comfy_table::{Table, presets};
+use nalgebra::DMatrix;
+use serde::Serialize;
+use twin::{EffectError, Machine, MachineResponse, Ring};
+
+use super::{CommandError, machine};
+use crate::cli::Response;
+use crate::output;
+
+#[derive(Serialize)]
+struct Answer {
+    machine: String,
+    effects: Vec<String>,
+    bpm: Vec<String>,
+    correctors: Vec<String>,
+    response_x_m_per_rad: Vec<Vec<f64>>,
+    response_y_m_per_rad: Vec<Vec<f64>>,
+    qx: f64,
+    qy: f64,
+    gamma_tr: f64,
+    dispersion_x: Vec<f64>,
+}
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Response) -> Result<(), CommandError> {
+    let mut ring = machine(options.common.machine.as_deref())?;
+    if let Some(path) = &options.vars {
+        ring = ring.with_vars(&vars(path, &ring)?);
+    }
+    let input = |error: EffectError| CommandError::Input(error.to_string());
+    let machine = Machine::new(ring.clone(), options.rf.into(), &options.effects).map_err(input)?;
+    let response = machine.response().map_err(|error| CommandError::Other(format!("{}: {error}", ring.name)))?;
+    let effects = options.effects.iter().map(|e| format!("{}@{}={}", e.kind.word(), e.place, e.amplitude)).collect();
+    let answer = Answer::of(&ring, effects, &response);
+    if let Some(path) = &options.common.json {
+        output::json(path, &answer)?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        answer.print(&ring);
+    }
+    Ok(())
+}
+
+/// Factor of every quadrupole: those in the file, 1 for the others.
+fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
+    let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|e| wrong(e.to_string()))?;
+    let file: BTreeMap<String, f64> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let names = ring.var_names();
+    if let Some(unknown) = file.keys().find(|name| !names.contains(name)) {
+        return Err(wrong(format!("expected a quadrupole of {}, found {unknown:?}", ring.name)));
+    }
+    if let Some((name, value)) = file.iter().find(|(_, value)| !(0.5..=1.5).contains(*value)) {
+        return Err(wrong(format!("var {name}: expected 0.5 to 1.5, found {value}")));
+    }
+    Ok(names.iter().map(|name| file.get(name).copied().unwrap_or(1.0)).collect())
+}
+
+impl Answer {
+    fn of(ring: &Ring, effects: Vec<String>, response: &MachineResponse) -> Self {
+        Self {
+            machine: ring.name.clone(),
+            effects,
+            bpm: ring.cells(&ring.monitors),
+            correctors: ring.cells(&ring.correctors),
+            response_x_m_per_rad: rows(&response.x),
+            response_y_m_per_rad: rows(&response.y),
+            qx: response.tunes.x,
+            qy: response.tunes.y,
+            gamma_tr: response.gamma_transition,
+            dispersion_x: response.dispersion.clone(),
+        }
+    }
+
+    fn print(&self, ring: &Ring) {
+        println!("{}", self.machine);
+        self.effects.iter().for_each(|effect| println!("with {effect}"));
+        println!("tunes {:.6} {:.6}, gamma_tr {:.4}\n", self.qx, self.qy, self.gamma_tr);
+        let horizontal = ring.correctors.iter().filter(|&&i| is_horizontal(ring, i)).count();
+        let (blocks, names) = ([&self.response_x_m_per_rad, &self.response_y_m_per_rad], ["x", "y"]);
+        let mut table = Table::new();
+        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.set_header(["response", "to", "rms m/rad", "largest m/rad", "at"]);
+        for (rows, name) in blocks.into_iter().zip(names) {
+            for (to, from, until) in [("H", 0, horizontal), ("V", horizontal, self.correctors.len())] {
+                table.add_row(self.summary(rows, name, to, from, until));
+            }
+        }
+        println!("{table}");
+        println!("all {} x {} elements of both planes: --json FILE", self.bpm.len(), self.correctors.len());
+    }
+
+    /// One line on a block of the response.
+    fn summary(&self, rows: &[Vec<f64>], name: &str, to: &str, from: usize, until: usize) -> [String; 5] {
+        let entries = || rows.iter().enumerate().flat_map(|(i, row)| (from..until).map(move |j| (row[j], i, j)));
+        let rms = (entries().map(|(r, ..)| r * r).sum::<f64>() / (rows.len() * (until - from)).max(1) as f64).sqrt();
+        let largest = entries().max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()));
+        let (value, place) = largest.map_or((0.0, String::new()), |(r, i, j)| {
+            (r, if r == 0.0 { String::new() } else { format!("{}, {to}_{}", self.bpm[i], self.correctors[j]) })
+        });
+        [name.into(), to.into(), format!("{rms:.3}"), format!("{value:.3}"), place]
+    }
+}
+
+fn is_horizontal(ring: &Ring, element: usize) -> bool {
+    matches!(ring.elements[element].kind, twin::Kind::Corrector { plane: twin::Plane::X, .. })
+}
+
+fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}

@@ -1,0 +1,85 @@
+//! `orbitcal surrogate check`: tables from the twin, and how wrong they are.
+
+use comfy_table::{Table, presets};
+use serde::Serialize;
+use training::SurrogateError;
+
+use super::{CommandError, machine, progress};
+use crate::cli::{Surrogate, SurrogateAction};
+use crate::output;
+
+#[derive(Serialize)]
+struct Check {
+    surrogates: Vec<Entry>,
+}
+
+#[derive(Serialize)]
+struct Entry {
+    name: &'static str,
+    plane: char,
+    parameters: usize,
+    bytes: usize,
+    samples: usize,
+    rms_mm: f64,
+    max_mm: f64,
+    stated_rms_mm: f64,
+}
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Surrogate) -> Result<(), CommandError> {
+    let SurrogateAction::Check { common, samples, seed } = &options.action;
+    let ring = machine(common.machine.as_deref())?;
+    let green = training::green::tables(&ring).map_err(|error| CommandError::Input(error.to_string()))?;
+    let bar = progress(*samples, "vars", common.quiet);
+    let planes = training::check(&ring, &green, *samples, *seed, || bar.inc(1));
+    bar.finish_and_clear();
+    let check = Check { surrogates: planes.iter().map(Entry::of).collect() };
+    if let Some(path) = &common.json {
+        output::json(path, &check)?;
+    }
+    if !common.quiet && common.json.as_deref() != Some("-".as_ref()) {
+        println!("error of the -22 A to +22 A response against the twin, vars 0.94..1.06, tunes within 0.05\n");
+        println!("{}", check.table());
+    }
+    Ok(())
+}
+
+impl Entry {
+    fn of(error: &SurrogateError) -> Self {
+        Self {
+            name: error.name,
+            plane: error.plane,
+            parameters: error.parameters,
+            bytes: error.bytes,
+            samples: error.samples,
+            rms_mm: error.rms * 1e3,
+            max_mm: error.max * 1e3,
+            stated_rms_mm: error.stated_rms * 1e3,
+        }
+    }
+}
+
+impl Check {
+    fn table(&self) -> Table {
+        let mut table = Table::new();
+        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.set_header(["surrogate", "plane", "numbers", "bytes", "vars", "rms/um", "largest/um", "stated rms/um"]);
+        for e in &self.surrogates {
+            let um = |mm: f64| format!("{:.2}", mm * 1e3);
+            table.add_row([
+                e.name.to_owned(),
+                e.plane.to_string(),
+                e.parameters.to_string(),
+                e.bytes.to_string(),
+                e.samples.to_string(),
+                um(e.rms_mm),
+                um(e.max_mm),
+                um(e.stated_rms_mm),
+            ]);
+        }
+        table
+    }
+}
