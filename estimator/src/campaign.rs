@@ -9,6 +9,7 @@ use heapless::Vec;
 
 use crate::drive::Drive;
 use crate::frame::{CurrentCode, Frame, PositionCode};
+use crate::monitor::Gate;
 
 /// The setting that a frame repeats: at most one corrector powered, or the RF moved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,37 +131,75 @@ impl<const B: usize, const C: usize> Cell<B, C> {
         }
     }
 
-    /// The last reading, if there is one, and whether it waits to be confirmed.
-    pub fn last(&self, b: usize) -> Option<(f32, bool)> {
+    /// Difference of a reading, moved to the mean drive, from the last one [m].
+    pub fn difference(&self, b: usize, moved: i32) -> Option<f32> {
         let last = self.last.get(b).filter(|_| self.heard >> b & 1 == 1)?;
-        Some((*last as f32 * PositionCode::METRES_PER_LSB, self.held >> b & 1 == 1))
+        Some(moved.saturating_sub(*last) as f32 * PositionCode::METRES_PER_LSB)
     }
 
-    /// Remember a reading, confirmed or held.
-    pub fn remember(&mut self, b: usize, code: i32, held: bool) {
-        if let Some(last) = self.last.get_mut(b) {
-            *last = code;
-            self.heard |= 1 << b;
-            self.held = self.held & !(1 << b) | u64::from(held) << b;
+    /// What the repeats say of a reading, moved to the mean drive; `sigma` is the monitor's noise [m].
+    ///
+    /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects
+    /// it. A surprising one waits. Two that agree outvote the model, and whatever came before.
+    pub fn judge(&self, b: usize, moved: i32, sigma: f32, gate: Gate, expected: bool) -> Verdict {
+        let (mean, count) = self.mean(b);
+        let reading = moved as f32 * PositionCode::METRES_PER_LSB;
+        let agrees_with_last = self.difference(b, moved).is_some_and(|d| gate.agree(d, 0.0, sigma));
+        let waiting = self.held >> b & 1 == 1;
+        if (count > 0 && gate.agree(reading, mean, sigma)) || (agrees_with_last && !waiting) {
+            Verdict::Accepted
+        } else if agrees_with_last {
+            Verdict::Confirms { outvotes: count > 0 }
+        } else if count == 0 && expected {
+            Verdict::Accepted
+        } else {
+            Verdict::Held
         }
     }
 
-    /// Count a reading into the mean; returns its squared distance from it, in squared steps, times `(n - 1)/n`:
-    /// the growth of the sum of squared deviations.
-    pub fn add_reading(&mut self, b: usize, code: i32, moved: i32) -> u64 {
+    /// Take a reading in as judged; returns the growth of the sum of squared deviations from the mean [squared steps].
+    pub fn take(&mut self, b: usize, code: i32, moved: i32, verdict: Verdict) -> u64 {
+        let before = self.last.get(b).copied().unwrap_or(0);
+        if let Some(last) = self.last.get_mut(b) {
+            *last = moved;
+            self.heard |= 1 << b;
+            self.held = self.held & !(1 << b) | u64::from(verdict == Verdict::Held) << b;
+        }
+        match verdict {
+            Verdict::Held => 0,
+            Verdict::Accepted => self.add(b, code, moved),
+            Verdict::Confirms { outvotes } => {
+                if let (true, Some(mean), Some(count)) = (outvotes, self.reading.get_mut(b), self.count.get_mut(b)) {
+                    (*mean, *count) = (0, 0);
+                }
+                self.add(b, before, before) + self.add(b, code, moved)
+            }
+        }
+    }
+
+    /// Count a reading into the mean: the squared distance from it grows the sum of squared deviations by `(n - 1)/n`.
+    fn add(&mut self, b: usize, code: i32, moved: i32) -> u64 {
         let (Some(mean), Some(count)) = (self.reading.get_mut(b), self.count.get_mut(b)) else { return 0 };
         *count = count.saturating_add(1);
-        let distance = u64::from((moved - (*mean >> FRACTION)).unsigned_abs());
+        let distance = u64::from(moved.saturating_sub(*mean >> FRACTION).unsigned_abs());
+        let square = distance.saturating_mul(distance);
         move_mean(mean, code << FRACTION, *count);
-        distance * distance * u64::from(*count - 1) / u64::from(*count)
+        square - square / u64::from(*count)
     }
+}
 
-    /// Forget the readings of one monitor.
-    pub fn restart(&mut self, b: usize) {
-        if let (Some(mean), Some(count)) = (self.reading.get_mut(b), self.count.get_mut(b)) {
-            (*mean, *count) = (0, 0);
-        }
-    }
+/// What becomes of a reading.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It is used.
+    Accepted,
+    /// It is used, and so is the one that waited for it.
+    Confirms {
+        /// Earlier readings of the setting are dropped.
+        outvotes: bool,
+    },
+    /// It waits for a repeat that confirms it.
+    Held,
 }
 
 /// All settings, at most `S`, and the scatter of repeats within them.
@@ -259,12 +298,48 @@ mod tests {
     fn means_and_scatter_are_those_of_the_readings() {
         let mut cell = Cell::<1, 1>::open(setting(None, 0.0, 0));
         let codes = [1000, -2000, 4000, 500, 900];
-        let scatter: u64 = codes.iter().map(|&code| cell.add_reading(0, code, code)).sum();
+        let scatter: u64 = codes.iter().map(|&code| cell.take(0, code, code, Verdict::Accepted)).sum();
         let mean = codes.iter().sum::<i32>() as f32 / 5.0;
         assert_eq!(cell.mean(0).1, 5);
         assert!((cell.mean(0).0 / 1e-7 - mean).abs() < 0.01);
         let direct: f32 = codes.iter().map(|&c| (c as f32 - mean) * (c as f32 - mean)).sum();
         assert!((scatter as f32 / direct - 1.0).abs() < 1e-3, "{scatter} {direct}"); // whole steps
+    }
+
+    /// Readings of 0.15 mm noise against the repeats of their setting: what each becomes, the model expecting it or not.
+    #[test]
+    fn repeats_outvote_the_model_and_single_jumps() {
+        use Verdict::{Accepted, Confirms, Held};
+        let stories: [&[(i32, bool, Verdict)]; 5] = [
+            // repeats of what the model expects; a jump; back again
+            &[(0, true, Accepted), (900, true, Accepted), (40_000, true, Held), (-700, true, Accepted)],
+            // the model is wrong: the repeat confirms
+            &[(40_000, false, Held), (40_900, false, Confirms { outvotes: false }), (40_100, false, Accepted)],
+            // a jump comes first, when the model still expects anything
+            &[
+                (40_000, true, Accepted),
+                (0, true, Held),
+                (500, true, Confirms { outvotes: true }),
+                (40_000, true, Held),
+            ],
+            // a surprise that nothing confirms makes way for what is expected
+            &[(40_000, false, Held), (0, true, Accepted), (500, true, Accepted)],
+            // the machine itself has moved
+            &[
+                (0, true, Accepted),
+                (500, true, Accepted),
+                (40_000, true, Held),
+                (40_500, true, Confirms { outvotes: true }),
+            ],
+        ];
+        for story in stories {
+            let mut cell = Cell::<1, 1>::open(setting(None, 0.0, 0));
+            for &(code, expected, verdict) in story {
+                let judged = cell.judge(0, code, 1.5e-4, Gate::default(), expected);
+                assert_eq!(judged, verdict, "{code} in {story:?}");
+                cell.take(0, code, code, judged);
+            }
+        }
     }
 
     #[test]

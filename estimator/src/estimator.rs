@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::campaign::{Campaign, Setting};
+use crate::campaign::{Campaign, Setting, Verdict};
 use crate::drive::{Calibration, Drive};
 use crate::estimate::{Estimate, MonitorState};
 use crate::frame::{Frame, FrameError, PositionCode};
@@ -113,6 +113,21 @@ struct Screened {
     rejected: u64,
     confirmed: u64,
     restarted: u64,
+}
+
+impl Screened {
+    fn note(&mut self, b: usize, verdict: Verdict) {
+        let bit = 1 << b;
+        match verdict {
+            Verdict::Accepted => self.accepted |= bit,
+            Verdict::Held => self.rejected |= bit,
+            Verdict::Confirms { outvotes } => {
+                self.accepted |= bit;
+                self.confirmed |= bit;
+                self.restarted |= if outvotes { bit } else { 0 };
+            }
+        }
+    }
 }
 
 /// A param that has moved by this many error bars calls for a new linearisation.
@@ -238,56 +253,31 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         screened
     }
 
-    /// A reading in a setting passes if a repeat agrees with it; the first one, if the model expects it.
+    /// A reading in a setting is judged by its repeats, the first one by the model.
     fn screen_repeat(&mut self, b: usize, code: i32, index: u16, screened: &mut Screened) {
-        let bit = 1_u64 << b;
-        let expected = self.is_expected(b, code);
-        let moved = self.moved_to_mean_drive(b, code);
-        let gate = self.model.gate;
+        let (expected, moved) = (self.is_expected(b, code), self.moved_to_mean_drive(b, code));
         let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
-        let (sigma, reading) = (monitor.noise.sigma(), metres(moved));
-        let (mean, count) = cell.mean(b);
-        let last = cell.last(b);
-        if let Some((last, _)) = last {
-            monitor.noise.learn(reading - last);
+        if let Some(difference) = cell.difference(b, moved) {
+            monitor.noise.learn(difference);
         }
-        let agrees_with_mean = count > 0 && gate.agree(reading, mean, sigma);
-        let waiting = last.filter(|(last, held)| *held && gate.agree(reading, *last, sigma));
-        let agrees_with_last = last.is_some_and(|(last, held)| !held && gate.agree(reading, last, sigma));
-        if agrees_with_mean || agrees_with_last || (count == 0 && expected && waiting.is_none()) {
-            screened.accepted |= bit;
-            let scatter = cell.add_reading(b, code, moved);
-            self.campaign.add_scatter(b, scatter);
-        } else if let Some((last, _)) = waiting {
-            // Two repeats agree with each other: they outvote the model, and whatever came before.
-            if count > 0 {
-                cell.restart(b);
-                screened.restarted |= bit;
-            }
-            monitor.pardon();
-            screened.accepted |= bit;
-            screened.confirmed |= bit;
-            let before = (last / PositionCode::METRES_PER_LSB) as i32;
-            cell.add_reading(b, before, before);
-            let scatter = cell.add_reading(b, code, moved);
-            self.campaign.add_scatter(b, scatter);
-        } else {
-            monitor.reject();
-            screened.rejected |= bit;
+        let verdict = cell.judge(b, moved, monitor.noise.sigma(), self.model.gate, expected);
+        let scatter = cell.take(b, code, moved, verdict);
+        match verdict {
+            Verdict::Accepted => {}
+            Verdict::Confirms { .. } => monitor.pardon(),
+            Verdict::Held => monitor.reject(),
         }
-        if let Some(cell) = self.campaign.cell_mut(index) {
-            cell.remember(b, moved, screened.rejected & bit != 0);
-        }
+        screened.note(b, verdict);
+        self.campaign.add_scatter(b, scatter);
     }
 
     /// A reading without a setting passes if the model expects it.
     fn screen_loose(&mut self, b: usize, code: i32, screened: &mut Screened) {
-        if self.is_expected(b, code) {
-            screened.accepted |= 1 << b;
-        } else if let Some(monitor) = self.monitors.get_mut(b) {
+        let verdict = if self.is_expected(b, code) { Verdict::Accepted } else { Verdict::Held };
+        if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
             monitor.reject();
-            screened.rejected |= 1 << b;
         }
+        screened.note(b, verdict);
     }
 
     /// True if the model, with all its uncertainty, expects a reading.
@@ -312,7 +302,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             (Some(mean), Some(this)) => mean - this,
             _ => 0.0,
         };
-        code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32)
+        let moved = code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32);
+        moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT)
     }
 
     fn slope(&self, b: usize) -> &[f32] {
@@ -334,13 +325,15 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
     fn condition(&mut self, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
         let before = self.solution.cost;
+        if cell.is_none() {
+            self.loose.recentre(self.gaussian.origin());
+        }
         for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
             let (innovation, variance) = (self.innovation(b, code), self.variance(b, 1, self.rf_offset));
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
             self.gaussian.condition(b, innovation, variance, slope);
             if cell.is_none() {
-                self.loose.recentre(self.gaussian.origin());
                 self.loose.condition(b, innovation, variance, slope);
             }
         }
@@ -509,27 +502,25 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// How well the model describes the readings of monitors in state ok, by the expected noise.
     ///
-    /// With constant vars: residuals of all frames kept as settings, at the MAP. With a random walk: innovations, each
+    /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk: innovations, each
     /// against the vars of its own time, counted in NIS.
     pub fn fit_quality(&mut self) -> FitQuality {
         if !self.is_still() {
             return FitQuality { chi_square: self.nis.0.value(), degrees_of_freedom: self.nis.1 as f32 };
         }
         let expected = self.model.noise * self.model.noise;
-        let ok = |monitor: &Monitor| monitor.health().state == MonitorState::Ok;
+        let is_ok = |(_, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok;
         let (mut sum, mut readings, mut baselines) = (Sum::default(), 0.0, 0.0);
-        for (b, monitor) in self.monitors.iter().enumerate().filter(|(_, m)| ok(m)) {
-            let _ = monitor;
+        for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
             sum.add(self.campaign.scatter(b) / expected);
             baselines += 1.0;
         }
         for cell in self.campaign.cells() {
             let drive = about(&cell.drive(), &self.supplies);
             self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for (b, _) in self.monitors.iter().enumerate().filter(|(_, m)| ok(m)) {
+            for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
                 let (mean, count) = cell.mean(b);
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let (d, _) = self.gaussian.effective(b, slope);
+                let (d, _) = self.gaussian.effective(b, column(self.prediction.jacobian.as_slice(), N, b));
                 let predicted = self.prediction.reading.get(b).copied().unwrap_or(0.0) + self.gaussian.baseline(b);
                 let residual = mean - predicted - dot(&d, self.solution.delta.as_slice());
                 sum.add(count as f32 * residual * residual / expected);

@@ -18,7 +18,7 @@ mod monitor;
 mod prior;
 pub mod surrogate;
 
-pub use campaign::{Campaign, Cell, Setting};
+pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Calibration, Drive};
 pub use estimate::{Estimate, Health, MonitorState};
 pub use estimator::{Estimator, FitQuality, IngestError, Model};
