@@ -149,7 +149,7 @@ impl Answer {
     /// Both families side by side, 24 rows.
     fn table(&self) -> Table {
         let mut table = Table::new();
-        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
         let head = ["var", "mean", "sigma/%", "95 % interval"];
         table.set_header(head.iter().chain(&head));
         let half = self.vars.len().div_ceil(2);

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use serde::Serialize;
+use tempfile::NamedTempFile;
 
 /// Why a file was not written.
 #[derive(Debug, thiserror::Error)]
@@ -28,29 +29,25 @@ pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
 }
 
 fn whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::Builder::new().permissions_like_created().tempfile_in(folder)?;
+    let mut file = temporary(path)?;
     file.write_all(bytes)?;
     file.persist(path).map_err(|e| e.error)?;
     Ok(())
 }
 
-/// A temporary file that ends up with the permissions that a created file has.
-trait LikeCreated {
-    fn permissions_like_created(&mut self) -> &mut Self;
-}
-
-impl LikeCreated for tempfile::Builder<'_, '_> {
+/// A temporary file beside its final place, with the permissions that a created file has.
+///
+/// # Errors
+/// What the system says, for instance that the folder does not exist.
+pub fn temporary(path: &Path) -> std::io::Result<NamedTempFile> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut builder = tempfile::Builder::new();
     #[cfg(unix)]
-    fn permissions_like_created(&mut self) -> &mut Self {
+    {
         use std::os::unix::fs::PermissionsExt;
-        self.permissions(std::fs::Permissions::from_mode(0o666)) // less the umask, as open(2) does
+        builder.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as open(2) does
     }
-
-    #[cfg(not(unix))]
-    fn permissions_like_created(&mut self) -> &mut Self {
-        self
-    }
+    builder.tempfile_in(folder)
 }
 
 #[cfg(test)]

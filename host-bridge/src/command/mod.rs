@@ -61,6 +61,7 @@ fn progress(length: usize, what: &'static str, quiet: bool) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }
-    let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {eta}").expect("the template is tested by use");
+    let style =
+        ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {eta}").expect("the template is tested by use");
     ProgressBar::new(length as u64).with_style(style).with_message(what)
 }

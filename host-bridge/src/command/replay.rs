@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use inference::stream::{self, Booster, BoosterEstimate};
 use inference::Recording;
+use inference::stream::{self, Booster, BoosterEstimate};
 use twin::Ring;
 
 use super::{CommandError, machine, progress, recording};
@@ -11,7 +11,7 @@ use crate::answer::{Answer, Timing};
 use crate::cli::{Rate, Replay};
 use crate::output;
 use crate::publish::Publisher;
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, now_ns};
 use crate::trace::Trace;
 
 /// Run it.
@@ -43,9 +43,10 @@ fn pump(
 ) -> Result<(BoosterEstimate, Timing), CommandError> {
     let other = |error: &dyn core::fmt::Display| CommandError::Other(error.to_string());
     let mut publisher = Publisher::try_new(&options.service).map_err(|e| other(&e))?;
-    let mut trace = options.trace.as_ref().map(|path| Trace::create(path, &ring.var_names())).transpose();
-    let trace = trace.as_mut().map_err(|e| other(&*e))?;
+    let trace = options.trace.as_ref().map(|path| Trace::create(path, &ring.var_names())).transpose();
+    let mut trace = trace.map_err(|e| other(&e))?;
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
+    let started = now_ns();
     let mut clock = Clock::new(options.rate);
     let (mut last, mut times) = (None, Vec::with_capacity(recording.rows.len()));
     for row in &recording.rows {
@@ -54,16 +55,16 @@ fn pump(
         let start = Instant::now();
         let estimate = core.ingest(&mut bytes).map_err(|e| other(&format!("frame {}: {e}", row.sequence)))?;
         times.push(start.elapsed());
-        let record = EstimateRecord::of(&estimate, core);
+        let record = EstimateRecord::of(&estimate, core, started);
         publisher.publish(&record).map_err(|e| other(&e))?;
-        if let Some(trace) = trace {
+        if let Some(trace) = &mut trace {
             trace.add(&record).map_err(|e| other(&e))?;
         }
         last = Some(estimate);
         bar.inc(1);
     }
     bar.finish_and_clear();
-    if let Some(trace) = trace.take() {
+    if let Some(trace) = trace {
         trace.finish().map_err(|e| other(&e))?;
     }
     let last = last.ok_or_else(|| CommandError::Input(format!("{}: no frames", recording.name)))?;

@@ -87,7 +87,7 @@ impl Answer {
         let horizontal = ring.correctors.iter().filter(|&&i| is_horizontal(ring, i)).count();
         let (blocks, names) = ([&self.response_x_m_per_rad, &self.response_y_m_per_rad], ["x", "y"]);
         let mut table = Table::new();
-        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
         table.set_header(["response", "to", "rms m/rad", "largest m/rad", "at"]);
         for (rows, name) in blocks.into_iter().zip(names) {
             for (to, from, until) in [("H", 0, horizontal), ("V", horizontal, self.correctors.len())] {

@@ -65,7 +65,7 @@ impl Entry {
 impl Check {
     fn table(&self) -> Table {
         let mut table = Table::new();
-        table.load_preset(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
         table.set_header(["surrogate", "plane", "numbers", "bytes", "vars", "rms/um", "largest/um", "stated rms/um"]);
         for e in &self.surrogates {
             let um = |mm: f64| format!("{:.2}", mm * 1e3);

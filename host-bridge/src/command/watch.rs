@@ -22,7 +22,10 @@ pub fn run(options: &Watch) -> Result<(), CommandError> {
     )
     .map_err(|error| CommandError::Other(error.to_string()))?;
     if !options.quiet {
-        println!("{} estimates seen, {} lost, {} restarts of the publisher", summary.seen, summary.lost, summary.restarts);
+        println!(
+            "{} estimates seen, {} lost, {} restarts of the publisher",
+            summary.seen, summary.lost, summary.restarts
+        );
     }
     Ok(())
 }

@@ -1,0 +1,150 @@
+//! Time of the core on one core of the host: a whole frame, and each step of its path.
+
+use divan::{Bencher, black_box};
+use estimator::surrogate::Surrogate;
+use estimator::{Calibration, Drive, Frame, Gaussian, Prediction, Prior, Solution};
+use inference::stream::{self, Booster, BoosterFrame};
+use inference::{Recording, StreamError};
+use system_tests::repository;
+use training::BoosterGreen;
+use twin::Ring;
+
+fn main() {
+    divan::main();
+}
+
+type Linearised = <BoosterGreen as Surrogate<33, 48, 48>>::Linearised;
+
+/// Frames of `recordings/paper-vars` as wire bytes, and a core that has heard some of them.
+struct Campaign {
+    wires: Vec<Vec<u8>>,
+    core: Box<Booster>,
+}
+
+impl Campaign {
+    fn read() -> Self {
+        let ring = Ring::booster();
+        let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+        let wires = recording.rows.iter().map(|row| stream::wire(&recording, row)).collect::<Result<_, StreamError>>();
+        Self { wires: wires.unwrap(), core: stream::estimator(&ring, &recording, 0.0).unwrap() }
+    }
+
+    /// The core just before each frame after which it linearises anew, or does not, and the frame.
+    fn moments(mut self, linearised: bool) -> Vec<(Box<Booster>, Vec<u8>)> {
+        let mut moments = Vec::new();
+        for wire in &self.wires {
+            let before = self.core.clone();
+            if self.core.ingest(&mut wire.clone()).unwrap().linearised == linearised {
+                moments.push((before, wire.clone()));
+            }
+        }
+        moments
+    }
+}
+
+/// Times of a frame at every moment of a campaign; divan's median is then that over its frames.
+fn ingest(bencher: Bencher, linearised: bool) {
+    let moments = Campaign::read().moments(linearised);
+    let mut next = (0..moments.len()).cycle();
+    bencher
+        .with_inputs(|| moments[next.next().expect("a cycle does not end")].clone())
+        .bench_local_values(|(mut core, mut wire)| (core.ingest(black_box(&mut wire)), core));
+}
+
+/// A frame from its bytes to the estimate, over those of a campaign that do not linearise anew.
+#[divan::bench(sample_count = 1000, sample_size = 1)]
+fn frame(bencher: Bencher) {
+    ingest(bencher, false);
+}
+
+/// A frame after which the surrogate is linearised anew and all settings so far are counted again.
+#[divan::bench(sample_size = 1)]
+fn frame_with_linearisation(bencher: Bencher) {
+    ingest(bencher, true);
+}
+
+/// Bytes to frame: COBS, CRC, body, ranges.
+#[divan::bench]
+fn decode(bencher: Bencher) {
+    let wire = Campaign::read().wires.swap_remove(100);
+    bencher.with_inputs(|| wire.clone()).bench_local_refs(|wire| BoosterFrame::decode(wire).unwrap());
+}
+
+/// Frame to bytes.
+#[divan::bench]
+fn encode(bencher: Bencher) {
+    let frame = BoosterFrame::decode(&mut Campaign::read().wires[100]).unwrap();
+    bencher
+        .with_inputs(|| [0; BoosterFrame::MAX_WIRE_BYTES])
+        .bench_local_refs(|bytes| black_box(&frame).encode(bytes).unwrap());
+}
+
+/// One powered corrector, and the stray currents of the others.
+fn drive(calibration: &Calibration) -> Drive<48> {
+    let frame: Frame<33, 48> = Frame::decode(&mut Campaign::read().wires[100]).unwrap();
+    calibration.drive(&frame)
+}
+
+/// Tables, linearised at vars of a few per cent, and what they predict.
+fn predicted() -> (BoosterGreen, Box<Linearised>, Drive<48>, Box<Prediction<33, 48>>) {
+    let core = Campaign::read().core;
+    let (tables, drive) = (core.model().surrogate.clone(), drive(&core.model().calibration));
+    let (mut linearised, mut prediction) = (Box::<Linearised>::default(), Box::<Prediction<33, 48>>::default());
+    linearise(&tables, &mut linearised);
+    tables.predict(&linearised, &drive, &mut prediction);
+    (tables, linearised, drive, prediction)
+}
+
+fn linearise(tables: &BoosterGreen, linearised: &mut Linearised) {
+    let strength: [f32; 48] = core::array::from_fn(|i| 1.0 + 0.03 * (1.7 * i as f32).sin());
+    Surrogate::<33, 48, 48>::linearise(tables, black_box(&strength), linearised).unwrap();
+}
+
+/// The surrogate at new gradients.
+#[divan::bench]
+fn linearisation(bencher: Bencher) {
+    let (tables, mut linearised, ..) = predicted();
+    bencher.bench_local(|| linearise(&tables, &mut linearised));
+}
+
+/// Orbit at 33 monitors and its derivative by 48 params.
+#[divan::bench]
+fn predict(bencher: Bencher) {
+    let (tables, linearised, drive, mut prediction) = predicted();
+    bencher.bench_local(|| tables.predict(black_box(&linearised), &drive, &mut prediction));
+}
+
+const PRIOR_WIDTH: f32 = 0.03;
+
+/// A frame's 33 readings enter the Gaussian.
+fn condition_all(gaussian: &mut Gaussian<33, 48>, prediction: &Prediction<33, 48>) {
+    for (b, slope) in prediction.jacobian.as_slice().chunks_exact(48).enumerate() {
+        gaussian.condition(b, black_box(1e-3), 2.25e-8, slope);
+    }
+    gaussian.settle();
+}
+
+/// All readings of a frame, 33 updates of the Gaussian.
+#[divan::bench]
+fn condition(bencher: Bencher) {
+    let (.., prediction) = predicted();
+    let mut gaussian = Box::new(Gaussian::prior(&Prior::lognormal(PRIOR_WIDTH)));
+    bencher.bench_local(|| condition_all(&mut gaussian, &prediction));
+}
+
+/// Best point, error bars and evidence of 48 params.
+#[divan::bench]
+fn solve(bencher: Bencher) {
+    let (.., prediction) = predicted();
+    let prior = Prior::lognormal(PRIOR_WIDTH);
+    let (mut gaussian, mut solution) = (Box::new(Gaussian::prior(&prior)), Box::<Solution<48>>::default());
+    condition_all(&mut gaussian, &prediction);
+    bencher.bench_local(|| assert!(solution.solve(black_box(&gaussian), &prior)));
+}
+
+/// The surrogate's tables from the twin.
+#[divan::bench]
+fn tables(bencher: Bencher) {
+    let ring = Ring::booster();
+    bencher.bench_local(|| training::green::tables::<15, 18, 24, 24, 96>(black_box(&ring)).unwrap());
+}

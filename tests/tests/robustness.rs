@@ -1,0 +1,560 @@
+//! What the core makes of bytes that are no frame, of frames that no machine sends, of settings that never repeat, and of a
+//! monitor that falls silent.
+
+use estimator::surrogate::Surrogate;
+use estimator::{
+    CurrentCode, Frame, FrameError, IngestError, MagnetCurrents, Model, MonitorState, PositionCode, Prior, RfCode,
+    TuneCode,
+};
+use inference::Recording;
+use inference::stream::{self, Booster, BoosterEstimate, BoosterFrame};
+use nalgebra::{DMatrix, DVector};
+use proptest::prelude::*;
+use system_tests::{repository, truth};
+use training::BoosterGreen;
+use twin::Ring;
+
+/// Random numbers, seeded. Source: G. Marsaglia, Xorshift RNGs, J. Stat. Softw. 8 (2003) 14.
+struct Random(u64);
+
+impl Random {
+    fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1)
+    }
+
+    fn bits(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.bits() >> 16) as usize % n
+    }
+
+    fn byte(&mut self) -> u8 {
+        (self.bits() >> 24) as u8
+    }
+
+    fn uniform(&mut self) -> f64 {
+        (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// A standard normal number, by Box and Muller.
+    fn normal(&mut self) -> f64 {
+        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
+        radius * (core::f64::consts::TAU * self.uniform()).cos()
+    }
+}
+
+fn paper_vars() -> (Ring, Recording) {
+    let ring = Ring::booster();
+    let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+    (ring, recording)
+}
+
+fn wires(recording: &Recording) -> Vec<Vec<u8>> {
+    recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
+}
+
+// ---- Bytes that are no frame ----
+
+/// The body of a frame, whatever it says.
+type Body<'a> = (u32, u64, u32, &'a [i32], [i32; 5], i32, &'a [i32], [Option<i32>; 2], u64);
+
+const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
+
+/// A frame of any version and body whose length and CRC are right.
+fn sealed(version: u8, body: &[u8]) -> Vec<u8> {
+    let mut plain = vec![version, body.len() as u8, (body.len() >> 8) as u8];
+    plain.extend_from_slice(body);
+    plain.extend_from_slice(&CRC.checksum(&plain).to_le_bytes());
+    framed(&plain)
+}
+
+fn framed(plain: &[u8]) -> Vec<u8> {
+    let mut wire = vec![0; cobs::max_encoding_length(plain.len()) + 1];
+    let n = cobs::encode(plain, &mut wire);
+    wire.truncate(n + 1);
+    wire
+}
+
+/// What stands in a wire frame, without COBS.
+fn plain(wire: &[u8]) -> Vec<u8> {
+    let mut plain = wire[..wire.len() - 1].to_vec();
+    let n = cobs::decode_in_place(&mut plain).unwrap();
+    plain.truncate(n);
+    plain
+}
+
+fn serialised(body: &Body) -> Vec<u8> {
+    postcard::to_slice(body, &mut [0; 4096]).unwrap().to_vec()
+}
+
+/// A frame that would be good but for the lengths of its lists.
+fn miscounted(sequence: u32, monitors: usize, correctors: usize) -> Vec<u8> {
+    let (readings, currents) = (vec![1000; monitors], vec![-5; correctors]);
+    let body = (sequence, 1, 2, currents.as_slice(), [23_997_850; 5], 0, readings.as_slice(), [None; 2], u64::MAX);
+    sealed(BoosterFrame::VERSION, &serialised(&body))
+}
+
+/// A frame that would be good but for one value.
+fn beyond(sequence: u32, random: &mut Random) -> Vec<u8> {
+    let (mut currents, mut magnets, mut rf_offset, mut readings, mut tune) =
+        ([0; 48], [23_997_850; 5], 0, [1000; 33], [Some(800_000), None]);
+    let far = |limit: i32, random: &mut Random| {
+        let steps = limit + 1 + random.below((i32::MAX - limit) as usize) as i32;
+        if random.below(2) == 0 { steps } else { -steps }
+    };
+    match random.below(6) {
+        0 => currents[random.below(48)] = far(CurrentCode::LIMIT, random),
+        1 => magnets[random.below(5)] = far(CurrentCode::LIMIT, random),
+        2 => rf_offset = far(RfCode::LIMIT, random),
+        3 => readings[random.below(33)] = far(PositionCode::LIMIT, random),
+        4 => tune[random.below(2)] = Some(far(TuneCode::LIMIT, random)),
+        _ => tune[random.below(2)] = Some(-1),
+    }
+    let body = (sequence, 1, 2, currents.as_slice(), magnets, rf_offset, readings.as_slice(), tune, u64::MAX);
+    sealed(BoosterFrame::VERSION, &serialised(&body))
+}
+
+/// The faults thrown at the core.
+const FAULTS: usize = 17;
+
+/// A faulty frame between two good ones, and whether an error is the one to expect of it.
+fn faulty(
+    fault: usize,
+    last: &[u8],
+    next: &[u8],
+    first: &[u8],
+    random: &mut Random,
+) -> (Vec<u8>, fn(&IngestError) -> bool) {
+    use FrameError::{Corrupted, Count, Framing, Malformed, Oversized, Range, Truncated, Version};
+    use IngestError::{Frame, OutOfOrder, Repeated};
+    let garbled: fn(&IngestError) -> bool =
+        |e| matches!(e, Frame(Framing | Truncated { .. } | Oversized { .. } | Corrupted { .. }));
+    let sequence = u32::MAX - random.below(1000) as u32;
+    let mut bytes = next.to_vec();
+    let n = bytes.len() - 1;
+    match fault {
+        0 => {
+            bytes.truncate(random.below(n));
+            (bytes, |e| matches!(e, Frame(Framing | Truncated { .. })))
+        }
+        1 => {
+            bytes[random.below(n)] ^= 1 << random.below(8);
+            (bytes, garbled)
+        }
+        2 => {
+            for _ in 0..2 + random.below(20) {
+                bytes[random.below(n)] ^= 1 + (random.byte() & 0x7f);
+            }
+            (bytes, garbled)
+        }
+        3 => {
+            let (i, j) = loop {
+                let (i, j) = (random.below(n), random.below(n));
+                if bytes[i] != bytes[j] {
+                    break (i, j);
+                }
+            };
+            bytes.swap(i, j);
+            (bytes, garbled)
+        }
+        4 => ((0..random.below(600)).map(|_| random.byte()).collect(), garbled),
+        5 => {
+            let long = BoosterFrame::MAX_WIRE_BYTES + 1 + random.below(3000);
+            ((0..long).map(|_| random.byte()).collect(), |e| {
+                matches!(e, Frame(Oversized { limit: BoosterFrame::MAX_WIRE_BYTES, .. }))
+            })
+        }
+        6 => {
+            let mut plain = plain(next);
+            plain.extend((0..1 + random.below(20)).map(|_| random.byte()));
+            (framed(&plain), |e| matches!(e, Frame(Oversized { limit, got }) if got > limit))
+        }
+        7 => (Vec::new(), |e| *e == Frame(Truncated { need: 7, got: 0 })),
+        8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Truncated { need: 7, got: 0 })),
+        9 => {
+            let (plain, other) = (plain(next), 2 + random.below(254) as u8);
+            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 1, .. })))
+        }
+        10 => {
+            let (monitors, correctors) = [(33, 47), (33, 49), (32, 48), (34, 48), (0, 0), (64, 64)][random.below(6)];
+            (miscounted(sequence, monitors, correctors), |e| matches!(e, Frame(Count { .. })))
+        }
+        11 => (beyond(sequence, random), |e| matches!(e, Frame(Range { .. }))),
+        12 => {
+            let mut plain = plain(next);
+            plain.truncate(plain.len() - 5); // the last byte of the mask
+            (sealed(BoosterFrame::VERSION, &plain[3..]), |e| *e == Frame(Malformed))
+        }
+        13 => (last.to_vec(), |e| matches!(e, Repeated { .. })),
+        14 => (first.to_vec(), |e| matches!(e, OutOfOrder { .. } | Repeated { .. })),
+        15 => ([&last[..last.len() - 1], next].concat(), garbled),
+        _ => {
+            let cut = n / 4 + random.below(n / 2);
+            ([&last[..cut.min(last.len() - 1)], &next[cut..]].concat(), garbled)
+        }
+    }
+}
+
+/// Everything that an estimate says, to the bit, but the number of refused frames.
+fn bits(core: &Booster, estimate: &BoosterEstimate) -> Vec<u64> {
+    let e = estimate;
+    let of = |values: &[f32]| values.iter().map(|v| u64::from(v.to_bits())).collect::<Vec<_>>();
+    let health = e.health.iter().flat_map(|h| {
+        [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
+    });
+    let covariance: Vec<f32> = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| core.covariance(i, j)).collect();
+    let counts = [u64::from(e.sequence), e.time_us, u64::from(e.frames), e.clipped, e.accepted, e.rejected, e.confirmed];
+    let more = [e.restarted, e.setting.map_or(u64::MAX, u64::from), u64::from(e.linearised)];
+    let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma].map(|list| of(list)).concat();
+    [&counts[..], &more, &lists, &of(&[e.nis, e.log_evidence]), &of(&covariance), &health.collect::<Vec<_>>()].concat()
+}
+
+#[test]
+fn ten_thousand_faulty_frames_leave_the_posterior_as_it_was() {
+    const FAULTY: usize = 10_000;
+    let (ring, recording) = paper_vars();
+    let good = wires(&recording);
+    let mut alone = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut disturbed = alone.clone();
+    let (mut random, mut thrown) = (Random::new(1), 0);
+    for (at, wire) in good.iter().enumerate() {
+        let expected = alone.ingest(&mut wire.clone()).unwrap();
+        let estimate = disturbed.ingest(&mut wire.clone()).unwrap();
+        assert_eq!(bits(&disturbed, &estimate), bits(&alone, &expected), "frame {at}");
+        assert_eq!((expected.rejected_frames, estimate.rejected_frames), (0, thrown), "frame {at}");
+        let next = good.get(at + 1).unwrap_or(&good[0]);
+        while (thrown as usize) < (at + 1) * FAULTY / good.len() {
+            let fault = thrown as usize % FAULTS;
+            let (mut bytes, is_expected) = faulty(fault, wire, next, &good[0], &mut random);
+            let shown = bytes.clone();
+            let error = disturbed.ingest(&mut bytes).expect_err("a faulty frame");
+            assert!(is_expected(&error), "fault {fault} after frame {at}: {error} for {shown:02x?}");
+            thrown += 1;
+        }
+    }
+    assert_eq!(thrown as usize, FAULTY);
+    let quality = [alone, disturbed].map(|mut core| core.fit_quality());
+    assert_eq!(quality[0], quality[1]);
+}
+
+/// A core that has heard 150 frames, and what it said last.
+fn seasoned() -> (Box<Booster>, BoosterEstimate) {
+    let (ring, recording) = paper_vars();
+    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let heard = wires(&recording).iter_mut().take(150).map(|wire| core.ingest(wire).unwrap()).last();
+    (core, heard.unwrap())
+}
+
+/// The CRC of whatever these bytes hold is right.
+fn is_sealed(wire: &[u8]) -> bool {
+    let mut plain = wire.strip_suffix(&[0]).unwrap_or(wire).to_vec();
+    let decoded = cobs::decode_in_place(&mut plain).ok().and_then(|n| plain.get(..n));
+    decoded.and_then(<[u8]>::split_last_chunk::<4>).is_some_and(|(covered, crc)| CRC.checksum(covered).to_le_bytes() == *crc)
+}
+
+#[test]
+fn bytes_never_panic_and_pass_only_with_their_crc() {
+    let (core, _) = seasoned();
+    let bytes = || prop::collection::vec(any::<u8>(), 0..900);
+    let body = (any::<u32>(), any::<u64>(), any::<u32>(), prop::collection::vec(any::<i32>(), 48), any::<[i32; 5]>());
+    let rest = (any::<i32>(), prop::collection::vec(any::<i32>(), 33), any::<[Option<i32>; 2]>(), any::<u64>());
+    // half of the small values are within their ranges
+    let frames = (body, rest, 0..31_u32).prop_map(|((sequence, time, cycle, c, m), (rf, r, tune, valid), shift)| {
+        let small = |v: &i32| v >> shift;
+        let (c, r): (Vec<_>, Vec<_>) = (c.iter().map(small).collect(), r.iter().map(small).collect());
+        let tune = tune.map(|t| t.map(|t| t >> shift));
+        serialised(&(sequence, time, cycle, &c, m.map(|v| v >> shift), rf >> shift, &r, tune, valid))
+    });
+    let any = prop_oneof![
+        bytes(),
+        bytes().prop_map(|body| sealed(1, &body[..body.len().min(757)])),
+        frames.prop_map(|body| sealed(1, &body)),
+    ];
+    proptest!(ProptestConfig::with_cases(1000), |(wire in any)| {
+        let taken = core.clone().ingest(&mut wire.clone());
+        prop_assert!(taken.is_err() || is_sealed(&wire));
+    });
+}
+
+// ---- Frames that no machine sends ----
+
+/// A number of steps within a limit: anything, ordinary ones, and the ends.
+fn steps(limit: i32, usual: i32) -> impl Strategy<Value = i32> {
+    prop_oneof![
+        4 => Just(usual),
+        2 => -limit..=limit,
+        2 => -1000..1000,
+        1 => prop::sample::select(vec![-limit, -1, 0, 1, limit]),
+    ]
+}
+
+fn current(usual: i32) -> impl Strategy<Value = CurrentCode> {
+    steps(CurrentCode::LIMIT, usual).prop_map(|s| CurrentCode::try_new(s).unwrap())
+}
+
+fn magnets() -> impl Strategy<Value = MagnetCurrents> {
+    (current(24_000_000), current(18_000_000), current(17_900_000), current(0), current(0))
+        .prop_map(|(dipole, qh, qv, sh, sv)| MagnetCurrents { dipole, qh, qv, sh, sv })
+}
+
+/// At most one powered corrector, as in a campaign, or anything at all.
+fn correctors() -> impl Strategy<Value = [CurrentCode; 48]> {
+    let one = (0..48_usize, current(220_000)).prop_map(|(at, current)| {
+        let mut currents = [CurrentCode::default(); 48];
+        currents[at] = current;
+        currents
+    });
+    prop_oneof![one, prop::collection::vec(current(0), 48).prop_map(|v| v.try_into().unwrap())]
+}
+
+fn readings() -> impl Strategy<Value = [PositionCode; 33]> {
+    let code = steps(PositionCode::LIMIT, 5_000).prop_map(|s| PositionCode::try_new(s).unwrap());
+    prop::collection::vec(code, 33).prop_map(|v| v.try_into().unwrap())
+}
+
+fn frame() -> impl Strategy<Value = BoosterFrame> {
+    let mask = prop_oneof![Just(u64::MAX), Just(0), any::<u64>()];
+    let sequence = prop_oneof![any::<u32>(), 0..100_u32];
+    (sequence, any::<u64>(), any::<u32>(), correctors(), magnets(), steps(RfCode::LIMIT, 0), readings(), mask).prop_map(
+        |(sequence, time_us, cycle_time_us, corrector, magnets, rf, reading, valid)| Frame {
+            sequence,
+            time_us,
+            cycle_time_us,
+            corrector,
+            magnets,
+            rf_offset: RfCode::try_new(rf).unwrap(),
+            reading,
+            tune: [TuneCode::try_new(999_999), None],
+            valid,
+        },
+    )
+}
+
+/// What holds of an estimate whatever the frames were.
+fn check(core: &Booster, estimate: &BoosterEstimate, prior: &Prior, walks: bool) -> Result<(), String> {
+    let e = estimate;
+    let finite = [e.mean, e.sigma, e.map_params, e.centre, e.params_sigma].concat();
+    if !finite.iter().chain(&[e.nis, e.log_evidence]).all(|v| v.is_finite()) {
+        return Err(format!("not finite: {e:?}"));
+    }
+    for i in 0..48 {
+        let (theta, sigma) = (e.map_params[i], e.params_sigma[i]);
+        if !(prior.lower..=prior.upper).contains(&theta) {
+            return Err(format!("map of {i} is {theta}"));
+        }
+        if e.mean[i] < 0.9399 || e.mean[i] > 1.0601 {
+            return Err(format!("mean of {i} is {}", e.mean[i]));
+        }
+        if sigma <= 0.0 || e.sigma[i] <= 0.0 {
+            return Err(format!("sigma of {i} is {sigma}, of its var {}", e.sigma[i]));
+        }
+        // rounding of f32 over a few hundred sums
+        if !walks && sigma > prior.sigma * 1.0001 {
+            return Err(format!("sigma of {i} is {sigma}, beyond the prior's"));
+        }
+        let variance = core.covariance(i, i);
+        if (variance / (sigma * sigma) - 1.0).abs() > 1e-3 {
+            return Err(format!("variance of {i} is {variance}, sigma {sigma}"));
+        }
+    }
+    if e.health.iter().any(|h| !(h.noise > 0.0 && h.noise.is_finite() && h.weighted_as.is_finite())) {
+        return Err(format!("health {:?}", e.health));
+    }
+    Ok(())
+}
+
+#[test]
+fn extreme_frames_leave_every_estimate_sound() {
+    let (ring, recording) = paper_vars();
+    let starts = [0.0, 1e-3].map(|walk| stream::estimator(&ring, &recording, walk).unwrap());
+    let frames = prop::collection::vec(frame(), 1..20);
+    proptest!(ProptestConfig::with_cases(300), |(frames in frames, walks in 0..2_usize, ordered: bool, heard in 0..40_usize)| {
+        let mut core = starts[walks].clone();
+        for mut wire in wires(&recording).into_iter().take(heard) {
+            core.ingest(&mut wire).unwrap();
+        }
+        for (at, mut frame) in frames.into_iter().enumerate() {
+            if ordered {
+                frame.sequence = 1000 + at as u32;
+            }
+            let mut wire = [0; BoosterFrame::MAX_WIRE_BYTES];
+            let n = frame.encode(&mut wire).unwrap();
+            match core.ingest(&mut wire[..n]) {
+                Ok(estimate) => {
+                    let sound = check(&core, &estimate, &core.model().prior, walks == 1);
+                    prop_assert!(sound.is_ok(), "frame {at}: {}", sound.unwrap_err());
+                }
+                Err(IngestError::Repeated { .. } | IngestError::OutOfOrder { .. }) => prop_assert!(!ordered),
+                Err(error) => prop_assert!(false, "frame {at}: {error}"),
+            }
+            let quality = core.fit_quality();
+            prop_assert!(quality.chi_square.is_finite() && quality.degrees_of_freedom.is_finite(), "{quality:?}");
+        }
+    });
+}
+
+// ---- Settings that never repeat ----
+
+/// A machine of known vars that steers with several correctors at once.
+struct Machine {
+    surrogate: BoosterGreen,
+    at: Box<<BoosterGreen as Surrogate<33, 48, 48>>::Linearised>,
+    prediction: Box<estimator::Prediction<33, 48>>,
+    params: [f32; 48],
+    offset: [f64; 33],
+    random: Random,
+}
+
+impl Machine {
+    /// Vars drawn from the prior.
+    fn drawn(model: &Model<BoosterGreen>, seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let prior = &model.prior;
+        let mut theta = || loop {
+            let theta = prior.mean + prior.sigma * random.normal() as f32;
+            if (prior.lower..=prior.upper).contains(&theta) {
+                return theta;
+            }
+        };
+        Self {
+            surrogate: model.surrogate.clone(),
+            at: Box::default(),
+            prediction: Box::default(),
+            params: core::array::from_fn(|_| theta()),
+            offset: core::array::from_fn(|_| 2e-3 * random.normal()),
+            random,
+        }
+    }
+
+    /// Let every param walk.
+    fn walk(&mut self, sigma: f32) {
+        self.params.iter_mut().for_each(|theta| *theta += sigma * self.random.normal() as f32);
+    }
+
+    /// A cycle with five correctors of 5 to 22 A; the readings are the surrogate's, and noise.
+    fn cycle(&mut self, model: &Model<BoosterGreen>, sequence: u32) -> BoosterFrame {
+        let mut corrector = [CurrentCode::default(); 48];
+        let mut powered = 0;
+        while powered < 5 {
+            let c = self.random.below(48);
+            if corrector[c] == CurrentCode::default() {
+                let sign = if self.random.below(2) == 0 { 1.0 } else { -1.0 };
+                corrector[c] = CurrentCode::nearest(sign * (5.0 + 17.0 * self.random.uniform())).unwrap();
+                powered += 1;
+            }
+        }
+        let [dipole, qh, qv] = model.calibration.nominal.map(|a| CurrentCode::nearest(f64::from(a)).unwrap());
+        let magnets = MagnetCurrents { dipole, qh, qv, ..MagnetCurrents::default() };
+        let mut frame = Frame {
+            sequence,
+            time_us: 100_000 * u64::from(sequence),
+            cycle_time_us: 92_000,
+            corrector,
+            magnets,
+            rf_offset: RfCode::default(),
+            reading: [PositionCode::default(); 33],
+            tune: [None; 2],
+            valid: (1 << 33) - 1,
+        };
+        let strength = self.params.map(f32::exp);
+        Surrogate::<33, 48, 48>::linearise(&self.surrogate, &strength, &mut self.at).unwrap();
+        self.surrogate.predict(&self.at, &model.calibration.drive(&frame), &mut self.prediction);
+        for b in 0..33 {
+            let noise = f64::from(model.noise) * self.random.normal();
+            let position = f64::from(self.prediction.reading[b]) + self.offset[b] + noise;
+            frame.reading[b] = PositionCode::nearest(position).unwrap();
+        }
+        frame
+    }
+}
+
+fn ingest(core: &mut Booster, frame: &BoosterFrame) -> BoosterEstimate {
+    let mut wire = [0; BoosterFrame::MAX_WIRE_BYTES];
+    let n = frame.encode(&mut wire).unwrap();
+    core.ingest(&mut wire[..n]).unwrap()
+}
+
+/// Normalised estimation error squared of the params.
+fn nees(core: &Booster, estimate: &BoosterEstimate, params: &[f64]) -> f64 {
+    let error = DVector::from_fn(48, |i, _| f64::from(estimate.map_params[i]) - params[i]);
+    let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
+    (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0]
+}
+
+/// Sum of NEES over machines, and mean NIS per reading, at the end of a stream of frames that belong to no setting.
+fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
+    let (ring, recording) = paper_vars();
+    let start = stream::estimator(&ring, &recording, process_noise).unwrap();
+    let (mut total, mut nis, mut readings) = (0.0, 0.0, 0.0);
+    for seed in 1..=machines {
+        let (mut core, mut machine) = (start.clone(), Machine::drawn(start.model(), seed));
+        let mut last = None;
+        for sequence in 0..frames {
+            if process_noise > 0.0 && sequence > 0 {
+                machine.walk(process_noise);
+            }
+            let estimate = ingest(&mut core, &machine.cycle(start.model(), sequence));
+            assert_eq!(estimate.setting, None);
+            if std::env::var("TRACE").is_ok_and(|t| t == seed.to_string()) && (sequence < 40 || sequence % 20 == 0) {
+                let worst = (0..48).map(|i| ((estimate.map_params[i]-machine.params[i])/estimate.params_sigma[i]).abs()).fold(0.0, f32::max);
+                println!("{sequence} nees {:.2} worst {worst:.2} nis {:.1} acc {} rej {} conf {} lin {} clip {} ev {}", nees(&core,&estimate,&machine.params.map(f64::from))/48.0, estimate.nis, estimate.accepted.count_ones(), estimate.rejected.count_ones(), estimate.confirmed.count_ones(), estimate.linearised, estimate.clipped.count_ones(), estimate.log_evidence);
+            }
+            nis += f64::from(estimate.nis);
+            readings += f64::from(estimate.accepted.count_ones());
+            last = Some(estimate);
+        }
+        let n = nees(&core, &last.unwrap(), &machine.params.map(f64::from));
+        println!("machine {seed}: NEES/48 {:.3}", n / 48.0);
+        total += n;
+    }
+    (total, nis / readings)
+}
+
+#[test]
+fn frames_of_no_setting_are_consistent_with_the_truth() {
+    for process_noise in [0.0, 1e-4] {
+        let machines = 4;
+        let (nees, nis) = steered(process_noise, machines, 300);
+        let k = 48.0 * machines as f64;
+        println!("process noise {process_noise}: NEES/k {:.3} NIS {nis:.3}", nees / k);
+        // chi-square of k degrees, three standard deviations
+        assert!((nees / k - 1.0).abs() < 3.0 * (2.0 / k).sqrt(), "NEES/{k} {:.2}", nees / k);
+    }
+}
+
+// ---- A monitor that falls silent ----
+
+#[test]
+fn a_silent_monitor_is_dead_until_it_speaks() {
+    // given a campaign in which one monitor says nothing in 300 frames
+    let (ring, recording) = paper_vars();
+    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let (monitor, silence) = (10, 20..320);
+    let mut last = None;
+    for (at, row) in recording.rows.iter().enumerate() {
+        let mut frame = stream::frame(&recording, row).unwrap();
+        if silence.contains(&at) {
+            frame.valid &= !(1 << monitor);
+        }
+        // when the frames are taken in
+        let estimate = ingest(&mut core, &frame);
+        // then it is dead from the 20th silent frame to the first after the silence, and none of its readings is used
+        let dead = (silence.start + 19..silence.end).contains(&at);
+        let state = estimate.health[monitor].state;
+        assert_eq!(state, if dead { MonitorState::Dead } else { MonitorState::Ok }, "frame {at}");
+        assert!(!silence.contains(&at) || (estimate.accepted | estimate.rejected) >> monitor & 1 == 0);
+        last = Some(estimate);
+    }
+    let last = last.unwrap();
+    assert_eq!(last.accepted >> monitor & 1, 1, "it is used again");
+    // and the others find the vars
+    let params: Vec<f64> = truth("recordings/paper-vars", &ring).iter().map(|var| var.ln()).collect();
+    let nees = nees(&core, &last, &params) / 48.0;
+    // 48 correlated directions: 0.6..1.5 is the 99 % range of chi-square with 48 degrees over 48
+    assert!((0.6..1.5).contains(&nees), "NEES/48 {nees:.2}");
+}
