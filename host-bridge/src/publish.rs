@@ -1,139 +1,341 @@
-//! Estimates over iceoryx2 shared memory: zero-copy samples, an event for each, history for late joiners.
+//! Estimates in shared memory: loan, write, send; up to 16 readers, none of which can hold the writer up.
+//!
+//! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
+//! killed leaves shared memory behind, which the next process that joins any service clears away.
+//!
+//! Caveat: joining installs handlers for SIGINT, SIGTERM and their like, so they no longer end the process. A loop that
+//! owns a [`Publisher`] or a [`Subscriber`] has to ask [`Publisher::is_stop_requested`] now and then.
 
+use core::fmt::Display;
 use core::time::Duration;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
-use iceoryx2::port::publisher::Publisher as Port;
-use iceoryx2::port::subscriber::Subscriber as SubscriberPort;
-use iceoryx2::prelude::*;
+use iceoryx2::prelude::{EventId, LogLevel, Node, NodeBuilder, ServiceName, ipc, set_log_level_from_env_or};
 use iceoryx2::service::port_factory::{event, publish_subscribe};
+use iceoryx2::{port, prelude::NodeName};
 
 use crate::record::EstimateRecord;
 
-/// Name of the service, unless another one is asked for.
+/// Name of the service of estimates, and of the event that announces each of them.
 pub const SERVICE: &str = "orbitcal/estimate";
+/// Estimates that a reader who joins late still gets.
+pub const HISTORY: usize = 16;
+/// Estimates that wait for a slow reader: a quarter of a second at 1 kHz.
+pub const BUFFER: usize = 256;
+/// Readers at a time.
+pub const SUBSCRIBERS: usize = 16;
+/// Writers at a time: a restarted one can join before the dead one is cleared away.
+pub const PUBLISHERS: usize = 4;
 
-/// Samples that a late joiner gets at once.
-const HISTORY: usize = 16;
-/// Samples that wait for a slow subscriber, a quarter of a second at 1 kHz; the oldest give way.
-const BUFFER: usize = 256;
-/// A restarted publisher joins before the dead one is cleared away.
-const PUBLISHERS: usize = 4;
-const SUBSCRIBERS: usize = 16;
+/// Processes at a time: every reader and writer, and some that look on.
+const NODES: usize = SUBSCRIBERS + PUBLISHERS + 4;
+/// The one event: a new estimate, or a new publisher.
+const NEWS: usize = 0;
+/// Asking for a signal costs a system call of some 60 us; this often is soon enough for a person.
+const ASK_EVERY: Duration = Duration::from_millis(50);
 
-/// Why shared memory cannot be used.
+/// Why estimates cannot be sent or heard.
 #[derive(Debug, thiserror::Error)]
-#[error("shared memory service {service}: {what}: {reason}")]
-pub struct PublishError {
-    service: String,
-    what: &'static str,
-    reason: String,
+#[non_exhaustive]
+pub enum PublishError {
+    /// The name cannot be a service.
+    #[error("service {service:?}: expected 1 to 255 bytes, not beginning with iox2://")]
+    Name {
+        /// The name.
+        service: String,
+    },
+    /// The shared memory cannot be joined.
+    #[error("service {service}: cannot create its {part}: {reason} (all processes need one user and one version)")]
+    Join {
+        /// The service.
+        service: String,
+        /// What could not be made.
+        part: &'static str,
+        /// Why.
+        reason: String,
+    },
+    /// An estimate was not sent.
+    #[error("service {service}: estimate {sequence} was not sent: {reason}")]
+    Send {
+        /// The service.
+        service: String,
+        /// Sequence number of its frame.
+        sequence: u32,
+        /// Why.
+        reason: String,
+    },
+    /// Waiting or receiving failed.
+    #[error("service {service}: cannot receive: {reason}")]
+    Receive {
+        /// The service.
+        service: String,
+        /// Why.
+        reason: String,
+    },
 }
 
-/// Sends estimates.
-pub struct Publisher {
-    service: String,
-    // ports before the node: they are dropped in this order
-    port: Port<ipc::Service, EstimateRecord, ()>,
-    notifier: Notifier<ipc::Service>,
-    _node: Node<ipc::Service>,
+/// What both sides join, with the same settings: whoever comes first creates it.
+struct Services {
+    name: String,
+    node: Node<ipc::Service>,
+    estimates: publish_subscribe::PortFactory<ipc::Service, EstimateRecord, ()>,
+    news: event::PortFactory<ipc::Service>,
+    asked: Instant,
 }
 
-/// Receives estimates.
-pub struct Subscriber {
-    service: String,
-    port: SubscriberPort<ipc::Service, EstimateRecord, ()>,
-    listener: Listener<ipc::Service>,
-    _node: Node<ipc::Service>,
-}
-
-impl Publisher {
-    /// Open or create the service of this name.
-    ///
-    /// # Errors
-    /// [`PublishError`], for instance if another version of the record is published under the name.
-    pub fn try_new(service: &str) -> Result<Self, PublishError> {
-        let node = node(service)?;
-        let port = samples(&node, service)?.publisher_builder().create().map_err(wrong(service, "publish"))?;
-        let notifier = events(&node, service)?.notifier_builder().create().map_err(wrong(service, "notify"))?;
-        Ok(Self { service: service.into(), port, notifier, _node: node })
+impl Services {
+    fn try_join(name: &str) -> Result<Self, PublishError> {
+        set_log_level_from_env_or(LogLevel::Error); // no word on absent configuration files
+        let wrong = |_| PublishError::Name { service: name.to_owned() };
+        let service = ServiceName::new(name).map_err(wrong)?;
+        let node = NodeBuilder::new()
+            .name(&NodeName::new("orbitcal").expect("a short name is a node name"))
+            .create::<ipc::Service>()
+            .map_err(|e| join(name, "node", &e))?;
+        let estimates = estimates(&node, &service).map_err(|e| join(name, "estimates", &e))?;
+        let news = news(&node, &service).map_err(|e| join(name, "event", &e))?;
+        Ok(Self { name: name.to_owned(), node, estimates, news, asked: Instant::now() })
     }
 
-    /// Send one estimate: loan, write in place, send, wake the listeners.
-    ///
-    /// # Errors
-    /// [`PublishError`].
-    pub fn publish(&mut self, record: &EstimateRecord) -> Result<(), PublishError> {
-        let sample = self.port.loan_uninit().map_err(wrong(&self.service, "loan"))?;
-        sample.write_payload(*record).send().map_err(wrong(&self.service, "send"))?;
-        self.notifier.notify().map_err(wrong(&self.service, "notify"))?;
-        Ok(())
-    }
-}
-
-impl Subscriber {
-    /// Open or create the service of this name.
-    ///
-    /// # Errors
-    /// [`PublishError`].
-    pub fn try_new(service: &str) -> Result<Self, PublishError> {
-        let node = node(service)?;
-        let port = samples(&node, service)?.subscriber_builder().buffer_size(BUFFER).create();
-        let listener = events(&node, service)?.listener_builder().create().map_err(wrong(service, "listen"))?;
-        Ok(Self { service: service.into(), port: port.map_err(wrong(service, "subscribe"))?, listener, _node: node })
-    }
-
-    /// Wait for estimates, at most `timeout`, and hand each one that is there to `hear`; returns their number.
-    ///
-    /// # Errors
-    /// [`PublishError`].
-    pub fn wait(&mut self, timeout: Duration, mut hear: impl FnMut(&EstimateRecord)) -> Result<usize, PublishError> {
-        // Wake-ups coalesce, so whatever is there is taken, however many events there were.
-        self.listener.timed_wait(|_| (), timeout).map_err(wrong(&self.service, "wait"))?;
-        let mut heard = 0;
-        while let Some(sample) = self.port.receive().map_err(wrong(&self.service, "receive"))? {
-            hear(sample.payload());
-            heard += 1;
+    /// True once after SIGINT or SIGTERM.
+    fn is_stop_requested(&mut self) -> bool {
+        if self.asked.elapsed() < ASK_EVERY {
+            return false;
         }
-        Ok(heard)
+        self.asked = Instant::now();
+        self.node.wait(Duration::ZERO).is_err()
     }
 }
 
-fn node(service: &str) -> Result<Node<ipc::Service>, PublishError> {
-    // Without a configuration file the library would say so on every start; its own variable turns it up again.
-    set_log_level_from_env_or(LogLevel::Error);
-    NodeBuilder::new().create::<ipc::Service>().map_err(wrong(service, "create node"))
-}
-
-type Samples = publish_subscribe::PortFactory<ipc::Service, EstimateRecord, ()>;
-
-fn samples(node: &Node<ipc::Service>, service: &str) -> Result<Samples, PublishError> {
-    node.service_builder(&name(service)?)
+fn estimates(
+    node: &Node<ipc::Service>,
+    name: &ServiceName,
+) -> Result<
+    publish_subscribe::PortFactory<ipc::Service, EstimateRecord, ()>,
+    iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError,
+> {
+    node.service_builder(name)
         .publish_subscribe::<EstimateRecord>()
         .history_size(HISTORY)
         .subscriber_max_buffer_size(BUFFER)
         .enable_safe_overflow(true)
-        .max_publishers(PUBLISHERS)
         .max_subscribers(SUBSCRIBERS)
+        .max_publishers(PUBLISHERS)
+        .max_nodes(NODES)
         .open_or_create()
-        .map_err(wrong(service, "open"))
 }
 
-fn events(node: &Node<ipc::Service>, service: &str) -> Result<event::PortFactory<ipc::Service>, PublishError> {
-    node.service_builder(&name(service)?)
+fn news(
+    node: &Node<ipc::Service>,
+    name: &ServiceName,
+) -> Result<event::PortFactory<ipc::Service>, iceoryx2::service::builder::event::EventOpenOrCreateError> {
+    node.service_builder(name)
         .event()
-        .max_notifiers(PUBLISHERS)
         .max_listeners(SUBSCRIBERS)
+        .max_notifiers(PUBLISHERS)
+        .max_nodes(NODES)
         .open_or_create()
-        .map_err(wrong(service, "open events"))
 }
 
-fn name(service: &str) -> Result<ServiceName, PublishError> {
-    service.try_into().map_err(wrong(service, "name"))
+fn join(service: &str, part: &'static str, reason: &dyn Display) -> PublishError {
+    PublishError::Join { service: service.to_owned(), part, reason: reason.to_string() }
 }
 
-fn wrong<E: core::fmt::Debug>(service: &str, what: &'static str) -> impl FnOnce(E) -> PublishError {
-    let service = service.to_owned();
-    move |error| PublishError { service, what, reason: format!("{error:?}") }
+/// The writer's end.
+pub struct Publisher {
+    notifier: Notifier<ipc::Service>,
+    publisher: port::publisher::Publisher<ipc::Service, EstimateRecord, ()>,
+    services: Services,
+    started_ns: u64,
+}
+
+impl Publisher {
+    /// Join a service, or create it, and clear away what dead processes have left.
+    ///
+    /// # Errors
+    /// [`PublishError::Name`] or [`PublishError::Join`].
+    pub fn try_new(service: &str) -> Result<Self, PublishError> {
+        let services = Services::try_join(service)?;
+        let publisher = services.estimates.publisher_builder().create().map_err(|e| join(service, "publisher", &e))?;
+        let notifier = services
+            .news
+            .notifier_builder()
+            .default_event_id(EventId::new(NEWS))
+            .create()
+            .map_err(|e| join(service, "notifier", &e))?;
+        let this = Self { notifier, publisher, services, started_ns: now_ns() };
+        this.announce(); // readers connect now, before the first estimate
+        Ok(this)
+    }
+
+    /// Write a record into shared memory, stamp it, and wake the readers. Never waits for them.
+    ///
+    /// # Errors
+    /// [`PublishError::Send`].
+    pub fn publish(&mut self, record: &EstimateRecord) -> Result<(), PublishError> {
+        let wrong = |reason: &dyn Display| PublishError::Send {
+            service: self.services.name.clone(),
+            sequence: record.sequence,
+            reason: reason.to_string(),
+        };
+        let sample = self.publisher.loan_uninit().map_err(|e| wrong(&e))?;
+        let stamped = EstimateRecord { started_ns: self.started_ns, published_ns: now_ns(), ..*record };
+        sample.write_payload(stamped).send().map_err(|e| wrong(&e))?;
+        self.announce();
+        Ok(())
+    }
+
+    /// Wake the readers. One that cannot be woken looks for itself when its wait ends: no error of the writer's.
+    fn announce(&self) {
+        let _ = self.notifier.notify();
+    }
+
+    /// True once after SIGINT or SIGTERM, 50 ms late at most if asked all the time.
+    pub fn is_stop_requested(&mut self) -> bool {
+        self.services.is_stop_requested()
+    }
+}
+
+/// A reader's end.
+pub struct Subscriber {
+    listener: Listener<ipc::Service>,
+    subscriber: port::subscriber::Subscriber<ipc::Service, EstimateRecord, ()>,
+    services: Services,
+}
+
+impl Subscriber {
+    /// Join a service, or create it: the publisher may start later, stop, and start again.
+    ///
+    /// # Errors
+    /// [`PublishError::Name`] or [`PublishError::Join`].
+    pub fn try_new(service: &str) -> Result<Self, PublishError> {
+        let services = Services::try_join(service)?;
+        let listener = services.news.listener_builder().create().map_err(|e| join(service, "listener", &e))?;
+        let subscriber =
+            services.estimates.subscriber_builder().create().map_err(|e| join(service, "subscriber", &e))?;
+        Ok(Self { listener, subscriber, services })
+    }
+
+    /// Everything that has arrived, in order; waits for something until the time is over or a signal comes.
+    ///
+    /// # Errors
+    /// [`PublishError::Receive`].
+    pub fn wait(&mut self, timeout: Duration) -> Result<Vec<EstimateRecord>, PublishError> {
+        let start = Instant::now();
+        loop {
+            let records = self.drain()?;
+            let left = timeout.saturating_sub(start.elapsed());
+            if !records.is_empty() || left.is_zero() || self.is_interrupted(left)? {
+                return Ok(records);
+            }
+        }
+    }
+
+    /// All estimates at hand: wake-ups coalesce, so one may stand for many.
+    fn drain(&self) -> Result<Vec<EstimateRecord>, PublishError> {
+        let next = || self.subscriber.receive().map_err(|e| self.wrong(&e)).transpose();
+        core::iter::from_fn(next).map(|sample| sample.map(|sample| *sample.payload())).collect()
+    }
+
+    /// Sleep until there is news; true if a signal came instead.
+    fn is_interrupted(&self, timeout: Duration) -> Result<bool, PublishError> {
+        match self.listener.timed_wait(|_| {}, timeout) {
+            Ok(_) => Ok(false),
+            Err(ListenerWaitError::InterruptSignal) => Ok(true),
+            Err(error) => Err(self.wrong(&error)),
+        }
+    }
+
+    fn wrong(&self, reason: &dyn Display) -> PublishError {
+        PublishError::Receive { service: self.services.name.clone(), reason: reason.to_string() }
+    }
+
+    /// True once after SIGINT or SIGTERM, 50 ms late at most if asked all the time.
+    pub fn is_stop_requested(&mut self) -> bool {
+        self.services.is_stop_requested()
+    }
+}
+
+/// Time [ns since 1970].
+pub(crate) fn now_ns() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SOON: Duration = Duration::from_secs(5);
+
+    fn name(test: &str) -> String {
+        format!("orbitcal/test/{}/{test}", std::process::id())
+    }
+
+    fn record(frames: u32) -> EstimateRecord {
+        EstimateRecord { frames, mean: [frames as f32; 48], ..EstimateRecord::ZERO }
+    }
+
+    fn frames(records: &[EstimateRecord]) -> Vec<u32> {
+        records.iter().map(|record| record.frames).collect()
+    }
+
+    #[test]
+    fn a_reader_gets_what_was_written() {
+        let mut subscriber = Subscriber::try_new(&name("same")).unwrap();
+        let mut publisher = Publisher::try_new(&name("same")).unwrap();
+        let before = now_ns();
+        publisher.publish(&record(7)).unwrap();
+        let heard = subscriber.wait(SOON).unwrap();
+        assert_eq!((heard.len(), heard[0].mean), (1, [7.0; 48]));
+        assert!(heard[0].started_ns <= before && before <= heard[0].published_ns);
+    }
+
+    #[test]
+    fn a_late_reader_gets_the_last_sixteen() {
+        let mut publisher = Publisher::try_new(&name("late")).unwrap();
+        (1..=40).for_each(|i| publisher.publish(&record(i)).unwrap());
+        let mut subscriber = Subscriber::try_new(&name("late")).unwrap();
+        publisher.publish(&record(41)).unwrap();
+        assert_eq!(frames(&subscriber.wait(SOON).unwrap()), (25..=41).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_reader_that_sleeps_loses_the_oldest_and_the_writer_does_not_wait() {
+        let mut subscriber = Subscriber::try_new(&name("slow")).unwrap();
+        let mut publisher = Publisher::try_new(&name("slow")).unwrap();
+        (1..=1000).for_each(|i| publisher.publish(&record(i)).unwrap());
+        assert_eq!(frames(&subscriber.wait(SOON).unwrap()), (745..=1000).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_reader_outlives_its_writers() {
+        let mut subscriber = Subscriber::try_new(&name("again")).unwrap();
+        let mut starts = Vec::new();
+        for i in 1..=5 {
+            let mut publisher = Publisher::try_new(&name("again")).unwrap();
+            subscriber.wait(Duration::ZERO).unwrap(); // as its wake-up would
+            publisher.publish(&record(i)).unwrap();
+            drop(publisher);
+            let heard = subscriber.wait(SOON).unwrap();
+            assert_eq!(frames(&heard), [i]);
+            starts.push(heard[0].started_ns);
+        }
+        assert!(starts.is_sorted_by(|a, b| a < b), "{starts:?}");
+    }
+
+    #[test]
+    fn waiting_ends_in_time() {
+        let mut subscriber = Subscriber::try_new(&name("idle")).unwrap();
+        let start = Instant::now();
+        assert!(subscriber.wait(Duration::from_millis(30)).unwrap().is_empty());
+        assert!((30..3000).contains(&start.elapsed().as_millis()), "{:?}", start.elapsed());
+    }
+
+    #[test]
+    fn a_name_that_is_none_is_refused_in_one_line() {
+        let error = Publisher::try_new("").err().unwrap().to_string();
+        assert_eq!(error, "service \"\": expected 1 to 255 bytes, not beginning with iox2://");
+    }
 }

@@ -1,262 +1,202 @@
-//! Following the published estimates from another process: a live table on a terminal, a line each in a pipe.
+//! Another process looks on: every estimate counted, shown live, and kept if asked.
+
+mod screen;
+mod view;
 
 use core::time::Duration;
-use std::io::IsTerminal;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use ratatui::DefaultTerminal;
-use ratatui::crossterm::event::{self, Event, KeyCode, KeyModifiers};
-use ratatui::layout::{Constraint, Layout};
-use ratatui::style::{Color, Style, Stylize};
-use ratatui::text::{Line, Span};
-use ratatui::widgets::{Cell, Paragraph, Row, Table};
 use twin::Ring;
 
 use crate::publish::{PublishError, Subscriber};
-use crate::record::{EstimateRecord, now_ns};
+use crate::record::{EstimateRecord, MONITORS, VARS};
 use crate::trace::{Trace, TraceError};
+use view::View;
 
-/// What to follow, and until when.
+/// What to watch, and when to stop.
 #[derive(Debug, Clone)]
 pub struct WatchOptions {
     /// Name of the service.
     pub service: String,
-    /// CSV with a row for each estimate.
+    /// CSV file of all estimates, one row each.
     pub trace: Option<PathBuf>,
     /// Stop after this many estimates.
     pub count: Option<u64>,
     /// Stop after this long without one.
     pub idle: Option<Duration>,
-    /// Print nothing.
+    /// Show nothing.
     pub quiet: bool,
 }
 
-/// What was seen.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+/// What came, and what did not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct WatchSummary {
-    /// Estimates seen.
+    /// Estimates received.
     pub seen: u64,
-    /// Estimates that were published between two that were seen, and were not.
+    /// Estimates between them that never came.
     pub lost: u64,
-    /// Other runs of the publisher after the first.
+    /// Publishers after the first.
     pub restarts: u64,
 }
 
-/// Why watching ended early.
+/// Why watching failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum WatchError {
-    /// Shared memory.
+    /// The shared memory.
     #[error(transparent)]
-    Publish(#[from] PublishError),
+    Receive(#[from] PublishError),
     /// The trace.
     #[error(transparent)]
     Trace(#[from] TraceError),
-    /// The terminal.
-    #[error("terminal: {0}")]
-    Terminal(#[from] std::io::Error),
+    /// The terminal, or stdout.
+    #[error("cannot show estimates: {0}")]
+    Show(#[from] std::io::Error),
+    /// Estimates are of another ring.
+    #[error("{ring} has {vars} vars and {monitors} monitors; an estimate has {VARS} and {MONITORS}")]
+    Ring {
+        /// The ring.
+        ring: String,
+        /// Its vars.
+        vars: usize,
+        /// Its monitors.
+        monitors: usize,
+    },
 }
 
-/// How often the terminal and the end are looked after.
+/// How long to sleep without news: keys, signals and the age on the screen wait for it.
 const TICK: Duration = Duration::from_millis(100);
 
-/// Follow the estimates of a service.
+/// Look on until there is enough, nothing more comes, or somebody asks to stop: `q` or Ctrl-C in a terminal, SIGINT,
+/// SIGTERM, a reader of stdout that has gone. The trace is then finished with what has come.
 ///
 /// # Errors
 /// [`WatchError`].
 pub fn watch(options: &WatchOptions, ring: &Ring) -> Result<WatchSummary, WatchError> {
+    let (vars, monitors) = names(ring)?;
+    let mut trace = options.trace.as_ref().map(|path| Trace::create(path, &vars)).transpose()?;
     let mut subscriber = Subscriber::try_new(&options.service)?;
-    let mut trace = options.trace.as_ref().map(|path| Trace::create(path, &ring.var_names())).transpose()?;
-    let mut view = View::open(options.quiet, ring);
-    let mut follower = Follower::default();
-    let mut heard = Instant::now();
-    while options.count.is_none_or(|count| follower.summary.seen < count) {
-        let mut written = Ok(());
-        let received = subscriber.wait(TICK, |record| {
-            if options.count.is_some_and(|count| follower.summary.seen >= count) {
-                return;
-            }
-            follower.follow(record);
-            view.line(record);
-            if let (Some(trace), Ok(())) = (&mut trace, &written) {
-                written = trace.add(record);
-            }
-        })?;
-        written?;
-        if received > 0 {
+    let mut view = View::open(options, vars, monitors)?;
+    let (mut tally, mut heard) = (Tally::default(), Instant::now());
+    while !tally.is_enough(options.count) && options.idle.is_none_or(|idle| heard.elapsed() < idle) {
+        let mut records = subscriber.wait(options.idle.map_or(TICK, |idle| idle.min(TICK)))?;
+        records.truncate(tally.room(options.count));
+        for record in &records {
             heard = Instant::now();
-        } else if options.idle.is_some_and(|idle| heard.elapsed() > idle) {
-            break;
+            tally.add(record);
+            trace.as_mut().map_or(Ok(()), |trace| trace.add(record))?;
         }
-        if view.draw(&follower)? {
+        if !view.show(&records, &tally.summary())? || subscriber.is_stop_requested() {
             break;
         }
     }
+    drop(view);
     trace.map_or(Ok(()), Trace::finish)?;
-    Ok(follower.summary)
+    Ok(tally.summary())
 }
 
-/// Counts what is seen and what is missing.
+/// Names of the vars and of the monitors.
+fn names(ring: &Ring) -> Result<(Vec<String>, Vec<String>), WatchError> {
+    let (vars, monitors) = (ring.var_names(), ring.monitor_names());
+    if vars.len() == VARS && monitors.len() == MONITORS {
+        return Ok((vars, monitors));
+    }
+    Err(WatchError::Ring { ring: ring.name.clone(), vars: vars.len(), monitors: monitors.len() })
+}
+
+/// Counts estimates. Those of one publisher number their frames without a gap.
 #[derive(Debug, Default)]
-struct Follower {
-    summary: WatchSummary,
-    last: Option<EstimateRecord>,
-    /// Estimates a second, smoothed.
-    rate: f64,
+struct Tally {
+    seen: u64,
+    lost: u64,
+    /// Last frame count of each publisher, by its start.
+    publishers: BTreeMap<u64, u32>,
 }
 
-impl Follower {
-    fn follow(&mut self, record: &EstimateRecord) {
-        self.summary.seen += 1;
-        if let Some(last) = self.last.replace(*record) {
-            if last.started_ns != record.started_ns {
-                self.summary.restarts += 1;
-                return;
-            }
-            self.summary.lost += u64::from(record.frames.saturating_sub(last.frames).saturating_sub(1));
-            let interval = record.published_ns.saturating_sub(last.published_ns).max(1) as f64 * 1e-9;
-            self.rate += 0.1 * (1.0 / interval - self.rate);
-        }
-    }
-}
-
-/// Where estimates are shown.
-enum View {
-    Nowhere,
-    Lines,
-    Terminal { terminal: DefaultTerminal, vars: Vec<String>, monitors: Vec<String> },
-}
-
-impl View {
-    fn open(quiet: bool, ring: &Ring) -> Self {
-        match (quiet, std::io::stdout().is_terminal()) {
-            (true, _) => Self::Nowhere,
-            (_, false) => Self::Lines,
-            _ => Self::Terminal { terminal: ratatui::init(), vars: ring.var_names(), monitors: ring.monitor_names() },
+impl Tally {
+    fn add(&mut self, record: &EstimateRecord) {
+        self.seen += 1;
+        if let Some(last) = self.publishers.insert(record.started_ns, record.frames) {
+            self.lost += u64::from(record.frames.saturating_sub(last).saturating_sub(1));
         }
     }
 
-    fn line(&self, record: &EstimateRecord) {
-        if let Self::Lines = self {
-            let readings = record.accepted.count_ones().max(1) as f32;
-            let (nis, refused) = (record.nis / readings, record.rejected.count_ones());
-            println!("cycle {}: NIS per reading {nis:.2}, {refused} readings refused", record.sequence);
-        }
+    /// How many more are wanted.
+    fn room(&self, count: Option<u64>) -> usize {
+        count.map_or(usize::MAX, |count| usize::try_from(count - self.seen.min(count)).unwrap_or(usize::MAX))
     }
 
-    /// Draw the table; true if the user has had enough.
-    fn draw(&mut self, follower: &Follower) -> Result<bool, std::io::Error> {
-        let Self::Terminal { terminal, vars, monitors } = self else { return Ok(false) };
-        terminal.draw(|frame| {
-            let areas = Layout::vertical([Constraint::Length(2), Constraint::Min(13), Constraint::Length(3)]);
-            let [head, body, foot] = areas.areas(frame.area());
-            frame.render_widget(heading(follower), head);
-            if let Some(record) = &follower.last {
-                frame.render_widget(table(record, vars), body);
-                frame.render_widget(footing(record, vars, monitors), foot);
-            }
-        })?;
-        while event::poll(Duration::ZERO)? {
-            if let Event::Key(key) = event::read()? {
-                let interrupt = key.code == KeyCode::Char('c') && key.modifiers.contains(KeyModifiers::CONTROL);
-                if interrupt || key.code == KeyCode::Char('q') {
-                    return Ok(true);
-                }
-            }
-        }
-        Ok(false)
+    fn is_enough(&self, count: Option<u64>) -> bool {
+        self.room(count) == 0
     }
-}
 
-impl Drop for View {
-    fn drop(&mut self) {
-        if let Self::Terminal { .. } = self {
-            ratatui::restore();
-        }
+    fn summary(&self) -> WatchSummary {
+        let restarts = self.publishers.len().saturating_sub(1) as u64;
+        WatchSummary { seen: self.seen, lost: self.lost, restarts }
     }
-}
-
-fn heading(follower: &Follower) -> Paragraph<'static> {
-    let Some(record) = &follower.last else { return Paragraph::new("waiting for estimates (q ends)") };
-    let age = now_ns().saturating_sub(record.published_ns) as f64 * 1e-9;
-    let nis = record.nis / record.accepted.count_ones().max(1) as f32;
-    let lost = if follower.summary.lost > 0 { format!(", {} lost", follower.summary.lost) } else { String::new() };
-    Paragraph::new(format!(
-        "cycle {}   {:.1}/s   NIS per reading {nis:.2}   ln evidence {:.1}   {age:.1} s old   {} seen{lost}   q ends",
-        record.sequence, follower.rate, record.log_evidence, follower.summary.seen
-    ))
-}
-
-/// Twelve rows of four vars: name, mean, sigma in percent. Orange or blue (told apart by every eye, and by the sign)
-/// where a var is 3 sigma from 1.
-fn table(record: &EstimateRecord, vars: &[String]) -> Table<'static> {
-    let cell = |i: usize| {
-        let (mean, sigma) = (record.mean[i], record.sigma[i]);
-        let away = (mean - 1.0) / sigma;
-        let style = match away {
-            a if a > 3.0 => Style::new().fg(Color::Rgb(230, 159, 0)),
-            a if a < -3.0 => Style::new().fg(Color::Rgb(86, 180, 233)),
-            _ => Style::new(),
-        };
-        Cell::from(format!("{:<3} {mean:.4} {:>5.2} % {away:>+5.1}", vars[i], 100.0 * sigma)).style(style)
-    };
-    let rows = (0..12).map(|row| Row::new((0..4).map(|column| cell(12 * column + row))));
-    let head = Row::new(["var mean    sigma  sigmas"; 4]).bold();
-    Table::new(rows, [Constraint::Length(27); 4]).header(head)
-}
-
-fn footing(record: &EstimateRecord, vars: &[String], monitors: &[String]) -> Paragraph<'static> {
-    let faulty: Vec<Span> = (0..monitors.len())
-        .filter(|&b| record.monitor_state[b] != 0)
-        .map(|b| {
-            let state = ["ok", "noisy", "jumps", "dead"][usize::from(record.monitor_state[b].min(3))];
-            Span::raw(format!("  {} {state} ({:.2} mm)", monitors[b], record.monitor_noise[b] * 1e3))
-        })
-        .collect();
-    let clipped: String =
-        (0..vars.len()).filter(|i| record.clipped >> i & 1 == 1).map(|i| format!(" {}", vars[i])).collect();
-    let mut monitors_line = vec![Span::raw("monitors:").bold()];
-    monitors_line.extend(if faulty.is_empty() { vec![Span::raw(" all ok")] } else { faulty });
-    let clipped =
-        if clipped.is_empty() { Line::default() } else { Line::raw(format!("at a bound of 0.94..1.06:{clipped}")) };
-    Paragraph::new(vec![Line::default(), Line::from(monitors_line), clipped])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::publish::Publisher;
 
-    fn record(started_ns: u64, frames: u32) -> EstimateRecord {
-        EstimateRecord {
-            time_us: 0,
-            started_ns,
-            published_ns: 0,
-            clipped: 0,
-            accepted: 0,
-            rejected: 0,
-            sequence: frames,
-            frames,
-            rejected_frames: 0,
-            linearised: 0,
-            nis: 0.0,
-            log_evidence: 0.0,
-            mean: [1.0; 48],
-            sigma: [0.03; 48],
-            covariance: [0.0; 1176],
-            monitor_noise: [0.0; 33],
-            monitor_rejected: [0; 33],
-            monitor_state: [0; 33],
-            reserved: [0; 7],
+    fn tally(stamps: &[(u64, u32)]) -> WatchSummary {
+        let mut tally = Tally::default();
+        for &(started_ns, frames) in stamps {
+            tally.add(&EstimateRecord { started_ns, frames, ..EstimateRecord::ZERO });
         }
+        tally.summary()
     }
 
     #[test]
-    fn gaps_are_lost_estimates_and_another_start_is_a_restart() {
-        let mut follower = Follower::default();
-        for (start, frames) in [(1, 5), (1, 6), (1, 9), (2, 1), (2, 2)] {
-            follower.follow(&record(start, frames));
-        }
-        assert_eq!(follower.summary, WatchSummary { seen: 5, lost: 2, restarts: 1 });
+    fn gaps_are_losses_and_restarts_are_not() {
+        assert_eq!(tally(&[]), WatchSummary { seen: 0, lost: 0, restarts: 0 });
+        assert_eq!(tally(&[(1, 17), (1, 18)]), WatchSummary { seen: 2, lost: 0, restarts: 0 });
+        assert_eq!(tally(&[(1, 1), (1, 5), (1, 6)]), WatchSummary { seen: 3, lost: 3, restarts: 0 });
+        assert_eq!(tally(&[(1, 9), (2, 1), (2, 2)]), WatchSummary { seen: 3, lost: 0, restarts: 1 });
+        assert_eq!(tally(&[(1, 9), (2, 1), (1, 10), (2, 3)]), WatchSummary { seen: 4, lost: 1, restarts: 1 });
+    }
+
+    #[test]
+    fn watching_ends_with_the_count_and_keeps_a_trace() {
+        let folder = tempfile::tempdir().unwrap();
+        let options = WatchOptions {
+            service: format!("orbitcal/test/{}/watch", std::process::id()),
+            trace: Some(folder.path().join("a.csv")),
+            count: Some(3),
+            idle: Some(Duration::from_secs(20)),
+            quiet: true,
+        };
+        let service = options.service.clone();
+        let writer = std::thread::spawn(move || {
+            let mut publisher = Publisher::try_new(&service).unwrap();
+            for frames in [1, 2, 4, 5] {
+                publisher.publish(&EstimateRecord { sequence: frames, frames, ..EstimateRecord::ZERO }).unwrap();
+            }
+            std::thread::sleep(Duration::from_millis(300)); // history is handed over with the next estimate
+            publisher.publish(&EstimateRecord { frames: 6, ..EstimateRecord::ZERO }).unwrap();
+            std::thread::sleep(Duration::from_millis(300));
+        });
+        let summary = watch(&options, &Ring::booster()).unwrap();
+        writer.join().unwrap();
+        assert_eq!(summary, WatchSummary { seen: 3, lost: 1, restarts: 0 });
+        let text = std::fs::read_to_string(options.trace.unwrap()).unwrap();
+        let first: Vec<_> = text.lines().map(|line| line.split(',').next().unwrap()).collect();
+        assert_eq!(first, ["seq", "1", "2", "4"]);
+    }
+
+    #[test]
+    fn watching_nothing_ends_when_idle() {
+        let options = WatchOptions {
+            service: format!("orbitcal/test/{}/nothing", std::process::id()),
+            trace: None,
+            count: None,
+            idle: Some(Duration::from_millis(50)),
+            quiet: true,
+        };
+        assert_eq!(watch(&options, &Ring::booster()).unwrap(), WatchSummary::default());
     }
 }

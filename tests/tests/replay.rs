@@ -109,27 +109,29 @@ fn the_core_agrees_with_the_exact_batch_fit() {
 }
 
 /// Frames in another order, numbered anew: only the moments at which the model was linearised differ, and a few readings
-/// of the noisy monitor that were judged before its noise was known.
+/// of the noisy monitor that were judged before its noise was known. Measured: 0.06 sigma at most.
 #[test]
 fn the_order_of_frames_does_not_matter() {
     let ordered = replay(read("paper-vars"));
-    for seed in 1..=8_u32 {
-        let (ring, mut recording) = read("paper-vars");
-        let times: Vec<(u32, f64)> = recording.rows.iter().map(|row| (row.sequence, row.time)).collect();
-        recording.rows.sort_by_key(|row| row.sequence.wrapping_add(seed).wrapping_mul(2_654_435_761));
-        recording
-            .rows
-            .iter_mut()
-            .zip(times)
-            .for_each(|(row, (sequence, time))| (row.sequence, row.time) = (sequence, time));
-        let shuffled = replay((ring, recording));
-        let worst = (0..48).map(|i| (shuffled.last.map_params[i] - ordered.last.map_params[i]).abs() / ordered.last.params_sigma[i]).fold(0.0, f32::max);
-        println!("seed {seed} worst {worst}"); for m in ["x_C6","y_B5"] { println!("  {:?} {:?}", shuffled.state(m), ordered.state(m)); }
+    for seed in 1..=5_u32 {
+        let shuffled = replay(shuffled("paper-vars", seed));
         for i in 0..48 {
             let shift = (shuffled.last.map_params[i] - ordered.last.map_params[i]) / ordered.last.params_sigma[i];
-            if false {}; assert!(shift.abs() < 9.0, "seed {seed}, {}: {shift:.3} sigma", shuffled.ring.var_names()[i]);
+            assert!(shift.abs() < 0.1, "seed {seed}, {}: {shift:.3} sigma", shuffled.ring.var_names()[i]);
         }
     }
+}
+
+/// A recording with its rows in another order, under the sequence numbers and times of the first one.
+fn shuffled(name: &str, seed: u32) -> (Ring, Recording) {
+    let (ring, mut recording) = read(name);
+    let clock: Vec<(u32, f64)> = recording.rows.iter().map(|row| (row.sequence, row.time)).collect();
+    // Knuth's multiplicative hash of the number
+    recording.rows.sort_by_key(|row| row.sequence.wrapping_add(seed).wrapping_mul(2_654_435_761));
+    for (row, (sequence, time)) in recording.rows.iter_mut().zip(clock) {
+        (row.sequence, row.time) = (sequence, time);
+    }
+    (ring, recording)
 }
 
 /// Has any number changed? `BLESS=1` rewrites the file; its diff is then reviewed.

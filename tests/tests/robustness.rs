@@ -207,8 +207,10 @@ fn bits(core: &Booster, estimate: &BoosterEstimate) -> Vec<u64> {
     let health = e.health.iter().flat_map(|h| {
         [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
     });
-    let covariance: Vec<f32> = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| core.covariance(i, j)).collect();
-    let counts = [u64::from(e.sequence), e.time_us, u64::from(e.frames), e.clipped, e.accepted, e.rejected, e.confirmed];
+    let covariance: Vec<f32> =
+        (0..48).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| core.covariance(i, j)).collect();
+    let counts =
+        [u64::from(e.sequence), e.time_us, u64::from(e.frames), e.clipped, e.accepted, e.rejected, e.confirmed];
     let more = [e.restarted, e.setting.map_or(u64::MAX, u64::from), u64::from(e.linearised)];
     let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma].map(|list| of(list)).concat();
     [&counts[..], &more, &lists, &of(&[e.nis, e.log_evidence]), &of(&covariance), &health.collect::<Vec<_>>()].concat()
@@ -254,7 +256,9 @@ fn seasoned() -> (Box<Booster>, BoosterEstimate) {
 fn is_sealed(wire: &[u8]) -> bool {
     let mut plain = wire.strip_suffix(&[0]).unwrap_or(wire).to_vec();
     let decoded = cobs::decode_in_place(&mut plain).ok().and_then(|n| plain.get(..n));
-    decoded.and_then(<[u8]>::split_last_chunk::<4>).is_some_and(|(covered, crc)| CRC.checksum(covered).to_le_bytes() == *crc)
+    decoded
+        .and_then(<[u8]>::split_last_chunk::<4>)
+        .is_some_and(|(covered, crc)| CRC.checksum(covered).to_le_bytes() == *crc)
 }
 
 #[test]
@@ -501,8 +505,20 @@ fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
             let estimate = ingest(&mut core, &machine.cycle(start.model(), sequence));
             assert_eq!(estimate.setting, None);
             if std::env::var("TRACE").is_ok_and(|t| t == seed.to_string()) && (sequence < 40 || sequence % 20 == 0) {
-                let worst = (0..48).map(|i| ((estimate.map_params[i]-machine.params[i])/estimate.params_sigma[i]).abs()).fold(0.0, f32::max);
-                println!("{sequence} nees {:.2} worst {worst:.2} nis {:.1} acc {} rej {} conf {} lin {} clip {} ev {}", nees(&core,&estimate,&machine.params.map(f64::from))/48.0, estimate.nis, estimate.accepted.count_ones(), estimate.rejected.count_ones(), estimate.confirmed.count_ones(), estimate.linearised, estimate.clipped.count_ones(), estimate.log_evidence);
+                let worst = (0..48)
+                    .map(|i| ((estimate.map_params[i] - machine.params[i]) / estimate.params_sigma[i]).abs())
+                    .fold(0.0, f32::max);
+                println!(
+                    "{sequence} nees {:.2} worst {worst:.2} nis {:.1} acc {} rej {} conf {} lin {} clip {} ev {}",
+                    nees(&core, &estimate, &machine.params.map(f64::from)) / 48.0,
+                    estimate.nis,
+                    estimate.accepted.count_ones(),
+                    estimate.rejected.count_ones(),
+                    estimate.confirmed.count_ones(),
+                    estimate.linearised,
+                    estimate.clipped.count_ones(),
+                    estimate.log_evidence
+                );
             }
             nis += f64::from(estimate.nis);
             readings += f64::from(estimate.accepted.count_ones());

@@ -3,7 +3,7 @@
 //! An effect changes the ring itself, what the machine holds constant, or what its monitors and correctors say; a
 //! [`Machine`] is a ring with effects applied, and answers with the response that would then be measured.
 
-use std::str::FromStr;
+use core::str::FromStr;
 
 use nalgebra::{DMatrix, Rotation2, Vector2};
 

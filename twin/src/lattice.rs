@@ -577,7 +577,7 @@ mod tests {
             .iter()
             .filter_map(|e| if let Kind::Bend(b) = &e.kind { Some(b.curvature * e.length) } else { None })
             .sum();
-        assert!((angle - std::f64::consts::TAU).abs() < 1e-12);
+        assert!((angle - core::f64::consts::TAU).abs() < 1e-12);
         assert_eq!((ring.quadrupoles.len(), ring.correctors.len(), ring.read_monitors.len()), (48, 48, 33));
         assert_eq!(ring.var_names()[0], "A2");
         assert_eq!(ring.var_names()[24], "A1");

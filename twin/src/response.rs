@@ -271,7 +271,7 @@ impl<'r> Optics<'r> {
             if half_trace.is_nan() || half_trace.abs() >= 1.0 {
                 return Err(OrbitError::Unstable { mode, half_trace });
             }
-            Ok(self.count_turns(half_trace.acos() / std::f64::consts::TAU, plane))
+            Ok(self.count_turns(half_trace.acos() / core::f64::consts::TAU, plane))
         };
         Ok(Tunes { x: turns('x', mean + split, Plane::X)?, y: turns('y', mean - split, Plane::Y)? })
     }
@@ -293,7 +293,7 @@ impl<'r> Optics<'r> {
         let ((beta, alpha), mut turns, mut last) = (self.start_twiss(i), 0.0, 0.0);
         for transfer in &self.orbit.transfer {
             let (m11, m12) = (transfer[(i, i)], transfer[(i, i + 1)]);
-            let phase = m12.atan2(beta * m11 - alpha * m12) / std::f64::consts::TAU;
+            let phase = m12.atan2(beta * m11 - alpha * m12) / core::f64::consts::TAU;
             let step = phase - last;
             turns += step - step.round(); // no element advances by half a turn
             last = phase;
@@ -390,7 +390,7 @@ mod tests {
         let place = ring.monitor(Plane::Y, "A1").unwrap();
         // beta/2 cot(pi Q) of a kick at the monitor itself
         let own = optics.green(&optics.observe(place, Plane::Y), &optics.kick(place, [0.0, 1.0]));
-        let known = 0.5 * optics.beta(place, Plane::Y) / (std::f64::consts::PI * optics.tunes().unwrap().y).tan();
+        let known = 0.5 * optics.beta(place, Plane::Y) / (core::f64::consts::PI * optics.tunes().unwrap().y).tan();
         assert!((own - known).abs() < 1e-10, "{own} {known}");
     }
 
@@ -528,10 +528,10 @@ mod tests {
         let tunes = optics.tunes().unwrap();
         // the modes' cosines sum to half the trace of the 4x4 matrix, and eigenvalues lie on the unit circle
         let m = optics.transverse();
-        let sum = (tunes.x * std::f64::consts::TAU).cos() + (tunes.y * std::f64::consts::TAU).cos();
+        let sum = (tunes.x * core::f64::consts::TAU).cos() + (tunes.y * core::f64::consts::TAU).cos();
         assert!((sum - 0.5 * m.trace()).abs() < 1e-12);
         for tune in [tunes.x, tunes.y] {
-            let (s, c) = (tune * std::f64::consts::TAU).sin_cos();
+            let (s, c) = (tune * core::f64::consts::TAU).sin_cos();
             let z = nalgebra::Complex::new(c, s);
             let determinant = (m.map(|v| nalgebra::Complex::new(v, 0.0)) - Matrix4::identity() * z).determinant();
             assert!(determinant.norm() < 1e-10, "{determinant}");

@@ -11,7 +11,7 @@ use crate::answer::{Answer, Timing};
 use crate::cli::{Rate, Replay};
 use crate::output;
 use crate::publish::Publisher;
-use crate::record::{EstimateRecord, now_ns};
+use crate::record::EstimateRecord;
 use crate::trace::Trace;
 
 /// Run it.
@@ -46,7 +46,6 @@ fn pump(
     let trace = options.trace.as_ref().map(|path| Trace::create(path, &ring.var_names())).transpose();
     let mut trace = trace.map_err(|e| other(&e))?;
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
-    let started = now_ns();
     let mut clock = Clock::new(options.rate);
     let (mut last, mut times) = (None, Vec::with_capacity(recording.rows.len()));
     for row in &recording.rows {
@@ -55,7 +54,7 @@ fn pump(
         let start = Instant::now();
         let estimate = core.ingest(&mut bytes).map_err(|e| other(&format!("frame {}: {e}", row.sequence)))?;
         times.push(start.elapsed());
-        let record = EstimateRecord::of(&estimate, core, started);
+        let record = EstimateRecord::of(&estimate, core);
         publisher.publish(&record).map_err(|e| other(&e))?;
         if let Some(trace) = &mut trace {
             trace.add(&record).map_err(|e| other(&e))?;
