@@ -3,7 +3,7 @@
 use core::fmt;
 
 use crate::campaign::{Campaign, Setting, Verdict};
-use crate::drive::{Calibration, Drive};
+use crate::drive::{Beyond, Calibration, Drive};
 use crate::estimate::{Estimate, MonitorState};
 use crate::frame::{Frame, FrameError, PositionCode};
 use crate::gaussian::{Gaussian, Level, Solution, Sum};
@@ -59,7 +59,7 @@ pub struct Estimator<G: Surrogate<B, C, N>, const B: usize, const C: usize, cons
 }
 
 /// Why a frame was refused. The posterior is as it was.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum IngestError {
@@ -77,6 +77,8 @@ pub enum IngestError {
         /// This one.
         got: u32,
     },
+    /// The currents are beyond what the model describes.
+    Beyond(Beyond),
 }
 
 impl From<FrameError> for IngestError {
@@ -91,6 +93,7 @@ impl fmt::Display for IngestError {
             Self::Frame(error) => error.fmt(f),
             Self::Repeated { sequence } => write!(f, "frame {sequence} has come before"),
             Self::OutOfOrder { last, got } => write!(f, "frame {got} after frame {last}"),
+            Self::Beyond(Beyond { what, limit, got }) => write!(f, "{what} is {got}, the model ends at {limit}"),
         }
     }
 }
@@ -132,6 +135,11 @@ impl Screened {
 
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f32 = 0.5;
+/// Share of a prediction's own variance that is added to the noise of a reading which cannot be linearised anew: while
+/// the params are uncertain, so is the linearisation.
+///
+/// Source: W. M. Lear's underweighting; R. Zanetti, K. DeMars and R. Bishop, J. Guid. Control Dyn. 33 (2010) 1670.
+const UNDERWEIGHT: f32 = 0.2;
 /// Growth of chi-square that counts as uphill: more than rounding of a chi-square of 1e5.
 const UPHILL: f32 = 1.0;
 /// Halvings of a step that leads uphill or to an unstable ring.
@@ -181,9 +189,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// # Errors
     /// [`IngestError`]; the posterior is then as it was before.
     pub fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
-        let frame = self.decode(bytes).inspect_err(|_| self.rejected_frames += 1)?;
+        let (frame, drive) = self.decode(bytes).inspect_err(|_| self.rejected_frames += 1)?;
         self.walk(&frame);
-        let drive = self.model.calibration.drive(&frame);
         let cell = self.find_setting(&frame, &drive);
         self.predict(&drive, cell);
         let screened = self.screen(&frame, cell);
@@ -192,13 +199,16 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         Ok(self.estimate(&frame, cell, &screened, nis, linearised))
     }
 
-    fn decode(&mut self, bytes: &mut [u8]) -> Result<Frame<B, C>, IngestError> {
+    /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
+    fn decode(&self, bytes: &mut [u8]) -> Result<(Frame<B, C>, Drive<C>), IngestError> {
         let frame = Frame::decode(bytes)?;
         match self.last_sequence {
-            Some(last) if frame.sequence == last => Err(IngestError::Repeated { sequence: last }),
-            Some(last) if frame.sequence < last => Err(IngestError::OutOfOrder { last, got: frame.sequence }),
-            _ => Ok(frame),
+            Some(last) if frame.sequence == last => return Err(IngestError::Repeated { sequence: last }),
+            Some(last) if frame.sequence < last => return Err(IngestError::OutOfOrder { last, got: frame.sequence }),
+            _ => {}
         }
+        let drive = self.model.calibration.drive(&frame).map_err(IngestError::Beyond)?;
+        Ok((frame, drive))
     }
 
     /// Let the params walk for the cycles since the last frame.
@@ -325,13 +335,18 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
     fn condition(&mut self, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
         let before = self.solution.cost;
+        let once_only = cell.is_none() || !self.is_still();
         if cell.is_none() {
             self.loose.recentre(self.gaussian.origin());
         }
         for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
-            let (innovation, variance) = (self.innovation(b, code), self.variance(b, 1, self.rf_offset));
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
+            let mut variance = self.variance(b, 1, self.rf_offset);
+            if once_only {
+                variance += UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(b, slope).0);
+            }
+            let innovation = self.innovation(b, code);
             self.gaussian.condition(b, innovation, variance, slope);
             if cell.is_none() {
                 self.loose.condition(b, innovation, variance, slope);

@@ -19,7 +19,7 @@ mod prior;
 pub mod surrogate;
 
 pub use campaign::{Campaign, Cell, Setting, Verdict};
-pub use drive::{Calibration, Drive};
+pub use drive::{Beyond, Calibration, Drive};
 pub use estimate::{Estimate, Health, MonitorState};
 pub use estimator::{Estimator, FitQuality, IngestError, Model};
 pub use frame::{CurrentCode, Frame, FrameError, MagnetCurrents, PositionCode, RfCode, TuneCode};

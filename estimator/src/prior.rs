@@ -55,7 +55,8 @@ impl Marginal {
         let (alpha, beta) = ((self.lower - self.mean) / self.sigma, (self.upper - self.mean) / self.sigma);
         let (mean, sigma) =
             if alpha < -6.0 && beta > 6.0 { (self.mean, self.sigma) } else { self.truncated(alpha, beta) };
-        let var = libm::expf(mean) * (1.0 + 0.5 * sigma * sigma);
+        let var =
+            (libm::expf(mean) * (1.0 + 0.5 * sigma * sigma)).clamp(libm::expf(self.lower), libm::expf(self.upper));
         (var, var * sigma)
     }
 

@@ -3,8 +3,8 @@
 //! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
 //! killed leaves shared memory behind, which the next process that joins any service clears away.
 //!
-//! Caveat: joining installs handlers for SIGINT, SIGTERM and their like, so they no longer end the process. A loop that
-//! owns a [`Publisher`] or a [`Subscriber`] has to ask [`Publisher::is_stop_requested`] now and then.
+//! Caveat: SIGINT, SIGTERM and their like end the process as usual until it first asks [`Subscriber::is_stop_requested`]
+//! or [`Publisher::is_stop_requested`]. From then on they only set what is asked, so the loop must go on asking.
 
 use core::fmt::Display;
 use core::time::Duration;
@@ -99,7 +99,7 @@ impl Services {
         Ok(Self { name: name.to_owned(), node, estimates, news, asked: Instant::now() })
     }
 
-    /// True once after SIGINT or SIGTERM.
+    /// True once after SIGINT or SIGTERM. The first question installs their handlers.
     fn is_stop_requested(&mut self) -> bool {
         if self.asked.elapsed() < ASK_EVERY {
             return false;
@@ -192,7 +192,7 @@ impl Publisher {
         let _ = self.notifier.notify();
     }
 
-    /// True once after SIGINT or SIGTERM, 50 ms late at most if asked all the time.
+    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves; 50 ms late if asked all the time.
     pub fn is_stop_requested(&mut self) -> bool {
         self.services.is_stop_requested()
     }
@@ -252,7 +252,7 @@ impl Subscriber {
         PublishError::Receive { service: self.services.name.clone(), reason: reason.to_string() }
     }
 
-    /// True once after SIGINT or SIGTERM, 50 ms late at most if asked all the time.
+    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves; 50 ms late if asked all the time.
     pub fn is_stop_requested(&mut self) -> bool {
         self.services.is_stop_requested()
     }

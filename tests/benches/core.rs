@@ -82,7 +82,7 @@ fn encode(bencher: Bencher) {
 /// One powered corrector, and the stray currents of the others.
 fn drive(calibration: &Calibration) -> Drive<48> {
     let frame: Frame<33, 48> = Frame::decode(&mut Campaign::read().wires[100]).unwrap();
-    calibration.drive(&frame)
+    calibration.drive(&frame).unwrap()
 }
 
 /// Tables, linearised at vars of a few per cent, and what they predict.

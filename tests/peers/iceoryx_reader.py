@@ -84,7 +84,7 @@ def estimates(name, seconds):
             yield estimate
         try:
             node.wait(iox2.Duration.from_millis(0))
-        except iox2.NodeWaitFailure:  # SIGINT or SIGTERM: they do not end the process any more
+        except iox2.NodeWaitFailure:  # SIGINT or SIGTERM: waiting on a node catches them
             return
 
 
