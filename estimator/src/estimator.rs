@@ -2,6 +2,8 @@
 
 use core::fmt;
 
+use heapless::Deque;
+
 use crate::campaign::{Campaign, Setting, Verdict};
 use crate::drive::{Beyond, Calibration, Drive};
 use crate::estimate::{Estimate, MonitorState};
@@ -45,8 +47,10 @@ pub struct Estimator<G: Surrogate<B, C, N>, const B: usize, const C: usize, cons
     monitors: [Monitor; B],
     campaign: Campaign<B, C, S>,
     gaussian: Gaussian<B, N>,
-    /// The prior, and those frames that belong to no setting: they cannot be linearised anew.
+    /// The prior, and frames that belong to no setting and are not recent: they cannot be linearised anew.
     loose: Gaussian<B, N>,
+    /// The last frames that belong to no setting.
+    recent: Deque<Loose<B, C>, RECENT>,
     solution: Solution<N>,
     /// Rms of the baseline orbit in x and y [m].
     orbit: [f32; 2],
@@ -109,6 +113,18 @@ pub struct FitQuality {
     pub degrees_of_freedom: f32,
 }
 
+/// A frame that belongs to no setting.
+#[derive(Debug, Clone)]
+struct Loose<const B: usize, const C: usize> {
+    drive: Drive<C>,
+    reading: [PositionCode; B],
+    accepted: u64,
+}
+
+/// Frames without a setting that are linearised anew with the rest; older ones keep the linearisation that they had when
+/// they left this window. At the start of a stream it holds 16 times 33 readings, enough for 48 params.
+const RECENT: usize = 16;
+
 /// Which readings of a frame are used.
 #[derive(Debug, Clone, Copy, Default)]
 struct Screened {
@@ -116,6 +132,16 @@ struct Screened {
     rejected: u64,
     confirmed: u64,
     restarted: u64,
+}
+
+impl<const B: usize, const C: usize> Loose<B, C> {
+    /// Measured minus predicted, before the baseline [m].
+    fn innovation(&self, b: usize, predicted: &[f32; B]) -> f32 {
+        match (self.reading.get(b), predicted.get(b)) {
+            (Some(reading), Some(predicted)) => reading.value() - predicted,
+            _ => 0.0,
+        }
+    }
 }
 
 impl Screened {
@@ -175,6 +201,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             campaign: Campaign::default(),
             gaussian,
             loose,
+            recent: Deque::new(),
             solution,
             orbit: [0.0; 2],
             rf_offset: 0.0,
@@ -195,6 +222,9 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.predict(&drive, cell);
         let screened = self.screen(&frame, cell);
         let nis = self.condition(&frame, cell, &screened);
+        if cell.is_none() {
+            self.keep_loose(&frame, &drive, &screened);
+        }
         let linearised = self.is_due() && self.linearise_anew();
         Ok(self.estimate(&frame, cell, &screened, nis, linearised))
     }
@@ -260,7 +290,22 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                 self.stale = true;
             }
         }
+        if cell.is_none() {
+            self.excuse(&mut screened);
+        }
         screened
+    }
+
+    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the model is at
+    /// fault, and all of it is used. (In a setting the repeats decide.)
+    fn excuse(&mut self, screened: &mut Screened) {
+        let (accepted, rejected) = (screened.accepted.count_ones(), screened.rejected.count_ones());
+        if 8 * rejected > accepted + rejected {
+            let each = self.monitors.iter_mut().enumerate();
+            each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
+            screened.accepted |= screened.rejected;
+            screened.rejected = 0;
+        }
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
@@ -298,7 +343,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         let certain = self.variance(b, 1, self.rf_offset) + baseline_variance;
         // the uncertainty of the params is only worked out for readings that need it
         self.model.gate.expects(surprise, certain)
-            || self.model.gate.expects(surprise, certain + self.solution.variance_of(&d))
+            || self.model.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
     }
 
     /// Measured minus predicted at the origin, before the baseline [m].
@@ -335,25 +380,15 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
     fn condition(&mut self, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
         let before = self.solution.cost;
-        let once_only = cell.is_none() || !self.is_still();
-        if cell.is_none() {
-            self.loose.recentre(self.gaussian.origin());
-        }
+        let underweight = if cell.is_none() || !self.is_still() { UNDERWEIGHT } else { 0.0 };
         for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
+            let (innovation, variance) = (self.innovation(b, code), self.variance(b, 1, self.rf_offset));
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
-            let mut variance = self.variance(b, 1, self.rf_offset);
-            if once_only {
-                variance += UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(b, slope).0);
-            }
-            let innovation = self.innovation(b, code);
-            self.gaussian.condition(b, innovation, variance, slope);
-            if cell.is_none() {
-                self.loose.condition(b, innovation, variance, slope);
-            }
+            let own = underweight * self.solution.variance_of(&self.gaussian.effective(b, slope).0);
+            self.gaussian.condition(b, innovation, variance + own, slope);
         }
         self.gaussian.settle();
-        self.loose.settle();
         // Readings confirmed late or outvoted are counted when the past is weighted anew, and so is an error that repeats
         // share.
         self.stale |= screened.confirmed != 0 || screened.restarted != 0 || frame.rf_offset.steps() != 0;
@@ -362,6 +397,28 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.nis.0.add(nis);
         self.nis.1 = self.nis.1.saturating_add(screened.accepted.count_ones());
         nis
+    }
+
+    /// Keep a frame that belongs to no setting among the recent ones; the oldest of them is linearised for the last time.
+    fn keep_loose(&mut self, frame: &Frame<B, C>, drive: &Drive<C>, screened: &Screened) {
+        if self.recent.is_full()
+            && let Some(oldest) = self.recent.pop_front()
+        {
+            self.loose.recentre(self.gaussian.origin());
+            let drive = about(&oldest.drive, &self.supplies);
+            self.model.surrogate.predict(&self.linearised, &drive, &mut self.at_mean_drive);
+            for b in (0..B).filter(|b| oldest.accepted >> b & 1 == 1) {
+                let variance = self.variance(b, 1, drive.rf_offset);
+                let slope = column(self.at_mean_drive.jacobian.as_slice(), N, b);
+                let own = UNDERWEIGHT * self.solution.variance_of(&self.loose.effective(b, slope).0);
+                let innovation = oldest.innovation(b, &self.at_mean_drive.reading);
+                self.loose.condition(b, innovation, variance + own, slope);
+            }
+            self.loose.settle();
+        }
+        let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
+        // there is room: one has just left
+        let _ = self.recent.push_back(kept);
     }
 
     fn solve(&mut self) {
@@ -442,6 +499,15 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                     self.gaussian.condition(b, innovation, variance, slope);
                 }
                 self.gaussian.add_repeats(count, self.noise_variance(b));
+            }
+        }
+        for frame in &self.recent {
+            let drive = about(&frame.drive, &self.supplies);
+            self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
+            for b in (0..B).filter(|b| frame.accepted >> b & 1 == 1) {
+                let slope = column(self.prediction.jacobian.as_slice(), N, b);
+                let innovation = frame.innovation(b, &self.prediction.reading);
+                self.gaussian.condition(b, innovation, self.variance(b, 1, drive.rf_offset), slope);
             }
         }
         for (b, level) in levels.iter().enumerate() {

@@ -76,16 +76,16 @@ def estimates(name, seconds):
     print(f"listening on {name}", flush=True)
     heard = time.monotonic()
     while time.monotonic() - heard < seconds:
-        listener.timed_wait(iox2.Duration.from_millis(100))
+        try:
+            node.wait(iox2.Duration.from_millis(0))
+            listener.timed_wait(iox2.Duration.from_millis(100))
+        except (iox2.NodeWaitFailure, iox2.ListenerWaitError):  # SIGINT or SIGTERM
+            return
         while (sample := subscriber.receive()) is not None:  # one wake-up may stand for many
             estimate = Estimate.from_buffer_copy(sample.payload().contents)
             sample.delete()
             heard = time.monotonic()
             yield estimate
-        try:
-            node.wait(iox2.Duration.from_millis(0))
-        except iox2.NodeWaitFailure:  # SIGINT or SIGTERM: waiting on a node catches them
-            return
 
 
 def main(name="orbitcal/estimate", count="0", seconds="20"):
