@@ -247,7 +247,11 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.last_sequence = Some(frame.sequence);
         self.frames = self.frames.saturating_add(1);
         if self.model.process_noise > 0.0 && cycles > 0 {
-            let sigma = self.model.process_noise * libm::sqrtf(cycles as f32);
+            // After a long silence the vars are unknown, but not more than the range of the prior allows.
+            let prior = self.model.prior.sigma * self.model.prior.sigma;
+            let largest = self.solution.sigma.iter().fold(0.0, |a: f32, sigma| a.max(sigma * sigma));
+            let variance = self.model.process_noise * self.model.process_noise * cycles as f32;
+            let sigma = libm::sqrtf(variance.min((2.0 * prior - largest).max(0.0)));
             self.gaussian.walk(sigma, &mut self.solution);
             self.solve();
         }

@@ -64,7 +64,7 @@ impl Marginal {
     /// (1994), sec. 10.1.
     fn truncated(&self, alpha: f32, beta: f32) -> (f32, f32) {
         let inside = between(alpha, beta);
-        if inside < TAIL {
+        if inside < TAIL && (alpha > 0.0 || beta < 0.0) {
             // the near bound, and an exponential of the slope there
             let (bound, distance) = if alpha > 0.0 { (self.lower, alpha) } else { (self.upper, beta) };
             return (bound + self.sigma / distance, self.sigma / distance.abs());

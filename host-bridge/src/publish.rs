@@ -6,17 +6,19 @@
 //! Caveat: SIGINT, SIGTERM and their like end the process as usual until it first asks [`Subscriber::is_stop_requested`]
 //! or [`Publisher::is_stop_requested`]. From then on they only set what is asked, so the loop must go on asking.
 
-use core::fmt::Display;
-use core::time::Duration;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+mod services;
+mod subscriber;
 
-use iceoryx2::port::listener::{Listener, ListenerWaitError};
+use core::fmt::Display;
+use std::time::{SystemTime, UNIX_EPOCH};
+
 use iceoryx2::port::notifier::Notifier;
-use iceoryx2::prelude::{EventId, LogLevel, Node, NodeBuilder, ServiceName, ipc, set_log_level_from_env_or};
-use iceoryx2::service::port_factory::{event, publish_subscribe};
-use iceoryx2::{port, prelude::NodeName};
+use iceoryx2::port::publisher;
+use iceoryx2::prelude::ipc;
 
 use crate::record::EstimateRecord;
+use services::{Services, join};
+pub use subscriber::Subscriber;
 
 /// Name of the service of estimates, and of the event that announces each of them.
 pub const SERVICE: &str = "orbitcal/estimate";
@@ -29,19 +31,12 @@ pub const SUBSCRIBERS: usize = 16;
 /// Writers at a time: a restarted one can join before the dead one is cleared away.
 pub const PUBLISHERS: usize = 4;
 
-/// Processes at a time: every reader and writer, and some that look on.
-const NODES: usize = SUBSCRIBERS + PUBLISHERS + 4;
-/// The one event: a new estimate, or a new publisher.
-const NEWS: usize = 0;
-/// Asking for a signal costs a system call of some 60 us; this often is soon enough for a person.
-const ASK_EVERY: Duration = Duration::from_millis(50);
-
 /// Why estimates cannot be sent or heard.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PublishError {
     /// The name cannot be a service.
-    #[error("service {service:?}: expected 1 to 255 bytes, not beginning with iox2://")]
+    #[error("service {service:?}: expected 1 to 255 ASCII characters, not beginning with iox2://")]
     Name {
         /// The name.
         service: String,
@@ -76,77 +71,10 @@ pub enum PublishError {
     },
 }
 
-/// What both sides join, with the same settings: whoever comes first creates it.
-struct Services {
-    name: String,
-    node: Node<ipc::Service>,
-    estimates: publish_subscribe::PortFactory<ipc::Service, EstimateRecord, ()>,
-    news: event::PortFactory<ipc::Service>,
-    asked: Instant,
-}
-
-impl Services {
-    fn try_join(name: &str) -> Result<Self, PublishError> {
-        set_log_level_from_env_or(LogLevel::Error); // no word on absent configuration files
-        let wrong = |_| PublishError::Name { service: name.to_owned() };
-        let service = ServiceName::new(name).map_err(wrong)?;
-        let node = NodeBuilder::new()
-            .name(&NodeName::new("orbitcal").expect("a short name is a node name"))
-            .create::<ipc::Service>()
-            .map_err(|e| join(name, "node", &e))?;
-        let estimates = estimates(&node, &service).map_err(|e| join(name, "estimates", &e))?;
-        let news = news(&node, &service).map_err(|e| join(name, "event", &e))?;
-        Ok(Self { name: name.to_owned(), node, estimates, news, asked: Instant::now() })
-    }
-
-    /// True once after SIGINT or SIGTERM. The first question installs their handlers.
-    fn is_stop_requested(&mut self) -> bool {
-        if self.asked.elapsed() < ASK_EVERY {
-            return false;
-        }
-        self.asked = Instant::now();
-        self.node.wait(Duration::ZERO).is_err()
-    }
-}
-
-fn estimates(
-    node: &Node<ipc::Service>,
-    name: &ServiceName,
-) -> Result<
-    publish_subscribe::PortFactory<ipc::Service, EstimateRecord, ()>,
-    iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError,
-> {
-    node.service_builder(name)
-        .publish_subscribe::<EstimateRecord>()
-        .history_size(HISTORY)
-        .subscriber_max_buffer_size(BUFFER)
-        .enable_safe_overflow(true)
-        .max_subscribers(SUBSCRIBERS)
-        .max_publishers(PUBLISHERS)
-        .max_nodes(NODES)
-        .open_or_create()
-}
-
-fn news(
-    node: &Node<ipc::Service>,
-    name: &ServiceName,
-) -> Result<event::PortFactory<ipc::Service>, iceoryx2::service::builder::event::EventOpenOrCreateError> {
-    node.service_builder(name)
-        .event()
-        .max_listeners(SUBSCRIBERS)
-        .max_notifiers(PUBLISHERS)
-        .max_nodes(NODES)
-        .open_or_create()
-}
-
-fn join(service: &str, part: &'static str, reason: &dyn Display) -> PublishError {
-    PublishError::Join { service: service.to_owned(), part, reason: reason.to_string() }
-}
-
 /// The writer's end.
 pub struct Publisher {
     notifier: Notifier<ipc::Service>,
-    publisher: port::publisher::Publisher<ipc::Service, EstimateRecord, ()>,
+    publisher: publisher::Publisher<ipc::Service, EstimateRecord, ()>,
     services: Services,
     started_ns: u64,
 }
@@ -159,12 +87,7 @@ impl Publisher {
     pub fn try_new(service: &str) -> Result<Self, PublishError> {
         let services = Services::try_join(service)?;
         let publisher = services.estimates.publisher_builder().create().map_err(|e| join(service, "publisher", &e))?;
-        let notifier = services
-            .news
-            .notifier_builder()
-            .default_event_id(EventId::new(NEWS))
-            .create()
-            .map_err(|e| join(service, "notifier", &e))?;
+        let notifier = services.news.notifier_builder().create().map_err(|e| join(service, "notifier", &e))?;
         let this = Self { notifier, publisher, services, started_ns: now_ns() };
         this.announce(); // readers connect now, before the first estimate
         Ok(this)
@@ -192,68 +115,8 @@ impl Publisher {
         let _ = self.notifier.notify();
     }
 
-    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves; 50 ms late if asked all the time.
-    pub fn is_stop_requested(&mut self) -> bool {
-        self.services.is_stop_requested()
-    }
-}
-
-/// A reader's end.
-pub struct Subscriber {
-    listener: Listener<ipc::Service>,
-    subscriber: port::subscriber::Subscriber<ipc::Service, EstimateRecord, ()>,
-    services: Services,
-}
-
-impl Subscriber {
-    /// Join a service, or create it: the publisher may start later, stop, and start again.
-    ///
-    /// # Errors
-    /// [`PublishError::Name`] or [`PublishError::Join`].
-    pub fn try_new(service: &str) -> Result<Self, PublishError> {
-        let services = Services::try_join(service)?;
-        let listener = services.news.listener_builder().create().map_err(|e| join(service, "listener", &e))?;
-        let subscriber =
-            services.estimates.subscriber_builder().create().map_err(|e| join(service, "subscriber", &e))?;
-        Ok(Self { listener, subscriber, services })
-    }
-
-    /// Everything that has arrived, in order; waits for something until the time is over or a signal comes.
-    ///
-    /// # Errors
-    /// [`PublishError::Receive`].
-    pub fn wait(&mut self, timeout: Duration) -> Result<Vec<EstimateRecord>, PublishError> {
-        let start = Instant::now();
-        loop {
-            let records = self.drain()?;
-            let left = timeout.saturating_sub(start.elapsed());
-            if !records.is_empty() || left.is_zero() || self.is_interrupted(left)? {
-                return Ok(records);
-            }
-        }
-    }
-
-    /// All estimates at hand: wake-ups coalesce, so one may stand for many.
-    fn drain(&self) -> Result<Vec<EstimateRecord>, PublishError> {
-        let next = || self.subscriber.receive().map_err(|e| self.wrong(&e)).transpose();
-        core::iter::from_fn(next).map(|sample| sample.map(|sample| *sample.payload())).collect()
-    }
-
-    /// Sleep until there is news; true if a signal came instead.
-    fn is_interrupted(&self, timeout: Duration) -> Result<bool, PublishError> {
-        match self.listener.timed_wait(|_| {}, timeout) {
-            Ok(_) => Ok(false),
-            Err(ListenerWaitError::InterruptSignal) => Ok(true),
-            Err(error) => Err(self.wrong(&error)),
-        }
-    }
-
-    fn wrong(&self, reason: &dyn Display) -> PublishError {
-        PublishError::Receive { service: self.services.name.clone(), reason: reason.to_string() }
-    }
-
-    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves; 50 ms late if asked all the time.
-    pub fn is_stop_requested(&mut self) -> bool {
+    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves.
+    pub fn is_stop_requested(&self) -> bool {
         self.services.is_stop_requested()
     }
 }
@@ -265,6 +128,9 @@ pub(crate) fn now_ns() -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use core::time::Duration;
+    use std::time::Instant;
+
     use super::*;
 
     const SOON: Duration = Duration::from_secs(5);
@@ -336,6 +202,6 @@ mod tests {
     #[test]
     fn a_name_that_is_none_is_refused_in_one_line() {
         let error = Publisher::try_new("").err().unwrap().to_string();
-        assert_eq!(error, "service \"\": expected 1 to 255 bytes, not beginning with iox2://");
+        assert_eq!(error, "service \"\": expected 1 to 255 ASCII characters, not beginning with iox2://");
     }
 }

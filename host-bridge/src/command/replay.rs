@@ -1,6 +1,7 @@
 //! `orbitcal replay`: recording to wire bytes to core to shared memory, frame by frame.
 
-use std::time::{Duration, Instant};
+use core::time::Duration;
+use std::time::Instant;
 
 use inference::Recording;
 use inference::stream::{self, Booster, BoosterEstimate};
