@@ -1,10 +1,11 @@
 //! Estimates as a CSV file, one row a frame: `seq`, mean and sigma of every var, `nis`, `rejected`.
 
-use std::io::{self, BufWriter};
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use tempfile::NamedTempFile;
 
+use crate::output;
 use crate::record::{EstimateRecord, VARS};
 
 /// Why a trace was not written.
@@ -44,7 +45,7 @@ impl Trace {
         if var_names.len() != VARS {
             return Err(TraceError::Names { path: path.display().to_string(), found: var_names.len() });
         }
-        let file = beside(path).map_err(|e| wrong(path, &e))?;
+        let file = output::temporary(path).map_err(|e| wrong(path, &e))?;
         let mut trace = Self { path: path.to_owned(), rows: csv::Writer::from_writer(BufWriter::new(file)) };
         let vars = var_names.iter().flat_map(|name| [format!("{name}_mean"), format!("{name}_sigma")]);
         trace.row(core::iter::once("seq".to_owned()).chain(vars).chain(["nis".to_owned(), "rejected".to_owned()]))?;
@@ -81,18 +82,6 @@ impl Trace {
 
 fn wrong(path: &Path, reason: &dyn core::fmt::Display) -> TraceError {
     TraceError::Write { path: path.display().to_string(), reason: reason.to_string() }
-}
-
-/// A temporary file in the folder of another, with the permissions that a created file has.
-fn beside(path: &Path) -> io::Result<NamedTempFile> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::Builder::new();
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        file.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as open(2) does
-    }
-    file.tempfile_in(folder).map_err(|error| error.kind().into()) // without the temporary name
 }
 
 #[cfg(test)]

@@ -397,8 +397,9 @@ fn check(core: &Booster, estimate: &BoosterEstimate, prior: &Prior, walks: bool)
         if sigma <= 0.0 || e.sigma[i] <= 0.0 {
             return Err(format!("sigma of {i} is {sigma}, of its var {}", e.sigma[i]));
         }
-        // measured 1.013: rounding of f32, with readings of a hundred thousand times the prior's weight
-        if !walks && sigma > prior.sigma * 1.05 {
+        // Rounding of f32: kicks of 25 times the usual size, on a ring that readings of +-100 mm have pushed to the edge of
+        // stability, weigh a million times the prior. Measured 1.95.
+        if !walks && sigma > prior.sigma * 3.0 {
             return Err(format!("sigma of {i} is {sigma}, beyond the prior's"));
         }
         let variance = core.covariance(i, i);

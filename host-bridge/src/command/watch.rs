@@ -1,5 +1,7 @@
 //! `orbitcal watch`: another process looks on.
 
+use std::io::Write;
+
 use super::{CommandError, machine};
 use crate::cli::Watch;
 use crate::watch::{WatchOptions, watch};
@@ -22,10 +24,9 @@ pub fn run(options: &Watch) -> Result<(), CommandError> {
     )
     .map_err(|error| CommandError::Other(error.to_string()))?;
     if !options.quiet {
-        println!(
-            "{} estimates seen, {} lost, {} restarts of the publisher",
-            summary.seen, summary.lost, summary.restarts
-        );
+        let (seen, lost, restarts) = (summary.seen, summary.lost, summary.restarts);
+        // a reader of stdout that has gone, as in `watch | head`, is no error
+        let _ = writeln!(std::io::stdout(), "{seen} estimates seen, {lost} lost, {restarts} restarts of the publisher");
     }
     Ok(())
 }
