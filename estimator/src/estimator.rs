@@ -1,18 +1,25 @@
-//! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate.
+//! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate. What decides on readings stands
+//! in `screen.rs`, what linearises anew in `laplace.rs`, both below this file.
+
+mod laplace;
+mod screen;
 
 use core::fmt;
 
 use heapless::Deque;
 
-use crate::campaign::{Campaign, Setting, Verdict};
+use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive};
-use crate::estimate::{Estimate, MonitorState};
+use crate::estimate::Estimate;
 use crate::frame::{Frame, FrameError, PositionCode};
-use crate::gaussian::{Gaussian, Level, Solution, Sum};
-use crate::linear::{column, dot};
+use crate::gaussian::{Gaussian, Solution, Sum};
+use crate::linear::column;
 use crate::monitor::{Gate, Monitor};
 use crate::prior::Prior;
 use crate::surrogate::{Prediction, Surrogate};
+
+pub use laplace::FitQuality;
+use screen::Screened;
 
 /// What is known beforehand; read only. Two models can be compared on the same frames.
 #[derive(Debug, Clone)]
@@ -104,15 +111,6 @@ impl fmt::Display for IngestError {
 
 impl core::error::Error for IngestError {}
 
-/// How well the model at the MAP describes the readings of monitors in state ok.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FitQuality {
-    /// Sum of (residual / expected noise)^2.
-    pub chi_square: f32,
-    /// Readings less baselines less params.
-    pub degrees_of_freedom: f32,
-}
-
 /// A frame that belongs to no setting.
 #[derive(Debug, Clone)]
 struct Loose<const B: usize, const C: usize> {
@@ -125,15 +123,6 @@ struct Loose<const B: usize, const C: usize> {
 /// they left this window. At the start of a stream it holds 16 times 33 readings, enough for 48 params.
 const RECENT: usize = 16;
 
-/// Which readings of a frame are used.
-#[derive(Debug, Clone, Copy, Default)]
-struct Screened {
-    accepted: u64,
-    rejected: u64,
-    confirmed: u64,
-    restarted: u64,
-}
-
 impl<const B: usize, const C: usize> Loose<B, C> {
     /// Measured minus predicted, before the baseline [m].
     fn innovation(&self, b: usize, predicted: &[f32; B]) -> f32 {
@@ -144,37 +133,11 @@ impl<const B: usize, const C: usize> Loose<B, C> {
     }
 }
 
-impl Screened {
-    fn note(&mut self, b: usize, verdict: Verdict) {
-        let bit = 1 << b;
-        match verdict {
-            Verdict::Accepted => self.accepted |= bit,
-            Verdict::Held => self.rejected |= bit,
-            Verdict::Confirms { outvotes } => {
-                self.accepted |= bit;
-                self.confirmed |= bit;
-                self.restarted |= if outvotes { bit } else { 0 };
-            }
-        }
-    }
-}
-
-/// A param that has moved by this many error bars calls for a new linearisation.
-const MOVED: f32 = 0.5;
 /// Share of a prediction's own variance that is added to the noise of a reading which cannot be linearised anew: while
 /// the params are uncertain, so is the linearisation.
 ///
 /// Source: W. M. Lear's underweighting; R. Zanetti, K. DeMars and R. Bishop, J. Guid. Control Dyn. 33 (2010) 1670.
 const UNDERWEIGHT: f32 = 0.2;
-/// Growth of chi-square that counts as uphill: more than rounding of a chi-square of 1e5.
-const UPHILL: f32 = 1.0;
-/// Halvings of a step that leads uphill or to an unstable ring.
-const HALVINGS: u32 = 4;
-/// A setting whose information on all params together is less than this share of the prior's on one tells of its
-/// monitor's baseline only. A thousand of them leave less than a hundredth of the prior's information unused.
-const QUIET: f32 = 2e-4;
-/// While the params have walked less than this share of an error bar, the past still counts as one ring.
-const WALKED: f32 = 0.1;
 
 impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> Estimator<G, B, C, N, S> {
     /// Start from the prior, linearised at vars = 1.
@@ -277,92 +240,9 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         }
     }
 
-    /// Decide which readings to use, and learn each monitor's noise from its repeats.
-    fn screen(&mut self, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
-        let mut screened = Screened::default();
-        for b in 0..B {
-            let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
-            let valid = frame.is_valid(b);
-            let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
-            if usable {
-                match cell {
-                    Some(index) => self.screen_repeat(b, code, index, &mut screened),
-                    None => self.screen_loose(b, code, &mut screened),
-                }
-            }
-            if self.monitors.get_mut(b).is_some_and(Monitor::judge) {
-                self.stale = true;
-            }
-        }
-        if cell.is_none() {
-            self.excuse(&mut screened);
-        }
-        screened
-    }
-
-    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the model is at
-    /// fault, and all of it is used. (In a setting the repeats decide.)
-    fn excuse(&mut self, screened: &mut Screened) {
-        let (accepted, rejected) = (screened.accepted.count_ones(), screened.rejected.count_ones());
-        if 8 * rejected > accepted + rejected {
-            let each = self.monitors.iter_mut().enumerate();
-            each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
-            screened.accepted |= screened.rejected;
-            screened.rejected = 0;
-        }
-    }
-
-    /// A reading in a setting is judged by its repeats, the first one by the model.
-    fn screen_repeat(&mut self, b: usize, code: i32, index: u16, screened: &mut Screened) {
-        let (expected, moved) = (self.is_expected(b, code), self.moved_to_mean_drive(b, code));
-        let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
-        if let Some(difference) = cell.difference(b, moved) {
-            monitor.noise.learn(difference);
-        }
-        let verdict = cell.judge(b, moved, monitor.noise.sigma(), self.model.gate, expected);
-        let scatter = cell.take(b, code, moved, verdict);
-        match verdict {
-            Verdict::Accepted => {}
-            Verdict::Confirms { .. } => monitor.pardon(),
-            Verdict::Held => monitor.reject(),
-        }
-        screened.note(b, verdict);
-        self.campaign.add_scatter(b, scatter);
-    }
-
-    /// A reading without a setting passes if the model expects it.
-    fn screen_loose(&mut self, b: usize, code: i32, screened: &mut Screened) {
-        let verdict = if self.is_expected(b, code) { Verdict::Accepted } else { Verdict::Held };
-        if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
-            monitor.reject();
-        }
-        screened.note(b, verdict);
-    }
-
-    /// True if the model, with all its uncertainty, expects a reading.
-    fn is_expected(&self, b: usize, code: i32) -> bool {
-        let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
-        let predicted = self.gaussian.baseline(b) + dot(&d, self.solution.delta.as_slice());
-        let surprise = self.innovation(b, code) - predicted;
-        let certain = self.variance(b, 1, self.rf_offset) + baseline_variance;
-        // the uncertainty of the params is only worked out for readings that need it
-        self.model.gate.expects(surprise, certain)
-            || self.model.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
-    }
-
     /// Measured minus predicted at the origin, before the baseline [m].
     fn innovation(&self, b: usize, code: i32) -> f32 {
         metres(code) - self.prediction.reading.get(b).copied().unwrap_or(0.0)
-    }
-
-    /// A reading as the mean drive of its setting would have made it, in steps.
-    fn moved_to_mean_drive(&self, b: usize, code: i32) -> i32 {
-        let shift = match (self.at_mean_drive.reading.get(b), self.prediction.reading.get(b)) {
-            (Some(mean), Some(this)) => mean - this,
-            _ => 0.0,
-        };
-        let moved = code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32);
-        moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT)
     }
 
     fn slope(&self, b: usize) -> &[f32] {
@@ -431,101 +311,6 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.orbit = [self.gaussian.orbit(0, split), self.gaussian.orbit(split, B)];
     }
 
-    /// True if the MAP has left the origin, or the past has to be weighted anew.
-    fn is_due(&self) -> bool {
-        let each = self.solution.map_params.iter().zip(self.gaussian.origin()).zip(&self.solution.sigma);
-        self.stale || each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
-    }
-
-    /// Linearise at the MAP, by a damped Gauss-Newton step: halved while it leads uphill or to an unstable ring.
-    fn linearise_anew(&mut self) -> bool {
-        let from = *self.gaussian.origin();
-        let mut to = self.solution.map_params;
-        // A past that is weighted anew has another chi-square; the step is then judged with the next one.
-        let uphill = if self.stale || !self.is_still() { f32::MAX } else { self.gaussian.cost() + UPHILL };
-        self.stale = false;
-        for _ in 0..HALVINGS {
-            if self.linearise_at(&to) && self.gaussian.cost() <= uphill {
-                self.solve();
-                return true;
-            }
-            to.iter_mut().zip(&from).for_each(|(to, from)| *to = 0.5 * (*to + from));
-        }
-        let back = self.linearise_at(&from);
-        self.solve();
-        back
-    }
-
-    fn linearise_at(&mut self, params: &[f32; N]) -> bool {
-        let supplies = self.campaign.mean_strength();
-        let first = self.model.surrogate.first_family();
-        let mut strength = [0.0; N];
-        for (i, (strength, theta)) in strength.iter_mut().zip(params).enumerate() {
-            *strength = libm::expf(theta + supplies[usize::from(i >= first)]);
-        }
-        if self.model.surrogate.linearise(&strength, &mut self.linearised).is_err() {
-            return false;
-        }
-        self.supplies = supplies;
-        if self.is_still() {
-            self.rebuild(params);
-        } else {
-            self.gaussian.recentre(params);
-        }
-        true
-    }
-
-    /// True while all frames so far have seen the same ring.
-    fn is_still(&self) -> bool {
-        let walked = self.model.process_noise * libm::sqrtf(self.frames as f32);
-        self.solution.sigma.iter().all(|sigma| walked <= WALKED * sigma)
-    }
-
-    /// The Gaussian of all frames so far, linearised at `params`.
-    fn rebuild(&mut self, params: &[f32; N]) {
-        self.gaussian.clone_from(&self.loose);
-        self.gaussian.recentre(params);
-        let mut levels = [Level::default(); B];
-        for cell in self.campaign.cells() {
-            let drive = about(&cell.drive(), &self.supplies);
-            self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for (b, level) in levels.iter_mut().enumerate() {
-                let (mean, count) = cell.mean(b);
-                if count == 0 {
-                    continue;
-                }
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let innovation = mean - self.prediction.reading.get(b).copied().unwrap_or(0.0);
-                let variance = self.variance(b, count, drive.rf_offset);
-                if dot(slope, slope) < variance * self.quiet() {
-                    self.gaussian.merge(level, innovation, variance);
-                } else {
-                    self.gaussian.condition(b, innovation, variance, slope);
-                }
-                self.gaussian.add_repeats(count, self.noise_variance(b));
-            }
-        }
-        for frame in &self.recent {
-            let drive = about(&frame.drive, &self.supplies);
-            self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for b in (0..B).filter(|b| frame.accepted >> b & 1 == 1) {
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let innovation = frame.innovation(b, &self.prediction.reading);
-                self.gaussian.condition(b, innovation, self.variance(b, 1, drive.rf_offset), slope);
-            }
-        }
-        for (b, level) in levels.iter().enumerate() {
-            self.gaussian.condition_level(b, level);
-            self.gaussian.add_scatter(self.campaign.scatter(b) / self.noise_variance(b));
-        }
-        self.gaussian.settle();
-    }
-
-    /// Information below which a setting says nothing of the params: that of the stray currents of idle correctors.
-    fn quiet(&self) -> f32 {
-        QUIET / (self.model.prior.sigma * self.model.prior.sigma)
-    }
-
     fn estimate(
         &self,
         frame: &Frame<B, C>,
@@ -583,36 +368,6 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Covariance of two params `theta = ln var`.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
         if i < N && j < N { self.solution.covariance(i, j) } else { 0.0 }
-    }
-
-    /// How well the model describes the readings of monitors in state ok, by the expected noise.
-    ///
-    /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk: innovations, each
-    /// against the vars of its own time, counted in NIS.
-    pub fn fit_quality(&mut self) -> FitQuality {
-        if !self.is_still() {
-            return FitQuality { chi_square: self.nis.0.value(), degrees_of_freedom: self.nis.1 as f32 };
-        }
-        let expected = self.model.noise * self.model.noise;
-        let is_ok = |(_, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok;
-        let (mut sum, mut readings, mut baselines) = (Sum::default(), 0.0, 0.0);
-        for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-            sum.add(self.campaign.scatter(b) / expected);
-            baselines += 1.0;
-        }
-        for cell in self.campaign.cells() {
-            let drive = about(&cell.drive(), &self.supplies);
-            self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-                let (mean, count) = cell.mean(b);
-                let (d, _) = self.gaussian.effective(b, column(self.prediction.jacobian.as_slice(), N, b));
-                let predicted = self.prediction.reading.get(b).copied().unwrap_or(0.0) + self.gaussian.baseline(b);
-                let residual = mean - predicted - dot(&d, self.solution.delta.as_slice());
-                sum.add(count as f32 * residual * residual / expected);
-                readings += count as f32;
-            }
-        }
-        FitQuality { chi_square: sum.value(), degrees_of_freedom: readings - baselines - N as f32 }
     }
 }
 

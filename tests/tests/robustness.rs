@@ -546,22 +546,22 @@ fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
             readings += f64::from(estimate.accepted.count_ones());
             last = Some(estimate);
         }
-        let n = nees(&core, &last.unwrap(), &machine.params.map(f64::from));
-        println!("machine {seed}: NEES/48 {:.3}", n / 48.0);
-        total += n;
+        total += nees(&core, &last.unwrap(), &machine.params.map(f64::from));
     }
     (total, nis / readings)
 }
 
 #[test]
 fn frames_of_no_setting_are_consistent_with_the_truth() {
+    // the fourth has its horizontal tune next to an integer: kicks move its orbit five times as far as the design's
+    const MACHINES: u64 = 4;
     for process_noise in [0.0, 1e-4] {
-        let machines = std::env::var("M").map_or(4, |m| m.parse().unwrap());
-        let (nees, nis) = steered(process_noise, machines, 300);
-        let k = 48.0 * machines as f64;
-        println!("process noise {process_noise}: NEES/k {:.3} NIS {nis:.3}", nees / k);
+        let (nees, nis) = steered(process_noise, MACHINES, 300);
+        let k = 48.0 * MACHINES as f64;
         // chi-square of k degrees, three standard deviations
-        assert!((nees / k - 1.0).abs() < 3.0 * (2.0 / k).sqrt() || machines > 4, "NEES/{k} {:.2}", nees / k);
+        assert!((nees / k - 1.0).abs() < 3.0 * (2.0 / k).sqrt(), "walk {process_noise}: NEES/{k} {:.2}", nees / k);
+        // 39 600 readings: 0.02 is three standard deviations; underweighted readings at the start make it smaller
+        assert!((nis - 1.0).abs() < 0.03, "walk {process_noise}: NIS {nis:.3}");
     }
 }
 

@@ -353,7 +353,7 @@ impl Machine {
         Ok(())
     }
 
-    fn bends(&mut self, effect: &Effect, change: impl Fn(&mut crate::map::Bend, f64)) -> Result<(), EffectError> {
+    fn bends(&mut self, effect: &Effect, change: impl Fn(&mut crate::lattice::Bend, f64)) -> Result<(), EffectError> {
         let everywhere = effect.place.is_empty() && effect.kind == EffectKind::DipoleEdge;
         let mut found = false;
         for element in &mut self.ring.elements {

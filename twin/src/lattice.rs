@@ -4,8 +4,6 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use crate::map::Bend;
-
 /// Transverse plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub enum Plane {
@@ -33,6 +31,21 @@ impl Misalignment {
     pub fn is_none(&self) -> bool {
         *self == Self::default()
     }
+}
+
+/// A sector dipole.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bend {
+    /// Curvature of the reference orbit, and of the field [1/m].
+    pub curvature: f64,
+    /// Gradient of the body [1/m^2].
+    pub k1: f64,
+    /// Entrance edge angle [rad], MAD's e1.
+    pub e1: f64,
+    /// Exit edge angle [rad], MAD's e2.
+    pub e2: f64,
+    /// Soft-edge integral times full gap, `2 fint hgap` [m].
+    pub fringe: f64,
 }
 
 /// What an element does to the beam.

@@ -9,7 +9,7 @@
 use nalgebra::{Matrix6, SVector};
 use num_dual::{DualNum, jacobian};
 
-use crate::lattice::{Element, Kind, Misalignment};
+use crate::lattice::{Bend, Element, Kind, Misalignment};
 
 /// A real number or a dual number over the reals.
 pub trait Scalar: DualNum<Primitive = f64> + Copy {}
@@ -223,21 +223,6 @@ fn integrate<T: Scalar>(
             body(z, 0.5 * step);
         }
     }
-}
-
-/// A sector dipole.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Bend {
-    /// Curvature of the reference orbit, and of the field [1/m].
-    pub curvature: f64,
-    /// Gradient of the body [1/m^2].
-    pub k1: f64,
-    /// Entrance edge angle [rad], MAD's e1.
-    pub e1: f64,
-    /// Exit edge angle [rad], MAD's e2.
-    pub e2: f64,
-    /// Soft-edge integral times full gap, `2 fint hgap` [m].
-    pub fringe: f64,
 }
 
 impl Bend {

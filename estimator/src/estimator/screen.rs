@@ -1,0 +1,117 @@
+//! Which readings of a frame are used: what their repeats say, and where there are none, the model.
+
+use super::{Estimator, UNDERWEIGHT};
+use crate::campaign::Verdict;
+use crate::frame::{Frame, PositionCode};
+use crate::linear::dot;
+use crate::monitor::Monitor;
+use crate::surrogate::Surrogate;
+
+/// Which readings of a frame are used.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Screened {
+    pub accepted: u64,
+    pub rejected: u64,
+    pub confirmed: u64,
+    pub restarted: u64,
+}
+
+impl Screened {
+    fn note(&mut self, b: usize, verdict: Verdict) {
+        let bit = 1 << b;
+        match verdict {
+            Verdict::Accepted => self.accepted |= bit,
+            Verdict::Held => self.rejected |= bit,
+            Verdict::Confirms { outvotes } => {
+                self.accepted |= bit;
+                self.confirmed |= bit;
+                self.restarted |= if outvotes { bit } else { 0 };
+            }
+        }
+    }
+}
+
+impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> Estimator<G, B, C, N, S> {
+    /// Decide which readings to use, and learn each monitor's noise from its repeats.
+    pub(super) fn screen(&mut self, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
+        let mut screened = Screened::default();
+        for b in 0..B {
+            let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
+            let valid = frame.is_valid(b);
+            let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
+            if usable {
+                match cell {
+                    Some(index) => self.screen_repeat(b, code, index, &mut screened),
+                    None => self.screen_loose(b, code, &mut screened),
+                }
+            }
+            if self.monitors.get_mut(b).is_some_and(Monitor::judge) {
+                self.stale = true;
+            }
+        }
+        if cell.is_none() {
+            self.excuse(&mut screened);
+        }
+        screened
+    }
+
+    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the model is at
+    /// fault, and all of it is used. (In a setting the repeats decide.)
+    fn excuse(&mut self, screened: &mut Screened) {
+        let (accepted, rejected) = (screened.accepted.count_ones(), screened.rejected.count_ones());
+        if 8 * rejected > accepted + rejected {
+            let each = self.monitors.iter_mut().enumerate();
+            each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
+            screened.accepted |= screened.rejected;
+            screened.rejected = 0;
+        }
+    }
+
+    /// A reading in a setting is judged by its repeats, the first one by the model.
+    fn screen_repeat(&mut self, b: usize, code: i32, index: u16, screened: &mut Screened) {
+        let (expected, moved) = (self.is_expected(b, code), self.moved_to_mean_drive(b, code));
+        let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
+        if let Some(difference) = cell.difference(b, moved) {
+            monitor.noise.learn(difference);
+        }
+        let verdict = cell.judge(b, moved, monitor.noise.sigma(), self.model.gate, expected);
+        let scatter = cell.take(b, code, moved, verdict);
+        match verdict {
+            Verdict::Accepted => {}
+            Verdict::Confirms { .. } => monitor.pardon(),
+            Verdict::Held => monitor.reject(),
+        }
+        screened.note(b, verdict);
+        self.campaign.add_scatter(b, scatter);
+    }
+
+    /// A reading without a setting passes if the model expects it.
+    fn screen_loose(&mut self, b: usize, code: i32, screened: &mut Screened) {
+        let verdict = if self.is_expected(b, code) { Verdict::Accepted } else { Verdict::Held };
+        if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
+            monitor.reject();
+        }
+        screened.note(b, verdict);
+    }
+
+    /// True if the model, with all its uncertainty, expects a reading.
+    fn is_expected(&self, b: usize, code: i32) -> bool {
+        let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
+        let predicted = self.gaussian.baseline(b) + dot(&d, self.solution.delta.as_slice());
+        let surprise = self.innovation(b, code) - predicted;
+        let certain = self.variance(b, 1, self.rf_offset) + baseline_variance;
+        // the uncertainty of the params is only worked out for readings that need it
+        self.model.gate.expects(surprise, certain)
+            || self.model.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
+    }
+
+    /// A reading as the mean drive of its setting would have made it, in steps.
+    fn moved_to_mean_drive(&self, b: usize, code: i32) -> i32 {
+        let shift = match (self.at_mean_drive.reading.get(b), self.prediction.reading.get(b)) {
+            (Some(mean), Some(this)) => mean - this,
+            _ => 0.0,
+        };
+        let moved = code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32);
+        moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT)
+    }
+}
