@@ -65,6 +65,8 @@ pub struct Estimator<G: Surrogate<B, C, N>, const B: usize, const C: usize, cons
     rf_offset: f32,
     /// Sum of NIS, and the number of readings in it.
     nis: (Sum, u32),
+    /// Frames without a setting in a row that surprised all over.
+    surprises: u32,
     /// The past has to be weighted anew.
     stale: bool,
 }
@@ -169,6 +171,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             orbit: [0.0; 2],
             rf_offset: 0.0,
             nis: (Sum::default(), 0),
+            surprises: 0,
             stale: false,
             model,
         })
@@ -179,7 +182,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// # Errors
     /// [`IngestError`]; the posterior is then as it was before.
     pub fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
-        let (frame, drive) = self.decode(bytes).inspect_err(|_| self.rejected_frames += 1)?;
+        let (frame, drive) =
+            self.decode(bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
         self.walk(&frame);
         let cell = self.find_setting(&frame, &drive);
         self.predict(&drive, cell);

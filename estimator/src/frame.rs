@@ -265,6 +265,10 @@ impl<const B: usize, const C: usize> Frame<B, C> {
         if encoded.is_empty() {
             return Err(FrameError::Truncated { need: HEADER + TRAILER, got: 0 });
         }
+        // the decoder would stop at a zero within and drop what follows
+        if encoded.contains(&0) {
+            return Err(FrameError::Framing);
+        }
         let length = cobs::decode_in_place(encoded).map_err(|_| FrameError::Framing)?;
         let plain = encoded.get(..length).ok_or(FrameError::Framing)?;
         let body = checked(plain, Self::VERSION)?;

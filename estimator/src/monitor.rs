@@ -177,13 +177,13 @@ impl Monitor {
         self.last_code = code;
         let moving = self.unchanged < STUCK;
         self.silent = if moving { 0 } else { self.silent.saturating_add(1) };
-        self.reported += u32::from(moving);
+        self.reported = self.reported.saturating_add(u32::from(moving));
         moving
     }
 
     /// Count a reading that is not used.
     pub fn reject(&mut self) {
-        self.rejected += 1;
+        self.rejected = self.rejected.saturating_add(1);
     }
 
     /// Take a rejection back: a repeat has confirmed the reading.

@@ -183,7 +183,7 @@ fn faulty(
             (framed(&plain), |e| matches!(e, Frame(Oversized { limit, got }) if got > limit))
         }
         7 => (Vec::new(), |e| *e == Frame(Truncated { need: 7, got: 0 })),
-        8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Truncated { need: 7, got: 0 })),
+        8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Framing)),
         9 => {
             let (plain, other) = (plain(next), 2 + random.below(254) as u8);
             (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 1, .. })))
@@ -562,6 +562,38 @@ fn frames_of_no_setting_are_consistent_with_the_truth() {
         assert!((nees / k - 1.0).abs() < 3.0 * (2.0 / k).sqrt(), "walk {process_noise}: NEES/{k} {:.2}", nees / k);
         // 39 600 readings: 0.02 is three standard deviations; underweighted readings at the start make it smaller
         assert!((nis - 1.0).abs() < 0.03, "walk {process_noise}: NIS {nis:.3}");
+    }
+}
+
+// ---- A lost beam ----
+
+#[test]
+fn a_frame_without_beam_moves_nothing() {
+    // given a machine that steers, the beam lost in one frame: its monitors read whatever they read
+    let (ring, recording) = paper_vars();
+    for process_noise in [0.0, 1e-4] {
+        let mut core = stream::estimator(&ring, &recording, process_noise).unwrap();
+        let mut machine = Machine::drawn(core.model(), 1);
+        let mut before = None;
+        for sequence in 0..=100 {
+            let mut frame = machine.cycle(core.model(), sequence);
+            let is_lost = sequence == 100;
+            if is_lost {
+                frame.reading =
+                    core::array::from_fn(|_| PositionCode::nearest(5e-3 * machine.random.normal()).unwrap());
+            }
+            // when it is taken in
+            let estimate = ingest(&mut core, &frame);
+            // then none of its readings is used, and no monitor is blamed
+            if is_lost {
+                let last: BoosterEstimate = before.take().unwrap();
+                assert_eq!((estimate.accepted, estimate.rejected), (0, (1 << 33) - 1));
+                assert_eq!(estimate.health, last.health);
+                let shift = (0..48).map(|i| (estimate.map_params[i] - last.map_params[i]).abs() / last.params_sigma[i]);
+                assert!(shift.fold(0.0, f32::max) < 0.05);
+            }
+            before = Some(estimate);
+        }
     }
 }
 

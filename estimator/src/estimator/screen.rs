@@ -31,6 +31,9 @@ impl Screened {
     }
 }
 
+/// Frames in a row that must surprise all over before the model is at fault, and not the beam.
+const CONVINCED: u32 = 3;
+
 impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> Estimator<G, B, C, N, S> {
     /// Decide which readings to use, and learn each monitor's noise from its repeats.
     pub(super) fn screen(&mut self, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
@@ -55,16 +58,20 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         screened
     }
 
-    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the model is at
-    /// fault, and all of it is used. (In a setting the repeats decide.)
+    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the beam was lost or
+    /// the model is at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before
+    /// are not. (In a setting the repeats decide.)
     fn excuse(&mut self, screened: &mut Screened) {
         let (accepted, rejected) = (screened.accepted.count_ones(), screened.rejected.count_ones());
-        if 8 * rejected > accepted + rejected {
-            let each = self.monitors.iter_mut().enumerate();
-            each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
-            screened.accepted |= screened.rejected;
-            screened.rejected = 0;
+        if 8 * rejected <= accepted + rejected {
+            self.surprises = 0;
+            return;
         }
+        let each = self.monitors.iter_mut().enumerate();
+        each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
+        let all = screened.accepted | screened.rejected;
+        self.surprises = self.surprises.saturating_add(1);
+        (screened.accepted, screened.rejected) = if self.surprises >= CONVINCED { (all, 0) } else { (0, all) };
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
