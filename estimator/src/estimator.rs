@@ -268,12 +268,16 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
     fn condition(&mut self, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
         let before = self.solution.cost;
-        let underweight = if cell.is_none() || !self.is_still() { UNDERWEIGHT } else { 0.0 };
+        let linearised_once = cell.is_none() || !self.is_still();
         for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
             let (innovation, variance) = (self.innovation(b, code), self.variance(b, 1, self.rf_offset));
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
-            let own = underweight * self.solution.variance_of(&self.gaussian.effective(b, slope).0);
+            let own = if linearised_once {
+                UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(b, slope).0)
+            } else {
+                0.0
+            };
             self.gaussian.condition(b, innovation, variance + own, slope);
         }
         self.gaussian.settle();
