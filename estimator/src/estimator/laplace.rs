@@ -126,8 +126,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// How well the model describes the readings of monitors in state ok, by the expected noise.
     ///
-    /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk: innovations, each
-    /// against the vars of its own time, counted in NIS.
+    /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk:
+    /// innovations, each against the vars of its own time, counted in NIS.
     pub fn fit_quality(&mut self) -> FitQuality {
         if !self.is_still() {
             return FitQuality { chi_square: self.nis.0.value(), degrees_of_freedom: self.nis.1 as f32 };
