@@ -131,6 +131,12 @@ impl<const B: usize, const C: usize> Cell<B, C> {
         }
     }
 
+    /// Distance of the last reading, moved to the mean drive, from the mean [m].
+    pub fn distance(&self, b: usize) -> f32 {
+        let last = self.last.get(b).map_or(0.0, |&last| last as f32 * PositionCode::METRES_PER_LSB);
+        last - self.mean(b).0
+    }
+
     /// Difference of a reading, moved to the mean drive, from the last one [m].
     pub fn difference(&self, b: usize, moved: i32) -> Option<f32> {
         let last = self.last.get(b).filter(|_| self.heard >> b & 1 == 1)?;
@@ -210,13 +216,16 @@ pub struct Campaign<const B: usize, const C: usize, const S: usize> {
     scatter: [u64; B],
 }
 
-impl<const B: usize, const C: usize, const S: usize> Default for Campaign<B, C, S> {
-    fn default() -> Self {
-        Self { cells: Vec::new(), scatter: [0; B] }
-    }
-}
-
 impl<const B: usize, const C: usize, const S: usize> Campaign<B, C, S> {
+    /// Nothing so far.
+    pub const BLANK: Self = Self { cells: Vec::new(), scatter: [0; B] };
+
+    /// Forget all settings.
+    pub fn clear(&mut self) {
+        self.cells.clear();
+        self.scatter = [0; B];
+    }
+
     /// The settings so far.
     pub fn cells(&self) -> &[Cell<B, C>] {
         &self.cells
@@ -287,7 +296,7 @@ mod tests {
 
     #[test]
     fn a_full_table_says_so() {
-        let mut campaign = Campaign::<1, 1, 2>::default();
+        let mut campaign = Campaign::<1, 1, 2>::BLANK;
         assert_eq!(campaign.find(&setting(None, 0.0, 0)), Some(0));
         assert_eq!(campaign.find(&setting(Some(0), 5.0, 0)), Some(1));
         assert_eq!(campaign.find(&setting(Some(0), -5.0, 0)), None);

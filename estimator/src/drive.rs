@@ -1,9 +1,11 @@
 //! What a frame's currents do to the beam: kicks, common changes of the quadrupoles, and the RF offset.
 
+use serde::{Deserialize, Serialize};
+
 use crate::frame::{CurrentCode, Frame};
 
 /// How read-backs become kicks and gradients: the constants of a recording's header.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Kick of a corrector at nominal momentum [rad/A].
     pub kick_per_ampere: f32,

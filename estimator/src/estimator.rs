@@ -7,25 +7,25 @@ mod screen;
 use core::fmt;
 
 use heapless::Deque;
+use serde::{Deserialize, Serialize};
 
 use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive};
 use crate::estimate::Estimate;
 use crate::frame::{Frame, FrameError, PositionCode};
-use crate::gaussian::{Gaussian, Solution, Sum};
+use crate::gaussian::{Gaussian, Solution};
 use crate::linear::column;
 use crate::monitor::{Gate, Monitor};
 use crate::prior::Prior;
+use crate::sum::Sum;
 use crate::surrogate::{Prediction, Surrogate};
 
 pub use laplace::FitQuality;
 use screen::Screened;
 
-/// What is known beforehand; read only. Two models can be compared on the same frames.
-#[derive(Debug, Clone)]
-pub struct Model<G> {
-    /// The ring.
-    pub surrogate: G,
+/// What is known beforehand, besides the ring.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Setup {
     /// Prior of each `theta = ln var`.
     pub prior: Prior,
     /// From read-backs to kicks and gradients.
@@ -38,27 +38,49 @@ pub struct Model<G> {
     pub process_noise: f32,
 }
 
-/// A model, and the posterior that frames have made of it: `B` monitors, `C` correctors, `N` params, `S` settings.
+/// The ring and all else that is known beforehand; read only. Two models can be compared on the same frames.
+#[derive(Debug)]
+pub struct Model<'a, G> {
+    /// The ring.
+    pub surrogate: &'a G,
+    /// All else.
+    pub setup: &'a Setup,
+}
+
+/// The posterior that frames have made of a model: `B` monitors, `C` correctors, `N` params, `S` settings; `T` entries make
+/// a triangle of `N`.
 #[derive(Debug, Clone)]
-pub struct Estimator<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> {
-    model: Model<G>,
+pub struct Estimator<
+    G: Surrogate<B, C, N>,
+    const B: usize,
+    const C: usize,
+    const N: usize,
+    const S: usize,
+    const T: usize,
+> {
+    started: bool,
     last_sequence: Option<u32>,
+    /// Cycles for which the params have walked ahead of the last frame.
+    ahead: u32,
     frames: u32,
     rejected_frames: u32,
     /// The surrogate at the origin of the Gaussian.
     linearised: G::Linearised,
+    /// Linearised since the last estimate.
+    news: bool,
     /// `ln` of the supplies' mean factors at which it was linearised.
     supplies: [f32; 2],
     prediction: Prediction<B, N>,
-    at_mean_drive: Prediction<B, N>,
+    /// Readings that the mean drive of the frame's setting would have made [m].
+    at_mean_drive: [f32; B],
     monitors: [Monitor; B],
     campaign: Campaign<B, C, S>,
-    gaussian: Gaussian<B, N>,
+    gaussian: Gaussian<B, N, T>,
     /// The prior, and frames that belong to no setting and are not recent: they cannot be linearised anew.
-    loose: Gaussian<B, N>,
+    loose: Gaussian<B, N, T>,
     /// The last frames that belong to no setting.
     recent: Deque<Loose<B, C>, RECENT>,
-    solution: Solution<N>,
+    solution: Solution<N, T>,
     /// Rms of the baseline orbit in x and y [m].
     orbit: [f32; 2],
     /// RF offset of the frame at hand.
@@ -92,6 +114,8 @@ pub enum IngestError {
     },
     /// The currents are beyond what the model describes.
     Beyond(Beyond),
+    /// No posterior yet: [`Estimator::restart`] was not called, or found no design.
+    NotStarted,
 }
 
 impl From<FrameError> for IngestError {
@@ -107,6 +131,7 @@ impl fmt::Display for IngestError {
             Self::Repeated { sequence } => write!(f, "frame {sequence} has come before"),
             Self::OutOfOrder { last, got } => write!(f, "frame {got} after frame {last}"),
             Self::Beyond(Beyond { what, limit, got }) => write!(f, "{what} is {got}, the model ends at {limit}"),
+            Self::NotStarted => write!(f, "frame before the estimator was started"),
         }
     }
 }
@@ -141,107 +166,155 @@ impl<const B: usize, const C: usize> Loose<B, C> {
 /// Source: W. M. Lear's underweighting; R. Zanetti, K. DeMars and R. Bishop, J. Guid. Control Dyn. 33 (2010) 1670.
 const UNDERWEIGHT: f32 = 0.2;
 
-impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> Estimator<G, B, C, N, S> {
-    /// Start from the prior, linearised at vars = 1.
+impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize, const T: usize>
+    Estimator<G, B, C, N, S, T>
+{
+    /// Memory for one, all zero, so that it costs no flash; [`Estimator::restart`] gives it a posterior.
+    pub const BLANK: Self = Self {
+        started: false,
+        last_sequence: None,
+        ahead: 0,
+        frames: 0,
+        rejected_frames: 0,
+        linearised: G::BLANK,
+        news: false,
+        supplies: [0.0; 2],
+        prediction: Prediction::BLANK,
+        at_mean_drive: [0.0; B],
+        monitors: [const { Monitor::BLANK }; B],
+        campaign: Campaign::BLANK,
+        gaussian: Gaussian::BLANK,
+        loose: Gaussian::BLANK,
+        recent: Deque::new(),
+        solution: Solution::BLANK,
+        orbit: [0.0; 2],
+        rf_offset: 0.0,
+        nis: (Sum::ZERO, 0),
+        surprises: 0,
+        stale: false,
+    };
+
+    /// Start from the prior, linearised at vars = 1, all frames forgotten.
     ///
     /// # Errors
     /// [`crate::surrogate::Unstable`] if the surrogate has no design.
-    pub fn try_new(model: Model<G>) -> Result<Self, crate::surrogate::Unstable> {
-        let mut linearised = G::Linearised::default();
-        model.surrogate.linearise(&[1.0; N], &mut linearised)?;
-        let loose = Gaussian::prior(&model.prior);
-        let mut gaussian = loose.clone();
-        gaussian.recentre(&[0.0; N]);
-        let mut solution = Solution::default();
-        solution.solve(&gaussian, &model.prior);
-        Ok(Self {
-            last_sequence: None,
-            frames: 0,
-            rejected_frames: 0,
-            linearised,
-            supplies: [0.0; 2],
-            prediction: Prediction::default(),
-            at_mean_drive: Prediction::default(),
-            monitors: core::array::from_fn(|_| Monitor::expecting(model.noise)),
-            campaign: Campaign::default(),
-            gaussian,
-            loose,
-            recent: Deque::new(),
-            solution,
-            orbit: [0.0; 2],
-            rf_offset: 0.0,
-            nis: (Sum::default(), 0),
-            surprises: 0,
-            stale: false,
-            model,
-        })
+    pub fn restart(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
+        self.started = false;
+        model.surrogate.linearise(&[1.0; N], &mut self.linearised)?;
+        (self.last_sequence, self.ahead, self.frames, self.rejected_frames) = (None, 0, 0, 0);
+        (self.supplies, self.orbit, self.rf_offset) = ([0.0; 2], [0.0; 2], 0.0);
+        (self.nis, self.surprises, self.stale, self.news) = ((Sum::ZERO, 0), 0, false, false);
+        self.monitors.iter_mut().for_each(|monitor| monitor.expect(model.setup.noise));
+        self.campaign.clear();
+        self.recent.clear();
+        self.loose.reset(&model.setup.prior);
+        self.gaussian.clone_from(&self.loose);
+        self.gaussian.recentre(&[0.0; N]);
+        self.solution.solve(&self.gaussian, &model.setup.prior);
+        self.started = true;
+        Ok(())
     }
 
     /// Take one machine cycle in: bytes to estimate.
     ///
     /// # Errors
     /// [`IngestError`]; the posterior is then as it was before.
-    pub fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
+    pub fn ingest(&mut self, model: &Model<'_, G>, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
         let (frame, drive) =
-            self.decode(bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
-        self.walk(&frame);
-        let cell = self.find_setting(&frame, &drive);
-        self.predict(&drive, cell);
-        let screened = self.screen(&frame, cell);
-        let nis = self.condition(&frame, cell, &screened);
+            self.decode(model, bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
+        self.catch_up(model, &frame);
+        let cell = self.find_setting(model, &frame, &drive);
+        self.predict(model, &drive, cell);
+        let screened = self.screen(model, &frame, cell);
+        let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
-            self.keep_loose(&frame, &drive, &screened);
+            self.keep_loose(model, &frame, &drive, &screened);
         }
-        let linearised = self.is_due() && self.linearise_anew();
-        Ok(self.estimate(&frame, cell, &screened, nis, linearised))
+        Ok(self.estimate(model, &frame, cell, &screened, nis))
+    }
+
+    /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
+    /// it was done), and let the params walk for one cycle. To be called after each frame.
+    pub fn prepare(&mut self, model: &Model<'_, G>) -> bool {
+        let linearised = self.started && self.is_due() && self.linearise_anew(model);
+        self.news |= linearised;
+        if self.last_sequence.is_some() && self.ahead == 0 {
+            self.ahead = 1;
+            self.walk(model, 1);
+        }
+        linearised
+    }
+
+    /// Take the next frame as new, whatever its number: its sender counts anew.
+    pub fn forget_sequence(&mut self) {
+        self.last_sequence = None;
+    }
+
+    /// The model has been exchanged for another one of the same ring: the past is to be weighted anew by it.
+    pub fn doubt(&mut self) {
+        self.stale = true;
     }
 
     /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
-    fn decode(&self, bytes: &mut [u8]) -> Result<(Frame<B, C>, Drive<C>), IngestError> {
+    #[inline(never)]
+    fn decode(&self, model: &Model<'_, G>, bytes: &mut [u8]) -> Result<(Frame<B, C>, Drive<C>), IngestError> {
+        if !self.started {
+            return Err(IngestError::NotStarted);
+        }
         let frame = Frame::decode(bytes)?;
         match self.last_sequence {
             Some(last) if frame.sequence == last => return Err(IngestError::Repeated { sequence: last }),
             Some(last) if frame.sequence < last => return Err(IngestError::OutOfOrder { last, got: frame.sequence }),
             _ => {}
         }
-        let drive = self.model.calibration.drive(&frame).map_err(IngestError::Beyond)?;
+        let drive = model.setup.calibration.drive(&frame).map_err(IngestError::Beyond)?;
         Ok((frame, drive))
     }
 
-    /// Let the params walk for the cycles since the last frame.
-    fn walk(&mut self, frame: &Frame<B, C>) {
+    /// Let the params walk for cycles that were lost since the last frame.
+    fn catch_up(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>) {
         let cycles = self.last_sequence.map_or(0, |last| frame.sequence.saturating_sub(last));
+        self.walk(model, cycles.saturating_sub(self.ahead));
         self.last_sequence = Some(frame.sequence);
         self.frames = self.frames.saturating_add(1);
-        if self.model.process_noise > 0.0 && cycles > 0 {
+        self.ahead = 0;
+    }
+
+    fn walk(&mut self, model: &Model<'_, G>, cycles: u32) {
+        let noise = model.setup.process_noise;
+        if noise > 0.0 && cycles > 0 {
             // After a long silence the vars are unknown, but not more than the range of the prior allows.
-            let prior = self.model.prior.sigma * self.model.prior.sigma;
+            let prior = model.setup.prior.sigma * model.setup.prior.sigma;
             let largest = self.solution.sigma.iter().fold(0.0, |a: f32, sigma| a.max(sigma * sigma));
-            let variance = self.model.process_noise * self.model.process_noise * cycles as f32;
+            let variance = noise * noise * cycles as f32;
             let sigma = libm::sqrtf(variance.min((2.0 * prior - largest).max(0.0)));
             self.gaussian.walk(sigma, &mut self.solution);
-            self.solve();
+            self.solve(model);
         }
     }
 
     /// The cell of the frame's setting, its drive counted in. Several correctors at once belong to none.
-    fn find_setting(&mut self, frame: &Frame<B, C>, drive: &Drive<C>) -> Option<u16> {
-        let setting = Setting::of(frame, self.model.calibration.powered)?;
+    fn find_setting(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, drive: &Drive<C>) -> Option<u16> {
+        let setting = Setting::of(frame, model.setup.calibration.powered)?;
         let index = self.campaign.find(&setting)?;
         self.campaign.cell_mut(index)?.add_drive(drive);
         Some(index)
     }
 
-    /// Predict the frame, and what the mean drive of its setting would have made.
-    fn predict(&mut self, drive: &Drive<C>, cell: Option<u16>) {
-        let drive = about(drive, &self.supplies);
-        self.model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-        self.rf_offset = drive.rf_offset;
+    /// Predict what the mean drive of the frame's setting would have made, and the frame.
+    #[inline(never)]
+    fn predict(&mut self, model: &Model<'_, G>, drive: &Drive<C>, cell: Option<u16>) {
         let mean = cell.and_then(|index| self.campaign.cells().get(usize::from(index))).map(|cell| cell.drive());
         if let Some(mean) = mean {
-            let mean = about(&mean, &self.supplies);
-            self.model.surrogate.predict(&self.linearised, &mean, &mut self.at_mean_drive);
+            self.predict_drive(model, &mean);
+            self.at_mean_drive = self.prediction.reading;
         }
+        self.predict_drive(model, drive);
+        self.rf_offset = drive.rf_offset;
+    }
+
+    fn predict_drive(&mut self, model: &Model<'_, G>, drive: &Drive<C>) {
+        model.surrogate.predict(&self.linearised, &about(drive, &self.supplies), &mut self.prediction);
     }
 
     /// Measured minus predicted at the origin, before the baseline [m].
@@ -255,10 +328,29 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// Variance of the mean of `n` repeats: the monitor's noise, and the stated error of the surrogate, which is the same
     /// in all of them [m^2].
-    fn variance(&self, b: usize, n: u32, rf_offset: f32) -> f32 {
-        let orbit = self.orbit[usize::from(b >= self.model.surrogate.horizontal_monitors())];
-        let error = self.model.surrogate.error_variance(b, rf_offset, orbit);
-        self.noise_variance(b) / n.max(1) as f32 + error
+    fn variance(&self, model: &Model<'_, G>, b: usize, n: u32, rf_offset: f32) -> f32 {
+        self.noise_variance(b) / n.max(1) as f32 + self.shared_variance(model, b, rf_offset)
+    }
+
+    /// Variance that repeats of a reading share: the stated error of the surrogate [m^2].
+    fn shared_variance(&self, model: &Model<'_, G>, b: usize, rf_offset: f32) -> f32 {
+        let [orbit_x, orbit_y] = self.orbit;
+        let orbit = if b < model.surrogate.horizontal_monitors() { orbit_x } else { orbit_y };
+        model.surrogate.error_variance(b, rf_offset, orbit)
+    }
+
+    /// What a reading adds to its earlier repeats, as one of its own: innovation [m] and variance [m^2].
+    ///
+    /// The `n`-th repeat `z` of mean `m` (itself included), with noise `v` of its own and an error of variance `e` that all
+    /// share, moves the mean as would an independent reading `z + n e/v (z - m)` of variance
+    /// `(v + (n - 1) e)(v + n e)/v`: both means then have variance `v/n + e`.
+    fn news_of(&self, model: &Model<'_, G>, b: usize, innovation: f32, cell: Option<u16>) -> (f32, f32) {
+        let (own, shared) = (self.noise_variance(b), self.shared_variance(model, b, self.rf_offset));
+        let cell = cell.and_then(|index| self.campaign.cells().get(usize::from(index)));
+        let (n, distance) = cell.map_or((1, 0.0), |cell| (cell.mean(b).1.max(1), cell.distance(b)));
+        let ratio = shared / own;
+        let n = n as f32;
+        (innovation + n * ratio * distance, own * (1.0 + (n - 1.0) * ratio) * (1.0 + n * ratio))
     }
 
     fn noise_variance(&self, b: usize) -> f32 {
@@ -266,12 +358,13 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
-    fn condition(&mut self, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
+    #[inline(never)]
+    fn condition(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
         let before = self.solution.cost;
-        let linearised_once = cell.is_none() || !self.is_still();
+        let linearised_once = cell.is_none() || !self.is_still(model);
         for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
-            let (innovation, variance) = (self.innovation(b, code), self.variance(b, 1, self.rf_offset));
+            let (innovation, variance) = self.news_of(model, b, self.innovation(b, code), cell);
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
             let own = if linearised_once {
                 UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(b, slope).0)
@@ -281,10 +374,9 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             self.gaussian.condition(b, innovation, variance + own, slope);
         }
         self.gaussian.settle();
-        // Readings confirmed late or outvoted are counted when the past is weighted anew, and so is an error that repeats
-        // share.
-        self.stale |= screened.confirmed != 0 || screened.restarted != 0 || frame.rf_offset.steps() != 0;
-        self.solve();
+        // readings confirmed late or outvoted are counted when the past is weighted anew
+        self.stale |= screened.confirmed != 0 || screened.restarted != 0;
+        self.solve(model);
         let nis = self.solution.cost - before;
         self.nis.0.add(nis);
         self.nis.1 = self.nis.1.saturating_add(screened.accepted.count_ones());
@@ -292,18 +384,17 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// Keep a frame that belongs to no setting among the recent ones; the oldest of them is linearised for the last time.
-    fn keep_loose(&mut self, frame: &Frame<B, C>, drive: &Drive<C>, screened: &Screened) {
+    fn keep_loose(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, drive: &Drive<C>, screened: &Screened) {
         if self.recent.is_full()
             && let Some(oldest) = self.recent.pop_front()
         {
             self.loose.recentre(self.gaussian.origin());
-            let drive = about(&oldest.drive, &self.supplies);
-            self.model.surrogate.predict(&self.linearised, &drive, &mut self.at_mean_drive);
+            self.predict_drive(model, &oldest.drive);
             for b in (0..B).filter(|b| oldest.accepted >> b & 1 == 1) {
-                let variance = self.variance(b, 1, drive.rf_offset);
-                let slope = column(self.at_mean_drive.jacobian.as_slice(), N, b);
+                let variance = self.variance(model, b, 1, oldest.drive.rf_offset);
+                let slope = column(self.prediction.jacobian.as_slice(), N, b);
                 let own = UNDERWEIGHT * self.solution.variance_of(&self.loose.effective(b, slope).0);
-                let innovation = oldest.innovation(b, &self.at_mean_drive.reading);
+                let innovation = oldest.innovation(b, &self.prediction.reading);
                 self.loose.condition(b, innovation, variance + own, slope);
             }
             self.loose.settle();
@@ -313,20 +404,22 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         let _ = self.recent.push_back(kept);
     }
 
-    fn solve(&mut self) {
-        self.solution.solve(&self.gaussian, &self.model.prior);
-        let split = self.model.surrogate.horizontal_monitors();
+    #[inline(never)]
+    fn solve(&mut self, model: &Model<'_, G>) {
+        self.solution.solve(&self.gaussian, &model.setup.prior);
+        let split = model.surrogate.horizontal_monitors();
         self.orbit = [self.gaussian.orbit(0, split), self.gaussian.orbit(split, B)];
     }
 
     fn estimate(
-        &self,
+        &mut self,
+        model: &Model<'_, G>,
         frame: &Frame<B, C>,
         cell: Option<u16>,
         screened: &Screened,
         nis: f32,
-        linearised: bool,
     ) -> Estimate<B, N> {
+        let linearised = core::mem::take(&mut self.news);
         let solution = &self.solution;
         let mut estimate = Estimate {
             sequence: frame.sequence,
@@ -350,7 +443,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             health: core::array::from_fn(|b| self.monitors.get(b).map(Monitor::health).unwrap_or_default()),
         };
         for i in 0..N {
-            let moments = estimate.marginal(i, &self.model.prior).map(|m| m.moments());
+            let moments = estimate.marginal(i, &model.setup.prior).map(|m| m.moments());
             if let (Some((var, spread)), Some(mean), Some(sigma)) =
                 (moments, estimate.mean.get_mut(i), estimate.sigma.get_mut(i))
             {
@@ -364,13 +457,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     fn centre(&self, i: usize) -> f32 {
         let clipped = self.solution.clipped >> i & 1 == 1;
         let origin = self.gaussian.origin().get(i).copied().unwrap_or(0.0);
-        let unbounded = origin + self.solution.delta.as_slice().get(i).copied().unwrap_or(0.0);
+        let unbounded = origin + self.solution.delta.get(i).copied().unwrap_or(0.0);
         if clipped { unbounded } else { self.solution.map_params.get(i).copied().unwrap_or(unbounded) }
-    }
-
-    /// The model.
-    pub fn model(&self) -> &Model<G> {
-        &self.model
     }
 
     /// Covariance of two params `theta = ln var`.

@@ -11,57 +11,12 @@
 //!
 //! Source: the square completion behind the Schur complement, e.g. A. Gelb, Applied Optimal Estimation (1974), ch. 4.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::SMatrix;
 
-use crate::linear::{BLOCK, add, block_start, column, combine, dot};
+use crate::linear::{add, column, combine, dot, zeros};
 use crate::prior::Prior;
-
-/// A sum of many small terms, compensated, so that months of frames lose nothing.
-///
-/// Source: A. Neumaier, ZAMM 54 (1974) 39.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Sum {
-    total: f32,
-    lost: f32,
-}
-
-impl Sum {
-    /// Add a term.
-    pub fn add(&mut self, term: f32) {
-        let total = self.total + term;
-        self.lost +=
-            if self.total.abs() >= term.abs() { (self.total - total) + term } else { (term - total) + self.total };
-        self.total = total;
-    }
-
-    /// The sum.
-    pub fn value(&self) -> f32 {
-        self.total + self.lost
-    }
-}
-
-/// The logarithm of a product of many factors near 1, with few logarithms taken.
-#[derive(Debug, Clone, Copy)]
-struct LogProduct {
-    taken: Sum,
-    product: f32,
-}
-
-impl LogProduct {
-    const ONE: Self = Self { taken: Sum { total: 0.0, lost: 0.0 }, product: 1.0 };
-
-    fn multiply(&mut self, factor: f32) {
-        self.product *= factor;
-        if !(1e-15..1e15).contains(&self.product) {
-            self.taken.add(libm::logf(self.product));
-            self.product = 1.0;
-        }
-    }
-
-    fn value(&self) -> f32 {
-        self.taken.value() + libm::logf(self.product)
-    }
-}
+use crate::sum::{LogProduct, Sum};
+use crate::triangle::Triangle;
 
 /// Variance against which the product of variances is kept, that of 0.15 mm [m^2].
 const USUAL: f32 = 2.25e-8;
@@ -78,19 +33,19 @@ pub struct Level {
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f32 = 0.02;
 
-/// Information on `N` params and `B` baselines.
-#[derive(Debug, Clone)]
-pub struct Gaussian<const B: usize, const N: usize> {
+/// Information on `N` params and `B` baselines; `T` entries make a triangle of `N`.
+#[derive(Debug, Clone, Copy)]
+pub struct Gaussian<const B: usize, const N: usize, const T: usize> {
     /// Params at which the readings were linearised.
     origin: [f32; N],
-    /// Information matrix of the params, baselines eliminated; lower triangle, see [`Gaussian::mirror`].
-    information: SMatrix<f32, N, N>,
+    /// Information matrix of the params, baselines eliminated.
+    information: Triangle<N, T>,
     /// Rows that wait to enter the information, with their weights.
     staged: [[f32; N]; 4],
     staged_weight: [f32; 4],
     staged_rows: usize,
     /// Information vector of `theta - origin`.
-    vector: SVector<f32, N>,
+    vector: [f32; N],
     /// Baselines at the origin [m].
     baseline: [f32; B],
     /// How much less baseline a unit of a param leaves [m], one column a monitor.
@@ -106,27 +61,38 @@ pub struct Gaussian<const B: usize, const N: usize> {
     readings: Sum,
 }
 
-impl<const B: usize, const N: usize> Gaussian<B, N> {
-    /// The prior alone.
-    pub fn prior(prior: &Prior) -> Self {
+impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
+    /// Memory for one, all zero; [`Gaussian::reset`] makes it a distribution.
+    pub const BLANK: Self = Self {
+        origin: [0.0; N],
+        information: Triangle::ZERO,
+        staged: [[0.0; N]; 4],
+        staged_weight: [0.0; 4],
+        staged_rows: 0,
+        vector: [0.0; N],
+        baseline: [0.0; B],
+        slope: zeros(),
+        covariance: zeros(),
+        walked: false,
+        cost: Sum::ZERO,
+        volume: LogProduct::BLANK,
+        readings: Sum::ZERO,
+    };
+
+    /// The prior alone, its mean the origin.
+    pub fn reset(&mut self, prior: &Prior) {
         let precision = 1.0 / (prior.sigma * prior.sigma);
-        let mut gaussian = Self {
-            origin: [prior.mean; N],
-            information: SMatrix::from_diagonal_element(precision),
-            staged: [[0.0; N]; 4],
-            staged_weight: [0.0; 4],
-            staged_rows: 0,
-            vector: SVector::zeros(),
-            baseline: [0.0; B],
-            slope: SMatrix::zeros(),
-            covariance: SMatrix::from_diagonal_element(BASELINE * BASELINE),
-            walked: false,
-            cost: Sum::default(),
-            volume: LogProduct::ONE,
-            readings: Sum::default(),
-        };
-        gaussian.volume.taken.add(-(N as f32) * libm::logf(precision));
-        gaussian
+        self.origin = [prior.mean; N];
+        self.information.fill_diagonal(precision);
+        self.staged_rows = 0;
+        self.vector = [0.0; N];
+        self.baseline = [0.0; B];
+        self.slope.fill(0.0);
+        self.covariance.fill(0.0);
+        self.covariance.fill_diagonal(BASELINE * BASELINE);
+        self.walked = false;
+        (self.cost, self.volume, self.readings) = (Sum::ZERO, LogProduct::ONE, Sum::ZERO);
+        self.volume.add_log(-(N as f32) * libm::logf(precision));
     }
 
     /// Params at which innovations are to be formed.
@@ -157,7 +123,7 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         let s = variance + baseline_variance;
         let e = innovation - mean;
         self.stage(&d, 1.0 / s);
-        add(self.vector.as_mut_slice(), e / s, &d);
+        add(&mut self.vector, e / s, &d);
         self.cost.add(e * e / s);
         self.volume.multiply(s / USUAL);
         self.readings.add(1.0);
@@ -177,24 +143,12 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
 
     /// Let the last readings enter the information; to be called after a frame's.
     pub fn settle(&mut self) {
-        let weights = self.staged_weight.iter().take(self.staged_rows);
-        for (j, to) in self.information.as_mut_slice().chunks_exact_mut(N).enumerate() {
-            let from = block_start(j);
-            let terms = self.staged.iter().zip(weights.clone()).map(|(row, weight)| {
-                (weight * row.get(j).copied().unwrap_or(0.0), row.get(from..).unwrap_or_default())
-            });
-            combine(to.get_mut(from..).unwrap_or_default(), terms);
+        let rows = self.staged.iter().zip(&self.staged_weight).take(self.staged_rows);
+        for (j, to) in self.information.rows_mut().enumerate() {
+            let term = |(row, weight): (&'_ [f32; N], _)| weight * row.get(j).copied().unwrap_or(0.0);
+            combine(to, rows.clone().map(|(row, weight)| (term((row, weight)), row.as_slice())));
         }
         self.staged_rows = 0;
-    }
-
-    /// Copy the lower triangle of the information to the upper one.
-    fn mirror(&mut self) {
-        for j in 0..N {
-            for i in j + 1..N {
-                self.information[(j, i)] = self.information[(i, j)];
-            }
-        }
     }
 
     /// Move the baselines: without process noise that of monitor `b` alone, else all, for they are correlated.
@@ -235,7 +189,7 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
     pub fn add_repeats(&mut self, n: u32, variance: f32) {
         self.volume.multiply(n as f32);
         if variance != USUAL {
-            self.volume.taken.add((n as f32 - 1.0) * libm::logf(variance / USUAL));
+            self.volume.add_log((n as f32 - 1.0) * libm::logf(variance / USUAL));
         }
         self.readings.add(n as f32 - 1.0);
     }
@@ -247,14 +201,13 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
 
     /// Move the origin without changing the distribution.
     pub fn recentre(&mut self, origin: &[f32; N]) {
-        self.mirror();
-        let mut step = SVector::<f32, N>::zeros();
+        let mut step = [0.0; N];
         step.iter_mut().zip(origin.iter().zip(&self.origin)).for_each(|(s, (to, from))| *s = to - from);
-        let moved = self.information * step;
-        self.cost.add(step.dot(&moved) - 2.0 * step.dot(&self.vector));
-        self.vector -= moved;
+        let moved = self.information.multiply(&step);
+        self.cost.add(dot(&step, &moved) - 2.0 * dot(&step, &self.vector));
+        add(&mut self.vector, -1.0, &moved);
         for (mean, slope) in self.baseline.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
-            *mean -= dot(slope, step.as_slice());
+            *mean -= dot(slope, &step);
         }
         self.origin = *origin;
     }
@@ -263,42 +216,59 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
     ///
     /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.
     /// `solution` is that of this Gaussian and serves as work space.
-    pub fn walk(&mut self, sigma: f32, solution: &mut Solution<N>) {
-        self.mirror();
+    pub fn walk(&mut self, sigma: f32, solution: &mut Solution<N, T>) {
         let variance = sigma * sigma;
         let mean = solution.delta;
         let k = &mut solution.factor;
-        *k = self.information * variance;
-        for i in 0..N {
-            k[(i, i)] += 1.0;
+        for (i, (to, from)) in k.rows_mut().zip(self.information.rows()).enumerate() {
+            to.iter_mut().zip(from).for_each(|(to, y)| *to = variance * y);
+            to.get_mut(i).into_iter().for_each(|diagonal| *diagonal += 1.0);
         }
-        if cholesky(k).is_none() {
+        if k.factorise().is_none() {
             return; // 1 + a positive matrix; only a NaN could fail, and none can enter
         }
-        for column in self.information.as_mut_slice().chunks_exact_mut(N) {
-            solve(k, column);
+        // from the first row down: each finds the rest of its column, in the rows below, as it was
+        for i in 0..N {
+            let mut row = self.information.symmetric_row(i);
+            k.solve_lower(&mut row);
+            k.solve_upper(&mut row);
+            self.information.row_mut(i).iter_mut().zip(&row).for_each(|(to, y)| *to = *y);
         }
-        let before = self.slope;
-        for column in self.slope.as_mut_slice().chunks_exact_mut(N) {
-            solve(k, column);
-        }
-        self.covariance += before.tr_mul(&self.slope) * variance;
+        self.walk_baselines(variance, k, &mean);
         self.walked = true;
-        let shift = (self.slope - before).tr_mul(&mean);
-        self.baseline.iter_mut().zip(shift.iter()).for_each(|(mean, s)| *mean += s);
         // the best point and its chi-square stay
-        let best = self.cost.value() - self.vector.dot(&mean);
-        self.vector = self.information * mean;
-        self.cost = Sum::default();
-        self.cost.add(best + self.vector.dot(&mean));
+        let best = self.cost.value() - dot(&self.vector, &mean);
+        self.vector = self.information.multiply(&mean);
+        self.cost = Sum::ZERO;
+        self.cost.add(best + dot(&self.vector, &mean));
+    }
+
+    /// Slopes, covariance and, so that the best point stays, baselines; `K = L^-T L^-1`.
+    fn walk_baselines(&mut self, variance: f32, k: &Triangle<N, T>, mean: &[f32; N]) {
+        for (baseline, slope) in self.baseline.iter_mut().zip(self.slope.as_mut_slice().as_chunks_mut::<N>().0) {
+            *baseline -= dot(slope, mean);
+            k.solve_lower(slope);
+        }
+        let half = self.slope.as_slice().chunks_exact(N);
+        for (column, one) in self.covariance.as_mut_slice().chunks_exact_mut(B).zip(half.clone()) {
+            column.iter_mut().zip(half.clone()).for_each(|(c, other)| *c += variance * dot(one, other));
+        }
+        for (baseline, slope) in self.baseline.iter_mut().zip(self.slope.as_mut_slice().as_chunks_mut::<N>().0) {
+            k.solve_upper(slope);
+            *baseline += dot(slope, mean);
+        }
     }
 }
 
+/// Shares by which the information's diagonal is enlarged until it is positive: rounding of a sum of 48 squares in f32 is
+/// 3e-6 of it, and twice the diagonal of any covariance is positive.
+const SUPPORT: [f32; 6] = [0.0, 1e-6, 1e-5, 1e-4, 1e-2, 1.0];
+
 /// The best point of a [`Gaussian`], and its spread.
 #[derive(Debug, Clone)]
-pub struct Solution<const N: usize> {
+pub struct Solution<const N: usize, const T: usize> {
     /// Best point without bounds, relative to the origin.
-    pub delta: SVector<f32, N>,
+    pub delta: [f32; N],
     /// Best point within the prior's range: the MAP params.
     pub map_params: [f32; N],
     /// Standard deviation of each param.
@@ -309,51 +279,53 @@ pub struct Solution<const N: usize> {
     pub cost: f32,
     /// `ln` of the evidence: the density of all readings under the model.
     pub log_evidence: f32,
-    /// Lower Cholesky factor of the information.
-    factor: SMatrix<f32, N, N>,
-    /// Rows of the factor's inverse.
-    inverse: [[f32; N]; N],
+    /// Inverse of the information's lower Cholesky factor, `P = X^T X`.
+    factor: Triangle<N, T>,
 }
 
-impl<const N: usize> Default for Solution<N> {
-    fn default() -> Self {
-        Self {
-            delta: SVector::zeros(),
-            map_params: [0.0; N],
-            sigma: [0.0; N],
-            clipped: 0,
-            cost: 0.0,
-            log_evidence: 0.0,
-            factor: SMatrix::zeros(),
-            inverse: [[0.0; N]; N],
-        }
-    }
-}
+impl<const N: usize, const T: usize> Solution<N, T> {
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self {
+        delta: [0.0; N],
+        map_params: [0.0; N],
+        sigma: [0.0; N],
+        clipped: 0,
+        cost: 0.0,
+        log_evidence: 0.0,
+        factor: Triangle::ZERO,
+    };
 
-impl<const N: usize> Solution<N> {
-    /// Solve a Gaussian. If rounding has made its information singular, the last solution stays and this is false.
-    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N>, prior: &Prior) -> bool {
+    /// Solve a Gaussian. Where rounding has made its information singular, the diagonal is enlarged by as little as makes
+    /// it positive again, and this is false.
+    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: &Prior) -> bool {
         const { assert!(N <= 64, "clipped params are counted in one u64") };
-        self.factor.copy_from(&gaussian.information);
-        let Some(log_determinant) = cholesky(&mut self.factor) else { return false };
+        let mut support = SUPPORT.into_iter();
+        let log_determinant = loop {
+            let Some(more) = support.next() else { return false };
+            self.factor = gaussian.information;
+            self.factor.rows_mut().filter_map(<[f32]>::last_mut).for_each(|diagonal| *diagonal *= 1.0 + more);
+            if let Some(log_determinant) = self.factor.factorise() {
+                break log_determinant;
+            }
+        };
         self.delta = gaussian.vector;
-        solve(&self.factor, self.delta.as_mut_slice());
-        invert_lower(&self.factor, &mut self.inverse);
-        // P = X^T X, X the inverse of the factor
+        self.factor.solve_lower(&mut self.delta);
+        self.factor.solve_upper(&mut self.delta);
+        self.factor.invert();
         let mut variance = [0.0; N];
-        for row in &self.inverse {
+        for row in self.factor.rows() {
             variance.iter_mut().zip(row).for_each(|(v, x)| *v += x * x);
         }
         self.sigma = variance.map(libm::sqrtf);
-        self.cost = gaussian.cost.value() - gaussian.vector.dot(&self.delta);
+        self.cost = gaussian.cost.value() - dot(&gaussian.vector, &self.delta);
         let volume = gaussian.volume.value() + LN_USUAL * gaussian.readings.value();
         self.log_evidence = -0.5 * (self.cost + volume + log_determinant);
         self.bound(gaussian, prior);
-        true
+        support.len() + 1 == SUPPORT.len()
     }
 
     /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
-    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N>, prior: &Prior) {
+    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: &Prior) {
         let bounded = |theta: f32| theta.clamp(prior.lower, prior.upper);
         let mut outside = false;
         for ((map, delta), origin) in self.map_params.iter_mut().zip(self.delta.iter()).zip(&gaussian.origin) {
@@ -369,7 +341,7 @@ impl<const N: usize> Solution<N> {
             for i in 0..N {
                 let pull = gaussian.pull(i, &self.map_params);
                 if let Some(map) = self.map_params.get_mut(i) {
-                    *map = bounded(*map + pull / gaussian.information[(i, i)]);
+                    *map = bounded(*map + pull / gaussian.information.get(i, i));
                 }
             }
         }
@@ -380,25 +352,25 @@ impl<const N: usize> Solution<N> {
 
     /// Covariance of two params.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
-        self.inverse.iter().filter_map(|row| Some(row.get(i)? * row.get(j)?)).sum()
+        self.factor.rows().skip(i.max(j)).filter_map(|row| Some(row.get(i)? * row.get(j)?)).sum()
     }
 
     /// Variance of a prediction with derivative `h`: `h^T P h`.
     pub fn variance_of(&self, h: &[f32]) -> f32 {
-        let image = |row: &[f32; N]| {
+        let image = |row: &[f32]| {
             let x = dot(row, h);
             x * x
         };
-        self.inverse.iter().map(image).sum()
+        self.factor.rows().map(image).sum()
     }
 }
 
-impl<const B: usize, const N: usize> Gaussian<B, N> {
+impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
     /// Downhill pull on param `i` at a point: minus half the derivative of chi-square.
     fn pull(&self, i: usize, at: &[f32; N]) -> f32 {
-        let information = |j: usize| self.information[(i.max(j), i.min(j))];
-        let steps = at.iter().zip(&self.origin).enumerate().map(|(j, (at, origin))| information(j) * (at - origin));
-        self.vector.as_slice().get(i).copied().unwrap_or(0.0) - steps.sum::<f32>()
+        let steps = at.iter().zip(&self.origin).enumerate();
+        let steps = steps.map(|(j, (at, origin))| self.information.get(i, j) * (at - origin));
+        self.vector.get(i).copied().unwrap_or(0.0) - steps.sum::<f32>()
     }
 
     /// Derivative of the difference between a reading and its baseline, and the variance of the baseline.
@@ -406,71 +378,7 @@ impl<const B: usize, const N: usize> Gaussian<B, N> {
         let mut d = [0.0; N];
         let slope = column(self.slope.as_slice(), N, b);
         d.iter_mut().zip(h).zip(slope).for_each(|((d, h), slope)| *d = h - slope);
-        (d, if b < B { self.covariance[(b, b)] } else { 0.0 })
-    }
-}
-
-/// Cholesky factor `L` of a symmetric matrix, in place, and the logarithm of its determinant; none if it is not
-/// positive. nalgebra's own takes the matrix by value, 9 kB of stack.
-fn cholesky<const N: usize>(a: &mut SMatrix<f32, N, N>) -> Option<f32> {
-    let mut determinant = LogProduct::ONE;
-    for j in 0..N {
-        let from = block_start(j);
-        let (done, rest) = a.as_mut_slice().split_at_mut_checked(j * N)?;
-        let column = rest.get_mut(from..N)?;
-        combine(
-            column,
-            done.chunks_exact(N).map(|before| (-before.get(j).unwrap_or(&0.0), before.get(from..).unwrap_or_default())),
-        );
-        let lower = column.get_mut(j - from..)?;
-        let pivot = *lower.first()?;
-        if pivot.is_nan() || pivot <= 0.0 {
-            return None;
-        }
-        let scale = 1.0 / libm::sqrtf(pivot);
-        lower.iter_mut().for_each(|v| *v *= scale);
-        determinant.multiply(pivot);
-    }
-    Some(determinant.value())
-}
-
-/// Solve `L L^T x = b`, in place.
-fn solve<const N: usize>(factor: &SMatrix<f32, N, N>, x: &mut [f32]) {
-    for (k, column) in factor.as_slice().chunks_exact(N).enumerate() {
-        if let (Some((top, under)), Some([pivot, below @ ..])) =
-            (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
-        {
-            *top /= pivot;
-            add(under, -*top, below);
-        }
-    }
-    for (k, column) in factor.as_slice().chunks_exact(N).enumerate().rev() {
-        if let (Some((top, under)), Some([pivot, below @ ..])) =
-            (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k..))
-        {
-            *top = (*top - dot(under, below)) / pivot;
-        }
-    }
-}
-
-/// Rows of the inverse of a lower triangle: `row_i = (e_i - sum over k < i of L_ik row_k)/L_ii`.
-fn invert_lower<const N: usize>(factor: &SMatrix<f32, N, N>, rows: &mut [[f32; N]; N]) {
-    for i in 0..N {
-        let Some((done, [row, ..])) = rows.split_at_mut_checked(i) else { return };
-        let entry = |k: usize| column(factor.as_slice(), N, k).get(i).copied().unwrap_or(0.0);
-        row.fill(0.0);
-        // in blocks of the rows above: each is zero beyond its own diagonal
-        for (block, before) in done.chunks(BLOCK).enumerate() {
-            let length = (BLOCK * (block + 1)).min(N);
-            let terms = before.iter().enumerate();
-            let terms = terms.map(|(k, before)| (-entry(BLOCK * block + k), before.as_slice()));
-            combine(row.get_mut(..length).unwrap_or_default(), terms);
-        }
-        if let Some(one) = row.get_mut(i) {
-            *one = 1.0;
-        }
-        let scale = 1.0 / entry(i);
-        row.iter_mut().for_each(|v| *v *= scale);
+        (d, column(self.covariance.as_slice(), B, b).get(b).copied().unwrap_or(0.0))
     }
 }
 
@@ -497,10 +405,16 @@ mod tests {
             .collect()
     }
 
+    fn prior() -> Gaussian<2, 2, 3> {
+        let mut gaussian = Gaussian::BLANK;
+        gaussian.reset(&WIDE);
+        gaussian
+    }
+
     const VARIANCE: f32 = 1.5e-4 * 1.5e-4;
 
-    fn conditioned() -> Gaussian<2, 2> {
-        let mut gaussian = Gaussian::prior(&WIDE);
+    fn conditioned() -> Gaussian<2, 2, 3> {
+        let mut gaussian = prior();
         for (b, innovation, h) in readings() {
             gaussian.condition(b, innovation, VARIANCE, &h);
         }
@@ -527,8 +441,8 @@ mod tests {
         (x, p)
     }
 
-    fn assert_equal(gaussian: &Gaussian<2, 2>, walks: &[usize], walk: f64) {
-        let mut solution = Solution::default();
+    fn assert_equal(gaussian: &Gaussian<2, 2, 3>, walks: &[usize], walk: f64) {
+        let mut solution = Solution::BLANK;
         assert!(solution.solve(gaussian, &WIDE));
         let (x, p) = batch(walks, walk);
         for i in 0..2 {
@@ -548,7 +462,7 @@ mod tests {
     #[test]
     fn recentring_changes_nothing() {
         let mut gaussian = conditioned();
-        let (mut before, mut after) = (Solution::default(), Solution::default());
+        let (mut before, mut after) = (Solution::BLANK, Solution::BLANK);
         before.solve(&gaussian, &WIDE);
         gaussian.recentre(&[0.01, -0.02]);
         after.solve(&gaussian, &WIDE);
@@ -558,23 +472,23 @@ mod tests {
 
     #[test]
     fn a_walk_is_a_kalman_prediction() {
-        let mut gaussian = Gaussian::prior(&WIDE);
-        let mut solution = Solution::default();
+        let mut gaussian = prior();
+        let mut solution = Solution::BLANK;
         for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
             if i == 10 || i == 25 {
                 solution.solve(&gaussian, &WIDE);
-                gaussian.walk(2e-3, &mut solution);
+                gaussian.walk(2e-2, &mut solution);
             }
             gaussian.condition(b, innovation, VARIANCE, &h);
             gaussian.settle();
         }
-        assert_equal(&gaussian, &[10, 25], 2e-3);
+        assert_equal(&gaussian, &[10, 25], 2e-2);
     }
 
     /// The evidence is the product of the predictive densities of the readings, one after another.
     #[test]
     fn evidence_is_the_product_of_predictions() {
-        let (mut gaussian, mut solution) = (Gaussian::<2, 2>::prior(&WIDE), Solution::default());
+        let (mut gaussian, mut solution) = (prior(), Solution::BLANK);
         let mut log_density = 0.0;
         for (b, innovation, h) in readings() {
             solution.solve(&gaussian, &WIDE);
@@ -593,20 +507,12 @@ mod tests {
     fn a_param_beyond_its_range_is_clipped_and_the_other_follows() {
         let narrow = Prior { upper: 0.005, ..WIDE };
         let gaussian = conditioned();
-        let mut solution = Solution::default();
+        let mut solution = Solution::BLANK;
         solution.solve(&gaussian, &narrow);
         assert_eq!(solution.clipped, 0b01);
         assert_eq!(solution.map_params[0], narrow.upper);
         // at the constrained best point nothing pulls on the free param
-        let pull = gaussian.pull(1, &solution.map_params) / gaussian.information[(1, 1)];
+        let pull = gaussian.pull(1, &solution.map_params) / gaussian.information.get(1, 1);
         assert!(pull.abs() < 1e-6, "{pull}");
-    }
-
-    #[test]
-    fn compensated_sums_lose_nothing() {
-        let mut sum = Sum::default();
-        sum.add(1e8);
-        (0..1_000_000).for_each(|_| sum.add(1.0));
-        assert_eq!(sum.value(), 1.01e8);
     }
 }

@@ -16,14 +16,17 @@ mod gaussian;
 mod linear;
 mod monitor;
 mod prior;
+mod sum;
 pub mod surrogate;
+mod triangle;
 
 pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Beyond, Calibration, Drive};
 pub use estimate::{Estimate, Health, MonitorState};
-pub use estimator::{Estimator, FitQuality, IngestError, Model};
+pub use estimator::{Estimator, FitQuality, IngestError, Model, Setup};
 pub use frame::{CurrentCode, Frame, FrameError, MagnetCurrents, PositionCode, RfCode, TuneCode};
 pub use gaussian::{Gaussian, Solution};
 pub use monitor::{Gate, Monitor, Noise};
 pub use prior::{Marginal, Prior};
 pub use surrogate::{Prediction, Surrogate};
+pub use triangle::Triangle;

@@ -1,6 +1,8 @@
 //! The loops that everything else is made of, over plain slices. Sums run in a fixed order, so that host and chip agree
 //! to the bit.
 
+use nalgebra::{ArrayStorage, SMatrix};
+
 /// `to += factor * from`.
 #[inline]
 pub fn add(to: &mut [f32], factor: f32, from: &[f32]) {
@@ -26,18 +28,11 @@ pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>
     }
 }
 
-/// Length of the blocks in which triangles are worked on: whole vectors, and not much beyond the triangle.
-pub const BLOCK: usize = 16;
-
-/// The start of the block that holds `i`.
-#[inline]
-pub fn block_start(i: usize) -> usize {
-    i - i % BLOCK
-}
-
-/// Scalar product, summed in eight lanes.
+/// Scalar product, summed in eight lanes; what one has beyond the other's end does not count.
 #[inline]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let shared = a.len().min(b.len());
+    let (Some(a), Some(b)) = (a.get(..shared), b.get(..shared)) else { return 0.0 };
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
     let mut lanes = [0.0; 8];
     for (a, b) in a.iter().zip(b) {
@@ -45,6 +40,11 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     }
     let rest: f32 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
     lanes.iter().sum::<f32>() + rest
+}
+
+/// A matrix of zeros, known to the compiler.
+pub const fn zeros<const R: usize, const C: usize>() -> SMatrix<f32, R, C> {
+    SMatrix::from_array_storage(ArrayStorage([[0.0; R]; C]))
 }
 
 /// Column `index` of a matrix of `rows` rows stored by columns; empty beyond the last.
@@ -60,6 +60,7 @@ mod tests {
     fn every_entry_counts_once() {
         let a: [f32; 19] = core::array::from_fn(|i| i as f32);
         assert_eq!(dot(&a, &[1.0; 19]), 171.0);
+        assert_eq!((dot(&a, &[1.0; 12]), dot(&[1.0; 12], &a)), (66.0, 66.0));
         let mut b = [1.0; 19];
         add(&mut b, 2.0, &a);
         assert!(b.iter().enumerate().all(|(i, b)| *b == 1.0 + 2.0 * i as f32));

@@ -5,11 +5,12 @@
 //! whatever the model says. Batch fits use these same definitions.
 
 use micromath::F32Ext;
+use serde::{Deserialize, Serialize};
 
 use crate::estimate::{Health, MonitorState};
 
 /// Decides whether two readings, or a reading and its prediction, agree.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Gate {
     /// Standard deviations allowed. At 5, one good reading in two million is refused.
     pub sigmas: f32,
@@ -66,9 +67,12 @@ pub struct Noise {
 }
 
 impl Noise {
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self { expected: 0.0, sigma: 0.0, total: 0, histogram: [0; BINS] };
+
     /// Expect `sigma` [m].
     pub fn expecting(sigma: f32) -> Self {
-        Self { expected: sigma, sigma, total: 0, histogram: [0; BINS] }
+        Self { expected: sigma, sigma, ..Self::BLANK }
     }
 
     /// Noise in use [m].
@@ -153,18 +157,21 @@ pub struct Monitor {
 }
 
 impl Monitor {
-    /// A monitor with an expected noise [m].
-    pub fn expecting(sigma: f32) -> Self {
-        Self {
-            noise: Noise::expecting(sigma),
-            state: MonitorState::Ok,
-            jumps: false,
-            reported: 0,
-            rejected: 0,
-            silent: 0,
-            last_code: 0,
-            unchanged: 0,
-        }
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self {
+        noise: Noise::BLANK,
+        state: MonitorState::Ok,
+        jumps: false,
+        reported: 0,
+        rejected: 0,
+        silent: 0,
+        last_code: 0,
+        unchanged: 0,
+    };
+
+    /// Begin anew, with an expected noise [m].
+    pub fn expect(&mut self, sigma: f32) {
+        *self = Self { noise: Noise::expecting(sigma), ..Self::BLANK };
     }
 
     /// Take note of a report (a code) or its absence; true if the reading can be used.
@@ -291,7 +298,8 @@ mod tests {
 
     #[test]
     fn silent_and_stuck_monitors_are_dead_until_they_speak() {
-        let mut monitor = Monitor::expecting(1.5e-4);
+        let mut monitor = Monitor::BLANK;
+        monitor.expect(1.5e-4);
         for _ in 0..SILENCE {
             monitor.hear(None);
         }

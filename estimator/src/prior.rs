@@ -3,8 +3,10 @@
 //! The params are `theta = ln var`; a lognormal var of mean 1 and width `w` has
 //! `sigma^2 = ln(1 + w^2)` and `mean of theta = -sigma^2/2`. Both are truncated to 0.94..1.06 (the paper's range).
 
+use serde::{Deserialize, Serialize};
+
 /// Prior of one `theta = ln var`.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Prior {
     /// Mean of theta.
     pub mean: f32,

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use inference::Recording;
-use inference::stream::{self, Booster, BoosterEstimate, BoosterFrame};
+use inference::stream::{self, BoosterEstimate, BoosterFrame, Core};
 use libfuzzer_sys::fuzz_target;
 use twin::Ring;
 
@@ -17,7 +17,7 @@ const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 struct Campaign {
     /// A core at its prior, whose params walk; and one that has heard the first `HEARD` frames.
-    cores: [Box<Booster>; 2],
+    cores: [Core; 2],
     /// Bodies of all frames.
     bodies: Vec<Vec<u8>>,
 }
@@ -65,7 +65,8 @@ fn is_finite(e: &BoosterEstimate) -> bool {
     lists.into_iter().flatten().chain([&e.nis, &e.log_evidence]).all(|v| v.is_finite())
 }
 
-fn ingest(core: &mut Booster, wire: &[u8]) {
+fn ingest(core: &mut Core, wire: &[u8]) {
+    core.prepare();
     if let Ok(estimate) = core.ingest(&mut wire.to_vec()) {
         assert!(is_sealed(wire), "accepted without its CRC");
         assert!(is_finite(&estimate), "{estimate:?}");

@@ -2,7 +2,7 @@
 
 use comfy_table::{CellAlignment, Table, presets};
 use estimator::{FitQuality, Health, Marginal, MonitorState};
-use inference::stream::{Booster, BoosterEstimate};
+use inference::stream::{BoosterEstimate, Core};
 use inference::{BatchFit, Recording};
 use serde::Serialize;
 use twin::{Hold, Optics, Ring};
@@ -74,12 +74,12 @@ impl Answer {
     pub fn of_core(
         ring: &Ring,
         recording: &Recording,
-        core: &Booster,
+        core: &Core,
         last: &BoosterEstimate,
         quality: FitQuality,
         timing: Timing,
     ) -> Self {
-        let marginals: Vec<Marginal> = (0..48).filter_map(|i| last.marginal(i, &core.model().prior)).collect();
+        let marginals: Vec<Marginal> = (0..48).filter_map(|i| last.marginal(i, &core.setup.prior)).collect();
         let vars = vars(ring, &marginals, |i| last.clipped >> i & 1 == 1);
         Self {
             recording: recording.name.clone(),

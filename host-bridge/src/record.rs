@@ -1,7 +1,7 @@
 //! An estimate as every process on the machine sees it: plain data of one size, the same for readers in any language.
 
 use iceoryx2::prelude::ZeroCopySend;
-use inference::stream::{Booster, BoosterEstimate};
+use inference::stream::{BoosterEstimate, Core};
 
 /// Vars in a record.
 pub const VARS: usize = 48;
@@ -116,7 +116,7 @@ impl EstimateRecord {
     };
 
     /// What the core says after a frame; the publisher adds its stamps.
-    pub fn of(estimate: &BoosterEstimate, core: &Booster) -> Self {
+    pub fn of(estimate: &BoosterEstimate, core: &Core) -> Self {
         Self {
             time_us: estimate.time_us,
             clipped: estimate.clipped,

@@ -1,16 +1,17 @@
 //! A recording as the core sees it: wire frames, and a model made of its header.
 
 use estimator::{
-    Calibration, CurrentCode, Estimate, Estimator, Frame, FrameError, Gate, IngestError, MagnetCurrents, Model,
-    PositionCode, Prior, RfCode, TuneCode,
+    Calibration, CurrentCode, Estimate, Estimator, FitQuality, Frame, FrameError, Gate, IngestError, MagnetCurrents,
+    Model, PositionCode, Prior, RfCode, Setup, TuneCode,
 };
 use training::BoosterGreen;
 use twin::Ring;
 
 use crate::recording::{Header, Layout, Recording, Row};
 
-/// The core for the Booster: 33 monitors, 48 correctors, 48 params, room for 112 settings.
-pub type Booster = Estimator<BoosterGreen, 33, 48, 48, 112>;
+/// The core for the Booster: 33 monitors, 48 correctors, 48 params (1176 pairs of them), and room for 100 settings: each
+/// corrector up and down, none, and three of the RF.
+pub type Booster = Estimator<BoosterGreen, 33, 48, 48, 100, 1176>;
 /// Its frame.
 pub type BoosterFrame = Frame<33, 48>;
 /// Its estimate.
@@ -106,20 +107,80 @@ pub fn calibration(recording: &Recording) -> Result<Calibration, StreamError> {
     })
 }
 
-/// The core at its prior, for a recording of a ring. Boxed: its state is some 300 kB.
+/// A core on the host, with the model that it goes by. Boxed: its state is some 150 kB.
+#[derive(Debug, Clone)]
+pub struct Core {
+    /// The ring.
+    pub tables: Box<BoosterGreen>,
+    /// What else is known beforehand.
+    pub setup: Setup,
+    state: Box<Booster>,
+}
+
+impl Core {
+    /// The core at its prior.
+    ///
+    /// # Errors
+    /// [`StreamError`] if the ring does not fit the core.
+    pub fn try_new(ring: &Ring, setup: Setup) -> Result<Self, StreamError> {
+        let mut core =
+            Self { tables: Box::new(training::green::tables(ring)?), setup, state: Box::new(Booster::BLANK) };
+        let (model, state) = core.parts();
+        state.restart(&model).expect("tables of a stable ring have a design");
+        Ok(core)
+    }
+
+    fn parts(&mut self) -> (Model<'_, BoosterGreen>, &mut Booster) {
+        (Model { surrogate: &self.tables, setup: &self.setup }, &mut self.state)
+    }
+
+    /// One machine cycle: bytes to estimate. See [`Estimator::ingest`].
+    ///
+    /// # Errors
+    /// [`IngestError`].
+    pub fn ingest(&mut self, bytes: &mut [u8]) -> Result<BoosterEstimate, IngestError> {
+        let (model, state) = self.parts();
+        state.ingest(&model, bytes)
+    }
+
+    /// What is done between frames. See [`Estimator::prepare`].
+    pub fn prepare(&mut self) -> bool {
+        let (model, state) = self.parts();
+        state.prepare(&model)
+    }
+
+    /// How well the model describes the frames so far. See [`Estimator::fit_quality`].
+    pub fn fit_quality(&mut self) -> FitQuality {
+        let (model, state) = self.parts();
+        state.fit_quality(&model)
+    }
+
+    /// Covariance of two params `theta = ln var`.
+    pub fn covariance(&self, i: usize, j: usize) -> f32 {
+        self.state.covariance(i, j)
+    }
+}
+
+/// What is known beforehand of a recording, from its header.
 ///
 /// # Errors
-/// [`StreamError`] if the ring or the recording do not fit the core.
-pub fn estimator(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Box<Booster>, StreamError> {
-    let model = Model {
-        surrogate: training::green::tables(ring)?,
+/// [`StreamError::Transfer`].
+pub fn setup(recording: &Recording, process_noise: f32) -> Result<Setup, StreamError> {
+    Ok(Setup {
         prior: Prior::lognormal(PRIOR_WIDTH),
         calibration: calibration(recording)?,
         noise: recording.header.bpm_sigma as f32,
         gate: Gate::default(),
         process_noise,
-    };
-    Ok(Box::new(Booster::try_new(model).expect("tables of a stable ring have a design")))
+    })
+}
+
+/// The core at its prior, for a recording of a ring.
+///
+/// # Errors
+/// [`StreamError`] if the ring or the recording do not fit the core.
+pub fn estimator(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Core, StreamError> {
+    Core::try_new(ring, setup(recording, process_noise)?)
 }
 
 /// A row as a frame.
@@ -185,11 +246,12 @@ pub fn wire(recording: &Recording, row: &Row) -> Result<Vec<u8>, StreamError> {
 /// # Errors
 /// [`StreamError`]; a recording that was read without error holds no frame that a core refuses.
 pub fn replay(
-    core: &mut Booster,
+    core: &mut Core,
     recording: &Recording,
     mut hear: impl FnMut(&Row, &BoosterEstimate),
 ) -> Result<(), StreamError> {
     for row in &recording.rows {
+        core.prepare();
         let estimate = core.ingest(&mut wire(recording, row)?).map_err(|source| StreamError::Ingest {
             recording: recording.name.clone(),
             sequence: row.sequence,

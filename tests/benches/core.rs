@@ -3,7 +3,7 @@
 use divan::{Bencher, black_box};
 use estimator::surrogate::Surrogate;
 use estimator::{Calibration, Drive, Frame, Gaussian, Prediction, Prior, Solution};
-use inference::stream::{self, Booster, BoosterFrame};
+use inference::stream::{self, BoosterFrame, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
 use training::BoosterGreen;
@@ -18,7 +18,7 @@ type Linearised = <BoosterGreen as Surrogate<33, 48, 48>>::Linearised;
 /// Frames of `recordings/paper-vars` as wire bytes, and a core that has heard some of them.
 struct Campaign {
     wires: Vec<Vec<u8>>,
-    core: Box<Booster>,
+    core: Core,
 }
 
 impl Campaign {
@@ -29,38 +29,49 @@ impl Campaign {
         Self { wires: wires.unwrap(), core: stream::estimator(&ring, &recording, 0.0).unwrap() }
     }
 
-    /// The core just before each frame after which it linearises anew, or does not, and the frame.
-    fn moments(mut self, linearised: bool) -> Vec<(Box<Booster>, Vec<u8>)> {
-        let mut moments = Vec::new();
+    /// The core just before each frame, and the frame.
+    fn frames(mut self) -> Vec<(Core, Vec<u8>)> {
+        let mut frames = Vec::new();
         for wire in &self.wires {
-            let before = self.core.clone();
-            if self.core.ingest(&mut wire.clone()).unwrap().linearised == linearised {
-                moments.push((before, wire.clone()));
+            self.core.prepare();
+            frames.push((self.core.clone(), wire.clone()));
+            self.core.ingest(&mut wire.clone()).unwrap();
+        }
+        frames
+    }
+
+    /// The core just before each time that it linearises anew.
+    fn linearisations(mut self) -> Vec<Core> {
+        let mut before = Vec::new();
+        for wire in &self.wires {
+            self.core.ingest(&mut wire.clone()).unwrap();
+            let core = self.core.clone();
+            if self.core.prepare() {
+                before.push(core);
             }
         }
-        moments
+        before
     }
 }
 
-/// Times of a frame at every moment of a campaign; divan's median is then that over its frames.
-fn ingest(bencher: Bencher, linearised: bool) {
-    let moments = Campaign::read().moments(linearised);
-    let mut next = (0..moments.len()).cycle();
+/// A frame from its bytes to the estimate, over a campaign; divan's median is then that over its frames.
+#[divan::bench(sample_count = 1000, sample_size = 1)]
+fn frame(bencher: Bencher) {
+    let frames = Campaign::read().frames();
+    let mut next = frames.iter().cycle();
     bencher
-        .with_inputs(|| moments[next.next().expect("a cycle does not end")].clone())
+        .with_inputs(|| next.next().expect("a cycle does not end").clone())
         .bench_local_values(|(mut core, mut wire)| (core.ingest(black_box(&mut wire)), core));
 }
 
-/// A frame from its bytes to the estimate, over those of a campaign that do not linearise anew.
-#[divan::bench(sample_count = 1000, sample_size = 1)]
-fn frame(bencher: Bencher) {
-    ingest(bencher, false);
-}
-
-/// A frame after which the surrogate is linearised anew and all settings so far are counted again.
+/// Between frames: the surrogate linearised anew and all settings so far counted again.
 #[divan::bench(sample_size = 1)]
-fn frame_with_linearisation(bencher: Bencher) {
-    ingest(bencher, true);
+fn linearise_anew(bencher: Bencher) {
+    let before = Campaign::read().linearisations();
+    let mut next = before.iter().cycle();
+    bencher
+        .with_inputs(|| next.next().expect("a cycle does not end").clone())
+        .bench_local_values(|mut core| (core.prepare(), core));
 }
 
 /// Bytes to frame: COBS, CRC, body, ranges.
@@ -88,8 +99,9 @@ fn drive(calibration: &Calibration) -> Drive<48> {
 /// Tables, linearised at vars of a few per cent, and what they predict.
 fn predicted() -> (BoosterGreen, Box<Linearised>, Drive<48>, Box<Prediction<33, 48>>) {
     let core = Campaign::read().core;
-    let (tables, drive) = (core.model().surrogate.clone(), drive(&core.model().calibration));
-    let (mut linearised, mut prediction) = (Box::<Linearised>::default(), Box::<Prediction<33, 48>>::default());
+    let (tables, drive) = (BoosterGreen::clone(&core.tables), drive(&core.setup.calibration));
+    let (mut linearised, mut prediction) =
+        (Box::new(<BoosterGreen as Surrogate<33, 48, 48>>::BLANK), Box::new(Prediction::BLANK));
     linearise(&tables, &mut linearised);
     tables.predict(&linearised, &drive, &mut prediction);
     (tables, linearised, drive, prediction)
@@ -116,8 +128,14 @@ fn predict(bencher: Bencher) {
 
 const PRIOR_WIDTH: f32 = 0.03;
 
+fn prior(prior: &Prior) -> Box<Gaussian<33, 48, 1176>> {
+    let mut gaussian = Box::new(Gaussian::BLANK);
+    gaussian.reset(prior);
+    gaussian
+}
+
 /// A frame's 33 readings enter the Gaussian.
-fn condition_all(gaussian: &mut Gaussian<33, 48>, prediction: &Prediction<33, 48>) {
+fn condition_all(gaussian: &mut Gaussian<33, 48, 1176>, prediction: &Prediction<33, 48>) {
     for (b, slope) in prediction.jacobian.as_slice().chunks_exact(48).enumerate() {
         gaussian.condition(b, black_box(1e-3), 2.25e-8, slope);
     }
@@ -128,7 +146,7 @@ fn condition_all(gaussian: &mut Gaussian<33, 48>, prediction: &Prediction<33, 48
 #[divan::bench]
 fn condition(bencher: Bencher) {
     let (.., prediction) = predicted();
-    let mut gaussian = Box::new(Gaussian::prior(&Prior::lognormal(PRIOR_WIDTH)));
+    let mut gaussian = prior(&Prior::lognormal(PRIOR_WIDTH));
     bencher.bench_local(|| condition_all(&mut gaussian, &prediction));
 }
 
@@ -136,15 +154,15 @@ fn condition(bencher: Bencher) {
 #[divan::bench]
 fn solve(bencher: Bencher) {
     let (.., prediction) = predicted();
-    let prior = Prior::lognormal(PRIOR_WIDTH);
-    let (mut gaussian, mut solution) = (Box::new(Gaussian::prior(&prior)), Box::<Solution<48>>::default());
+    let width = Prior::lognormal(PRIOR_WIDTH);
+    let (mut gaussian, mut solution) = (prior(&width), Box::new(Solution::BLANK));
     condition_all(&mut gaussian, &prediction);
-    bencher.bench_local(|| assert!(solution.solve(black_box(&gaussian), &prior)));
+    bencher.bench_local(|| assert!(solution.solve(black_box(&gaussian), &width)));
 }
 
 /// The surrogate's tables from the twin.
 #[divan::bench]
 fn tables(bencher: Bencher) {
     let ring = Ring::booster();
-    bencher.bench_local(|| training::green::tables::<15, 18, 24, 24, 96>(black_box(&ring)).unwrap());
+    bencher.bench_local(|| training::green::tables::<15, 18, 24, 24, 96, 4656>(black_box(&ring)).unwrap());
 }

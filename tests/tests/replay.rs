@@ -1,7 +1,7 @@
 //! The main job on the recordings that ship with the repository: readings in, vars out, against the truth, against the
 //! exact batch answer, and in another order.
 
-use inference::stream::{self, Booster, BoosterEstimate};
+use inference::stream::{self, BoosterEstimate, Core};
 use inference::{BatchFit, Recording};
 use nalgebra::{DMatrix, DVector};
 use system_tests::{repository, truth};
@@ -10,7 +10,7 @@ use twin::Ring;
 struct Replayed {
     ring: Ring,
     recording: Recording,
-    core: Box<Booster>,
+    core: Core,
     last: BoosterEstimate,
 }
 

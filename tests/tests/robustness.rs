@@ -3,11 +3,11 @@
 
 use estimator::surrogate::Surrogate;
 use estimator::{
-    CurrentCode, Frame, FrameError, IngestError, MagnetCurrents, Model, MonitorState, PositionCode, Prior, RfCode,
+    CurrentCode, Frame, FrameError, IngestError, MagnetCurrents, MonitorState, PositionCode, Prior, RfCode, Setup,
     TuneCode,
 };
 use inference::Recording;
-use inference::stream::{self, Booster, BoosterEstimate, BoosterFrame};
+use inference::stream::{self, BoosterEstimate, BoosterFrame, Core};
 use nalgebra::{DMatrix, DVector};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -220,7 +220,7 @@ fn faulty(
 }
 
 /// Everything that an estimate says, to the bit, but the number of refused frames.
-fn bits(core: &Booster, estimate: &BoosterEstimate) -> Vec<u64> {
+fn bits(core: &Core, estimate: &BoosterEstimate) -> Vec<u64> {
     let e = estimate;
     let of = |values: &[f32]| values.iter().map(|v| u64::from(v.to_bits())).collect::<Vec<_>>();
     let health = e.health.iter().flat_map(|h| {
@@ -244,6 +244,8 @@ fn ten_thousand_faulty_frames_leave_the_posterior_as_it_was() {
     let mut disturbed = alone.clone();
     let (mut random, mut thrown) = (Random::new(1), 0);
     for (at, wire) in good.iter().enumerate() {
+        alone.prepare();
+        disturbed.prepare();
         let expected = alone.ingest(&mut wire.clone()).unwrap();
         let estimate = disturbed.ingest(&mut wire.clone()).unwrap();
         assert_eq!(bits(&disturbed, &estimate), bits(&alone, &expected), "frame {at}");
@@ -269,11 +271,15 @@ fn seeded(cases: u32) -> ProptestConfig {
 }
 
 /// A core that has heard 150 frames, and what it said last.
-fn seasoned() -> (Box<Booster>, BoosterEstimate) {
+fn seasoned() -> (Core, BoosterEstimate) {
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
-    let heard = wires(&recording).iter_mut().take(150).map(|wire| core.ingest(wire).unwrap()).last();
-    (core, heard.unwrap())
+    let mut last = None;
+    for mut wire in wires(&recording).into_iter().take(150) {
+        core.prepare();
+        last = Some(core.ingest(&mut wire).unwrap());
+    }
+    (core, last.unwrap())
 }
 
 /// The CRC of whatever these bytes hold is right.
@@ -380,7 +386,7 @@ fn frame() -> impl Strategy<Value = BoosterFrame> {
 }
 
 /// What holds of an estimate whatever the frames were.
-fn check(core: &Booster, estimate: &BoosterEstimate, prior: &Prior, walks: bool) -> Result<(), String> {
+fn check(core: &Core, estimate: &BoosterEstimate, prior: &Prior, walks: bool) -> Result<(), String> {
     let e = estimate;
     let finite = [e.mean, e.sigma, e.map_params, e.centre, e.params_sigma].concat();
     if !finite.iter().chain(&[e.nis, e.log_evidence]).all(|v| v.is_finite()) {
@@ -421,15 +427,17 @@ fn extreme_frames_leave_every_estimate_sound() {
     proptest!(seeded(300), |(frames in frames, walks in 0..2_usize, ordered: bool, heard in 0..40_usize)| {
         let mut core = starts[walks].clone();
         for mut wire in wires(&recording).into_iter().take(heard) {
+            core.prepare();
             core.ingest(&mut wire).unwrap();
         }
         for (at, mut frame) in frames.into_iter().enumerate() {
             if ordered {
                 frame.sequence = 1000 + at as u32;
             }
+            core.prepare();
             match core.ingest(&mut wire_of(&frame)) {
                 Ok(estimate) => {
-                    let sound = check(&core, &estimate, &core.model().prior, walks == 1);
+                    let sound = check(&core, &estimate, &core.setup.prior, walks == 1);
                     prop_assert!(sound.is_ok(), "frame {at}: {}", sound.unwrap_err());
                 }
                 Err(IngestError::Beyond(_)) => {}
@@ -456,9 +464,9 @@ struct Machine {
 
 impl Machine {
     /// Vars drawn from the prior.
-    fn drawn(model: &Model<BoosterGreen>, seed: u64) -> Self {
+    fn drawn(core: &Core, seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let prior = &model.prior;
+        let prior = core.setup.prior;
         let mut theta = || loop {
             let theta = prior.mean + prior.sigma * random.normal() as f32;
             if (prior.lower..=prior.upper).contains(&theta) {
@@ -466,9 +474,9 @@ impl Machine {
             }
         };
         Self {
-            surrogate: model.surrogate.clone(),
-            at: Box::default(),
-            prediction: Box::default(),
+            surrogate: BoosterGreen::clone(&core.tables),
+            at: Box::new(<BoosterGreen as Surrogate<33, 48, 48>>::BLANK),
+            prediction: Box::new(estimator::Prediction::BLANK),
             params: core::array::from_fn(|_| theta()),
             offset: core::array::from_fn(|_| 2e-3 * random.normal()),
             random,
@@ -481,7 +489,7 @@ impl Machine {
     }
 
     /// A cycle with five correctors of 5 to 22 A; the readings are the surrogate's, and noise.
-    fn cycle(&mut self, model: &Model<BoosterGreen>, sequence: u32) -> BoosterFrame {
+    fn cycle(&mut self, setup: &Setup, sequence: u32) -> BoosterFrame {
         let mut corrector = [CurrentCode::default(); 48];
         let mut powered = 0;
         while powered < 5 {
@@ -492,7 +500,7 @@ impl Machine {
                 powered += 1;
             }
         }
-        let [dipole, qh, qv] = model.calibration.nominal.map(|a| CurrentCode::nearest(f64::from(a)).unwrap());
+        let [dipole, qh, qv] = setup.calibration.nominal.map(|a| CurrentCode::nearest(f64::from(a)).unwrap());
         let magnets = MagnetCurrents { dipole, qh, qv, ..MagnetCurrents::default() };
         let mut frame = Frame {
             sequence,
@@ -507,9 +515,9 @@ impl Machine {
         };
         let strength = self.params.map(f32::exp);
         Surrogate::<33, 48, 48>::linearise(&self.surrogate, &strength, &mut self.at).unwrap();
-        self.surrogate.predict(&self.at, &model.calibration.drive(&frame).unwrap(), &mut self.prediction);
+        self.surrogate.predict(&self.at, &setup.calibration.drive(&frame).unwrap(), &mut self.prediction);
         for b in 0..33 {
-            let noise = f64::from(model.noise) * self.random.normal();
+            let noise = f64::from(setup.noise) * self.random.normal();
             let position = f64::from(self.prediction.reading[b]) + self.offset[b] + noise;
             frame.reading[b] = PositionCode::nearest(position).unwrap();
         }
@@ -517,12 +525,13 @@ impl Machine {
     }
 }
 
-fn ingest(core: &mut Booster, frame: &BoosterFrame) -> BoosterEstimate {
+fn ingest(core: &mut Core, frame: &BoosterFrame) -> BoosterEstimate {
+    core.prepare();
     core.ingest(&mut wire_of(frame)).unwrap()
 }
 
 /// Normalised estimation error squared of the params.
-fn nees(core: &Booster, estimate: &BoosterEstimate, params: &[f64]) -> f64 {
+fn nees(core: &Core, estimate: &BoosterEstimate, params: &[f64]) -> f64 {
     let error = DVector::from_fn(48, |i, _| f64::from(estimate.map_params[i]) - params[i]);
     let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
     (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0]
@@ -534,13 +543,13 @@ fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
     let start = stream::estimator(&ring, &recording, process_noise).unwrap();
     let (mut total, mut nis, mut readings) = (0.0, 0.0, 0.0);
     for seed in 1..=machines {
-        let (mut core, mut machine) = (start.clone(), Machine::drawn(start.model(), seed));
+        let (mut core, mut machine) = (start.clone(), Machine::drawn(&start, seed));
         let mut last = None;
         for sequence in 0..frames {
             if process_noise > 0.0 && sequence > 0 {
                 machine.walk(process_noise);
             }
-            let estimate = ingest(&mut core, &machine.cycle(start.model(), sequence));
+            let estimate = ingest(&mut core, &machine.cycle(&start.setup, sequence));
             assert_eq!(estimate.setting, None);
             nis += f64::from(estimate.nis);
             readings += f64::from(estimate.accepted.count_ones());
@@ -573,10 +582,10 @@ fn a_frame_without_beam_moves_nothing() {
     let (ring, recording) = paper_vars();
     for process_noise in [0.0, 1e-4] {
         let mut core = stream::estimator(&ring, &recording, process_noise).unwrap();
-        let mut machine = Machine::drawn(core.model(), 1);
+        let mut machine = Machine::drawn(&core, 1);
         let mut before = None;
         for sequence in 0..=100 {
-            let mut frame = machine.cycle(core.model(), sequence);
+            let mut frame = machine.cycle(&core.setup, sequence);
             let is_lost = sequence == 100;
             if is_lost {
                 frame.reading =

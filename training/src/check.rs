@@ -1,6 +1,5 @@
 //! Measured error of a surrogate against the exact twin.
 
-use estimator::surrogate::GreenLinearised;
 use estimator::{Drive, Prediction, Surrogate};
 use twin::{Hold, Optics, Ring};
 
@@ -53,7 +52,7 @@ pub fn check(
     let design = Optics::of(ring, Hold::Momentum { delta: 0.0 }).expect("the surrogate has a design").tunes();
     let design = design.expect("the surrogate's design is stable");
     let (mut sums, mut largest, mut used) = ([0.0; 2], [0.0_f64; 2], 0);
-    let mut linearised = GreenLinearised::default();
+    let mut linearised = <BoosterGreen as Surrogate<33, 48, 48>>::BLANK;
     for i in 0.. {
         if used == samples {
             break;
@@ -69,7 +68,7 @@ pub fn check(
         let strength: [f32; 48] = core::array::from_fn(|q| vars[q] as f32);
         let solved = Surrogate::<33, 48, 48>::linearise(green, &strength, &mut linearised);
         solved.expect("a ring within the tune cut is connected with the design");
-        let mut prediction = Prediction::<33, 48>::default();
+        let mut prediction = Prediction::<33, 48>::BLANK;
         for c in 0..48 {
             let mut drive = Drive { kick: [0.0; 48], strength: [0.0; 2], rf_offset: 0.0 };
             drive.kick[c] = FULL_SWING as f32;

@@ -1,10 +1,10 @@
 //! Green's function tables of a ring, from its twin.
 
-use estimator::surrogate::{Block, Dispersion, Green, GreenPlane};
+use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, SymmetricBlock};
 use twin::{ClosedOrbit, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
 
-/// The Booster's Green's function surrogate: 15 + 18 monitors, 24 + 24 correctors, 96 nodes.
-pub type BoosterGreen = Green<15, 18, 24, 24, 96>;
+/// The Booster's Green's function surrogate: 15 + 18 monitors, 24 + 24 correctors, 96 nodes, 4656 pairs of them.
+pub type BoosterGreen = Green<15, 18, 24, 24, 96, 4656>;
 
 /// Why no tables can be made for a ring.
 #[derive(Debug, thiserror::Error)]
@@ -40,9 +40,9 @@ const STATED_ERROR: [f32; 2] = [1.5e-6, 0.5e-6];
 ///
 /// # Errors
 /// [`TrainingError`] if the ring's counts differ from the table's, or if it is unstable.
-pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize>(
+pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
     ring: &Ring,
-) -> Result<Green<BX, BY, CX, CY, Q>, TrainingError> {
+) -> Result<Green<BX, BY, CX, CY, Q, T>, TrainingError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let monitors = optics.read_monitors();
     let correctors = optics.correctors();
@@ -72,13 +72,13 @@ fn nodes(ring: &Ring) -> Vec<Place> {
     ring.quadrupoles.iter().flat_map(at).collect()
 }
 
-fn plane<const B: usize, const C: usize, const Q: usize>(
+fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
     ring: &Ring,
     optics: &Optics,
     plane: Plane,
     monitors: &[Observer],
     correctors: &[Source],
-) -> GreenPlane<B, C, Q> {
+) -> GreenPlane<B, C, Q, T> {
     let (direction, sign) = match plane {
         Plane::X => ([1.0, 0.0], 1.0),
         Plane::Y => ([0.0, 1.0], -1.0),
@@ -98,7 +98,7 @@ fn plane<const B: usize, const C: usize, const Q: usize>(
         seen: Block::quantise(|q, b| reading[(b, q)]),
         driven: Block::quantise(|q, c| driven[(q, c)]),
         // the average of both orders removes what rounding of the transfer maps leaves of an asymmetry
-        mutual: Block::quantise(|i, j| 0.5 * (mutual[(i, j)] + mutual[(j, i)])),
+        mutual: SymmetricBlock::quantise(|i, j| 0.5 * (mutual[(i, j)] + mutual[(j, i)])),
         weight: core::array::from_fn(|n| strength(n) as f32),
     }
 }

@@ -1,6 +1,6 @@
 //! Which readings of a frame are used: what their repeats say, and where there are none, the model.
 
-use super::{Estimator, UNDERWEIGHT};
+use super::{Estimator, Model, UNDERWEIGHT};
 use crate::campaign::Verdict;
 use crate::frame::{Frame, PositionCode};
 use crate::linear::dot;
@@ -34,9 +34,12 @@ impl Screened {
 /// Frames in a row that must surprise all over before the model is at fault, and not the beam.
 const CONVINCED: u32 = 3;
 
-impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize> Estimator<G, B, C, N, S> {
+impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize, const T: usize>
+    Estimator<G, B, C, N, S, T>
+{
     /// Decide which readings to use, and learn each monitor's noise from its repeats.
-    pub(super) fn screen(&mut self, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
+    #[inline(never)]
+    pub(super) fn screen(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
         let mut screened = Screened::default();
         for b in 0..B {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
@@ -44,8 +47,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
             if usable {
                 match cell {
-                    Some(index) => self.screen_repeat(b, code, index, &mut screened),
-                    None => self.screen_loose(b, code, &mut screened),
+                    Some(index) => self.screen_repeat(model, b, code, index, &mut screened),
+                    None => self.screen_loose(model, b, code, &mut screened),
                 }
             }
             if self.monitors.get_mut(b).is_some_and(Monitor::judge) {
@@ -75,13 +78,13 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
-    fn screen_repeat(&mut self, b: usize, code: i32, index: u16, screened: &mut Screened) {
-        let (expected, moved) = (self.is_expected(b, code), self.moved_to_mean_drive(b, code));
+    fn screen_repeat(&mut self, model: &Model<'_, G>, b: usize, code: i32, index: u16, screened: &mut Screened) {
+        let (expected, moved) = (self.is_expected(model, b, code), self.moved_to_mean_drive(b, code));
         let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
         }
-        let verdict = cell.judge(b, moved, monitor.noise.sigma(), self.model.gate, expected);
+        let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
         let scatter = cell.take(b, code, moved, verdict);
         match verdict {
             Verdict::Accepted => {}
@@ -93,8 +96,8 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// A reading without a setting passes if the model expects it.
-    fn screen_loose(&mut self, b: usize, code: i32, screened: &mut Screened) {
-        let verdict = if self.is_expected(b, code) { Verdict::Accepted } else { Verdict::Held };
+    fn screen_loose(&mut self, model: &Model<'_, G>, b: usize, code: i32, screened: &mut Screened) {
+        let verdict = if self.is_expected(model, b, code) { Verdict::Accepted } else { Verdict::Held };
         if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
             monitor.reject();
         }
@@ -102,19 +105,19 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// True if the model, with all its uncertainty, expects a reading.
-    fn is_expected(&self, b: usize, code: i32) -> bool {
+    fn is_expected(&self, model: &Model<'_, G>, b: usize, code: i32) -> bool {
         let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
-        let predicted = self.gaussian.baseline(b) + dot(&d, self.solution.delta.as_slice());
+        let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
         let surprise = self.innovation(b, code) - predicted;
-        let certain = self.variance(b, 1, self.rf_offset) + baseline_variance;
+        let certain = self.variance(model, b, 1, self.rf_offset) + baseline_variance;
         // the uncertainty of the params is only worked out for readings that need it
-        self.model.gate.expects(surprise, certain)
-            || self.model.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
+        model.setup.gate.expects(surprise, certain)
+            || model.setup.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
     }
 
     /// A reading as the mean drive of its setting would have made it, in steps.
     fn moved_to_mean_drive(&self, b: usize, code: i32) -> i32 {
-        let shift = match (self.at_mean_drive.reading.get(b), self.prediction.reading.get(b)) {
+        let shift = match (self.at_mean_drive.get(b), self.prediction.reading.get(b)) {
             (Some(mean), Some(this)) => mean - this,
             _ => 0.0,
         };

@@ -1,25 +1,30 @@
-//! The closed-orbit Green's function of the design ring, quantised, with the gradient errors solved for exactly.
+//! The closed-orbit Green's function of the design ring, quantised, with the gradient errors taken in exactly.
 //!
 //! Each quadrupole is two Gauss-Legendre nodes. With `G` the design Green's functions between correctors c, monitors b
-//! and nodes q, and `D = diag(k L w (strength - 1))` (k becomes -k in y, w = 1/2), a kick drives at the nodes
+//! and nodes q, and `D = diag(k L w (strength - 1))` (k becomes -k in y, w = 1/2), the function between the nodes of the
+//! ring as it is, `Z_qq = (1 + G_qq D)^-1 G_qq`, is built up node by node: switching on the error `e` of node n takes
 //!
-//! `Z_qc = (1 + G_qq D)^-1 G_qc`, and at the monitors `R = G_bc - G_bq D Z_qc`;
+//! `g g^T e/(1 + e g_n)` from it, `g` its column n. The rest are products:
 //!
-//! with `Z_qb` made the same way, `dR_bc/d(ln strength) = - sum over the quadrupole's nodes of k L w strength Z_qb Z_qc`.
+//! `Z_qc = G_qc - Z_qq D G_qc`, `Z_qb = G_qb - Z_qq D G_qb`, `R = G_bc - Z_bq D G_qc`, and
+//! `dR_bc/d(ln strength) = - sum over the quadrupole's nodes of k L w strength Z_qb Z_qc`.
+//!
 //! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent: coupling
 //! is left to a surrogate that carries it.
 //!
-//! Source: the resolvent (Dyson) form of the perturbed Green's function; S. Y. Lee, Accelerator Physics, ch. 2, for G.
+//! Source: the resolvent (Dyson) form of the perturbed Green's function, taken in by rank one after rank one (J. Sherman
+//! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
 use nalgebra::SMatrix;
 
-use super::{Block, Prediction, Surrogate, Unstable};
+use super::{Block, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, dot};
+use crate::linear::{add, combine, dot, zeros};
+use crate::triangle::Triangle;
 
-/// One plane: `B` monitors, `C` correctors, `Q` nodes (two a quadrupole).
-#[derive(Debug, Clone)]
-pub struct GreenPlane<const B: usize, const C: usize, const Q: usize> {
+/// One plane: `B` monitors, `C` correctors, `Q` nodes (two a quadrupole), `T = Q (Q + 1)/2` pairs of nodes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GreenPlane<const B: usize, const C: usize, const Q: usize, const T: usize> {
     /// Monitors to correctors, `G_bc` [m/rad].
     pub direct: Block<B, C>,
     /// Nodes to monitors, `G_qb` [m/rad].
@@ -27,13 +32,13 @@ pub struct GreenPlane<const B: usize, const C: usize, const Q: usize> {
     /// Nodes to correctors, `G_qc` [m/rad].
     pub driven: Block<Q, C>,
     /// Nodes to nodes, `G_qq` [m/rad].
-    pub mutual: Block<Q, Q>,
+    pub mutual: SymmetricBlock<Q, T>,
     /// `k L w` of each node, focusing in this plane positive [1/m].
     pub weight: [f32; Q],
 }
 
 /// Horizontal dispersion and the slip factor, for frames with an RF offset.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Dispersion<const B: usize, const Q: usize> {
     /// Design dispersion at the monitors [m].
     pub monitor: [f32; B],
@@ -53,12 +58,12 @@ pub struct Dispersion<const B: usize, const Q: usize> {
 }
 
 /// Green's function surrogate of a ring with monitors and correctors in two planes.
-#[derive(Debug, Clone)]
-pub struct Green<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize> {
+#[derive(Debug, Clone, PartialEq)]
+pub struct Green<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize> {
     /// Horizontal plane: the first `BX` monitors and `CX` correctors.
-    pub x: GreenPlane<BX, CX, Q>,
+    pub x: GreenPlane<BX, CX, Q, T>,
     /// Vertical plane: the rest.
-    pub y: GreenPlane<BY, CY, Q>,
+    pub y: GreenPlane<BY, CY, Q, T>,
     /// Momentum.
     pub dispersion: Dispersion<BX, Q>,
     /// Number of quadrupoles on the first (QH) supply; they come first.
@@ -91,36 +96,36 @@ pub struct GreenLinearised<const BX: usize, const BY: usize, const CX: usize, co
     node_dispersion: [f32; Q],
     /// Slip factor `compaction - 1/gamma^2` [1].
     slip: f32,
-    /// Factors of `1 + G_qq D`, work space of both planes.
-    factors: SMatrix<f32, Q, Q>,
 }
 
-impl<const B: usize, const C: usize, const Q: usize> Default for PlaneLinearised<B, C, Q> {
-    fn default() -> Self {
-        Self { seen: SMatrix::zeros(), driven: SMatrix::zeros(), response: SMatrix::zeros(), slope: [0.0; Q] }
-    }
+impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
+    const BLANK: Self = Self { seen: zeros(), driven: zeros(), response: zeros(), slope: [0.0; Q] };
 }
 
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize> Default
-    for GreenLinearised<BX, BY, CX, CY, Q>
+impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
+    Green<BX, BY, CX, CY, Q, T>
 {
-    fn default() -> Self {
-        Self {
-            x: PlaneLinearised::default(),
-            y: PlaneLinearised::default(),
-            monitor_dispersion: [0.0; BX],
-            node_dispersion: [0.0; Q],
-            slip: 0.0,
-            factors: SMatrix::zeros(),
-        }
-    }
-}
-
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize> Green<BX, BY, CX, CY, Q> {
+    /// Memory for tables, all zero.
+    pub const BLANK: Self = Self {
+        x: GreenPlane::BLANK,
+        y: GreenPlane::BLANK,
+        dispersion: Dispersion {
+            monitor: [0.0; BX],
+            node: [0.0; Q],
+            second_order: [0.0; BX],
+            spurious: [0.0; 2],
+            compaction: 0.0,
+            inverse_gamma_squared: 0.0,
+            circumference: 0.0,
+        },
+        first_family: 0,
+        stated_error: [0.0; 2],
+    };
     /// Bytes of the tables.
-    pub const BYTES: usize = GreenPlane::<BX, CX, Q>::BYTES + GreenPlane::<BY, CY, Q>::BYTES + 4 * (2 * BX + Q + 5);
+    pub const BYTES: usize =
+        GreenPlane::<BX, CX, Q, T>::BYTES + GreenPlane::<BY, CY, Q, T>::BYTES + 4 * (2 * BX + Q + 5);
     /// Entries of the tables.
-    pub const PARAMETERS: usize = BX * CX + BY * CY + Q * (BX + BY + CX + CY + 2 * Q + 3) + 2 * BX + 5;
+    pub const PARAMETERS: usize = BX * CX + BY * CY + Q * (BX + BY + CX + CY + 3) + 2 * T + 2 * BX + 5;
 }
 
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize>
@@ -146,29 +151,26 @@ impl<
     const CX: usize,
     const CY: usize,
     const Q: usize,
-> Surrogate<B, C, N> for Green<BX, BY, CX, CY, Q>
+    const T: usize,
+> Surrogate<B, C, N> for Green<BX, BY, CX, CY, Q, T>
 {
     type Linearised = GreenLinearised<BX, BY, CX, CY, Q>;
 
+    const BLANK: Self::Linearised = GreenLinearised {
+        x: PlaneLinearised::BLANK,
+        y: PlaneLinearised::BLANK,
+        monitor_dispersion: [0.0; BX],
+        node_dispersion: [0.0; Q],
+        slip: 0.0,
+    };
+
     fn linearise(&self, strength: &[f32; N], at: &mut Self::Linearised) -> Result<(), Unstable> {
         const { assert!(B == BX + BY && C == CX + CY && Q == 2 * N, "planes and nodes add up") };
-        let mut pivots = [0; Q];
-        self.y.linearise(strength, &mut at.y, &mut at.factors, &mut pivots)?;
-        // x last: its factors are used once more, for the dispersion
-        self.x.linearise(strength, &mut at.x, &mut at.factors, &mut pivots)?;
-        let d = &self.dispersion;
-        at.node_dispersion = d.node;
-        solve(&at.factors, &pivots, &mut at.node_dispersion);
-        let excess = self.x.excess(strength);
-        let mut compaction = d.compaction;
-        let weighted: [f32; Q] = core::array::from_fn(|n| excess[n] * at.node_dispersion[n]);
-        compaction -= dot(&weighted, &d.node) / d.circumference;
-        at.slip = compaction - d.inverse_gamma_squared;
-        let mut seen = [0.0; Q];
-        for (b, (to, design)) in at.monitor_dispersion.iter_mut().zip(&d.monitor).enumerate() {
-            seen.iter_mut().zip(self.x.seen.column(b)).for_each(|(s, v)| *s = v);
-            *to = design - dot(&seen, &weighted);
-        }
+        let mut mutual = Triangle::ZERO;
+        self.y.linearise(strength, self.first_family, &mut at.y, &mut mutual)?;
+        // x last: what it leaves between the nodes is used once more, for the dispersion
+        self.x.linearise(strength, self.first_family, &mut at.x, &mut mutual)?;
+        self.linearise_dispersion(&self.x.excess(strength), at, &mutual);
         Ok(())
     }
 
@@ -205,7 +207,28 @@ impl<
     }
 }
 
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize> Green<BX, BY, CX, CY, Q> {
+impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
+    Green<BX, BY, CX, CY, Q, T>
+{
+    /// Dispersion `D' = D - Z_qq D_q D` at the nodes, alike at the monitors, and the slip factor.
+    fn linearise_dispersion(
+        &self,
+        excess: &[f32; Q],
+        at: &mut GreenLinearised<BX, BY, CX, CY, Q>,
+        mutual: &Triangle<Q, T>,
+    ) {
+        let d = &self.dispersion;
+        let kick = product(excess, d.node.iter().copied());
+        at.node_dispersion = d.node;
+        add(&mut at.node_dispersion, -1.0, &mutual.multiply(&kick));
+        let seen = at.x.seen.as_slice().chunks_exact(Q);
+        for ((to, design), seen) in at.monitor_dispersion.iter_mut().zip(&d.monitor).zip(seen) {
+            *to = design - dot(seen, &kick);
+        }
+        let compaction = d.compaction - dot(&kick, &at.node_dispersion) / d.circumference;
+        at.slip = compaction - d.inverse_gamma_squared;
+    }
+
     /// Add the momentum `delta = -offset/slip` that an RF offset makes, with its derivative through the slip factor:
     /// `d(slip)/d(ln strength) = -sum of k L w strength D^2 / C`.
     fn disperse(
@@ -231,10 +254,17 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
     }
 }
 
-impl<const B: usize, const C: usize, const Q: usize> GreenPlane<B, C, Q> {
+impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<B, C, Q, T> {
     /// Bytes of the tables of one plane.
     pub const BYTES: usize =
-        Block::<B, C>::BYTES + Block::<Q, B>::BYTES + Block::<Q, C>::BYTES + Block::<Q, Q>::BYTES + 4 * Q;
+        Block::<B, C>::BYTES + Block::<Q, B>::BYTES + Block::<Q, C>::BYTES + SymmetricBlock::<Q, T>::BYTES + 4 * Q;
+    const BLANK: Self = Self {
+        direct: Block::BLANK,
+        seen: Block::BLANK,
+        driven: Block::BLANK,
+        mutual: SymmetricBlock::BLANK,
+        weight: [0.0; Q],
+    };
 
     /// `D`, the integrated gradient error of each node [1/m].
     fn excess<const N: usize>(&self, strength: &[f32; N]) -> [f32; Q] {
@@ -248,28 +278,26 @@ impl<const B: usize, const C: usize, const Q: usize> GreenPlane<B, C, Q> {
     fn linearise<const N: usize>(
         &self,
         strength: &[f32; N],
+        first_family: usize,
         at: &mut PlaneLinearised<B, C, Q>,
-        factors: &mut SMatrix<f32, Q, Q>,
-        pivots: &mut [usize; Q],
+        mutual: &mut Triangle<Q, T>,
     ) -> Result<(), Unstable> {
         let excess = self.excess(strength);
-        for (n, excess) in excess.iter().enumerate() {
-            let column = factors.as_mut_slice().iter_mut().skip(n * Q).take(Q);
-            column.zip(self.mutual.column(n)).for_each(|(f, g)| *f = g * excess);
-            factors[(n, n)] += 1.0;
+        self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
+        // a quadrupole of each family together: in between, the tunes stay between the design's and the ring's
+        for k in 0..first_family.max(N - first_family.min(N)) {
+            let (one, other) = (2 * k, 2 * (k + first_family));
+            let one = if k < first_family { [one, one + 1] } else { [Q; 2] };
+            switch_on(mutual, &excess, [one[0], one[1], other, other + 1])?;
         }
-        factorise(factors, pivots)?;
-        fill(at.driven.as_mut_slice(), &self.driven, factors, pivots);
-        fill(at.seen.as_mut_slice(), &self.seen, factors, pivots);
-        let mut seen = SMatrix::<f32, Q, B>::zeros();
-        for (b, to) in seen.as_mut_slice().chunks_exact_mut(Q).enumerate() {
-            to.iter_mut().zip(self.seen.column(b)).zip(&excess).for_each(|((to, g), e)| *to = g * e);
-        }
-        let responses = at.response.as_mut_slice().chunks_exact_mut(B).zip(at.driven.as_slice().chunks_exact(Q));
-        for (c, (response, driven)) in responses.enumerate() {
-            let seen = seen.as_slice().chunks_exact(Q);
+        fill(at.seen.as_mut_slice(), &self.seen, mutual, &excess);
+        fill(at.driven.as_mut_slice(), &self.driven, mutual, &excess);
+        let responses = at.response.as_mut_slice().chunks_exact_mut(B);
+        for (c, response) in responses.enumerate() {
+            let kick = product(&excess, self.driven.column(c));
+            let seen = at.seen.as_slice().chunks_exact(Q);
             for ((to, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(seen) {
-                *to = direct - dot(seen, driven);
+                *to = direct - dot(seen, &kick);
             }
         }
         at.slope = self.weight;
@@ -284,11 +312,8 @@ impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
     /// Readings and their derivatives for kicks on top of the `orbit` that the momentum makes at the nodes.
     fn predict(&self, kick: &[f32], orbit: &mut [f32; Q], reading: &mut [f32], jacobian: &mut [f32]) {
         reading.fill(0.0);
-        let columns = self.driven.as_slice().chunks_exact(Q).zip(self.response.as_slice().chunks_exact(B));
-        for (kick, (driven, response)) in kick.iter().zip(columns) {
-            add(orbit, *kick, driven);
-            add(reading, *kick, response);
-        }
+        combine(orbit, kick.iter().copied().zip(self.driven.as_slice().chunks_exact(Q)));
+        combine(reading, kick.iter().copied().zip(self.response.as_slice().chunks_exact(B)));
         orbit.iter_mut().zip(&self.slope).for_each(|(x, k)| *x *= -k);
         for (slopes, seen) in jacobian.chunks_exact_mut(Q / 2).zip(self.seen.as_slice().chunks_exact(Q)) {
             for (slope, (z, x)) in slopes.iter_mut().zip(seen.chunks_exact(2).zip(orbit.chunks_exact(2))) {
@@ -298,99 +323,98 @@ impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
     }
 }
 
-/// Columns of a table, solved with the factors.
-fn fill<const Q: usize, const M: usize>(
+/// Columns of a table, in the ring as it is: `Z = G - Z_qq D G`.
+fn fill<const Q: usize, const M: usize, const T: usize>(
     to: &mut [f32],
     table: &Block<Q, M>,
-    factors: &SMatrix<f32, Q, Q>,
-    pivots: &[usize; Q],
+    mutual: &Triangle<Q, T>,
+    excess: &[f32; Q],
 ) {
     for (m, column) in to.chunks_exact_mut(Q).enumerate() {
-        column.iter_mut().zip(table.column(m)).for_each(|(to, v)| *to = v);
-        solve(factors, pivots, column);
+        let change = mutual.multiply(&product(excess, table.column(m)));
+        column.iter_mut().zip(table.column(m)).zip(&change).for_each(|((to, g), change)| *to = g - change);
     }
 }
 
-/// LU factors with partial pivoting, in place. nalgebra's own take the matrix by value, 37 kB of stack at Q = 96.
+/// `a b`, one by one.
+fn product<const Q: usize>(a: &[f32; Q], b: impl Iterator<Item = f32>) -> [f32; Q] {
+    let mut product = *a;
+    product.iter_mut().zip(b).for_each(|(a, b)| *a *= b);
+    product
+}
+
+/// Switch on the errors of four nodes, one after the other; a node beyond the last has none.
 ///
-/// The determinant is that of the ring's closure over the design's; it reaches zero at an integer resonance, and a
-/// ring beyond one is not connected with the design.
-fn factorise<const Q: usize>(a: &mut SMatrix<f32, Q, Q>, pivots: &mut [usize; Q]) -> Result<(), Unstable> {
-    let mut positive = true;
-    for (k, chosen) in pivots.iter_mut().enumerate() {
-        let largest = (k..Q).fold(k, |best, r| if a[(r, k)].abs() > a[(best, k)].abs() { r } else { best });
-        *chosen = largest;
-        if largest != k {
-            a.swap_rows(k, largest);
-            positive = !positive;
-        }
-        let pivot = a[(k, k)];
-        if pivot.is_nan() || pivot.abs() < 1e-3 {
-            return Err(Unstable);
-        }
-        positive ^= pivot < 0.0;
-        let (done, rest) = a.as_mut_slice().split_at_mut((k + 1) * Q);
-        let Some(below) = done.get_mut(k * Q + k + 1..) else { continue };
-        below.iter_mut().for_each(|l| *l /= pivot);
-        for column in rest.chunks_exact_mut(Q) {
-            if let Some((top, under)) = column.get_mut(k..).and_then(<[f32]>::split_first_mut) {
-                add(under, -*top, below);
-            }
-        }
-    }
-    if positive { Ok(()) } else { Err(Unstable) }
-}
-
-/// Solve with the factors, in place.
-fn solve<const Q: usize>(factors: &SMatrix<f32, Q, Q>, pivots: &[usize; Q], x: &mut [f32]) {
-    for (k, &pivot) in pivots.iter().enumerate() {
-        x.swap(k, pivot.min(Q - 1));
-    }
-    let columns = factors.as_slice().chunks_exact(Q);
-    for (k, column) in columns.clone().enumerate() {
-        if let (Some((top, under)), Some(below)) =
-            (x.get_mut(k..).and_then(<[f32]>::split_first_mut), column.get(k + 1..))
-        {
-            add(under, -*top, below);
-        }
-    }
-    for (k, column) in columns.enumerate().rev() {
-        let (Some((above, pivot)), Some((over, top))) = (
-            column.get(..=k).and_then(|c| c.split_last().map(|(p, a)| (a, *p))),
-            x.get_mut(..=k).and_then(<[f32]>::split_last_mut).map(|(t, o)| (o, t)),
-        ) else {
+/// `1 + e g_n` is the ring's closure with the node's error over that without; it reaches zero at an integer resonance,
+/// and a ring beyond one is not connected with the design.
+fn switch_on<const Q: usize, const T: usize>(
+    mutual: &mut Triangle<Q, T>,
+    excess: &[f32; Q],
+    nodes: [usize; 4],
+) -> Result<(), Unstable> {
+    let (mut columns, mut weights) = ([[0.0; Q]; 4], [0.0; 4]);
+    for (i, &node) in nodes.iter().enumerate() {
+        let (Some((done, [column, ..])), Some(error)) = (columns.split_at_mut_checked(i), excess.get(node)) else {
             continue;
         };
-        *top /= pivot;
-        add(over, -*top, above);
+        *column = mutual.symmetric_row(node);
+        for (before, weight) in done.iter().zip(&weights) {
+            add(column, -weight * before.get(node).copied().unwrap_or(0.0), before);
+        }
+        let pivot = 1.0 + error * column.get(node).copied().unwrap_or(0.0);
+        if pivot.is_nan() || pivot < 1e-3 {
+            return Err(Unstable);
+        }
+        weights.get_mut(i).into_iter().for_each(|w| *w = error / pivot);
     }
+    for (r, row) in mutual.rows_mut().enumerate() {
+        let term = |(column, weight): (&'_ [f32; Q], &f32)| -weight * column.get(r).copied().unwrap_or(0.0);
+        let terms = columns.iter().zip(&weights);
+        combine(row, terms.map(|(column, weight)| (term((column, weight)), column.as_slice())));
+    }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::SVector;
+    use nalgebra::SMatrix;
 
     use super::*;
 
-    #[test]
-    fn factors_solve_their_matrix() {
-        let a =
-            SMatrix::<f32, 6, 6>::from_fn(|r, c| if r == c { 1.0 } else { 0.3 * libm::sinf((3 * r + 5 * c) as f32) });
-        let (mut factors, mut pivots) = (a, [0; 6]);
-        let x = SVector::<f32, 6>::from_fn(|r, _| r as f32 - 2.0);
-        let determinant = a.determinant();
-        assert!(determinant > 0.0);
-        factorise(&mut factors, &mut pivots).unwrap();
-        let mut b = a * x;
-        solve(&factors, &pivots, b.as_mut_slice());
-        assert!((b - x).abs().max() < 1e-5, "{b}"); // f32 rounding
+    /// A symmetric Green's function of six nodes, and errors.
+    fn example() -> (SMatrix<f32, 6, 6>, [f32; 6]) {
+        let g = SMatrix::<f32, 6, 6>::from_fn(|r, c| libm::cosf(2.4 - (r as f32 - c as f32).abs()));
+        (g, core::array::from_fn(|n| 0.1 * libm::sinf(2.0 * n as f32)))
+    }
+
+    fn triangle(g: &SMatrix<f32, 6, 6>) -> Triangle<6, 21> {
+        let mut triangle = Triangle::ZERO;
+        for (r, row) in triangle.rows_mut().enumerate() {
+            row.iter_mut().enumerate().for_each(|(c, v)| *v = g[(r, c)]);
+        }
+        triangle
     }
 
     #[test]
-    fn a_matrix_beyond_the_resonance_is_unstable() {
-        let mut a = SMatrix::<f32, 4, 4>::identity();
-        a[(2, 2)] = -0.2;
-        assert_eq!(factorise(&mut a, &mut [0; 4]), Err(Unstable));
-        assert_eq!(factorise(&mut SMatrix::<f32, 4, 4>::zeros(), &mut [0; 4]), Err(Unstable));
+    fn node_by_node_is_the_resolvent() {
+        let (g, excess) = example();
+        let mut mutual = triangle(&g);
+        switch_on(&mut mutual, &excess, [0, 1, 4, 5]).unwrap();
+        switch_on(&mut mutual, &excess, [2, 3, 6, 7]).unwrap();
+        let d = SMatrix::from_diagonal(&excess.into());
+        let exact = (SMatrix::identity() + g * d).try_inverse().unwrap() * g;
+        for r in 0..6 {
+            for c in 0..=r {
+                assert!((mutual.get(r, c) - exact[(r, c)]).abs() < 1e-5); // f32 rounding
+            }
+        }
+    }
+
+    #[test]
+    fn a_ring_beyond_the_resonance_is_unstable() {
+        let (g, mut excess) = example();
+        excess[2] = -1.2 / g[(2, 2)];
+        assert_eq!(switch_on(&mut triangle(&g), &excess, [2, 3, 0, 1]), Err(Unstable));
+        assert_eq!(switch_on(&mut triangle(&g), &[f32::NAN; 6], [0, 1, 2, 3]), Err(Unstable));
     }
 }

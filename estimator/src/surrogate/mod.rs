@@ -4,11 +4,12 @@ mod green;
 mod quantised;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane};
-pub use quantised::Block;
+pub use quantised::{Block, SymmetricBlock};
 
 use nalgebra::SMatrix;
 
 use crate::drive::Drive;
+use crate::linear::zeros;
 
 /// The orbit at the monitors, and its derivative with respect to `ln` of every gradient.
 #[derive(Debug, Clone)]
@@ -19,10 +20,9 @@ pub struct Prediction<const B: usize, const N: usize> {
     pub jacobian: SMatrix<f32, N, B>,
 }
 
-impl<const B: usize, const N: usize> Default for Prediction<B, N> {
-    fn default() -> Self {
-        Self { reading: [0.0; B], jacobian: SMatrix::zeros() }
-    }
+impl<const B: usize, const N: usize> Prediction<B, N> {
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self { reading: [0.0; B], jacobian: zeros() };
 }
 
 /// No linearisation there: the ring would cross an integer resonance on the way from its design.
@@ -33,7 +33,10 @@ pub struct Unstable;
 /// A model of the ring that is linearised now and then, and asked every frame.
 pub trait Surrogate<const B: usize, const C: usize, const N: usize> {
     /// What one linearisation leaves behind.
-    type Linearised: Default;
+    type Linearised;
+
+    /// Memory for a linearisation, all zero.
+    const BLANK: Self::Linearised;
 
     /// Linearise at `strength`, the gradient of each quadrupole over its design value [N].
     ///

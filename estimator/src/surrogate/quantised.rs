@@ -1,38 +1,75 @@
-//! A matrix in 16-bit codes with one scale.
+//! Matrices in 16-bit codes with one scale.
 
-use nalgebra::SMatrix;
-
-/// A matrix `[R][C]` of codes; the value is `scale * code`, off by half a step, `max/65534`, at most.
+/// A matrix `[R][C]` of codes, stored by columns; the value is `scale * code`, off by half a step, `max/65534`, at most.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Block<const R: usize, const C: usize> {
     /// Size of one step.
     pub scale: f32,
-    /// The codes.
-    pub codes: SMatrix<i16, R, C>,
+    /// The codes, column by column.
+    pub codes: [[i16; R]; C],
+}
+
+/// The lower triangle of a symmetric matrix `[N][N]`, row by row, in the same codes; `T = N (N + 1)/2`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SymmetricBlock<const N: usize, const T: usize> {
+    /// Size of one step.
+    pub scale: f32,
+    /// The codes, `(0,0) (1,0) (1,1) (2,0) ..`.
+    pub codes: [i16; T],
 }
 
 impl<const R: usize, const C: usize> Block<R, C> {
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self { scale: 0.0, codes: [[0; R]; C] };
+    /// Bytes of the codes and the scale.
+    pub const BYTES: usize = 2 * R * C + 4;
+
     /// Quantise; `value(row, column)` must be finite.
     pub fn quantise(value: impl Fn(usize, usize) -> f64) -> Self {
-        let mut largest = 0.0_f64;
-        for c in 0..C {
-            for r in 0..R {
-                largest = largest.max(value(r, c).abs());
-            }
-        }
-        let scale = (largest / f64::from(i16::MAX)).max(f64::from(f32::MIN_POSITIVE)) as f32;
-        Self { scale, codes: SMatrix::from_fn(|r, c| libm::round(value(r, c) / f64::from(scale)) as i16) }
+        let all = || (0..C).flat_map(|c| (0..R).map(move |r| (r, c)));
+        let scale = step(all().map(|(r, c)| value(r, c)));
+        Self { scale, codes: core::array::from_fn(|c| core::array::from_fn(|r| code(value(r, c), scale))) }
     }
 
     /// The values of one column.
     pub fn column(&self, c: usize) -> impl Iterator<Item = f32> + '_ {
-        let scale = self.scale;
-        let codes = self.codes.as_slice().get(c * R..(c + 1) * R).unwrap_or_default();
-        codes.iter().map(move |&code| scale * f32::from(code))
+        let codes = self.codes.get(c).map_or([].as_slice(), |column| column);
+        codes.iter().map(|&code| self.scale * f32::from(code))
+    }
+}
+
+impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
+    const FITS: () = assert!(T == N * (N + 1) / 2, "T entries make a triangle of N");
+
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self { scale: 0.0, codes: [0; T] };
+    /// Bytes of the codes and the scale.
+    pub const BYTES: usize = 2 * T + 4;
+
+    /// Quantise; `value(row, column)` must be finite, and is asked for the lower triangle only.
+    pub fn quantise(value: impl Fn(usize, usize) -> f64) -> Self {
+        let () = Self::FITS;
+        let all = || (0..N).flat_map(|r| (0..=r).map(move |c| (r, c)));
+        let scale = step(all().map(|(r, c)| value(r, c)));
+        let mut codes = [0; T];
+        codes.iter_mut().zip(all()).for_each(|(to, (r, c))| *to = code(value(r, c), scale));
+        Self { scale, codes }
     }
 
-    /// Bytes of the codes and the scale.
-    pub const BYTES: usize = 2 * R * C + 4;
+    /// The values, row by row.
+    pub fn values(&self) -> impl Iterator<Item = f32> + '_ {
+        self.codes.iter().map(|&code| self.scale * f32::from(code))
+    }
+}
+
+/// The step with which the largest of some values just fits 16 bits.
+fn step(values: impl Iterator<Item = f64>) -> f32 {
+    let largest = values.fold(0.0_f64, |largest, v| largest.max(libm::fabs(v)));
+    (largest / f64::from(i16::MAX)).max(f64::from(f32::MIN_POSITIVE)) as f32
+}
+
+fn code(value: f64, scale: f32) -> i16 {
+    libm::round(value / f64::from(scale)) as i16
 }
 
 #[cfg(test)]
@@ -43,16 +80,20 @@ mod tests {
     fn every_value_is_within_half_a_step() {
         let value = |r: usize, c: usize| libm::sin((r * 7 + c) as f64) * 12.0;
         let block = Block::<20, 5>::quantise(value);
+        // half a step, and the rounding of scale * code to f32
+        let near = |v: f32, exact: f64, scale: f32| (f64::from(v) - exact).abs() <= f64::from(scale) * 0.51;
         for c in 0..5 {
-            for (r, v) in block.column(c).enumerate() {
-                // half a step, and the rounding of scale * code to f32
-                assert!((f64::from(v) - value(r, c)).abs() <= f64::from(block.scale) * 0.51);
-            }
+            assert!(block.column(c).enumerate().all(|(r, v)| near(v, value(r, c), block.scale)));
         }
+        let symmetric = SymmetricBlock::<4, 10>::quantise(value);
+        let places = (0..4).flat_map(|r| (0..=r).map(move |c| (r, c)));
+        assert!(symmetric.values().zip(places).all(|(v, (r, c))| near(v, value(r, c), symmetric.scale)));
+        assert_eq!(symmetric.values().count(), 10);
     }
 
     #[test]
     fn a_block_of_zeros_stays_zero() {
         assert!(Block::<3, 2>::quantise(|_, _| 0.0).column(1).all(|v| v == 0.0));
+        assert_eq!(Block::<3, 2>::BLANK.column(2).count(), 0);
     }
 }

@@ -4,7 +4,7 @@ use core::time::Duration;
 use std::time::Instant;
 
 use inference::Recording;
-use inference::stream::{self, Booster, BoosterEstimate};
+use inference::stream::{self, BoosterEstimate, Core};
 use twin::Ring;
 
 use super::{CommandError, machine, progress, recording};
@@ -40,7 +40,7 @@ fn pump(
     options: &Replay,
     ring: &Ring,
     recording: &Recording,
-    core: &mut Booster,
+    core: &mut Core,
 ) -> Result<(BoosterEstimate, Timing), CommandError> {
     let other = |error: &dyn core::fmt::Display| CommandError::Other(error.to_string());
     let mut publisher = Publisher::try_new(&options.service).map_err(|e| other(&e))?;
@@ -51,6 +51,7 @@ fn pump(
     let (mut last, mut times) = (None, Vec::with_capacity(recording.rows.len()));
     for row in &recording.rows {
         let mut bytes = stream::wire(recording, row)?;
+        core.prepare();
         clock.wait();
         let start = Instant::now();
         let estimate = core.ingest(&mut bytes).map_err(|e| other(&format!("frame {}: {e}", row.sequence)))?;

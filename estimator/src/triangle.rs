@@ -1,0 +1,246 @@
+//! Symmetric and triangular matrices, packed: a lower triangle row by row, half the memory of a square.
+
+use crate::linear::{add, combine, dot};
+use crate::sum::LogProduct;
+
+/// Lower triangle of an `N x N` matrix; `T = N (N + 1)/2` entries, row `i` holds columns `0..=i`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Triangle<const N: usize, const T: usize>([f32; T]);
+
+impl<const N: usize, const T: usize> Triangle<N, T> {
+    const FITS: () = assert!(T == N * (N + 1) / 2, "T entries make a triangle of N");
+
+    /// All zero.
+    pub const ZERO: Self = Self([0.0; T]);
+
+    /// The rows, each up to its diagonal.
+    pub fn rows(&self) -> Rows<'_> {
+        let () = Self::FITS;
+        Rows { rest: &self.0, length: 1 }
+    }
+
+    /// The rows, to be changed.
+    pub fn rows_mut(&mut self) -> RowsMut<'_> {
+        let () = Self::FITS;
+        RowsMut { rest: &mut self.0, length: 1 }
+    }
+
+    /// All entries, row by row.
+    pub fn entries_mut(&mut self) -> &mut [f32] {
+        &mut self.0
+    }
+
+    /// One row up to its diagonal; empty beyond the last.
+    pub fn row(&self, i: usize) -> &[f32] {
+        self.0.get(start(i)..start(i + 1)).unwrap_or_default()
+    }
+
+    /// One row, to be changed.
+    pub fn row_mut(&mut self, i: usize) -> &mut [f32] {
+        self.0.get_mut(start(i)..start(i + 1)).unwrap_or_default()
+    }
+
+    /// An entry of the symmetric matrix; 0 beyond its edge.
+    pub fn get(&self, i: usize, j: usize) -> f32 {
+        self.row(i.max(j)).get(i.min(j)).copied().unwrap_or(0.0)
+    }
+
+    /// A whole row, which is also a column, of the symmetric matrix [N].
+    pub fn symmetric_row(&self, i: usize) -> [f32; N] {
+        let mut row = [0.0; N];
+        let (left, right) = row.split_at_mut_checked(i + 1).unwrap_or_default();
+        left.copy_from_slice(self.row(i).get(..left.len()).unwrap_or_default());
+        let below = self.rows().skip(i + 1);
+        right.iter_mut().zip(below).for_each(|(to, row)| *to = row.get(i).copied().unwrap_or(0.0));
+        row
+    }
+
+    /// Set the diagonal to one value, the rest to zero.
+    pub fn fill_diagonal(&mut self, value: f32) {
+        self.0.fill(0.0);
+        self.rows_mut().filter_map(<[f32]>::last_mut).for_each(|diagonal| *diagonal = value);
+    }
+
+    /// `A x` for the symmetric matrix.
+    pub fn multiply(&self, x: &[f32; N]) -> [f32; N] {
+        let mut product = [0.0; N];
+        for (i, (row, xi)) in self.rows().zip(x).enumerate() {
+            let Some((diagonal, left)) = row.split_last() else { continue };
+            add(&mut product, *xi, left);
+            if let Some(to) = product.get_mut(i) {
+                *to += diagonal * xi + dot(left, x);
+            }
+        }
+        product
+    }
+
+    /// Cholesky factor `L` of the symmetric matrix, in place, and the logarithm of its determinant; none if it is not
+    /// positive. nalgebra's own takes a full matrix by value, 9 kB of stack.
+    pub fn factorise(&mut self) -> Option<f32> {
+        let mut determinant = LogProduct::ONE;
+        for i in 0..N {
+            let (done, rest) = self.0.split_at_mut_checked(start(i))?;
+            let row = rest.get_mut(..=i)?;
+            for (j, before) in (Rows { rest: done, length: 1 }).enumerate() {
+                let (pivot, before) = before.split_last()?;
+                let (left, [entry, ..]) = row.split_at_mut_checked(j)? else { return None };
+                *entry = (*entry - dot(left, before)) / pivot;
+            }
+            let (diagonal, left) = row.split_last_mut()?;
+            let pivot = *diagonal - dot(left, left);
+            if pivot.is_nan() || pivot <= 0.0 {
+                return None;
+            }
+            *diagonal = libm::sqrtf(pivot);
+            determinant.multiply(pivot);
+        }
+        Some(determinant.value())
+    }
+
+    /// Invert a lower triangle, in place: `x_i = (e_i - sum over k < i of L_ik x_k)/L_ii` by rows.
+    pub fn invert(&mut self) {
+        let mut factors = [0.0; N];
+        for i in 0..N {
+            let Some((done, rest)) = self.0.split_at_mut_checked(start(i)) else { return };
+            let Some((diagonal, row)) = rest.get_mut(..=i).and_then(<[f32]>::split_last_mut) else { return };
+            *diagonal = 1.0 / *diagonal;
+            factors.iter_mut().zip(row.iter()).for_each(|(to, l)| *to = -*diagonal * l);
+            row.fill(0.0);
+            add_rows(row, &factors, Rows { rest: done, length: 1 });
+        }
+    }
+
+    /// `L x = b` for a lower triangle, in place.
+    pub fn solve_lower(&self, x: &mut [f32; N]) {
+        for (i, row) in self.rows().enumerate() {
+            if let (Some((pivot, left)), Some((done, [here, ..]))) = (row.split_last(), x.split_at_mut_checked(i)) {
+                *here = (*here - dot(left, done)) / pivot;
+            }
+        }
+    }
+
+    /// `L^T x = b` for a lower triangle, in place.
+    pub fn solve_upper(&self, x: &mut [f32; N]) {
+        for i in (0..N).rev() {
+            if let (Some((pivot, left)), Some((open, [here, ..]))) =
+                (self.row(i).split_last(), x.split_at_mut_checked(i))
+            {
+                *here /= pivot;
+                add(open, -*here, left);
+            }
+        }
+    }
+}
+
+/// Start of a row among the entries.
+const fn start(row: usize) -> usize {
+    row * (row + 1) / 2
+}
+
+/// `to += sum of factor * row`, four rows at a time where all four have an entry.
+fn add_rows(to: &mut [f32], factors: &[f32], mut rows: Rows<'_>) {
+    for (group, factors) in factors.chunks_exact(4).enumerate() {
+        let four = [rows.next(), rows.next(), rows.next(), rows.next()];
+        let terms = factors.iter().zip(four).filter_map(|(factor, row)| Some((*factor, row?)));
+        let shared = 4 * group + 1;
+        combine(to.get_mut(..shared.min(to.len())).unwrap_or_default(), terms.clone());
+        for (factor, row) in terms {
+            add(to.get_mut(shared..).unwrap_or_default(), factor, row.get(shared..).unwrap_or_default());
+        }
+    }
+    let left = factors.as_chunks::<4>().1;
+    left.iter().zip(rows).for_each(|(factor, row)| add(to, *factor, row));
+}
+
+/// The rows of a packed triangle, one longer than the other.
+#[derive(Debug, Clone)]
+pub struct Rows<'a> {
+    rest: &'a [f32],
+    length: usize,
+}
+
+impl<'a> Iterator for Rows<'a> {
+    type Item = &'a [f32];
+
+    fn next(&mut self) -> Option<&'a [f32]> {
+        let (row, rest) = self.rest.split_at_checked(self.length)?;
+        (self.rest, self.length) = (rest, self.length + 1);
+        Some(row)
+    }
+}
+
+/// The rows of a packed triangle, to be changed.
+#[derive(Debug)]
+pub struct RowsMut<'a> {
+    rest: &'a mut [f32],
+    length: usize,
+}
+
+impl<'a> Iterator for RowsMut<'a> {
+    type Item = &'a mut [f32];
+
+    fn next(&mut self) -> Option<&'a mut [f32]> {
+        let (row, rest) = core::mem::take(&mut self.rest).split_at_mut_checked(self.length)?;
+        (self.rest, self.length) = (rest, self.length + 1);
+        Some(row)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{SMatrix, SVector};
+
+    use super::*;
+
+    /// A positive matrix, and its triangle.
+    fn example() -> (SMatrix<f32, 9, 9>, Triangle<9, 45>) {
+        let r = SMatrix::<f32, 9, 9>::from_fn(|i, j| libm::sinf((3 * i + 5 * j * j) as f32));
+        let a = r * r.transpose() + SMatrix::identity();
+        let mut triangle = Triangle::ZERO;
+        for (i, row) in triangle.rows_mut().enumerate() {
+            row.iter_mut().enumerate().for_each(|(j, v)| *v = a[(i, j)]);
+        }
+        (a, triangle)
+    }
+
+    #[test]
+    fn entries_rows_and_products_are_those_of_the_matrix() {
+        let (a, triangle) = example();
+        let x: [f32; 9] = core::array::from_fn(|i| i as f32 - 2.0);
+        let product = a * SVector::from(x);
+        for i in 0..9 {
+            assert_eq!(triangle.symmetric_row(i), core::array::from_fn(|j| a[(i.max(j), i.min(j))]));
+            assert!((triangle.multiply(&x)[i] - product[i]).abs() < 1e-4); // f32 rounding
+            assert_eq!(triangle.get(i, 3), a[(i.max(3), i.min(3))]);
+        }
+        assert_eq!((triangle.rows().count(), triangle.get(9, 0), triangle.row(9).len()), (9, 0.0, 0));
+    }
+
+    #[test]
+    fn the_factor_solves_and_inverts() {
+        let (a, mut factor) = example();
+        let log_determinant = factor.factorise().unwrap();
+        assert!((log_determinant - libm::logf(a.determinant())).abs() < 1e-4);
+        let x = SVector::<f32, 9>::from_fn(|i, _| i as f32 - 2.0);
+        let mut b: [f32; 9] = (a * x).into();
+        factor.solve_lower(&mut b);
+        factor.solve_upper(&mut b);
+        let mut inverse = factor;
+        inverse.invert();
+        for i in 0..9 {
+            assert!((b[i] - x[i]).abs() < 1e-4, "{} {}", b[i], x[i]);
+            for j in 0..=i {
+                let product: f32 = (j..=i).map(|k| factor.get(i, k) * inverse.get(k, j)).sum();
+                assert!((product - f32::from(u8::from(i == j))).abs() < 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_positive_has_no_factor() {
+        let mut zero = Triangle::<3, 6>::ZERO;
+        assert_eq!(zero.factorise(), None);
+        zero.fill_diagonal(f32::NAN);
+        assert_eq!(zero.factorise(), None);
+    }
+}
