@@ -18,6 +18,19 @@ pub enum MonitorState {
     Dead = 3,
 }
 
+impl MonitorState {
+    /// The state of a code, as in a record.
+    pub const fn from_code(code: u8) -> Option<Self> {
+        match code {
+            0 => Some(Self::Ok),
+            1 => Some(Self::Noisy),
+            2 => Some(Self::Jumps),
+            3 => Some(Self::Dead),
+            _ => None,
+        }
+    }
+}
+
 /// State of one monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Health {

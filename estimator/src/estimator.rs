@@ -38,6 +38,19 @@ pub struct Setup {
     pub process_noise: f32,
 }
 
+impl Setup {
+    /// True if every number is one, and every size positive.
+    pub fn is_sound(&self) -> bool {
+        let Self { prior, calibration, noise, gate, process_noise } = self;
+        let sizes = [prior.sigma, *noise, gate.sigmas, calibration.powered, prior.upper - prior.lower];
+        let numbers = calibration.transfer.iter().chain(&calibration.nominal);
+        let mut numbers = numbers.chain([&calibration.kick_per_ampere, &prior.mean, process_noise]).chain(&sizes);
+        numbers.all(|v| v.is_finite())
+            && sizes.iter().chain(&calibration.nominal).all(|v| *v > 0.0)
+            && *process_noise >= 0.0
+    }
+}
+
 /// The ring and all else that is known beforehand; read only. Two models can be compared on the same frames.
 #[derive(Debug)]
 pub struct Model<'a, G> {
@@ -250,9 +263,13 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.last_sequence = None;
     }
 
-    /// The model has been exchanged for another one of the same ring: the past is to be weighted anew by it.
-    pub fn doubt(&mut self) {
+    /// Go over to another model of the same machine: all frames so far are weighed anew by it.
+    ///
+    /// # Errors
+    /// [`crate::surrogate::Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
+    pub fn adopt(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
         self.stale = true;
+        if !self.started || self.linearise_anew(model) { Ok(()) } else { Err(crate::surrogate::Unstable) }
     }
 
     /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
@@ -459,6 +476,11 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         let origin = self.gaussian.origin().get(i).copied().unwrap_or(0.0);
         let unbounded = origin + self.solution.delta.get(i).copied().unwrap_or(0.0);
         if clipped { unbounded } else { self.solution.map_params.get(i).copied().unwrap_or(unbounded) }
+    }
+
+    /// Frames used so far.
+    pub fn frames(&self) -> u32 {
+        self.frames
     }
 
     /// Covariance of two params `theta = ln var`.

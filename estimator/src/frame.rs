@@ -1,20 +1,15 @@
 //! One machine cycle as the front end sends it. The bytes of a worked example stand in `docs/frame.md`.
 //!
 //! On the wire a frame is COBS-encoded and ends with a zero byte. Inside: version (1 byte), length of the body (2 bytes,
-//! little endian), the body in postcard, and the CRC-32 (ISO-HDLC, 4 bytes, little endian) of all that. COBS gives
-//! boundaries, not integrity: without the CRC a flipped bit decodes as a good frame.
+//! little endian), the body in postcard, and the CRC-32 (ISO-HDLC, 4 bytes, little endian) of all that; see `packet.rs`.
 
 use core::fmt;
 
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
+use crate::packet;
 
-/// Bytes in front of the body: version and length.
-const HEADER: usize = 3;
-/// Bytes of the CRC.
-const TRAILER: usize = 4;
 /// Largest decoded frame; the largest body of 64 monitors and 64 correctors is 719 bytes.
 const MAX_BYTES: usize = 768;
 
@@ -231,21 +226,7 @@ impl<const B: usize, const C: usize> Frame<B, C> {
     /// [`FrameError::Space`] if `out` is too small; [`Frame::MAX_WIRE_BYTES`] always suffice.
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
         let () = Self::FITS;
-        let space = FrameError::Space { got: out.len() };
-        let mut plain = [0u8; MAX_BYTES];
-        let (header, rest) = plain.split_at_mut(HEADER);
-        let body = postcard::to_slice(&self.body(), rest).map_err(|_| space)?.len();
-        header.copy_from_slice(&[Self::VERSION, body as u8, (body >> 8) as u8]);
-        let covered = HEADER + body;
-        let crc = CRC.checksum(plain.get(..covered).ok_or(space)?);
-        plain.get_mut(covered..covered + TRAILER).ok_or(space)?.copy_from_slice(&crc.to_le_bytes());
-        let plain = plain.get(..covered + TRAILER).ok_or(space)?;
-        if out.len() <= cobs::max_encoding_length(plain.len()) {
-            return Err(space);
-        }
-        let written = cobs::encode(plain, out);
-        *out.get_mut(written).ok_or(space)? = 0;
-        Ok(written + 1)
+        packet::seal(Self::VERSION, &self.body(), out)
     }
 
     /// Read a frame from its bytes, with or without the terminating zero; `bytes` is used as work space.
@@ -254,24 +235,7 @@ impl<const B: usize, const C: usize> Frame<B, C> {
     /// [`FrameError`]: COBS, length, CRC, version, counts and ranges are all checked here, and nowhere else.
     pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
         let () = Self::FITS;
-        let received = bytes.len();
-        if received > Self::MAX_WIRE_BYTES {
-            return Err(FrameError::Oversized { limit: Self::MAX_WIRE_BYTES, got: received });
-        }
-        let encoded = match bytes {
-            [encoded @ .., 0] => encoded,
-            encoded => encoded,
-        };
-        if encoded.is_empty() {
-            return Err(FrameError::Truncated { need: HEADER + TRAILER, got: 0 });
-        }
-        // the decoder would stop at a zero within and drop what follows
-        if encoded.contains(&0) {
-            return Err(FrameError::Framing);
-        }
-        let length = cobs::decode_in_place(encoded).map_err(|_| FrameError::Framing)?;
-        let plain = encoded.get(..length).ok_or(FrameError::Framing)?;
-        let body = checked(plain, Self::VERSION)?;
+        let body = packet::open(Self::VERSION, Self::MAX_WIRE_BYTES, bytes)?;
         match postcard::take_from_bytes::<Body<B, C>>(body) {
             Ok((body, [])) => body.frame(),
             _ => Err(miscounted(body, B, C)),
@@ -297,33 +261,6 @@ impl<const B: usize, const C: usize> Frame<B, C> {
             valid: self.valid,
         }
     }
-}
-
-/// The body, if length, CRC and version are right.
-fn checked(plain: &[u8], version: u8) -> Result<&[u8], FrameError> {
-    let (&[got_version, low, high], rest) = plain
-        .split_first_chunk::<HEADER>()
-        .ok_or(FrameError::Truncated { need: HEADER + TRAILER, got: plain.len() })?;
-    let need = HEADER + usize::from(u16::from_le_bytes([low, high])) + TRAILER;
-    if plain.len() < need {
-        return Err(FrameError::Truncated { need, got: plain.len() });
-    }
-    if plain.len() > need {
-        return Err(FrameError::Oversized { limit: need, got: plain.len() });
-    }
-    let (body, trailer) = rest.split_last_chunk::<TRAILER>().ok_or(FrameError::Truncated { need, got: plain.len() })?;
-    let stated = u32::from_le_bytes(*trailer);
-    let mut digest = CRC.digest();
-    digest.update(&[got_version, low, high]);
-    digest.update(body);
-    let computed = digest.finalize();
-    if stated != computed {
-        return Err(FrameError::Corrupted { stated, computed });
-    }
-    if got_version != version {
-        return Err(FrameError::Version { supported: version, got: got_version });
-    }
-    Ok(body)
 }
 
 /// Which list of a body with a good CRC does not fit this machine.
@@ -401,6 +338,9 @@ mod tests {
     use std::vec::Vec as Bytes;
 
     use super::*;
+    use crate::packet::{HEADER, TRAILER};
+
+    const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
     fn frame() -> Frame<2, 3> {
         Frame {

@@ -7,6 +7,7 @@
 #![no_std]
 #![forbid(unsafe_code)]
 
+pub mod booster;
 mod campaign;
 mod drive;
 mod estimate;
@@ -15,6 +16,7 @@ mod frame;
 mod gaussian;
 mod linear;
 mod monitor;
+pub mod packet;
 mod prior;
 mod sum;
 pub mod surrogate;

@@ -132,9 +132,9 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
     }
 }
 
-/// Start of a row among the entries.
-const fn start(row: usize) -> usize {
-    row * (row + 1) / 2
+/// Start of a row among the entries of a packed triangle.
+pub const fn start(row: usize) -> usize {
+    row.saturating_mul(row.saturating_add(1)) / 2
 }
 
 /// `to += sum of factor * row`, four rows at a time where all four have an entry.

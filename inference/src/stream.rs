@@ -1,21 +1,15 @@
 //! A recording as the core sees it: wire frames, and a model made of its header.
 
 use estimator::{
-    Calibration, CurrentCode, Estimate, Estimator, FitQuality, Frame, FrameError, Gate, IngestError, MagnetCurrents,
-    Model, PositionCode, Prior, RfCode, Setup, TuneCode,
+    Calibration, CurrentCode, FitQuality, FrameError, Gate, IngestError, MagnetCurrents, Model, PositionCode, Prior,
+    RfCode, Setup, TuneCode,
 };
 use training::BoosterGreen;
 use twin::Ring;
 
 use crate::recording::{Header, Layout, Recording, Row};
 
-/// The core for the Booster: 33 monitors, 48 correctors, 48 params (1176 pairs of them), and room for 100 settings: each
-/// corrector up and down, none, and three of the RF.
-pub type Booster = Estimator<BoosterGreen, 33, 48, 48, 100, 1176>;
-/// Its frame.
-pub type BoosterFrame = Frame<33, 48>;
-/// Its estimate.
-pub type BoosterEstimate = Estimate<33, 48>;
+pub use estimator::booster::{Estimate as BoosterEstimate, Estimator as Booster, Frame as BoosterFrame};
 
 /// Width of the prior of a var, the paper's.
 pub const PRIOR_WIDTH: f32 = 0.03;

@@ -3,8 +3,8 @@
 use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, SymmetricBlock};
 use twin::{ClosedOrbit, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
 
-/// The Booster's Green's function surrogate: 15 + 18 monitors, 24 + 24 correctors, 96 nodes, 4656 pairs of them.
-pub type BoosterGreen = Green<15, 18, 24, 24, 96, 4656>;
+/// The Booster's Green's function surrogate.
+pub type BoosterGreen = estimator::booster::Green;
 
 /// Why no tables can be made for a ring.
 #[derive(Debug, thiserror::Error)]
@@ -62,7 +62,7 @@ pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize
         x: plane(ring, &optics, Plane::X, monitors_x, correctors_x),
         y: plane(ring, &optics, Plane::Y, monitors_y, correctors_y),
         dispersion: dispersion(ring, &optics, monitors_x)?,
-        first_family: ring.gradients().iter().filter(|k| **k > 0.0).count(),
+        first_family: ring.gradients().iter().filter(|k| **k > 0.0).count() as u16,
         stated_error: STATED_ERROR,
     })
 }

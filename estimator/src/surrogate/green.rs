@@ -67,7 +67,7 @@ pub struct Green<const BX: usize, const BY: usize, const CX: usize, const CY: us
     /// Momentum.
     pub dispersion: Dispersion<BX, Q>,
     /// Number of quadrupoles on the first (QH) supply; they come first.
-    pub first_family: usize,
+    pub first_family: u16,
     /// Stated rms error in x and y [m].
     pub stated_error: [f32; 2],
 }
@@ -167,9 +167,10 @@ impl<
     fn linearise(&self, strength: &[f32; N], at: &mut Self::Linearised) -> Result<(), Unstable> {
         const { assert!(B == BX + BY && C == CX + CY && Q == 2 * N, "planes and nodes add up") };
         let mut mutual = Triangle::ZERO;
-        self.y.linearise(strength, self.first_family, &mut at.y, &mut mutual)?;
+        let first_family = usize::from(self.first_family);
+        self.y.linearise(strength, first_family, &mut at.y, &mut mutual)?;
         // x last: what it leaves between the nodes is used once more, for the dispersion
-        self.x.linearise(strength, self.first_family, &mut at.x, &mut mutual)?;
+        self.x.linearise(strength, first_family, &mut at.x, &mut mutual)?;
         self.linearise_dispersion(&self.x.excess(strength), at, &mutual);
         Ok(())
     }
@@ -187,13 +188,13 @@ impl<
         }
         // A change of a family's current is a change of ln strength that is known.
         for (reading, slope) in into.reading.iter_mut().zip(into.jacobian.as_slice().chunks_exact(N)) {
-            let (first, second) = slope.split_at(self.first_family.min(N));
+            let (first, second) = slope.split_at(usize::from(self.first_family).min(N));
             *reading += drive.strength[0] * first.iter().sum::<f32>() + drive.strength[1] * second.iter().sum::<f32>();
         }
     }
 
     fn first_family(&self) -> usize {
-        self.first_family
+        usize::from(self.first_family)
     }
 
     fn horizontal_monitors(&self) -> usize {

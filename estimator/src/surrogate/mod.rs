@@ -1,9 +1,11 @@
 //! A fast stand-in for the twin: the orbit that a drive makes at given gradients, and its derivative.
 
 mod green;
+mod parcel;
 mod quantised;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane};
+pub use parcel::{Head, List, Parcel, ParcelError, Table};
 pub use quantised::{Block, SymmetricBlock};
 
 use nalgebra::SMatrix;

@@ -1,5 +1,7 @@
 //! Matrices in 16-bit codes with one scale.
 
+use crate::triangle::start;
+
 /// A matrix `[R][C]` of codes, stored by columns; the value is `scale * code`, off by half a step, `max/65534`, at most.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Block<const R: usize, const C: usize> {
@@ -54,6 +56,16 @@ impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
         let mut codes = [0; T];
         codes.iter_mut().zip(all()).for_each(|(to, (r, c))| *to = code(value(r, c), scale));
         Self { scale, codes }
+    }
+
+    /// The codes of each row, up to its diagonal.
+    pub fn rows(&self) -> impl Iterator<Item = &[i16]> {
+        (0..N).map(|row| self.codes.get(start(row)..start(row + 1)).unwrap_or_default())
+    }
+
+    /// The codes of one row, to be changed.
+    pub fn row_mut(&mut self, row: usize) -> Option<&mut [i16]> {
+        self.codes.get_mut(start(row)..start(row.saturating_add(1)))
     }
 
     /// The values, row by row.

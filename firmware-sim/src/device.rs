@@ -1,0 +1,169 @@
+//! A device: the core, the tables that it goes by, and what it answers to each packet.
+
+use estimator::booster::{Estimate, Estimator, Green};
+use estimator::surrogate::{Parcel, ParcelError};
+use estimator::{Model, Setup, packet};
+use heapless::Vec;
+
+use crate::link::{PIECE, REQUEST, Refusal, Reply, Request, Status, TRIANGLE, Taken, Vitals};
+
+/// The core and its tables: those in flash, and one slot for others that came over the wire.
+#[derive(Debug)]
+pub struct Device<'m> {
+    core: &'m mut Estimator,
+    built_in: &'m Green,
+    slot: &'m mut Green,
+    contents: Contents,
+    setup: Option<Setup>,
+    wants_covariance: bool,
+    refused: u32,
+}
+
+/// What the slot holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Contents {
+    /// Nothing of use.
+    Nothing,
+    /// Parts of new tables.
+    Parts,
+    /// The tables in use.
+    InUse,
+}
+
+impl<'m> Device<'m> {
+    /// A device that waits for its setup.
+    pub fn new(core: &'m mut Estimator, built_in: &'m Green, slot: &'m mut Green) -> Self {
+        Self { core, built_in, slot, contents: Contents::Nothing, setup: None, wants_covariance: false, refused: 0 }
+    }
+
+    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first. Returns that answer.
+    pub fn hear(&mut self, bytes: &mut [u8], vitals: Vitals, reply: &mut impl FnMut(&Reply)) -> Option<Estimate> {
+        if packet::kind(bytes) == Some(REQUEST) {
+            self.obey(bytes, vitals, reply);
+            return None;
+        }
+        self.ingest(bytes, reply)
+    }
+
+    /// What can be done between packets. See [`estimator::Estimator::prepare`].
+    pub fn prepare(&mut self) -> bool {
+        let Some(setup) = &self.setup else { return false };
+        self.core.prepare(&Model { surrogate: tables(self.contents, self.built_in, self.slot), setup })
+    }
+
+    /// Count a packet that was no packet.
+    pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply)) {
+        self.refused = self.refused.saturating_add(1);
+        reply(&Reply::Refused { why: why.into(), count: self.refused });
+    }
+
+    /// A frame: the answer, and what was asked for with it.
+    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply)) -> Option<Estimate> {
+        let Some(setup) = &self.setup else {
+            self.refuse(estimator::IngestError::NotStarted, reply);
+            return None;
+        };
+        let model = Model { surrogate: tables(self.contents, self.built_in, self.slot), setup };
+        match self.core.ingest(&model, bytes) {
+            Ok(estimate) => {
+                reply(&Reply::Estimate((&estimate).into()));
+                if core::mem::take(&mut self.wants_covariance) {
+                    self.send_covariance(estimate.sequence, reply);
+                }
+                Some(estimate)
+            }
+            Err(error) => {
+                self.refuse(error, reply);
+                None
+            }
+        }
+    }
+
+    fn send_covariance(&self, sequence: u32, reply: &mut impl FnMut(&Reply)) {
+        let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
+        for first in (0..TRIANGLE as u16).step_by(PIECE) {
+            let entries: Vec<f32, PIECE> =
+                places.by_ref().take(PIECE).map(|(i, j)| self.core.covariance(i, j)).collect();
+            reply(&Reply::Covariance { sequence, first, entries });
+        }
+    }
+
+    fn obey(&mut self, bytes: &mut [u8], vitals: Vitals, reply: &mut impl FnMut(&Reply)) {
+        match packet::unseal::<Request>(REQUEST, bytes) {
+            Ok(Request::Restart(setup)) => self.restart(setup, reply),
+            Ok(Request::ForgetSequence) => {
+                self.core.forget_sequence();
+                reply(&Reply::SequenceForgotten);
+            }
+            Ok(Request::Covariance) => self.wants_covariance = true,
+            Ok(Request::Status) => reply(&Reply::Status(self.status(vitals))),
+            Ok(Request::Model(parcel)) => reply(&Reply::Model(self.load(&parcel))),
+            Ok(Request::BuiltIn) => reply(&Reply::Model(self.go_back())),
+            Err(error) => self.refuse(error, reply),
+        }
+    }
+
+    fn restart(&mut self, setup: Setup, reply: &mut impl FnMut(&Reply)) {
+        let model = Model { surrogate: tables(self.contents, self.built_in, self.slot), setup: &setup };
+        if !setup.is_sound() || self.core.restart(&model).is_err() {
+            self.refuse(Refusal::Setup, reply);
+            return;
+        }
+        self.setup = Some(setup);
+        reply(&Reply::Restarted);
+    }
+
+    /// Write a part of new tables into the slot; with the last one they are put in use.
+    fn load(&mut self, parcel: &Parcel) -> Result<Taken, ParcelError> {
+        match (self.contents, parcel) {
+            (Contents::InUse, _) => return Err(ParcelError::Busy),
+            (Contents::Nothing, Parcel::Codes { .. } | Parcel::Values { .. } | Parcel::Seal { .. }) => {
+                return Err(ParcelError::Headless);
+            }
+            _ => {}
+        }
+        // a part that does not fit spoils them all
+        self.contents = Contents::Nothing;
+        self.slot.take(parcel)?;
+        if !matches!(parcel, Parcel::Seal { .. }) {
+            self.contents = Contents::Parts;
+            return Ok(Taken::Stored);
+        }
+        if let Some(setup) = &self.setup
+            && self.core.adopt(&Model { surrogate: &*self.slot, setup }).is_err()
+        {
+            // the tables in flash have described all frames so far, so they can again
+            let _ = self.core.adopt(&Model { surrogate: self.built_in, setup });
+            return Err(ParcelError::Unstable);
+        }
+        self.contents = Contents::InUse;
+        Ok(Taken::InUse)
+    }
+
+    fn go_back(&mut self) -> Result<Taken, ParcelError> {
+        let was = core::mem::replace(&mut self.contents, Contents::Nothing);
+        if let (Contents::InUse, Some(setup)) = (was, &self.setup) {
+            self.core.adopt(&Model { surrogate: self.built_in, setup }).map_err(|_| ParcelError::Unstable)?;
+        }
+        Ok(Taken::BuiltIn)
+    }
+
+    fn status(&mut self, vitals: Vitals) -> Status {
+        let tables = tables(self.contents, self.built_in, self.slot);
+        let quality = self.setup.as_ref().map(|setup| self.core.fit_quality(&Model { surrogate: tables, setup }));
+        Status {
+            frames: self.core.frames(),
+            refused: self.refused,
+            vitals,
+            tables: tables.digest(),
+            loaded: self.contents == Contents::InUse,
+            chi_square: quality.map_or(0.0, |q| q.chi_square),
+            degrees_of_freedom: quality.map_or(0.0, |q| q.degrees_of_freedom),
+        }
+    }
+}
+
+/// The tables in use.
+fn tables<'t>(contents: Contents, built_in: &'t Green, slot: &'t Green) -> &'t Green {
+    if contents == Contents::InUse { slot } else { built_in }
+}

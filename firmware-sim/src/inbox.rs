@@ -1,0 +1,150 @@
+//! From bytes to packets: what stands between two zeros.
+
+use embedded_io::{Error, ErrorKind, Read};
+use estimator::packet;
+
+use crate::link::Refusal;
+
+/// Cycles without a byte after which the rest of a packet will not come: its sender has stalled, or begun anew.
+const PATIENCE: u32 = 2;
+
+/// The packet that is coming in.
+#[derive(Debug)]
+pub struct Inbox {
+    bytes: [u8; packet::MAX_WIRE_BYTES],
+    length: usize,
+    /// More came than any packet has; what follows up to the next zero is dropped.
+    overflown: bool,
+    /// Cycles since the last byte.
+    silence: u32,
+    /// Cycles in which nothing came, since power-on.
+    silent_cycles: u32,
+}
+
+/// What comes out of an inbox.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Event<'i> {
+    /// The bytes of a packet, its zero included.
+    Packet(&'i mut [u8]),
+    /// Bytes that are none.
+    Broken(Refusal),
+    /// Nothing came for a cycle.
+    Silence,
+    /// The source has ended.
+    End,
+}
+
+impl Default for Inbox {
+    fn default() -> Self {
+        Self { bytes: [0; packet::MAX_WIRE_BYTES], length: 0, overflown: false, silence: 0, silent_cycles: 0 }
+    }
+}
+
+impl Inbox {
+    /// Cycles in which nothing came, since power-on.
+    pub fn silent_cycles(&self) -> u32 {
+        self.silent_cycles
+    }
+
+    /// Wait for a packet, or for a cycle to pass without a byte.
+    ///
+    /// # Errors
+    /// What the source reports, but [`ErrorKind::TimedOut`].
+    pub fn next<R: Read>(&mut self, source: &mut R) -> Result<Event<'_>, R::Error> {
+        let mut byte = [0];
+        loop {
+            match source.read(&mut byte) {
+                Ok(0) => return Ok(Event::End),
+                Ok(_) => self.silence = 0,
+                Err(error) if error.kind() == ErrorKind::TimedOut => return Ok(self.wait()),
+                Err(error) => return Err(error),
+            }
+            match (byte, self.overflown) {
+                ([0], true) => {
+                    (self.length, self.overflown) = (0, false);
+                    return Ok(Event::Broken(Refusal::Oversized));
+                }
+                ([0], false) if self.length > 0 => {
+                    self.push(0);
+                    let length = core::mem::take(&mut self.length);
+                    return Ok(Event::Packet(self.bytes.get_mut(..length).unwrap_or_default()));
+                }
+                ([0], false) | (_, true) => {} // an empty packet is no packet: a sender may begin with a zero
+                ([other], false) => self.push(other),
+            }
+        }
+    }
+
+    fn push(&mut self, byte: u8) {
+        match self.bytes.get_mut(self.length) {
+            Some(to) => (*to, self.length) = (byte, self.length + 1),
+            None => self.overflown = true,
+        }
+    }
+
+    fn wait(&mut self) -> Event<'static> {
+        self.silence = self.silence.saturating_add(1);
+        self.silent_cycles = self.silent_cycles.saturating_add(1);
+        if self.silence < PATIENCE || (self.length == 0 && !self.overflown) {
+            return Event::Silence;
+        }
+        (self.length, self.overflown) = (0, false);
+        Event::Broken(Refusal::Stalled)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A source of bytes, with cycles that pass where a `None` stands.
+    struct Script<'s>(&'s [Option<u8>]);
+
+    impl embedded_io::ErrorType for Script<'_> {
+        type Error = ErrorKind;
+    }
+
+    impl Read for Script<'_> {
+        fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
+            let Some((first, rest)) = self.0.split_first() else { return Ok(0) };
+            self.0 = rest;
+            to[0] = first.ok_or(ErrorKind::TimedOut)?;
+            Ok(1)
+        }
+    }
+
+    fn bytes<const L: usize>(bytes: [u8; L]) -> [Option<u8>; L] {
+        bytes.map(Some)
+    }
+
+    #[test]
+    fn packets_end_with_a_zero_and_may_begin_with_one() {
+        let (script, mut inbox) = (bytes([0, 0, 2, 7, 0, 3, 0, 9]), Inbox::default());
+        let mut source = Script(&script);
+        assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [2, 7, 0])));
+        assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [3, 0])));
+        assert_eq!(inbox.next(&mut source), Ok(Event::End));
+    }
+
+    #[test]
+    fn a_packet_that_does_not_end_is_dropped_up_to_the_next_zero() {
+        let mut script = [Some(1); packet::MAX_WIRE_BYTES + 10];
+        script[packet::MAX_WIRE_BYTES + 5] = Some(0);
+        script[packet::MAX_WIRE_BYTES + 7] = Some(0);
+        let (mut source, mut inbox) = (Script(&script), Inbox::default());
+        assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Oversized)));
+        assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [1, 0])));
+    }
+
+    #[test]
+    fn a_stalled_sender_does_not_spoil_the_packet_after() {
+        let script = [Some(5), None, Some(6), None, None, None, Some(7), Some(0)];
+        let (mut source, mut inbox) = (Script(&script), Inbox::default());
+        assert_eq!(inbox.next(&mut source), Ok(Event::Silence), "one cycle is no stall");
+        assert_eq!(inbox.next(&mut source), Ok(Event::Silence));
+        assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Stalled)));
+        assert_eq!(inbox.next(&mut source), Ok(Event::Silence), "nothing is waiting any more");
+        assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [7, 0])));
+        assert_eq!(inbox.silent_cycles(), 4);
+    }
+}

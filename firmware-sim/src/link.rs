@@ -1,0 +1,274 @@
+//! What host and device say to each other besides frames: requests in, replies out, each a packet of its own kind. See
+//! `docs/device.md`.
+
+use estimator::booster::Estimate;
+use estimator::surrogate::{Parcel, ParcelError};
+use estimator::{FrameError, Health, IngestError, MonitorState, Setup, packet};
+use heapless::Vec;
+use serde::{Deserialize, Serialize};
+
+/// First byte of a request: kind 1 of version 1.
+pub const REQUEST: u8 = 0x11;
+/// First byte of a reply.
+pub const REPLY: u8 = 0x21;
+/// Entries of a covariance in one piece: 21 pieces make the triangle of 48.
+pub const PIECE: usize = 56;
+/// Entries of the covariance's lower triangle.
+pub const TRIANGLE: usize = 48 * 49 / 2;
+
+/// What a host asks of a device.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // there is no allocator to box one with
+pub enum Request {
+    /// Forget all frames and begin at the prior.
+    Restart(Setup),
+    /// Take the next frame whatever its number: the front end counts anew.
+    ForgetSequence,
+    /// Send the covariance after the next estimate.
+    Covariance,
+    /// Say how the device is.
+    Status,
+    /// A part of new tables. The last one puts them in use, if they are whole.
+    Model(Parcel),
+    /// Use the tables in flash again, which frees the slot.
+    BuiltIn,
+}
+
+/// What a device says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // there is no allocator to box one with
+pub enum Reply {
+    /// The answer to a frame.
+    Estimate(Answer),
+    /// A part of the covariance of `theta = ln var`, lower triangle row by row.
+    Covariance {
+        /// The frame after which it was taken.
+        sequence: u32,
+        /// Place of the first entry.
+        first: u16,
+        /// The entries.
+        entries: Vec<f32, PIECE>,
+    },
+    /// A packet was refused; the posterior is as it was.
+    Refused {
+        /// Why.
+        why: Refusal,
+        /// Packets refused so far.
+        count: u32,
+    },
+    /// The device begins at the prior.
+    Restarted,
+    /// The next frame may have any number.
+    SequenceForgotten,
+    /// A part of new tables was taken, or not.
+    Model(Result<Taken, ParcelError>),
+    /// How the device is.
+    Status(Status),
+}
+
+/// What became of a part of new tables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Taken {
+    /// It waits for the rest.
+    Stored,
+    /// All are in use now; the posterior is that of all frames so far under them.
+    InUse,
+    /// The tables in flash are in use.
+    BuiltIn,
+}
+
+/// Why a packet was refused; the values that disagreed stand in the device's log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(missing_docs)] // named after `FrameError` and `IngestError`
+pub enum Refusal {
+    Framing,
+    Truncated,
+    Oversized,
+    Corrupted,
+    Version,
+    Malformed,
+    Count,
+    Range,
+    Repeated,
+    OutOfOrder,
+    Beyond,
+    NotStarted,
+    /// A setup with a number that is none, or a ring without a design.
+    Setup,
+    /// The rest of it did not come within two cycles.
+    Stalled,
+}
+
+impl From<FrameError> for Refusal {
+    fn from(error: FrameError) -> Self {
+        match error {
+            FrameError::Framing => Self::Framing,
+            FrameError::Truncated { .. } => Self::Truncated,
+            FrameError::Oversized { .. } => Self::Oversized,
+            FrameError::Corrupted { .. } => Self::Corrupted,
+            FrameError::Version { .. } => Self::Version,
+            FrameError::Count { .. } => Self::Count,
+            FrameError::Range { .. } => Self::Range,
+            _ => Self::Malformed,
+        }
+    }
+}
+
+impl From<IngestError> for Refusal {
+    fn from(error: IngestError) -> Self {
+        match error {
+            IngestError::Frame(error) => error.into(),
+            IngestError::Repeated { .. } => Self::Repeated,
+            IngestError::OutOfOrder { .. } => Self::OutOfOrder,
+            IngestError::Beyond(_) => Self::Beyond,
+            _ => Self::NotStarted,
+        }
+    }
+}
+
+/// What a board says of itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Vitals {
+    /// Bytes that found the receive queue or the receiver full.
+    pub lost_bytes: u32,
+    /// Machine cycles since power-on.
+    pub cycles: u32,
+    /// Cycles in which nothing came.
+    pub silent_cycles: u32,
+    /// Most stack used so far [bytes].
+    pub stack_bytes: u32,
+}
+
+/// How the device is.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Status {
+    /// Frames used so far.
+    pub frames: u32,
+    /// Packets refused so far.
+    pub refused: u32,
+    /// What the board says of itself.
+    pub vitals: Vitals,
+    /// CRC of the tables in use, see [`estimator::surrogate::Green::digest`].
+    pub tables: u32,
+    /// The tables in use came over the wire.
+    pub loaded: bool,
+    /// See [`estimator::FitQuality`].
+    pub chi_square: f32,
+    /// Degrees of freedom of that.
+    pub degrees_of_freedom: f32,
+}
+
+/// An [`Estimate`] on the wire: the same fields in the same order, lists with their length.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs)] // those of `Estimate`
+pub struct Answer {
+    pub sequence: u32,
+    pub time_us: u64,
+    pub frames: u32,
+    pub rejected_frames: u32,
+    pub mean: Vec<f32, 48>,
+    pub sigma: Vec<f32, 48>,
+    pub map_params: Vec<f32, 48>,
+    pub centre: Vec<f32, 48>,
+    pub params_sigma: Vec<f32, 48>,
+    pub clipped: u64,
+    pub nis: f32,
+    pub accepted: u64,
+    pub rejected: u64,
+    pub confirmed: u64,
+    pub restarted: u64,
+    pub setting: Option<u16>,
+    pub log_evidence: f32,
+    pub linearised: bool,
+    pub health: Vec<(u8, f32, f32, u32), 33>,
+}
+
+impl From<&Estimate> for Answer {
+    fn from(e: &Estimate) -> Self {
+        let list = |values: &[f32; 48]| values.iter().copied().collect();
+        Self {
+            sequence: e.sequence,
+            time_us: e.time_us,
+            frames: e.frames,
+            rejected_frames: e.rejected_frames,
+            mean: list(&e.mean),
+            sigma: list(&e.sigma),
+            map_params: list(&e.map_params),
+            centre: list(&e.centre),
+            params_sigma: list(&e.params_sigma),
+            clipped: e.clipped,
+            nis: e.nis,
+            accepted: e.accepted,
+            rejected: e.rejected,
+            confirmed: e.confirmed,
+            restarted: e.restarted,
+            setting: e.setting,
+            log_evidence: e.log_evidence,
+            linearised: e.linearised,
+            health: e.health.iter().map(|h| (h.state as u8, h.noise, h.weighted_as, h.rejected)).collect(),
+        }
+    }
+}
+
+impl Answer {
+    /// The estimate, if every list is whole.
+    pub fn estimate(&self) -> Option<Estimate> {
+        let list = |values: &Vec<f32, 48>| <[f32; 48]>::try_from(values.as_slice()).ok();
+        let mut health = [Health::default(); 33];
+        if self.health.len() != health.len() {
+            return None;
+        }
+        for (to, &(state, noise, weighted_as, rejected)) in health.iter_mut().zip(&self.health) {
+            *to = Health { state: MonitorState::from_code(state)?, noise, weighted_as, rejected };
+        }
+        Some(Estimate {
+            sequence: self.sequence,
+            time_us: self.time_us,
+            frames: self.frames,
+            rejected_frames: self.rejected_frames,
+            mean: list(&self.mean)?,
+            sigma: list(&self.sigma)?,
+            map_params: list(&self.map_params)?,
+            centre: list(&self.centre)?,
+            params_sigma: list(&self.params_sigma)?,
+            clipped: self.clipped,
+            nis: self.nis,
+            accepted: self.accepted,
+            rejected: self.rejected,
+            confirmed: self.confirmed,
+            restarted: self.restarted,
+            setting: self.setting,
+            log_evidence: self.log_evidence,
+            linearised: self.linearised,
+            health,
+        })
+    }
+}
+
+impl Request {
+    /// Write the request as a packet; returns its bytes.
+    ///
+    /// # Errors
+    /// [`FrameError::Space`]; [`packet::MAX_WIRE_BYTES`] always suffice.
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REQUEST, self, out)
+    }
+}
+
+impl Reply {
+    /// Write the reply as a packet; returns its bytes.
+    ///
+    /// # Errors
+    /// [`FrameError::Space`]; [`packet::MAX_WIRE_BYTES`] always suffice.
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REPLY, self, out)
+    }
+
+    /// Read a reply; `bytes` is used as work space.
+    ///
+    /// # Errors
+    /// [`FrameError`].
+    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
+        packet::unseal(REPLY, bytes)
+    }
+}

@@ -1,0 +1,116 @@
+//! What a person, and a watchdog, can see of a device: three pins.
+
+use embedded_hal::digital::OutputPin;
+use estimator::MonitorState;
+use estimator::booster::Estimate;
+
+/// Two lamps, one that follows the cycle and one that says that something needs a look; and the line that keeps an
+/// external watchdog from resetting the device, fed by an edge.
+#[derive(Debug)]
+pub struct Panel<P> {
+    heartbeat: Line<P>,
+    attention: P,
+    watchdog: Line<P>,
+}
+
+/// A pin that shows its news by an edge.
+#[derive(Debug)]
+struct Line<P> {
+    pin: P,
+    is_high: bool,
+}
+
+impl<P: OutputPin> Line<P> {
+    fn toggle(&mut self) -> Result<(), P::Error> {
+        self.is_high = !self.is_high;
+        self.pin.set_state(self.is_high.into())
+    }
+}
+
+impl<P: OutputPin> Panel<P> {
+    /// Drive three pins, all low so far.
+    pub fn new(heartbeat: P, attention: P, watchdog: P) -> Self {
+        let line = |pin| Line { pin, is_high: false };
+        Self { heartbeat: line(heartbeat), attention, watchdog: line(watchdog) }
+    }
+
+    /// Show an estimate: the heartbeat toggles, and attention lights while any monitor is not ok or any var clipped.
+    ///
+    /// # Errors
+    /// What the pins report.
+    pub fn show(&mut self, estimate: &Estimate) -> Result<(), P::Error> {
+        self.heartbeat.toggle()?;
+        let faulty = estimate.health.iter().any(|h| h.state != MonitorState::Ok);
+        self.attention.set_state((faulty || estimate.clipped != 0).into())
+    }
+
+    /// Light attention: a packet was refused, or bytes were lost.
+    ///
+    /// # Errors
+    /// What the pin reports.
+    pub fn alarm(&mut self) -> Result<(), P::Error> {
+        self.attention.set_high()
+    }
+
+    /// Say that the loop goes round.
+    ///
+    /// # Errors
+    /// What the pin reports.
+    pub fn feed(&mut self) -> Result<(), P::Error> {
+        self.watchdog.toggle()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use embedded_hal_mock::eh1::digital::{Mock, State, Transaction};
+    use estimator::Health;
+
+    use super::*;
+
+    fn estimate(state: MonitorState) -> Estimate {
+        Estimate {
+            sequence: 0,
+            time_us: 0,
+            frames: 1,
+            rejected_frames: 0,
+            mean: [1.0; 48],
+            sigma: [0.01; 48],
+            map_params: [0.0; 48],
+            centre: [0.0; 48],
+            params_sigma: [0.01; 48],
+            clipped: 0,
+            nis: 1.0,
+            accepted: 1,
+            rejected: 0,
+            confirmed: 0,
+            restarted: 0,
+            setting: None,
+            log_evidence: 0.0,
+            linearised: false,
+            health: [Health { state, ..Health::default() }; 33],
+        }
+    }
+
+    fn pin(states: &[State]) -> Mock {
+        Mock::new(&states.iter().map(|state| Transaction::set(*state)).collect::<std::vec::Vec<_>>())
+    }
+
+    #[test]
+    fn pins_follow_the_loop() {
+        use State::{High, Low};
+        // given pins that expect a beat per estimate, attention from the fault on, and an edge per turn of the loop
+        let mut pins = [pin(&[High, Low, High]), pin(&[Low, High, Low, High]), pin(&[High, Low])];
+        let [heartbeat, attention, watchdog] = pins.clone();
+        let mut panel = Panel::new(heartbeat, attention, watchdog);
+        // when two turns show a good, a faulty and a good estimate, and an alarm
+        panel.show(&estimate(MonitorState::Ok)).unwrap();
+        panel.feed().unwrap();
+        panel.show(&estimate(MonitorState::Noisy)).unwrap();
+        panel.feed().unwrap();
+        panel.show(&estimate(MonitorState::Ok)).unwrap();
+        panel.alarm().unwrap();
+        // then nothing else was done to them
+        pins.iter_mut().for_each(Mock::done);
+    }
+}

@@ -1,0 +1,61 @@
+//! The loop of a device: bytes in, packets, answers out. The same on the host and on a chip.
+
+use embedded_hal::digital::OutputPin;
+use embedded_io::{Read, Write};
+use estimator::packet;
+
+use crate::device::Device;
+use crate::inbox::{Event, Inbox};
+use crate::link::{Reply, Vitals};
+use crate::panel::Panel;
+
+/// Run until the source ends.
+///
+/// `source` reports [`embedded_io::ErrorKind::TimedOut`] once a machine cycle while nothing comes; `vitals` asks the board
+/// how it is.
+///
+/// # Errors
+/// What the source or the sink report.
+pub fn run<R: Read, W: Write<Error = R::Error>, P: OutputPin>(
+    device: &mut Device<'_>,
+    source: &mut R,
+    sink: &mut W,
+    panel: &mut Panel<P>,
+    vitals: impl Fn() -> Vitals,
+) -> Result<(), R::Error> {
+    let mut inbox = Inbox::default();
+    loop {
+        let silent_cycles = inbox.silent_cycles();
+        let event = inbox.next(source)?;
+        let mut sent = Ok(());
+        let mut reply = |reply: &Reply| {
+            if sent.is_ok() {
+                sent = send(sink, reply);
+            }
+        };
+        // a lamp that does not light is no reason to stop
+        let _ = match event {
+            Event::Packet(bytes) => match device.hear(bytes, Vitals { silent_cycles, ..vitals() }, &mut reply) {
+                Some(estimate) => panel.show(&estimate),
+                None => Ok(()),
+            },
+            Event::Broken(why) => {
+                device.refuse(why, &mut reply);
+                panel.alarm()
+            }
+            Event::Silence => Ok(()),
+            Event::End => return sink.flush(),
+        };
+        sent?;
+        let _ = panel.feed();
+        // the answer is out; this may take until the next frame
+        device.prepare();
+    }
+}
+
+fn send<W: Write>(sink: &mut W, reply: &Reply) -> Result<(), W::Error> {
+    let mut outbox = [0; packet::MAX_WIRE_BYTES];
+    // a reply always fits its buffer
+    let bytes = reply.encode(&mut outbox).ok().and_then(|n| outbox.get(..n)).unwrap_or_default();
+    sink.write_all(bytes)
+}
