@@ -73,8 +73,8 @@ pub struct Estimator<
 > {
     started: bool,
     last_sequence: Option<u32>,
-    /// Cycles for which the params have walked ahead of the last frame.
-    ahead: u32,
+    /// All is done that can be before the next frame: linearised if due, and the params walked one cycle ahead.
+    prepared: bool,
     frames: u32,
     rejected_frames: u32,
     /// The surrogate at the origin of the Gaussian.
@@ -186,7 +186,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     pub const BLANK: Self = Self {
         started: false,
         last_sequence: None,
-        ahead: 0,
+        prepared: false,
         frames: 0,
         rejected_frames: 0,
         linearised: G::BLANK,
@@ -214,7 +214,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     pub fn restart(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
         self.started = false;
         model.surrogate.linearise(&[1.0; N], &mut self.linearised)?;
-        (self.last_sequence, self.ahead, self.frames, self.rejected_frames) = (None, 0, 0, 0);
+        (self.last_sequence, self.prepared, self.frames, self.rejected_frames) = (None, true, 0, 0);
         (self.supplies, self.orbit, self.rf_offset) = ([0.0; 2], [0.0; 2], 0.0);
         (self.nis, self.surprises, self.stale, self.news) = ((Sum::ZERO, 0), 0, false, false);
         self.monitors.iter_mut().for_each(|monitor| monitor.expect(model.setup.noise));
@@ -247,14 +247,15 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
-    /// it was done), and let the params walk for one cycle. To be called after each frame.
+    /// it was done), and let the params walk for one cycle. To be called after each frame; a second call does nothing.
     pub fn prepare(&mut self, model: &Model<'_, G>) -> bool {
-        let linearised = self.started && self.is_due() && self.linearise_anew(model);
-        self.news |= linearised;
-        if self.last_sequence.is_some() && self.ahead == 0 {
-            self.ahead = 1;
-            self.walk(model, 1);
+        if !self.started || self.prepared {
+            return false;
         }
+        self.prepared = true;
+        let linearised = self.is_due() && self.linearise_anew(model);
+        self.news |= linearised;
+        self.walk(model, 1);
         linearised
     }
 
@@ -291,10 +292,10 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Let the params walk for cycles that were lost since the last frame.
     fn catch_up(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>) {
         let cycles = self.last_sequence.map_or(0, |last| frame.sequence.saturating_sub(last));
-        self.walk(model, cycles.saturating_sub(self.ahead));
+        self.walk(model, cycles.saturating_sub(u32::from(self.prepared)));
         self.last_sequence = Some(frame.sequence);
         self.frames = self.frames.saturating_add(1);
-        self.ahead = 0;
+        self.prepared = false;
     }
 
     fn walk(&mut self, model: &Model<'_, G>, cycles: u32) {

@@ -1,0 +1,305 @@
+//! A device on the host: the loop that a chip runs, fed with recorded frames, bad bytes and new tables, beside the core in
+//! process.
+
+use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use estimator::booster::{Estimator, Green};
+use estimator::packet;
+use estimator::surrogate::{Parcel, ParcelError, Table};
+use firmware_sim::link::{Answer, Refusal, Reply, Request, TRIANGLE, Taken, Vitals};
+use firmware_sim::{Device, Panel};
+use inference::Recording;
+use inference::stream::{self, BoosterEstimate, Core};
+use system_tests::repository;
+use twin::Ring;
+
+/// Bytes from memory, a cycle of silence where there is none.
+struct Source(Vec<Option<u8>>);
+
+/// Bytes to memory.
+struct Sink(Vec<u8>);
+
+impl ErrorType for Source {
+    type Error = ErrorKind;
+}
+
+impl ErrorType for Sink {
+    type Error = ErrorKind;
+}
+
+impl Read for Source {
+    fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
+        let Some(next) = self.0.pop() else { return Ok(0) };
+        to[0] = next.ok_or(ErrorKind::TimedOut)?;
+        Ok(1)
+    }
+}
+
+impl Write for Sink {
+    fn write(&mut self, bytes: &[u8]) -> Result<usize, ErrorKind> {
+        self.0.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> Result<(), ErrorKind> {
+        Ok(())
+    }
+}
+
+/// A pin of no lamp.
+struct Dark;
+
+impl embedded_hal::digital::ErrorType for Dark {
+    type Error = core::convert::Infallible;
+}
+
+impl embedded_hal::digital::OutputPin for Dark {
+    fn set_low(&mut self) -> Result<(), Self::Error> {
+        Ok(())
+    }
+
+    fn set_high(&mut self) -> Result<(), Self::Error> {
+        Ok(())
+    }
+}
+
+/// What a device with these tables in flash says to these bytes.
+fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
+    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+    let mut device = Device::new(&mut core, built_in, &mut slot);
+    let (mut source, mut sink) = (Source(bytes.iter().rev().copied().collect()), Sink(Vec::new()));
+    let mut panel = Panel::new(Dark, Dark, Dark);
+    firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default).unwrap();
+    sink.0.split_inclusive_mut(|byte| *byte == 0).map(|packet| Reply::decode(packet).unwrap()).collect()
+}
+
+fn request(request: &Request) -> Vec<Option<u8>> {
+    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+    let n = request.encode(&mut bytes).unwrap();
+    heard(&bytes[..n])
+}
+
+fn heard(bytes: &[u8]) -> Vec<Option<u8>> {
+    bytes.iter().copied().map(Some).collect()
+}
+
+fn paper_vars() -> (Ring, Recording) {
+    let ring = Ring::booster();
+    let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+    (ring, recording)
+}
+
+fn wires(recording: &Recording) -> Vec<Vec<u8>> {
+    recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
+}
+
+fn start(core: &Core) -> Vec<Option<u8>> {
+    request(&Request::Restart(core.setup))
+}
+
+fn estimates(replies: &[Reply]) -> Vec<BoosterEstimate> {
+    let answer = |reply: &Reply| match reply {
+        Reply::Estimate(answer) => Some(answer.estimate().unwrap()),
+        _ => None,
+    };
+    replies.iter().filter_map(answer).collect()
+}
+
+#[test]
+fn the_loop_answers_as_the_core_in_process() {
+    let (ring, recording) = paper_vars();
+    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut bytes = start(&core);
+    for (at, wire) in wires(&recording).iter().enumerate() {
+        if at % 100 == 0 {
+            bytes.extend(request(&Request::Covariance));
+        }
+        bytes.extend(heard(wire));
+    }
+    bytes.extend(request(&Request::Status));
+    let replies = replies(&core.tables.clone(), &bytes);
+    let mut replies = replies.iter();
+    assert_eq!(replies.next(), Some(&Reply::Restarted));
+    for (at, wire) in wires(&recording).iter_mut().enumerate() {
+        core.prepare();
+        let estimate = core.ingest(wire).unwrap();
+        assert!(replies.next() == Some(&Reply::Estimate(Answer::from(&estimate))), "frame {at}");
+        let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
+        for _ in (0..if at % 100 == 0 { TRIANGLE } else { 0 }).step_by(56) {
+            let Some(Reply::Covariance { sequence, entries, .. }) = replies.next() else { panic!("no covariance") };
+            assert_eq!(*sequence, estimate.sequence);
+            assert!(entries.iter().zip(&mut places).all(|(entry, (i, j))| *entry == core.covariance(i, j)));
+        }
+    }
+    core.prepare();
+    let quality = core.fit_quality();
+    let Some(Reply::Status(status)) = replies.next() else { panic!("no status") };
+    assert_eq!((status.frames, status.refused, status.loaded), (346, 0, false));
+    assert_eq!((status.chi_square, status.degrees_of_freedom), (quality.chi_square, quality.degrees_of_freedom));
+    assert_eq!(replies.next(), None);
+}
+
+#[test]
+fn bad_bytes_are_counted_and_good_frames_answered_as_if_there_were_none() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let good = wires(&recording);
+    let (mut clean, mut disturbed) = (start(&core), start(&core));
+    let mut faults = Vec::new();
+    for (at, wire) in good.iter().take(120).enumerate() {
+        clean.extend(heard(wire));
+        disturbed.extend(heard(wire));
+        let next = &good[at + 1];
+        match at % 6 {
+            0 => {
+                disturbed.extend(heard(wire));
+                faults.push(Refusal::Repeated);
+            }
+            1 => {
+                disturbed.extend(heard(&good[0]));
+                faults.push(Refusal::OutOfOrder);
+            }
+            2 => {
+                // reset in mid-frame: half of the next one, and then it begins anew
+                disturbed.extend(heard(&next[..next.len() / 2]));
+                disturbed.push(Some(0));
+                faults.push(Refusal::Framing);
+            }
+            3 => {
+                // stalled in mid-frame
+                disturbed.extend(heard(&next[..next.len() / 3]));
+                disturbed.extend([None, None]);
+                faults.push(Refusal::Stalled);
+            }
+            4 => {
+                disturbed.extend([Some(1); 4000]);
+                disturbed.push(Some(0));
+                faults.push(Refusal::Oversized);
+            }
+            _ => {
+                let mut changed = next.clone();
+                changed[100] ^= 0x10;
+                disturbed.extend(heard(&changed));
+            }
+        }
+    }
+    let (clean, disturbed) = (replies(&core.tables, &clean), replies(&core.tables, &disturbed));
+    let rejected_frames = |mut estimate: BoosterEstimate| {
+        estimate.rejected_frames = 0;
+        estimate
+    };
+    let posteriors = |replies: &[Reply]| estimates(replies).into_iter().map(rejected_frames).collect::<Vec<_>>();
+    assert!(posteriors(&clean) == posteriors(&disturbed), "another posterior");
+    let refused: Vec<(Refusal, u32)> = disturbed
+        .iter()
+        .filter_map(|reply| match reply {
+            Reply::Refused { why, count } => Some((*why, *count)),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(refused.len(), 120, "one for each fault");
+    assert!(refused.iter().zip(1..).all(|((_, count), n)| *count == n), "all are counted");
+    let known: Vec<Refusal> = refused.iter().map(|(why, _)| *why).collect();
+    assert!(known.chunks(6).zip(faults.chunks(5)).all(|(known, faults)| {
+        // half a frame may have lost its framing, or only its CRC
+        known[..2] == faults[..2] && known[3..5] == faults[3..]
+    }));
+}
+
+/// Tables of a ring whose first quadrupole is 1 % stronger than the design.
+fn other_tables(ring: &Ring) -> Green {
+    let mut vars = vec![1.0; 48];
+    vars[0] = 1.01;
+    training::green::tables(&ring.with_vars(&vars)).unwrap()
+}
+
+#[test]
+fn new_tables_change_the_answer_as_they_do_in_process() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let good = wires(&recording);
+    let other = other_tables(&ring);
+    let mut bytes = start(&core);
+    good[..200].iter().for_each(|wire| bytes.extend(heard(wire)));
+    other.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    good[200..].iter().for_each(|wire| bytes.extend(heard(wire)));
+    bytes.extend(request(&Request::Status));
+    bytes.extend(request(&Request::BuiltIn));
+    bytes.extend(request(&Request::Status));
+    let replies = replies(&core.tables, &bytes);
+    // a core that went by the new tables from its first frame on, linearised at other moments
+    let mut expected = core.clone();
+    expected.tables = Box::new(other.clone());
+    let mut last = None;
+    stream::replay(&mut expected, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
+    let (last, got) = (last.unwrap(), estimates(&replies).pop().unwrap());
+    for i in 0..48 {
+        let shift = (got.map_params[i] - last.map_params[i]) / last.params_sigma[i];
+        assert!(shift.abs() < 0.1, "{i}: {shift}"); // as between orders of the frames
+    }
+    // ln var is relative to the tables' own ring
+    assert!((got.map_params[0] - (0.99862_f32 / 1.01).ln()).abs() < 5e-4, "{}", got.map_params[0]);
+    let status: Vec<_> = replies.iter().filter_map(|r| if let Reply::Status(s) = r { Some(s) } else { None }).collect();
+    assert_eq!((status[0].loaded, status[0].tables), (true, other.digest()));
+    assert_eq!((status[1].loaded, status[1].tables), (false, core.tables.digest()));
+}
+
+#[test]
+fn damaged_tables_are_rejected_whole() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let good = wires(&recording);
+    let parcels: Vec<Parcel> = other_tables(&ring).parcels().collect();
+    let mut clean = start(&core);
+    good.iter().take(40).for_each(|wire| clean.extend(heard(wire)));
+    let mut disturbed = start(&core);
+    good[..20].iter().for_each(|wire| disturbed.extend(heard(wire)));
+    // one parcel lost
+    let lost = parcels.iter().enumerate().filter(|(at, _)| *at != 77);
+    lost.for_each(|(_, parcel)| disturbed.extend(request(&Request::Model(parcel.clone()))));
+    // one code changed, and its packet's CRC right
+    for parcel in &parcels {
+        let mut parcel = parcel.clone();
+        if let Parcel::Codes { table: Table::Mutual(0), line: 50, codes } = &mut parcel {
+            codes[3] += 1;
+        }
+        disturbed.extend(request(&Request::Model(parcel)));
+    }
+    // a part without its head
+    disturbed.extend(request(&Request::Model(parcels[5].clone())));
+    good[20..40].iter().for_each(|wire| disturbed.extend(heard(wire)));
+    let (clean, disturbed) = (replies(&core.tables, &clean), replies(&core.tables, &disturbed));
+    assert!(estimates(&clean) == estimates(&disturbed), "another posterior");
+    let wrong: Vec<ParcelError> =
+        disturbed.iter().filter_map(|r| if let Reply::Model(Err(e)) = r { Some(*e) } else { None }).collect();
+    assert!(
+        matches!(wrong[..], [ParcelError::Corrupted { .. }, ParcelError::Corrupted { .. }, ParcelError::Headless]),
+        "{wrong:?}"
+    );
+    assert!(!disturbed.contains(&Reply::Model(Ok(Taken::InUse))));
+}
+
+#[test]
+fn a_front_end_that_counts_anew_is_taken_after_a_word() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let good = wires(&recording);
+    let mut bytes = start(&core);
+    bytes.extend(heard(&good[10]));
+    bytes.extend(heard(&good[0]));
+    bytes.extend(request(&Request::ForgetSequence));
+    bytes.extend(heard(&good[0]));
+    let replies = replies(&core.tables, &bytes);
+    assert!(matches!(replies[2], Reply::Refused { why: Refusal::OutOfOrder, count: 1 }));
+    assert!(matches!(&replies[4], Reply::Estimate(answer) if answer.sequence == 0 && answer.frames == 2));
+}
+
+#[test]
+fn a_device_says_what_it_lacks() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut bytes = heard(&wires(&recording)[0]);
+    bytes.extend(request(&Request::Restart(estimator::Setup { noise: 0.0, ..core.setup })));
+    let replies = replies(&core.tables, &bytes);
+    assert_eq!(replies[0], Reply::Refused { why: Refusal::NotStarted, count: 1 });
+    assert_eq!(replies[1], Reply::Refused { why: Refusal::Setup, count: 2 });
+}
