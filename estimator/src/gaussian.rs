@@ -326,7 +326,8 @@ impl<const N: usize, const T: usize> Solution<N, T> {
 
     /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
     fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: &Prior) {
-        let bounded = |theta: f32| theta.clamp(prior.lower, prior.upper);
+        // not `clamp`, which panics on bounds that are crossed
+        let bounded = |theta: f32| theta.max(prior.lower).min(prior.upper);
         let mut outside = false;
         for ((map, delta), origin) in self.map_params.iter_mut().zip(self.delta.iter()).zip(&gaussian.origin) {
             *map = bounded(origin + delta);

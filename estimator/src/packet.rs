@@ -3,6 +3,7 @@
 //!
 //! COBS gives boundaries, not integrity: without the CRC a flipped bit decodes as a good body.
 
+use cobs::{DecodeResult, DecoderState};
 use serde::{Deserialize, Serialize};
 
 use crate::frame::FrameError;
@@ -65,8 +66,20 @@ pub fn open(expected: u8, limit: usize, bytes: &mut [u8]) -> Result<&[u8], Frame
     if encoded.contains(&0) {
         return Err(FrameError::Framing);
     }
-    let length = cobs::decode_in_place(encoded).map_err(|_| FrameError::Framing)?;
+    let length = unstuff(encoded).ok_or(FrameError::Framing)?;
     checked(encoded.get(..length).ok_or(FrameError::Framing)?, expected)
+}
+
+/// Decode COBS in place, byte by byte: the library's own loop over a whole buffer holds index checks that can panic.
+fn unstuff(bytes: &mut [u8]) -> Option<usize> {
+    let (mut state, mut length) = (DecoderState::Idle, 0);
+    for at in 0..bytes.len() {
+        if let DecodeResult::DataContinue(byte) = state.feed(*bytes.get(at)?).ok()? {
+            *bytes.get_mut(length)? = byte;
+            length += 1;
+        }
+    }
+    matches!(state.feed(0), Ok(DecodeResult::DataComplete)).then_some(length)
 }
 
 /// A packet's body.

@@ -57,8 +57,9 @@ impl Marginal {
         let (alpha, beta) = ((self.lower - self.mean) / self.sigma, (self.upper - self.mean) / self.sigma);
         let (mean, sigma) =
             if alpha < -6.0 && beta > 6.0 { (self.mean, self.sigma) } else { self.truncated(alpha, beta) };
+        // not `clamp`, which panics on bounds that are crossed
         let var =
-            (libm::expf(mean) * (1.0 + 0.5 * sigma * sigma)).clamp(libm::expf(self.lower), libm::expf(self.upper));
+            (libm::expf(mean) * (1.0 + 0.5 * sigma * sigma)).max(libm::expf(self.lower)).min(libm::expf(self.upper));
         (var, var * sigma)
     }
 
@@ -88,7 +89,7 @@ impl Marginal {
         } else {
             self.upper - self.sigma / beta * libm::logf(p)
         };
-        libm::expf(theta.clamp(self.lower, self.upper))
+        libm::expf(theta.max(self.lower).min(self.upper))
     }
 }
 

@@ -15,14 +15,24 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
 
     /// The rows, each up to its diagonal.
     pub fn rows(&self) -> Rows<'_> {
-        let () = Self::FITS;
-        Rows { rest: &self.0, length: 1 }
+        self.rows_from(0)
     }
 
     /// The rows, to be changed.
     pub fn rows_mut(&mut self) -> RowsMut<'_> {
+        self.rows_from_mut(0)
+    }
+
+    /// The rows from the `i`-th on.
+    pub fn rows_from(&self, i: usize) -> Rows<'_> {
         let () = Self::FITS;
-        RowsMut { rest: &mut self.0, length: 1 }
+        Rows { rest: self.0.get(start(i)..).unwrap_or_default(), length: i + 1 }
+    }
+
+    /// The rows from the `i`-th on, to be changed.
+    pub fn rows_from_mut(&mut self, i: usize) -> RowsMut<'_> {
+        let () = Self::FITS;
+        RowsMut { rest: self.0.get_mut(start(i)..).unwrap_or_default(), length: i + 1 }
     }
 
     /// All entries, row by row.
@@ -49,8 +59,8 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
     pub fn symmetric_row(&self, i: usize) -> [f32; N] {
         let mut row = [0.0; N];
         let (left, right) = row.split_at_mut_checked(i + 1).unwrap_or_default();
-        left.copy_from_slice(self.row(i).get(..left.len()).unwrap_or_default());
-        let below = self.rows().skip(i + 1);
+        left.iter_mut().zip(self.row(i)).for_each(|(to, v)| *to = *v);
+        let below = self.rows_from(i + 1);
         right.iter_mut().zip(below).for_each(|(to, row)| *to = row.get(i).copied().unwrap_or(0.0));
         row
     }
@@ -76,37 +86,66 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
 
     /// Cholesky factor `L` of the symmetric matrix, in place, and the logarithm of its determinant; none if it is not
     /// positive. nalgebra's own takes a full matrix by value, 9 kB of stack.
+    ///
+    /// Four columns of the factor at a time, then their products are taken from the rows that remain.
     pub fn factorise(&mut self) -> Option<f32> {
         let mut determinant = LogProduct::ONE;
-        for i in 0..N {
-            let (done, rest) = self.0.split_at_mut_checked(start(i))?;
-            let row = rest.get_mut(..=i)?;
-            for (j, before) in (Rows { rest: done, length: 1 }).enumerate() {
-                let (pivot, before) = before.split_last()?;
-                let (left, [entry, ..]) = row.split_at_mut_checked(j)? else { return None };
-                *entry = (*entry - dot(left, before)) / pivot;
+        for from in (0..N).step_by(4) {
+            let to = (from + 4).min(N);
+            let mut columns = [[0.0; N]; 4];
+            for (j, m) in (from..to).zip(0..) {
+                let (done, [column, ..]) = columns.split_at_mut_checked(m)? else { return None };
+                determinant.multiply(self.factorise_column(j, column, done)?);
             }
-            let (diagonal, left) = row.split_last_mut()?;
-            let pivot = *diagonal - dot(left, left);
-            if pivot.is_nan() || pivot <= 0.0 {
-                return None;
+            for (r, row) in (to..).zip(self.rows_from_mut(to)) {
+                let terms = columns
+                    .iter()
+                    .map(|column| (-column.get(r).copied().unwrap_or(0.0), column.get(to..).unwrap_or_default()));
+                combine(row.get_mut(to..).unwrap_or_default(), terms);
             }
-            *diagonal = libm::sqrtf(pivot);
-            determinant.multiply(pivot);
         }
         Some(determinant.value())
     }
 
+    /// Column `j` of the factor, to `column` and in place; what the columns before take from it is taken already, but for
+    /// those of its own group. Returns its pivot, the square of its diagonal.
+    fn factorise_column(&mut self, j: usize, column: &mut [f32; N], group: &[[f32; N]]) -> Option<f32> {
+        let below = column.get_mut(j..)?;
+        below.iter_mut().zip(self.rows_from(j)).for_each(|(to, row)| *to = row.get(j).copied().unwrap_or(0.0));
+        combine(
+            below,
+            group.iter().map(|before| (-before.get(j).unwrap_or(&0.0), before.get(j..).unwrap_or_default())),
+        );
+        let pivot = *below.first()?;
+        if pivot.is_nan() || pivot <= 0.0 {
+            return None;
+        }
+        let scale = 1.0 / libm::sqrtf(pivot);
+        for (l, row) in below.iter_mut().zip(self.rows_from_mut(j)) {
+            *l *= scale;
+            row.get_mut(j).into_iter().for_each(|to| *to = *l);
+        }
+        Some(pivot)
+    }
+
     /// Invert a lower triangle, in place: `x_i = (e_i - sum over k < i of L_ik x_k)/L_ii` by rows.
+    ///
+    /// Four rows of the inverse at a time; the rows below then hold, left of where their factor still stands, the sum so far.
     pub fn invert(&mut self) {
-        let mut factors = [0.0; N];
-        for i in 0..N {
-            let Some((done, rest)) = self.0.split_at_mut_checked(start(i)) else { return };
-            let Some((diagonal, row)) = rest.get_mut(..=i).and_then(<[f32]>::split_last_mut) else { return };
-            *diagonal = 1.0 / *diagonal;
-            factors.iter_mut().zip(row.iter()).for_each(|(to, l)| *to = -*diagonal * l);
-            row.fill(0.0);
-            add_rows(row, &factors, Rows { rest: done, length: 1 });
+        for from in (0..N).step_by(4) {
+            let to = (from + 4).min(N);
+            let mut inverse = [[0.0; N]; 4];
+            for (i, m) in (from..to).zip(0..) {
+                let Some((done, [x, ..])) = inverse.split_at_mut_checked(m) else { return };
+                invert_row(self.row_mut(i), from, done, x);
+            }
+            for row in self.rows_from_mut(to) {
+                let Some(sum) = row.get_mut(..to) else { return };
+                let mut factor = [0.0; 4];
+                let own = sum.get_mut(from..).unwrap_or_default();
+                factor.iter_mut().zip(own).for_each(|(to, l)| *to = -core::mem::take(l));
+                combine(sum, factor.iter().copied().zip(inverse.iter().map(<[f32; N]>::as_slice)));
+            }
         }
     }
 
@@ -137,19 +176,18 @@ pub const fn start(row: usize) -> usize {
     row.saturating_mul(row.saturating_add(1)) / 2
 }
 
-/// `to += sum of factor * row`, four rows at a time where all four have an entry.
-fn add_rows(to: &mut [f32], factors: &[f32], mut rows: Rows<'_>) {
-    for (group, factors) in factors.chunks_exact(4).enumerate() {
-        let four = [rows.next(), rows.next(), rows.next(), rows.next()];
-        let terms = factors.iter().zip(four).filter_map(|(factor, row)| Some((*factor, row?)));
-        let shared = 4 * group + 1;
-        combine(to.get_mut(..shared.min(to.len())).unwrap_or_default(), terms.clone());
-        for (factor, row) in terms {
-            add(to.get_mut(shared..).unwrap_or_default(), factor, row.get(shared..).unwrap_or_default());
-        }
-    }
-    let left = factors.as_chunks::<4>().1;
-    left.iter().zip(rows).for_each(|(factor, row)| add(to, *factor, row));
+/// A row of the inverse, to `x` and in place: left of `from` the row holds the sum so far, from there on the factor, whose
+/// rows `done` are inverted.
+fn invert_row<const N: usize>(row: &mut [f32], from: usize, done: &[[f32; N]], x: &mut [f32; N]) {
+    let Some((diagonal, left)) = row.split_last_mut() else { return };
+    let scale = 1.0 / *diagonal;
+    let (sum, own) = left.split_at_mut_checked(from).unwrap_or_default();
+    x.iter_mut().zip(sum.iter()).for_each(|(x, sum)| *x = *sum);
+    combine(x, own.iter().map(|l| -l).zip(done.iter().map(<[f32; N]>::as_slice)));
+    x.iter_mut().for_each(|x| *x *= scale);
+    left.iter_mut().zip(x.iter()).for_each(|(to, x)| *to = *x);
+    *diagonal = scale;
+    x.get_mut(left.len()).into_iter().for_each(|x| *x = scale);
 }
 
 /// The rows of a packed triangle, one longer than the other.
