@@ -1,5 +1,7 @@
 //! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate. What decides on readings stands
 //! in `screen.rs`, what linearises anew in `laplace.rs`, both below this file.
+//!
+//! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
 mod laplace;
 mod screen;
@@ -232,6 +234,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     ///
     /// # Errors
     /// [`IngestError`]; the posterior is then as it was before.
+    #[inline(never)]
     pub fn ingest(&mut self, model: &Model<'_, G>, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
         let (frame, drive) =
             self.decode(model, bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
@@ -248,6 +251,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
     /// it was done), and let the params walk for one cycle. To be called after each frame; a second call does nothing.
+    #[inline(never)]
     pub fn prepare(&mut self, model: &Model<'_, G>) -> bool {
         if !self.started || self.prepared {
             return false;
@@ -298,6 +302,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.prepared = false;
     }
 
+    #[inline(never)]
     fn walk(&mut self, model: &Model<'_, G>, cycles: u32) {
         let noise = model.setup.process_noise;
         if noise > 0.0 && cycles > 0 {
@@ -402,6 +407,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// Keep a frame that belongs to no setting among the recent ones; the oldest of them is linearised for the last time.
+    #[inline(never)]
     fn keep_loose(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, drive: &Drive<C>, screened: &Screened) {
         if self.recent.is_full()
             && let Some(oldest) = self.recent.pop_front()
@@ -429,6 +435,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.orbit = [self.gaussian.orbit(0, split), self.gaussian.orbit(split, B)];
     }
 
+    #[inline(never)]
     fn estimate(
         &mut self,
         model: &Model<'_, G>,

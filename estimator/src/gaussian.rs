@@ -13,7 +13,7 @@
 
 use nalgebra::SMatrix;
 
-use crate::linear::{add, column, combine, dot, zeros};
+use crate::linear::{add, add_four, column, dot, zeros};
 use crate::prior::Prior;
 use crate::sum::{LogProduct, Sum};
 use crate::triangle::Triangle;
@@ -143,10 +143,13 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
 
     /// Let the last readings enter the information; to be called after a frame's.
     pub fn settle(&mut self) {
-        let rows = self.staged.iter().zip(&self.staged_weight).take(self.staged_rows);
+        // what is left of a group of four waits with no weight
+        self.staged_weight.iter_mut().skip(self.staged_rows).for_each(|weight| *weight = 0.0);
+        let staged = self.staged.each_ref().map(<[f32; N]>::as_slice);
         for (j, to) in self.information.rows_mut().enumerate() {
-            let term = |(row, weight): (&'_ [f32; N], _)| weight * row.get(j).copied().unwrap_or(0.0);
-            combine(to, rows.clone().map(|(row, weight)| (term((row, weight)), row.as_slice())));
+            let mut factors = self.staged_weight;
+            factors.iter_mut().zip(&staged).for_each(|(w, row)| *w *= row.get(j).copied().unwrap_or(0.0));
+            add_four(to, factors, staged);
         }
         self.staged_rows = 0;
     }
@@ -227,9 +230,10 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         if k.factorise().is_none() {
             return; // 1 + a positive matrix; only a NaN could fail, and none can enter
         }
+        let mut row = [0.0; N];
         // from the first row down: each finds the rest of its column, in the rows below, as it was
         for i in 0..N {
-            let mut row = self.information.symmetric_row(i);
+            self.information.copy_row(i, &mut row);
             k.solve_lower(&mut row);
             k.solve_upper(&mut row);
             self.information.row_mut(i).iter_mut().zip(&row).for_each(|(to, y)| *to = *y);

@@ -9,22 +9,30 @@ pub fn add(to: &mut [f32], factor: f32, from: &[f32]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * from);
 }
 
-/// `to += sum of factor * row`, four rows at a time: loads and stores of `to` are what costs. Rows are at least as long.
+/// `to += sum of factor * row`, four rows at a time.
 #[inline]
 pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>) {
     let mut terms = terms.fuse();
-    while let Some((a, first)) = terms.next() {
-        let none = (0.0, first);
-        let (b, second) = terms.next().unwrap_or(none);
-        let (c, third) = terms.next().unwrap_or(none);
-        let (d, fourth) = terms.next().unwrap_or(none);
-        // one length for all, so that the loop below has no bounds to check and becomes vector code
-        let n = to.len();
-        let rows = (first.get(..n), second.get(..n), third.get(..n), fourth.get(..n));
-        let (Some(first), Some(second), Some(third), Some(fourth)) = rows else { return };
-        for i in 0..n {
-            to[i] += (a * first[i] + b * second[i]) + (c * third[i] + d * fourth[i]);
+    while let Some((factor, first)) = terms.next() {
+        let (mut factors, mut rows) = ([factor, 0.0, 0.0, 0.0], [first; 4]);
+        for ((factor, row), term) in factors.iter_mut().zip(&mut rows).skip(1).zip(&mut terms) {
+            (*factor, *row) = term;
         }
+        add_four(to, factors, rows);
+    }
+}
+
+/// `to += sum of factor * row`, all four in one pass: loads and stores of `to` are what costs. Rows are at least as long;
+/// what they have beyond its end does not count.
+#[inline(never)]
+pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
+    // one length for all, so that the loop below has no bounds to check and becomes vector code
+    let n = to.len();
+    let [first, second, third, fourth] = rows.map(|row| row.get(..n));
+    let (Some(first), Some(second), Some(third), Some(fourth)) = (first, second, third, fourth) else { return };
+    let [a, b, c, d] = factors;
+    for i in 0..n {
+        to[i] = (((to[i] + a * first[i]) + b * second[i]) + c * third[i]) + d * fourth[i];
     }
 }
 

@@ -1,6 +1,6 @@
 //! Symmetric and triangular matrices, packed: a lower triangle row by row, half the memory of a square.
 
-use crate::linear::{add, combine, dot};
+use crate::linear::{add, add_four, combine, dot};
 use crate::sum::LogProduct;
 
 /// Lower triangle of an `N x N` matrix; `T = N (N + 1)/2` entries, row `i` holds columns `0..=i`.
@@ -55,14 +55,12 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
         self.row(i.max(j)).get(i.min(j)).copied().unwrap_or(0.0)
     }
 
-    /// A whole row, which is also a column, of the symmetric matrix [N].
-    pub fn symmetric_row(&self, i: usize) -> [f32; N] {
-        let mut row = [0.0; N];
-        let (left, right) = row.split_at_mut_checked(i + 1).unwrap_or_default();
+    /// Copy a whole row, which is also a column, of the symmetric matrix.
+    pub fn copy_row(&self, i: usize, to: &mut [f32; N]) {
+        let (left, right) = to.split_at_mut_checked(i + 1).unwrap_or_default();
         left.iter_mut().zip(self.row(i)).for_each(|(to, v)| *to = *v);
         let below = self.rows_from(i + 1);
         right.iter_mut().zip(below).for_each(|(to, row)| *to = row.get(i).copied().unwrap_or(0.0));
-        row
     }
 
     /// Set the diagonal to one value, the rest to zero.
@@ -144,7 +142,7 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
                 let mut factor = [0.0; 4];
                 let own = sum.get_mut(from..).unwrap_or_default();
                 factor.iter_mut().zip(own).for_each(|(to, l)| *to = -core::mem::take(l));
-                combine(sum, factor.iter().copied().zip(inverse.iter().map(<[f32; N]>::as_slice)));
+                add_four(sum, factor, inverse.each_ref().map(<[f32; N]>::as_slice));
             }
         }
     }
@@ -247,7 +245,9 @@ mod tests {
         let x: [f32; 9] = core::array::from_fn(|i| i as f32 - 2.0);
         let product = a * SVector::from(x);
         for i in 0..9 {
-            assert_eq!(triangle.symmetric_row(i), core::array::from_fn(|j| a[(i.max(j), i.min(j))]));
+            let mut row = [0.0; 9];
+            triangle.copy_row(i, &mut row);
+            assert_eq!(row, core::array::from_fn(|j| a[(i.max(j), i.min(j))]));
             assert!((triangle.multiply(&x)[i] - product[i]).abs() < 1e-4); // f32 rounding
             assert_eq!(triangle.get(i, 3), a[(i.max(3), i.min(3))]);
         }

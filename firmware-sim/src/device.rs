@@ -1,4 +1,6 @@
 //! A device: the core, the tables that it goes by, and what it answers to each packet.
+//!
+//! Each answer is a function of its own, not inlined, so that the stack holds the buffers of one of them at a time.
 
 use estimator::booster::{Estimate, Estimator, Green};
 use estimator::surrogate::{Parcel, ParcelError};
@@ -52,12 +54,14 @@ impl<'m> Device<'m> {
     }
 
     /// Count a packet that was no packet.
+    #[inline(never)]
     pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply)) {
         self.refused = self.refused.saturating_add(1);
         reply(&Reply::Refused { why: why.into(), count: self.refused });
     }
 
     /// A frame: the answer, and what was asked for with it.
+    #[inline(never)]
     fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply)) -> Option<Estimate> {
         let Some(setup) = &self.setup else {
             self.refuse(estimator::IngestError::NotStarted, reply);
@@ -79,6 +83,7 @@ impl<'m> Device<'m> {
         }
     }
 
+    #[inline(never)]
     fn send_covariance(&self, sequence: u32, reply: &mut impl FnMut(&Reply)) {
         let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
         for first in (0..TRIANGLE as u16).step_by(PIECE) {
@@ -88,6 +93,7 @@ impl<'m> Device<'m> {
         }
     }
 
+    #[inline(never)]
     fn obey(&mut self, bytes: &mut [u8], vitals: Vitals, reply: &mut impl FnMut(&Reply)) {
         match packet::unseal::<Request>(REQUEST, bytes) {
             Ok(Request::Restart(setup)) => self.restart(setup, reply),
@@ -103,6 +109,7 @@ impl<'m> Device<'m> {
         }
     }
 
+    #[inline(never)]
     fn restart(&mut self, setup: Setup, reply: &mut impl FnMut(&Reply)) {
         let model = Model { surrogate: tables(self.contents, self.built_in, self.slot), setup: &setup };
         if !setup.is_sound() || self.core.restart(&model).is_err() {
@@ -114,6 +121,7 @@ impl<'m> Device<'m> {
     }
 
     /// Write a part of new tables into the slot; with the last one they are put in use.
+    #[inline(never)]
     fn load(&mut self, parcel: &Parcel) -> Result<Taken, ParcelError> {
         match (self.contents, parcel) {
             (Contents::InUse, _) => return Err(ParcelError::Busy),
@@ -140,6 +148,7 @@ impl<'m> Device<'m> {
         Ok(Taken::InUse)
     }
 
+    #[inline(never)]
     fn go_back(&mut self) -> Result<Taken, ParcelError> {
         let was = core::mem::replace(&mut self.contents, Contents::Nothing);
         if let (Contents::InUse, Some(setup)) = (was, &self.setup) {
@@ -148,6 +157,7 @@ impl<'m> Device<'m> {
         Ok(Taken::BuiltIn)
     }
 
+    #[inline(never)]
     fn status(&mut self, vitals: Vitals) -> Status {
         let tables = tables(self.contents, self.built_in, self.slot);
         let quality = self.setup.as_ref().map(|setup| self.core.fit_quality(&Model { surrogate: tables, setup }));

@@ -7,10 +7,10 @@ use estimator::booster::Estimate;
 /// Two lamps, one that follows the cycle and one that says that something needs a look; and the line that keeps an
 /// external watchdog from resetting the device, fed by an edge.
 #[derive(Debug)]
-pub struct Panel<P> {
+pub struct Panel<P, W> {
     heartbeat: Line<P>,
     attention: P,
-    watchdog: Line<P>,
+    watchdog: Line<W>,
 }
 
 /// A pin that shows its news by an edge.
@@ -27,11 +27,11 @@ impl<P: OutputPin> Line<P> {
     }
 }
 
-impl<P: OutputPin> Panel<P> {
+impl<P: OutputPin, W: OutputPin> Panel<P, W> {
     /// Drive three pins, all low so far.
-    pub fn new(heartbeat: P, attention: P, watchdog: P) -> Self {
-        let line = |pin| Line { pin, is_high: false };
-        Self { heartbeat: line(heartbeat), attention, watchdog: line(watchdog) }
+    pub fn new(heartbeat: P, attention: P, watchdog: W) -> Self {
+        let heartbeat = Line { pin: heartbeat, is_high: false };
+        Self { heartbeat, attention, watchdog: Line { pin: watchdog, is_high: false } }
     }
 
     /// Show an estimate: the heartbeat toggles, and attention lights while any monitor is not ok or any var clipped.
@@ -56,7 +56,7 @@ impl<P: OutputPin> Panel<P> {
     ///
     /// # Errors
     /// What the pin reports.
-    pub fn feed(&mut self) -> Result<(), P::Error> {
+    pub fn feed(&mut self) -> Result<(), W::Error> {
         self.watchdog.toggle()
     }
 }

@@ -16,11 +16,11 @@ use crate::panel::Panel;
 ///
 /// # Errors
 /// What the source or the sink report.
-pub fn run<R: Read, W: Write<Error = R::Error>, P: OutputPin>(
+pub fn run<R: Read, W: Write<Error = R::Error>>(
     device: &mut Device<'_>,
     source: &mut R,
     sink: &mut W,
-    panel: &mut Panel<P>,
+    panel: &mut Panel<impl OutputPin, impl OutputPin>,
     vitals: impl Fn() -> Vitals,
 ) -> Result<(), R::Error> {
     let mut inbox = Inbox::default();
@@ -53,6 +53,7 @@ pub fn run<R: Read, W: Write<Error = R::Error>, P: OutputPin>(
     }
 }
 
+#[inline(never)] // its buffers are not to lie on the stack meanwhile
 fn send<W: Write>(sink: &mut W, reply: &Reply) -> Result<(), W::Error> {
     let mut outbox = [0; packet::MAX_WIRE_BYTES];
     // a reply always fits its buffer

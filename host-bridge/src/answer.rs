@@ -1,8 +1,8 @@
 //! The answer to a recording, the same from the core and from the batch fit: as JSON and as a table.
 
 use comfy_table::{CellAlignment, Table, presets};
-use estimator::{FitQuality, Health, Marginal, MonitorState};
-use inference::stream::{BoosterEstimate, Core};
+use estimator::{FitQuality, Health, Marginal, MonitorState, Setup};
+use inference::stream::BoosterEstimate;
 use inference::{BatchFit, Recording};
 use serde::Serialize;
 use twin::{Hold, Optics, Ring};
@@ -70,16 +70,17 @@ pub struct Timing {
 }
 
 impl Answer {
-    /// What the core says after its last frame.
+    /// What a core says after its last frame, here or on a device; `of_params` is the covariance of two `ln var`.
     pub fn of_core(
         ring: &Ring,
         recording: &Recording,
-        core: &Core,
+        setup: &Setup,
         last: &BoosterEstimate,
+        of_params: impl Fn(usize, usize) -> f32,
         quality: FitQuality,
         timing: Timing,
     ) -> Self {
-        let marginals: Vec<Marginal> = (0..48).filter_map(|i| last.marginal(i, &core.setup.prior)).collect();
+        let marginals: Vec<Marginal> = (0..48).filter_map(|i| last.marginal(i, &setup.prior)).collect();
         let vars = vars(ring, &marginals, |i| last.clipped >> i & 1 == 1);
         Self {
             recording: recording.name.clone(),
@@ -87,7 +88,7 @@ impl Answer {
             model: "green",
             frames: last.frames as usize,
             rejected_frames: last.rejected_frames,
-            covariance: covariance(&vars, |i, j| f64::from(core.covariance(i, j))),
+            covariance: covariance(&vars, |i, j| f64::from(of_params(i, j))),
             tunes: tunes(ring, &vars),
             vars,
             chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use twin::Effect;
 
+use crate::link::Source;
 use crate::publish::SERVICE;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
@@ -29,6 +30,8 @@ pub enum Command {
     Response(Response),
     /// The host's batch answer for a recording, with the exact twin
     Fit(Fit),
+    /// Publish the estimates of a device
+    Serve(Serve),
     /// Surrogates and their measured errors
     Surrogate(Surrogate),
 }
@@ -64,6 +67,41 @@ pub struct Replay {
     /// Frames a second, or `max`
     #[arg(long, value_name = "HZ", default_value = "max")]
     pub rate: Rate,
+    /// Which prediction
+    #[arg(long, value_enum, default_value_t = CoreModel::Green)]
+    pub model: CoreModel,
+    /// Name of the shared-memory service
+    #[arg(long, default_value = SERVICE)]
+    pub service: String,
+}
+
+/// `orbitcal serve`.
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// Where the device is: tcp://HOST:PORT, unix:PATH or serial:PATH[@BAUD]
+    #[arg(long)]
+    pub source: Source,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// Send it the frames of this recording; without it, a front end does
+    #[arg(long, value_name = "RECORDING")]
+    pub feed: Option<PathBuf>,
+    /// Send it the tables of the machine first; without it, it goes by those that it has
+    #[arg(long, requires = "feed")]
+    pub load: bool,
+    /// Random walk of each ln var, standard deviation per sqrt(frame)
+    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
+    pub process_noise: f32,
+    /// One CSV row a frame
+    #[arg(long, value_name = "FILE")]
+    pub trace: Option<PathBuf>,
+    /// Frames a second, or `max`
+    #[arg(long, value_name = "HZ", default_value = "max")]
+    pub rate: Rate,
+    /// Stop after this many estimates of frames that a front end sends
+    #[arg(long, value_name = "N")]
+    pub count: Option<u64>,
     /// Which prediction
     #[arg(long, value_enum, default_value_t = CoreModel::Green)]
     pub model: CoreModel,

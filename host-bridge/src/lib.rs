@@ -3,6 +3,7 @@
 pub mod answer;
 pub mod cli;
 pub mod command;
+pub mod link;
 pub mod output;
 pub mod publish;
 pub mod record;

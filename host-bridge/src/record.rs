@@ -1,7 +1,7 @@
 //! An estimate as every process on the machine sees it: plain data of one size, the same for readers in any language.
 
 use iceoryx2::prelude::ZeroCopySend;
-use inference::stream::{BoosterEstimate, Core};
+use inference::stream::BoosterEstimate;
 
 /// Vars in a record.
 pub const VARS: usize = 48;
@@ -115,8 +115,8 @@ impl EstimateRecord {
         padding: [0; 7],
     };
 
-    /// What the core says after a frame; the publisher adds its stamps.
-    pub fn of(estimate: &BoosterEstimate, core: &Core) -> Self {
+    /// What a core says after a frame, with the covariance of two `ln var`; the publisher adds its stamps.
+    pub fn of(estimate: &BoosterEstimate, of_params: impl Fn(usize, usize) -> f32) -> Self {
         Self {
             time_us: estimate.time_us,
             clipped: estimate.clipped,
@@ -132,7 +132,7 @@ impl EstimateRecord {
             sigma: estimate.sigma,
             map_params: estimate.map_params,
             params_sigma: estimate.params_sigma,
-            covariance: triangle(|i, j| estimate.mean[i] * estimate.mean[j] * core.covariance(i, j)),
+            covariance: triangle(|i, j| estimate.mean[i] * estimate.mean[j] * of_params(i, j)),
             monitor_sigma: estimate.health.map(|health| health.noise),
             monitor_rejected: estimate.health.map(|health| health.rejected),
             monitor_state: estimate.health.map(|health| health.state as u8),
@@ -210,7 +210,7 @@ mod tests {
         let mut core = inference::stream::estimator(&ring, &recording, 0.0).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
-        let record = EstimateRecord::of(&estimate, &core);
+        let record = EstimateRecord::of(&estimate, |i, j| core.covariance(i, j));
         assert_eq!((record.mean, record.sequence, record.frames), (estimate.mean, estimate.sequence, 1));
         for (i, j) in [(0, 0), (30, 7), (7, 30), (47, 47)] {
             let (of_vars, of_params) = (record.covariance_of(i, j), core.covariance(i, j));

@@ -1,5 +1,8 @@
 //! What the system tests share: where the repository's files lie, and the truth behind its recordings.
 
+pub mod qemu;
+pub mod sil;
+
 use std::path::{Path, PathBuf};
 
 use twin::Ring;

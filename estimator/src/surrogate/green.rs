@@ -19,7 +19,7 @@ use nalgebra::SMatrix;
 
 use super::{Block, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, combine, dot, zeros};
+use crate::linear::{add, add_four, combine, dot, zeros};
 use crate::triangle::Triangle;
 
 /// One plane: `B` monitors, `C` correctors, `Q` nodes (two a quadrupole), `T = Q (Q + 1)/2` pairs of nodes.
@@ -164,6 +164,7 @@ impl<
         slip: 0.0,
     };
 
+    #[inline(never)] // 19 kB of stack, for as long as it runs
     fn linearise(&self, strength: &[f32; N], at: &mut Self::Linearised) -> Result<(), Unstable> {
         const { assert!(B == BX + BY && C == CX + CY && Q == 2 * N, "planes and nodes add up") };
         let mut mutual = Triangle::ZERO;
@@ -211,6 +212,7 @@ impl<
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
     Green<BX, BY, CX, CY, Q, T>
 {
+    #[inline(never)]
     /// Dispersion `D' = D - Z_qq D_q D` at the nodes, alike at the monitors, and the slip factor.
     fn linearise_dispersion(
         &self,
@@ -276,6 +278,7 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
         excess
     }
 
+    #[inline(never)]
     fn linearise<const N: usize>(
         &self,
         strength: &[f32; N],
@@ -316,15 +319,17 @@ impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
         combine(orbit, kick.iter().copied().zip(self.driven.as_slice().chunks_exact(Q)));
         combine(reading, kick.iter().copied().zip(self.response.as_slice().chunks_exact(B)));
         orbit.iter_mut().zip(&self.slope).for_each(|(x, k)| *x *= -k);
+        let orbit = orbit.as_chunks::<2>().0;
         for (slopes, seen) in jacobian.chunks_exact_mut(Q / 2).zip(self.seen.as_slice().chunks_exact(Q)) {
-            for (slope, (z, x)) in slopes.iter_mut().zip(seen.chunks_exact(2).zip(orbit.chunks_exact(2))) {
+            for (slope, (z, x)) in slopes.iter_mut().zip(seen.as_chunks::<2>().0.iter().zip(orbit)) {
                 *slope = z[0] * x[0] + z[1] * x[1];
             }
         }
     }
 }
 
-/// Columns of a table, in the ring as it is: `Z = G - Z_qq D G`.
+/// Columns of a table, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a time.
+#[inline(never)]
 fn fill<const Q: usize, const M: usize, const T: usize>(
     to: &mut [f32],
     table: &Block<Q, M>,
@@ -332,8 +337,20 @@ fn fill<const Q: usize, const M: usize, const T: usize>(
     excess: &[f32; Q],
 ) {
     for (m, column) in to.chunks_exact_mut(Q).enumerate() {
-        let change = mutual.multiply(&product(excess, table.column(m)));
-        column.iter_mut().zip(table.column(m)).zip(&change).for_each(|((to, g), change)| *to = g - change);
+        column.iter_mut().zip(table.column(m)).for_each(|(to, g)| *to = g);
+    }
+    let mut rows = [[0.0; Q]; 4];
+    for from in (0..Q).step_by(4) {
+        let mut errors = [0.0; 4];
+        for ((n, row), error) in (from..Q).zip(&mut rows).zip(&mut errors) {
+            mutual.copy_row(n, row);
+            *error = -table.scale * excess.get(n).copied().unwrap_or(0.0);
+        }
+        for (column, codes) in to.chunks_exact_mut(Q).zip(&table.codes) {
+            let mut kicks = errors;
+            kicks.iter_mut().zip(codes.iter().skip(from)).for_each(|(k, code)| *k *= f32::from(*code));
+            add_four(column, kicks, rows.each_ref().map(<[f32; Q]>::as_slice));
+        }
     }
 }
 
@@ -348,6 +365,7 @@ fn product<const Q: usize>(a: &[f32; Q], b: impl Iterator<Item = f32>) -> [f32; 
 ///
 /// `1 + e g_n` is the ring's closure with the node's error over that without; it reaches zero at an integer resonance,
 /// and a ring beyond one is not connected with the design.
+#[inline(never)]
 fn switch_on<const Q: usize, const T: usize>(
     mutual: &mut Triangle<Q, T>,
     excess: &[f32; Q],
@@ -358,7 +376,7 @@ fn switch_on<const Q: usize, const T: usize>(
         let (Some((done, [column, ..])), Some(error)) = (columns.split_at_mut_checked(i), excess.get(node)) else {
             continue;
         };
-        *column = mutual.symmetric_row(node);
+        mutual.copy_row(node, column);
         for (before, weight) in done.iter().zip(&weights) {
             add(column, -weight * before.get(node).copied().unwrap_or(0.0), before);
         }
@@ -369,9 +387,9 @@ fn switch_on<const Q: usize, const T: usize>(
         weights.get_mut(i).into_iter().for_each(|w| *w = error / pivot);
     }
     for (r, row) in mutual.rows_mut().enumerate() {
-        let term = |(column, weight): (&'_ [f32; Q], &f32)| -weight * column.get(r).copied().unwrap_or(0.0);
-        let terms = columns.iter().zip(&weights);
-        combine(row, terms.map(|(column, weight)| (term((column, weight)), column.as_slice())));
+        let mut factors = weights;
+        factors.iter_mut().zip(&columns).for_each(|(w, column)| *w *= -column.get(r).copied().unwrap_or(0.0));
+        add_four(row, factors, columns.each_ref().map(<[f32; Q]>::as_slice));
     }
     Ok(())
 }

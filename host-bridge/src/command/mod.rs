@@ -3,6 +3,7 @@
 pub mod fit;
 pub mod replay;
 pub mod response;
+pub mod serve;
 pub mod surrogate;
 pub mod watch;
 
@@ -57,7 +58,7 @@ fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.
-fn progress(length: usize, what: &'static str, quiet: bool) -> ProgressBar {
+pub fn progress(length: usize, what: &'static str, quiet: bool) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }

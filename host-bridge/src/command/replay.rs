@@ -25,7 +25,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let mut core = stream::estimator(&ring, &recording, options.process_noise)?;
     let (last, timing) = pump(options, &ring, &recording, &mut core)?;
     let quality = core.fit_quality();
-    let answer = Answer::of_core(&ring, &recording, &core, &last, quality, timing);
+    let answer = Answer::of_core(&ring, &recording, &core.setup, &last, |i, j| core.covariance(i, j), quality, timing);
     if let Some(path) = &options.common.json {
         output::json(path, &answer)?;
     }
@@ -56,7 +56,7 @@ fn pump(
         let start = Instant::now();
         let estimate = core.ingest(&mut bytes).map_err(|e| other(&format!("frame {}: {e}", row.sequence)))?;
         times.push(start.elapsed());
-        let record = EstimateRecord::of(&estimate, core);
+        let record = EstimateRecord::of(&estimate, |i, j| core.covariance(i, j));
         publisher.publish(&record).map_err(|e| other(&e))?;
         if let Some(trace) = &mut trace {
             trace.add(&record).map_err(|e| other(&e))?;
@@ -73,14 +73,15 @@ fn pump(
 }
 
 /// Releases frames at a fixed rate, without drift.
-struct Clock {
+pub struct Clock {
     start: Instant,
     period: Option<Duration>,
     ticks: u32,
 }
 
 impl Clock {
-    fn new(rate: Rate) -> Self {
+    /// Begin now.
+    pub fn new(rate: Rate) -> Self {
         let period = match rate {
             Rate::Max => None,
             Rate::Hertz(hertz) => Some(Duration::from_secs_f64(1.0 / hertz)),
@@ -88,7 +89,8 @@ impl Clock {
         Self { start: Instant::now(), period, ticks: 0 }
     }
 
-    fn wait(&mut self) {
+    /// Wait for the next release.
+    pub fn wait(&mut self) {
         let Some(period) = self.period else { return };
         let due = self.start + period * self.ticks;
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
@@ -96,7 +98,8 @@ impl Clock {
     }
 }
 
-fn quantiles(mut times: Vec<Duration>) -> Timing {
+/// Median, 99th percentile and largest.
+pub(super) fn quantiles(mut times: Vec<Duration>) -> Timing {
     times.sort_unstable();
     let at = |p: f64| {
         let index = (p * times.len() as f64) as usize;

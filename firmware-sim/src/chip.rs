@@ -1,0 +1,45 @@
+//! The image: what lies where in memory, and the wiring.
+
+use estimator::booster::{Estimator, Green};
+use estimator::surrogate::{Block, Dispersion, GreenPlane, SymmetricBlock};
+use firmware_sim::link::Vitals;
+use firmware_sim::{Device, Panel};
+use static_cell::ConstStaticCell;
+
+use crate::board::clock::Clock;
+use crate::board::pins::Pins;
+use crate::board::watchdog::Watchdog;
+use crate::board::{stack, uart};
+
+/// The tables of the built-in machine, in flash.
+static BUILT_IN: Green = include!(concat!(env!("OUT_DIR"), "/tables.rs"));
+/// The posterior. All zero at first, so that it takes no flash.
+static CORE: ConstStaticCell<Estimator> = ConstStaticCell::new(Estimator::BLANK);
+/// Room for other tables.
+static SLOT: ConstStaticCell<Green> = ConstStaticCell::new(Green::BLANK);
+
+/// Rate of the UART [baud].
+const BAUD: u32 = 921_600;
+/// One machine cycle [us], that of the recordings' drift stream.
+const CYCLE_US: u32 = 200_000;
+/// The watchdog bites after [s]: 25 cycles, 40 times the longest computation.
+const WATCHDOG_S: u32 = 5;
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    let core = cortex_m::Peripherals::take().expect("taken once");
+    let clock = Clock::start::<CYCLE_US>(core.SYST);
+    let pins = Pins::start();
+    let (mut receiver, mut sender) = uart::start(BAUD, &clock);
+    let mut panel = Panel::new(pins.heartbeat, pins.attention, Watchdog::start(WATCHDOG_S, pins.supervisor));
+    let mut device = Device::new(CORE.take(), &BUILT_IN, SLOT.take());
+    let vitals = || Vitals {
+        lost_bytes: uart::lost(),
+        cycles: clock.now(),
+        stack_bytes: stack::peak() as u32,
+        ..Vitals::default()
+    };
+    defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest());
+    let ended = firmware_sim::run(&mut device, &mut receiver, &mut sender, &mut panel, vitals);
+    panic!("the UART has ended: {}", ended.is_ok())
+}

@@ -1,0 +1,64 @@
+//! Software in the loop: a device between standard input and output, for tests of feedback without any hardware.
+
+use std::io::{self, Read as _, Write as _};
+
+use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
+use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use estimator::booster::{Estimator, Green};
+use firmware_sim::link::Vitals;
+use firmware_sim::{Device, Panel};
+
+/// Run until standard input ends.
+pub fn run() -> io::Result<()> {
+    let tables = training::green::tables(&twin::Ring::booster()).expect("the built-in ring has tables");
+    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+    let mut device = Device::new(&mut core, &tables, &mut slot);
+    let (mut source, mut sink) = (Stdin(io::stdin()), Stdout(io::stdout()));
+    let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
+    let ended = firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
+    ended.map_err(|kind| io::Error::other(format!("{kind:?}")))
+}
+
+struct Stdin(io::Stdin);
+struct Stdout(io::Stdout);
+
+impl ErrorType for Stdin {
+    type Error = ErrorKind;
+}
+
+impl ErrorType for Stdout {
+    type Error = ErrorKind;
+}
+
+impl Read for Stdin {
+    fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
+        self.0.read(to).map_err(|e| e.kind().into())
+    }
+}
+
+impl Write for Stdout {
+    fn write(&mut self, bytes: &[u8]) -> Result<usize, ErrorKind> {
+        self.0.write(bytes).and_then(|n| self.0.flush().map(|()| n)).map_err(|e| e.kind().into())
+    }
+
+    fn flush(&mut self) -> Result<(), ErrorKind> {
+        self.0.flush().map_err(|e| e.kind().into())
+    }
+}
+
+/// A pin with nothing on it.
+struct NoLamp;
+
+impl PinErrorType for NoLamp {
+    type Error = core::convert::Infallible;
+}
+
+impl OutputPin for NoLamp {
+    fn set_low(&mut self) -> Result<(), Self::Error> {
+        Ok(())
+    }
+
+    fn set_high(&mut self) -> Result<(), Self::Error> {
+        Ok(())
+    }
+}

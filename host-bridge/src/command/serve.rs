@@ -1,0 +1,150 @@
+//! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
+
+use core::fmt::Display;
+
+use estimator::{FitQuality, Setup};
+use inference::{Recording, stream};
+use twin::Ring;
+
+use super::replay::{Clock, quantiles};
+use super::{CommandError, machine, progress, recording};
+use crate::answer::{Answer, Timing};
+use crate::cli::{CoreModel, Serve};
+use crate::link::{Heard, Line, Link};
+use crate::output;
+use crate::publish::Publisher;
+use crate::record::EstimateRecord;
+use crate::trace::Trace;
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Serve) -> Result<(), CommandError> {
+    let ring = machine(options.common.machine.as_deref())?;
+    let mut link = Link::open(&options.source).map_err(|e| CommandError::Other(e.to_string()))?;
+    let Some(path) = &options.feed else { return listen(options, &ring, &mut link) };
+    let recording = recording(path, &ring)?;
+    let answer = feed(options, &ring, &recording, &mut link)?;
+    if let Some(path) = &options.common.json {
+        output::json(path, &answer)?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        answer.print();
+    }
+    Ok(())
+}
+
+fn other(error: impl Display) -> CommandError {
+    CommandError::Other(error.to_string())
+}
+
+/// Where estimates go.
+struct Sinks {
+    publisher: Publisher,
+    trace: Option<Trace>,
+}
+
+impl Sinks {
+    fn open(options: &Serve, ring: &Ring) -> Result<Self, CommandError> {
+        let publisher = Publisher::try_new(&options.service).map_err(other)?;
+        let trace = options.trace.as_ref().map(|path| Trace::create(path, &ring.var_names()));
+        Ok(Self { publisher, trace: trace.transpose().map_err(other)? })
+    }
+
+    fn add(&mut self, heard: &Heard) -> Result<(), CommandError> {
+        let record = EstimateRecord::of(&heard.estimate, |i, j| heard.covariance(i, j));
+        self.publisher.publish(&record).map_err(other)?;
+        self.trace.as_mut().map_or(Ok(()), |trace| trace.add(&record)).map_err(other)
+    }
+
+    fn close(self) -> Result<(), CommandError> {
+        self.trace.map_or(Ok(()), Trace::finish).map_err(other)
+    }
+}
+
+/// Publish what the device says to frames that somebody else sends it, until it or a signal ends that.
+fn listen(options: &Serve, ring: &Ring, link: &mut Link<Box<dyn Line>>) -> Result<(), CommandError> {
+    let mut sinks = Sinks::open(options, ring)?;
+    let mut count = 0;
+    let wanted = options.count.unwrap_or(u64::MAX);
+    while count < wanted && !sinks.publisher.is_stop_requested() {
+        link.send(&firmware_sim::link::Request::Covariance).map_err(other)?;
+        sinks.add(&link.listen().map_err(other)?)?;
+        count += 1;
+    }
+    sinks.close()
+}
+
+/// Send a recording through the device, one frame after the other.
+fn feed(
+    options: &Serve,
+    ring: &Ring,
+    recording: &Recording,
+    link: &mut Link<Box<dyn Line>>,
+) -> Result<Answer, CommandError> {
+    let setup = stream::setup(recording, options.process_noise)?;
+    let tables = match options.model {
+        CoreModel::Green if options.load => Some(training::green::tables(ring).map_err(stream::StreamError::from)?),
+        CoreModel::Green => None,
+    };
+    if let Some(tables) = &tables {
+        let bar = progress(tables.parcels().count(), "tables", options.common.quiet);
+        link.load(tables, || bar.inc(1)).map_err(other)?;
+        bar.finish_and_clear();
+    }
+    link.restart(&setup).map_err(other)?;
+    let mut sinks = Sinks::open(options, ring)?;
+    let bar = progress(recording.rows.len(), "frames", options.common.quiet);
+    let fed = replay(link, recording, Clock::new(options.rate), |heard| {
+        bar.inc(1);
+        sinks.add(heard)
+    })?;
+    bar.finish_and_clear();
+    sinks.close()?;
+    Ok(fed.answer(ring, recording, &setup))
+}
+
+/// What a device said at the end of a recording.
+pub struct Fed {
+    /// Its last estimate.
+    pub last: Heard,
+    /// How well it says that its model describes all frames.
+    pub quality: FitQuality,
+    /// Time from frame to estimate, over the line.
+    pub timing: Timing,
+}
+
+impl Fed {
+    /// The same answer as `replay` gives.
+    pub fn answer(&self, ring: &Ring, recording: &Recording, setup: &Setup) -> Answer {
+        let covariance = |i, j| self.last.covariance(i, j);
+        Answer::of_core(ring, recording, setup, &self.last.estimate, covariance, self.quality, self.timing)
+    }
+}
+
+/// Send every frame of a recording to a device that was restarted; `hear` gets each answer.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn replay<L: Line>(
+    link: &mut Link<L>,
+    recording: &Recording,
+    mut clock: Clock,
+    mut hear: impl FnMut(&Heard) -> Result<(), CommandError>,
+) -> Result<Fed, CommandError> {
+    let (mut last, mut times) = (None, Vec::with_capacity(recording.rows.len()));
+    for row in &recording.rows {
+        let wire = stream::wire(recording, row)?;
+        clock.wait();
+        let start = std::time::Instant::now();
+        let heard = link.ingest(&wire).map_err(|e| other(format!("frame {}: {e}", row.sequence)))?;
+        times.push(start.elapsed());
+        hear(&heard)?;
+        last = Some(heard);
+    }
+    let last = last.ok_or_else(|| CommandError::Input(format!("{}: no frames", recording.name)))?;
+    let status = link.status().map_err(other)?;
+    let quality = FitQuality { chi_square: status.chi_square, degrees_of_freedom: status.degrees_of_freedom };
+    Ok(Fed { last, quality, timing: quantiles(times) })
+}

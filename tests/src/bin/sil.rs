@@ -1,0 +1,124 @@
+//! Software in the loop: recordings through the emulated chip into shared memory, beside the core in process; the final
+//! tables, what the chip needed, and `target/sil.json`.
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Parser;
+use comfy_table::{CellAlignment, Table, presets};
+use host_bridge::output;
+use host_bridge::publish::{Publisher, SERVICE};
+use host_bridge::record::EstimateRecord;
+use inference::Recording;
+use inference::stream;
+use serde_json::{Value, json};
+use system_tests::qemu::{Image, Sizes};
+use system_tests::repository;
+use system_tests::sil::{Comparison, compare, largest};
+use twin::Ring;
+
+/// Recordings that are run through the chip, and the random walk of their vars.
+const RECORDINGS: [(&str, f32); 2] = [("recordings/paper-vars", 0.0), ("recordings/drift-stream", 2e-4)];
+
+/// Replay recordings through the emulated chip.
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// First frames of each recording; all of them without it
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
+    /// Where the answer goes as JSON
+    #[arg(long, value_name = "FILE", default_value = "target/sil.json")]
+    json: PathBuf,
+    /// Name of the shared-memory service
+    #[arg(long, default_value = SERVICE)]
+    service: String,
+}
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            eprintln!("sil: {error}");
+            ExitCode::from(1)
+        }
+    }
+}
+
+/// True if chip and host agree to the bit.
+fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
+    let (image, ring) = (Image::build()?, Ring::booster());
+    let sizes = image.sizes()?;
+    let mut publisher = Publisher::try_new(&arguments.service)?;
+    let mut answers = Vec::new();
+    for (name, process_noise) in RECORDINGS {
+        let mut recording = Recording::read(&repository(name), &stream::layout(&ring))?;
+        recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
+        let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
+        let comparison = compare(&image, (&ring, &recording), process_noise, true, |heard| {
+            bar.inc(1);
+            let record = EstimateRecord::of(&heard.estimate, |i, j| heard.covariance(i, j));
+            publisher.publish(&record).map_err(|e| host_bridge::command::CommandError::Other(e.to_string()))
+        })?;
+        bar.finish_and_clear();
+        print(&comparison, &sizes);
+        answers.push(summary(&recording.name, &comparison, &sizes));
+    }
+    let bit_equal = answers.iter().all(|answer| answer["bit_equal"] == true);
+    // the first recording's numbers stand at the top, where scripts look for them
+    let mut whole = answers[0].clone();
+    whole["recordings"] = Value::Array(answers);
+    output::json(&arguments.json, &whole)?;
+    println!("{}", arguments.json.display());
+    Ok(bit_equal)
+}
+
+fn print(comparison: &Comparison, sizes: &Sizes) {
+    comparison.answer.print();
+    let mut table = Table::new();
+    table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
+    table.set_header(["step", "runs", "median instructions", "most"]);
+    for (word, name) in system_tests::sil::REGIONS {
+        let mut runs = comparison.counts.get(name).cloned().unwrap_or_default();
+        runs.sort_unstable();
+        let (median, most) = (runs.get(runs.len() / 2).copied().unwrap_or(0), runs.last().copied().unwrap_or(0));
+        table.add_row([word.to_owned(), runs.len().to_string(), median.to_string(), most.to_string()]);
+    }
+    table.column_iter_mut().skip(1).for_each(|column| column.set_cell_alignment(CellAlignment::Right));
+    println!("\non the emulated chip\n{table}");
+    let equal = match comparison.different.as_slice() {
+        [] => "equal the host's, bit for bit".to_owned(),
+        different => format!("differ from the host's in {} frames, first {}", different.len(), different[0]),
+    };
+    println!(
+        "{} answers {equal}; flash {} kB, RAM {} kB, stack {:.1} kB; {} bytes lost\n",
+        comparison.frames,
+        sizes.flash / 1024,
+        sizes.ram / 1024,
+        f64::from(comparison.status.vitals.stack_bytes) / 1024.0,
+        comparison.status.vitals.lost_bytes,
+    );
+}
+
+/// The keys that scripts rely on.
+fn summary(recording: &str, comparison: &Comparison, sizes: &Sizes) -> Value {
+    let most: serde_json::Map<String, Value> =
+        largest(&comparison.counts).into_iter().map(|(word, count)| (word.to_owned(), count.into())).collect();
+    let of = |word: &str| most[word].as_u64().unwrap_or(0);
+    json!({
+        "recording": recording,
+        "frames": comparison.frames,
+        "bit_equal": comparison.different.is_empty(),
+        "instructions": {
+            "decode": of("decode"),
+            "predict": of("predict"),
+            "update": of("screen") + of("condition"),
+            "linearise": of("linearise"),
+            "frame": of("ingest") + of("encode"),
+        },
+        "flash_bytes": sizes.flash,
+        "ram_bytes": sizes.ram,
+        "stack_bytes": comparison.status.vitals.stack_bytes,
+    })
+}
