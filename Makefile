@@ -1,12 +1,12 @@
 # The one door for people and machines. `make demo` runs the main job, `make test` passes every test; both install what
-# they need: a C linker from Debian if there is none, and the Cortex-M target of the toolchain.
+# they need: a C compiler and the Arm emulator from Debian if there are none, and the Cortex-M target of the toolchain.
 
 TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup train bench docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil train bench docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -14,10 +14,13 @@ help: ## this list
 demo: build ## the main job on a recording that ships with the repository
 	$(ORBITCAL) replay $(RECORDING)
 
-build: setup ## the program, at target/release/orbitcal
+build: toolchain ## the program, at target/release/orbitcal
 	cargo build --release --locked -p host-bridge
 
-setup:
+setup: toolchain
+	@command -v qemu-system-arm >/dev/null || { apt-get update && apt-get install -y qemu-system-arm; }
+
+toolchain:
 	@command -v cargo >/dev/null || { echo "cargo not found: install Rust from https://rustup.rs"; exit 1; }
 	@command -v cc >/dev/null || { apt-get update && apt-get install -y build-essential; }
 	@rustup target list --installed | grep -q $(TARGET) || rustup target add $(TARGET) || { sleep 5; rustup target add $(TARGET); }
@@ -28,13 +31,19 @@ test: setup ## format, lint, tests in debug and release, docs, and the core for 
 	cargo test --locked --workspace
 	cargo test --locked --workspace --release
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
-	cargo build --locked --release -p estimator -p firmware-sim --target $(TARGET)
-	cargo build --locked --release -p estimator --features defmt --target $(TARGET)
+	cargo build --locked --release -p estimator --target $(TARGET)
+	cargo build --locked --release -p firmware-sim --lib --target $(TARGET) # the core with its log lines, and the loop
+
+firmware: toolchain ## the image for the chip; PART=stm32h743 links it for that part instead of the emulated board
+	cargo build --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET)
+
+sil: setup ## recordings through the image in the emulator, beside the core in process; numbers in target/sil.json
+	cargo run --locked --release -p system-tests --bin sil
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check
 
-bench: setup .venv ## medians of the hot paths, and pyAT on the same response
+bench: toolchain .venv ## medians of the hot paths, and pyAT on the same response
 	cargo bench --locked -p system-tests
 	.venv/bin/python tests/peers/pyat_response.py
 

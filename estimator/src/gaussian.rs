@@ -13,7 +13,7 @@
 
 use nalgebra::SMatrix;
 
-use crate::linear::{add, add_four, column, dot, zeros};
+use crate::linear::{add, column, dot, zeros};
 use crate::prior::Prior;
 use crate::sum::{LogProduct, Sum};
 use crate::triangle::Triangle;
@@ -146,26 +146,29 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         // what is left of a group of four waits with no weight
         self.staged_weight.iter_mut().skip(self.staged_rows).for_each(|weight| *weight = 0.0);
         let staged = self.staged.each_ref().map(<[f32; N]>::as_slice);
-        for (j, to) in self.information.rows_mut().enumerate() {
+        let factors = |j: usize| {
             let mut factors = self.staged_weight;
             factors.iter_mut().zip(&staged).for_each(|(w, row)| *w *= row.get(j).copied().unwrap_or(0.0));
-            add_four(to, factors, staged);
-        }
+            factors
+        };
+        self.information.add_products(factors, staged);
         self.staged_rows = 0;
     }
 
     /// Move the baselines: without process noise that of monitor `b` alone, else all, for they are correlated.
     fn learn_baselines(&mut self, b: usize, d: &[f32; N], e: f32, s: f32) {
         let mut gain = [0.0; B];
-        gain.iter_mut().zip(column(self.covariance.as_slice(), B, b)).for_each(|(to, v)| *to = v / s);
         let (from, to) = if self.walked { (0, B) } else { (b, b + 1) };
+        let own = column(self.covariance.as_slice(), B, b);
+        gain.iter_mut().zip(own).skip(from).take(to - from).for_each(|(to, v)| *to = v / s);
         let slopes = self.slope.as_mut_slice().chunks_exact_mut(N);
         let covariances = self.covariance.as_mut_slice().chunks_exact_mut(B);
         let each = self.baseline.iter_mut().zip(slopes).zip(covariances).zip(&gain);
         for (((mean, slope), covariance), g) in each.skip(from).take(to - from) {
             *mean += g * e;
             add(slope, *g, d);
-            add(covariance, -g * s, &gain);
+            let covariance = covariance.get_mut(from..to).unwrap_or_default();
+            add(covariance, -g * s, gain.get(from..to).unwrap_or_default());
         }
     }
 
@@ -333,7 +336,7 @@ impl<const N: usize, const T: usize> Solution<N, T> {
         // not `clamp`, which panics on bounds that are crossed
         let bounded = |theta: f32| theta.max(prior.lower).min(prior.upper);
         let mut outside = false;
-        for ((map, delta), origin) in self.map_params.iter_mut().zip(self.delta.iter()).zip(&gaussian.origin) {
+        for ((map, delta), origin) in self.map_params.iter_mut().zip(&self.delta).zip(&gaussian.origin) {
             *map = bounded(origin + delta);
             outside |= *map != origin + delta;
         }
@@ -341,18 +344,37 @@ impl<const N: usize, const T: usize> Solution<N, T> {
         if !outside {
             return;
         }
+        let mut pull = gaussian.pull(&self.map_params);
         // Each sweep minimises over one param at a time; the error falls by the coupling, about a half, each sweep.
         for _ in 0..30 {
-            for i in 0..N {
-                let pull = gaussian.pull(i, &self.map_params);
-                if let Some(map) = self.map_params.get_mut(i) {
-                    *map = bounded(*map + pull / gaussian.information.get(i, i));
-                }
+            if !self.sweep(gaussian, &mut pull, bounded) {
+                break;
             }
         }
         for (i, &map) in self.map_params.iter().enumerate() {
             self.clipped |= u64::from(map == prior.lower || map == prior.upper) << i;
         }
+    }
+
+    /// Move each param to its best value within the bounds, the others held; false if none moved by more than a thousandth
+    /// of its error bar.
+    fn sweep<const B: usize>(
+        &mut self,
+        gaussian: &Gaussian<B, N, T>,
+        pull: &mut [f32; N],
+        bounded: impl Fn(f32) -> f32,
+    ) -> bool {
+        let (mut moved, mut row) = (false, [0.0; N]);
+        for (i, (map, sigma)) in self.map_params.iter_mut().zip(&self.sigma).enumerate() {
+            let to = bounded(*map + pull.get(i).copied().unwrap_or(0.0) / gaussian.information.get(i, i));
+            let step = to - *map;
+            if step.abs() > 1e-3 * sigma {
+                gaussian.information.copy_row(i, &mut row);
+                add(pull, -step, &row);
+                (*map, moved) = (to, true);
+            }
+        }
+        moved
     }
 
     /// Covariance of two params.
@@ -371,11 +393,13 @@ impl<const N: usize, const T: usize> Solution<N, T> {
 }
 
 impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
-    /// Downhill pull on param `i` at a point: minus half the derivative of chi-square.
-    fn pull(&self, i: usize, at: &[f32; N]) -> f32 {
-        let steps = at.iter().zip(&self.origin).enumerate();
-        let steps = steps.map(|(j, (at, origin))| self.information.get(i, j) * (at - origin));
-        self.vector.get(i).copied().unwrap_or(0.0) - steps.sum::<f32>()
+    /// Downhill pull on the params at a point: minus half the derivative of chi-square.
+    fn pull(&self, at: &[f32; N]) -> [f32; N] {
+        let mut step = *at;
+        add(&mut step, -1.0, &self.origin);
+        let mut pull = self.vector;
+        add(&mut pull, -1.0, &self.information.multiply(&step));
+        pull
     }
 
     /// Derivative of the difference between a reading and its baseline, and the variance of the baseline.
@@ -517,7 +541,7 @@ mod tests {
         assert_eq!(solution.clipped, 0b01);
         assert_eq!(solution.map_params[0], narrow.upper);
         // at the constrained best point nothing pulls on the free param
-        let pull = gaussian.pull(1, &solution.map_params) / gaussian.information.get(1, 1);
-        assert!(pull.abs() < 1e-6, "{pull}");
+        let pull = gaussian.pull(&solution.map_params)[1] / gaussian.information.get(1, 1);
+        assert!(pull.abs() < 1e-3 * solution.sigma[1], "{pull}");
     }
 }

@@ -36,6 +36,42 @@ pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
     }
 }
 
+/// [`add_four`] for two at a time: loads of the rows are shared. What the longer has beyond the other's end is done by
+/// itself.
+#[inline(never)]
+pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
+    let [one, other] = to;
+    let n = one.len().min(other.len());
+    let (Some((one, one_rest)), Some((other, other_rest))) =
+        (one.split_at_mut_checked(n), other.split_at_mut_checked(n))
+    else {
+        return;
+    };
+    let rests = rows.map(|row| row.get(n..).unwrap_or_default());
+    for (rest, factors) in [one_rest, other_rest].into_iter().zip(factors) {
+        if !rest.is_empty() {
+            add_four(rest, factors, rests);
+        }
+    }
+    two_by_four(one, other, factors, rows);
+}
+
+/// The part of [`add_four_twice`] that both share. The two are arguments of their own, so that the compiler knows them apart
+/// from the rows and keeps what it has loaded.
+#[inline(never)]
+fn two_by_four(one: &mut [f32], other: &mut [f32], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
+    let n = one.len();
+    let Some(other) = other.get_mut(..n) else { return };
+    let [first, second, third, fourth] = rows.map(|row| row.get(..n));
+    let (Some(first), Some(second), Some(third), Some(fourth)) = (first, second, third, fourth) else { return };
+    let [[a, b, c, d], [e, f, g, h]] = factors;
+    for i in 0..n {
+        let (w, x, y, z) = (first[i], second[i], third[i], fourth[i]);
+        one[i] = (((one[i] + a * w) + b * x) + c * y) + d * z;
+        other[i] = (((other[i] + e * w) + f * x) + g * y) + h * z;
+    }
+}
+
 /// Scalar product, summed in eight lanes; what one has beyond the other's end does not count.
 #[inline]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {

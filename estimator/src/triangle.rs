@@ -1,6 +1,6 @@
 //! Symmetric and triangular matrices, packed: a lower triangle row by row, half the memory of a square.
 
-use crate::linear::{add, add_four, combine, dot};
+use crate::linear::{add, add_four, add_four_twice, combine, dot};
 use crate::sum::LogProduct;
 
 /// Lower triangle of an `N x N` matrix; `T = N (N + 1)/2` entries, row `i` holds columns `0..=i`.
@@ -67,6 +67,17 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
     pub fn fill_diagonal(&mut self, value: f32) {
         self.0.fill(0.0);
         self.rows_mut().filter_map(<[f32]>::last_mut).for_each(|diagonal| *diagonal = value);
+    }
+
+    /// `A += sum of factor * row` for four rows, each of them with its own factor for each row of `A`.
+    pub fn add_products(&mut self, factors: impl Fn(usize) -> [f32; 4], rows: [&[f32]; 4]) {
+        let mut own = self.rows_mut().enumerate();
+        while let Some((i, one)) = own.next() {
+            match own.next() {
+                Some((j, other)) => add_four_twice([one, other], [factors(i), factors(j)], rows),
+                None => add_four(one, factors(i), rows),
+            }
+        }
     }
 
     /// `A x` for the symmetric matrix.

@@ -53,7 +53,12 @@ impl<'m> Device<'m> {
         self.core.prepare(&Model { surrogate: tables(self.contents, self.built_in, self.slot), setup })
     }
 
-    /// Count a packet that was no packet.
+    /// Packets refused so far.
+    pub fn refused(&self) -> u32 {
+        self.refused
+    }
+
+    /// Count a packet that was none, and say so.
     #[inline(never)]
     pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply)) {
         self.refused = self.refused.saturating_add(1);

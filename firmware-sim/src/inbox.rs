@@ -28,7 +28,7 @@ pub enum Event<'i> {
     Packet(&'i mut [u8]),
     /// Bytes that are none.
     Broken(Refusal),
-    /// Nothing came for a cycle.
+    /// No packet yet: nothing came for a cycle, or many bytes that are none.
     Silence,
     /// The source has ended.
     End,
@@ -46,13 +46,14 @@ impl Inbox {
         self.silent_cycles
     }
 
-    /// Wait for a packet, or for a cycle to pass without a byte.
+    /// Wait for a packet, or for a cycle to pass without a byte. A stream of bytes that never makes a packet is left now and
+    /// then, so that the loop around can show that it lives.
     ///
     /// # Errors
     /// What the source reports, but [`ErrorKind::TimedOut`].
     pub fn next<R: Read>(&mut self, source: &mut R) -> Result<Event<'_>, R::Error> {
         let mut byte = [0];
-        loop {
+        for _ in 0..2 * packet::MAX_WIRE_BYTES {
             match source.read(&mut byte) {
                 Ok(0) => return Ok(Event::End),
                 Ok(_) => self.silence = 0,
@@ -73,6 +74,7 @@ impl Inbox {
                 ([other], false) => self.push(other),
             }
         }
+        Ok(Event::Silence)
     }
 
     fn push(&mut self, byte: u8) {
@@ -134,6 +136,16 @@ mod tests {
         let (mut source, mut inbox) = (Script(&script), Inbox::default());
         assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Oversized)));
         assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [1, 0])));
+    }
+
+    #[test]
+    fn a_stream_without_packets_is_left_now_and_then() {
+        for noise in [0, 1] {
+            let script = [Some(noise); 3 * packet::MAX_WIRE_BYTES];
+            let (mut source, mut inbox) = (Script(&script), Inbox::default());
+            assert_eq!(inbox.next(&mut source), Ok(Event::Silence));
+            assert_eq!(inbox.next(&mut source), Ok(Event::End));
+        }
     }
 
     #[test]

@@ -77,7 +77,7 @@ pub enum Taken {
     BuiltIn,
 }
 
-/// Why a packet was refused; the values that disagreed stand in the device's log.
+/// Why a packet was refused: the kind of the error, without the values that disagreed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(missing_docs)] // named after `FrameError` and `IngestError`
 pub enum Refusal {

@@ -44,7 +44,7 @@ impl<P: OutputPin, W: OutputPin> Panel<P, W> {
         self.attention.set_state((faulty || estimate.clipped != 0).into())
     }
 
-    /// Light attention: a packet was refused, or bytes were lost.
+    /// Light attention until the next good estimate: a packet was refused.
     ///
     /// # Errors
     /// What the pin reports.

@@ -33,19 +33,19 @@ pub fn run<R: Read, W: Write<Error = R::Error>>(
                 sent = send(sink, reply);
             }
         };
-        // a lamp that does not light is no reason to stop
-        let _ = match event {
-            Event::Packet(bytes) => match device.hear(bytes, Vitals { silent_cycles, ..vitals() }, &mut reply) {
-                Some(estimate) => panel.show(&estimate),
-                None => Ok(()),
-            },
+        let refused = device.refused();
+        let answer = match event {
+            Event::Packet(bytes) => device.hear(bytes, Vitals { silent_cycles, ..vitals() }, &mut reply),
             Event::Broken(why) => {
                 device.refuse(why, &mut reply);
-                panel.alarm()
+                None
             }
-            Event::Silence => Ok(()),
+            Event::Silence => None,
             Event::End => return sink.flush(),
         };
+        // a lamp that does not light is no reason to stop
+        let _ = answer.map(|estimate| panel.show(&estimate));
+        let _ = (device.refused() != refused).then(|| panel.alarm());
         sent?;
         let _ = panel.feed();
         // the answer is out; this may take until the next frame

@@ -9,7 +9,7 @@ use twin::{Hold, Optics, Ring};
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
 #[derive(Debug, Clone, Serialize)]
-#[allow(missing_docs)] // docs/json.md describes them for readers of the file
+#[allow(missing_docs)] // named after what they are
 pub struct Answer {
     pub recording: String,
     pub method: &'static str,

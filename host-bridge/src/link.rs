@@ -112,6 +112,14 @@ pub struct Heard {
     pub covariance: Option<Box<[f32; TRIANGLE]>>,
 }
 
+impl LinkError {
+    /// True if the line is sound, and only nothing came.
+    pub fn is_silence(&self) -> bool {
+        let silent = |error: &io::Error| matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut);
+        matches!(self, Self::Line(error) if silent(error))
+    }
+}
+
 impl Heard {
     /// Covariance of two params `theta = ln var`; 0 if it was not sent.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
@@ -171,7 +179,7 @@ impl<L: Read + Write> Link<L> {
     /// [`LinkError`].
     pub fn restart(&mut self, setup: &Setup) -> Result<(), LinkError> {
         // a zero first: half a packet of somebody before us may be waiting
-        self.line.write_all(&[0])?;
+        self.write(&[0])?;
         self.send(&Request::Restart(*setup))?;
         loop {
             match self.next()? {
@@ -190,7 +198,7 @@ impl<L: Read + Write> Link<L> {
     /// [`LinkError`].
     pub fn ingest(&mut self, wire: &[u8]) -> Result<Heard, LinkError> {
         self.send(&Request::Covariance)?;
-        self.line.write_all(wire)?;
+        self.write(wire)?;
         self.listen()
     }
 
@@ -199,26 +207,29 @@ impl<L: Read + Write> Link<L> {
     /// # Errors
     /// [`LinkError`].
     pub fn listen(&mut self) -> Result<Heard, LinkError> {
-        let estimate = match self.next()? {
-            Reply::Estimate(answer) => answer.estimate().ok_or(FrameError::Malformed)?,
-            Reply::Refused { why, .. } => return Err(LinkError::Refused { what: "a frame", why }),
-            other => return Err(unexpected("an estimate", &other)),
+        let estimate = |reply| match reply {
+            Reply::Estimate(answer) => answer.estimate().ok_or(LinkError::Reply(FrameError::Malformed)),
+            Reply::Refused { why, .. } => Err(LinkError::Refused { what: "a frame", why }),
+            other => Err(unexpected("an estimate", &other)),
         };
+        let mut estimate_so_far = estimate(self.next()?)?;
         let mut covariance = Box::new([0.0; TRIANGLE]);
         let mut place = 0;
         while place < TRIANGLE {
             match self.next()? {
                 Reply::Covariance { sequence, first, entries }
-                    if sequence == estimate.sequence && usize::from(first) == place && !entries.is_empty() =>
+                    if sequence == estimate_so_far.sequence && usize::from(first) == place && !entries.is_empty() =>
                 {
                     let room = covariance.iter_mut().skip(place);
                     room.zip(&entries).for_each(|(to, entry)| *to = *entry);
                     place += entries.len();
                 }
+                // the frame of that estimate came before the request: the covariance follows this one
+                newer if place == 0 => estimate_so_far = estimate(newer)?,
                 other => return Err(unexpected("the rest of a covariance", &other)),
             }
         }
-        Ok(Heard { estimate, covariance: Some(covariance) })
+        Ok(Heard { estimate: estimate_so_far, covariance: Some(covariance) })
     }
 
     /// How the device is.
@@ -256,6 +267,15 @@ impl<L: Read + Write> Link<L> {
         }
     }
 
+    /// Send bytes as they are.
+    ///
+    /// # Errors
+    /// [`LinkError::Line`].
+    pub fn write(&mut self, bytes: &[u8]) -> Result<(), LinkError> {
+        self.line.write_all(bytes)?;
+        Ok(self.line.flush()?)
+    }
+
     /// Send a request.
     ///
     /// # Errors
@@ -263,8 +283,7 @@ impl<L: Read + Write> Link<L> {
     pub fn send(&mut self, request: &Request) -> Result<(), LinkError> {
         let mut bytes = [0; packet::MAX_WIRE_BYTES];
         let n = request.encode(&mut bytes)?;
-        self.line.write_all(&bytes[..n])?;
-        Ok(self.line.flush()?)
+        self.write(&bytes[..n])
     }
 
     /// Wait for the next reply.

@@ -1,5 +1,6 @@
 //! A recording as the core sees it: wire frames, and a model made of its header.
 
+use estimator::surrogate::Unstable;
 use estimator::{
     Calibration, CurrentCode, FitQuality, FrameError, Gate, IngestError, MagnetCurrents, Model, PositionCode, Prior,
     RfCode, Setup, TuneCode,
@@ -128,7 +129,7 @@ impl Core {
         (Model { surrogate: &self.tables, setup: &self.setup }, &mut self.state)
     }
 
-    /// One machine cycle: bytes to estimate. See [`Estimator::ingest`].
+    /// One machine cycle: bytes to estimate. See [`estimator::Estimator::ingest`].
     ///
     /// # Errors
     /// [`IngestError`].
@@ -137,13 +138,27 @@ impl Core {
         state.ingest(&model, bytes)
     }
 
-    /// What is done between frames. See [`Estimator::prepare`].
+    /// What is done between frames. See [`estimator::Estimator::prepare`].
     pub fn prepare(&mut self) -> bool {
         let (model, state) = self.parts();
         state.prepare(&model)
     }
 
-    /// How well the model describes the frames so far. See [`Estimator::fit_quality`].
+    /// Go over to other tables of the same machine. See [`estimator::Estimator::adopt`].
+    ///
+    /// # Errors
+    /// [`Unstable`] if they have no ring at the vars at hand; the former tables are then in use again.
+    pub fn adopt(&mut self, tables: BoosterGreen) -> Result<(), Unstable> {
+        let former = core::mem::replace(&mut *self.tables, tables);
+        let (model, state) = self.parts();
+        state.adopt(&model).inspect_err(|_| {
+            *self.tables = former;
+            let (model, state) = self.parts();
+            let _ = state.adopt(&model); // they have described all frames so far, so they can again
+        })
+    }
+
+    /// How well the model describes the frames so far. See [`estimator::Estimator::fit_quality`].
     pub fn fit_quality(&mut self) -> FitQuality {
         let (model, state) = self.parts();
         state.fit_quality(&model)

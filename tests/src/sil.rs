@@ -1,6 +1,6 @@
 //! A recording through the emulated chip and through the core in process, side by side.
 
-use std::error::Error;
+use core::error::Error;
 
 use estimator::booster::Estimate;
 use firmware_sim::link::Status;
@@ -24,7 +24,7 @@ pub const REGIONS: [(&str, &str); 8] = [
     ("ingest", "Estimator::ingest"),
     ("encode", "Reply::encode"),
     ("linearise", "linearise_anew"),
-    ("rebuild", "linearise_at"),
+    ("attempt", "linearise_at"),
 ];
 
 /// What a run on the chip showed beside the same frames in process.

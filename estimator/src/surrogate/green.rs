@@ -19,7 +19,7 @@ use nalgebra::SMatrix;
 
 use super::{Block, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, add_four, combine, dot, zeros};
+use crate::linear::{add, add_four, add_four_twice, combine, dot, zeros};
 use crate::triangle::Triangle;
 
 /// One plane: `B` monitors, `C` correctors, `Q` nodes (two a quadrupole), `T = Q (Q + 1)/2` pairs of nodes.
@@ -346,10 +346,18 @@ fn fill<const Q: usize, const M: usize, const T: usize>(
             mutual.copy_row(n, row);
             *error = -table.scale * excess.get(n).copied().unwrap_or(0.0);
         }
-        for (column, codes) in to.chunks_exact_mut(Q).zip(&table.codes) {
+        let rows = rows.each_ref().map(<[f32; Q]>::as_slice);
+        let kicks = |codes: &[i16; Q]| {
             let mut kicks = errors;
             kicks.iter_mut().zip(codes.iter().skip(from)).for_each(|(k, code)| *k *= f32::from(*code));
-            add_four(column, kicks, rows.each_ref().map(<[f32; Q]>::as_slice));
+            kicks
+        };
+        let mut each = to.chunks_exact_mut(Q).zip(&table.codes);
+        while let Some((one, codes)) = each.next() {
+            match each.next() {
+                Some((other, others)) => add_four_twice([one, other], [kicks(codes), kicks(others)], rows),
+                None => add_four(one, kicks(codes), rows),
+            }
         }
     }
 }
@@ -386,11 +394,12 @@ fn switch_on<const Q: usize, const T: usize>(
         }
         weights.get_mut(i).into_iter().for_each(|w| *w = error / pivot);
     }
-    for (r, row) in mutual.rows_mut().enumerate() {
+    let factors = |r: usize| {
         let mut factors = weights;
         factors.iter_mut().zip(&columns).for_each(|(w, column)| *w *= -column.get(r).copied().unwrap_or(0.0));
-        add_four(row, factors, columns.each_ref().map(<[f32; Q]>::as_slice));
-    }
+        factors
+    };
+    mutual.add_products(factors, columns.each_ref().map(<[f32; Q]>::as_slice));
     Ok(())
 }
 

@@ -3,6 +3,7 @@
 use core::fmt::Display;
 
 use estimator::{FitQuality, Setup};
+use firmware_sim::link::Request;
 use inference::{Recording, stream};
 use twin::Ring;
 
@@ -10,7 +11,7 @@ use super::replay::{Clock, quantiles};
 use super::{CommandError, machine, progress, recording};
 use crate::answer::{Answer, Timing};
 use crate::cli::{CoreModel, Serve};
-use crate::link::{Heard, Line, Link};
+use crate::link::{Heard, Line, Link, LinkError};
 use crate::output;
 use crate::publish::Publisher;
 use crate::record::EstimateRecord;
@@ -66,12 +67,20 @@ impl Sinks {
 /// Publish what the device says to frames that somebody else sends it, until it or a signal ends that.
 fn listen(options: &Serve, ring: &Ring, link: &mut Link<Box<dyn Line>>) -> Result<(), CommandError> {
     let mut sinks = Sinks::open(options, ring)?;
-    let mut count = 0;
-    let wanted = options.count.unwrap_or(u64::MAX);
+    let (mut count, wanted) = (0, options.count.unwrap_or(u64::MAX));
+    link.send(&Request::Covariance).map_err(other)?;
     while count < wanted && !sinks.publisher.is_stop_requested() {
-        link.send(&firmware_sim::link::Request::Covariance).map_err(other)?;
-        sinks.add(&link.listen().map_err(other)?)?;
-        count += 1;
+        match link.listen() {
+            Ok(heard) => {
+                sinks.add(&heard)?;
+                count += 1;
+                link.send(&Request::Covariance).map_err(other)?;
+            }
+            Err(error) if error.is_silence() => {}
+            // a bad frame is its sender's concern, and was counted
+            Err(error @ LinkError::Refused { .. }) => eprintln!("orbitcal: {error}"),
+            Err(error) => return Err(other(error)),
+        }
     }
     sinks.close()
 }

@@ -1,7 +1,7 @@
 //! Software in the loop: recordings through the emulated chip into shared memory, beside the core in process; the final
 //! tables, what the chip needed, and `target/sil.json`.
 
-use std::error::Error;
+use core::error::Error;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

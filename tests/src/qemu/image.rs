@@ -87,6 +87,25 @@ impl Image {
         }
     }
 
+    /// The same image, written to `path`, with other code at the beginning of a function.
+    ///
+    /// # Errors
+    /// If the function is not in the file, or the file cannot be written.
+    pub fn patched(&self, function: &Function, code: &[u8], path: &Path) -> Result<Self, Error> {
+        let address = function.address & !1; // the lowest bit says Thumb
+        let object = self.object()?;
+        let place = object.sections().find_map(|section| {
+            let (start, _) = section.file_range()?;
+            let within = address.checked_sub(section.address()).filter(|within| *within < section.size())?;
+            usize::try_from(start + within).ok()
+        });
+        let mut elf = self.elf.clone();
+        let place = place.and_then(|place| elf.get_mut(place..place + code.len()));
+        place.ok_or_else(|| Error::Image(format!("{} is not in the file", function.name)))?.copy_from_slice(code);
+        fs::write(path, &elf).map_err(Error::file(path))?;
+        Self::open(path)
+    }
+
     /// Flash and static RAM.
     ///
     /// # Errors

@@ -1,0 +1,291 @@
+//! The image on the emulated chip beside the core in process: the same bits, within its memory and its instructions, and
+//! alive whatever comes over the wire.
+
+use std::process::Command;
+use std::sync::LazyLock;
+use std::time::Duration;
+
+use estimator::booster::Green;
+use firmware_sim::link::{Refusal, Reply, Request};
+use host_bridge::link::Link;
+use inference::Recording;
+use inference::stream::{self, Core};
+use system_tests::qemu::{Emulator, Image, Options};
+use system_tests::repository;
+use system_tests::sil::{bits, compare, largest};
+use twin::Ring;
+
+/// Built once for all tests.
+static IMAGE: LazyLock<Image> = LazyLock::new(|| Image::build().unwrap_or_else(|error| panic!("{error}")));
+
+fn read(name: &str) -> (Ring, Recording) {
+    let ring = Ring::booster();
+    let recording = Recording::read(&repository("recordings").join(name), &stream::layout(&ring)).unwrap();
+    (ring, recording)
+}
+
+fn wires(recording: &Recording) -> Vec<Vec<u8>> {
+    recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
+}
+
+fn start() -> Emulator {
+    Emulator::start(&IMAGE, &Options::default()).unwrap_or_else(|error| panic!("{error}"))
+}
+
+#[test]
+fn the_image_fits_its_memory() {
+    let sizes = IMAGE.sizes().unwrap();
+    assert!(sizes.flash <= 256 * 1024, "{} bytes of flash", sizes.flash);
+    assert!(sizes.ram <= 192 * 1024, "{} bytes of RAM", sizes.ram);
+    // a network of 760 kB has room in what is left of 1 MB
+    assert!(sizes.flash + 760 * 1024 <= 1024 * 1024, "{} bytes of flash", sizes.flash);
+}
+
+/// Most instructions of each step, beside those that were committed; `BLESS=1` rewrites them.
+///
+/// The counts repeat exactly with one compiler; 2 % leaves room for another one's patch release.
+fn check_instructions(counts: &[(&'static str, u64)]) {
+    let path = repository("tests/golden/instructions.csv");
+    let table: String = counts.iter().map(|(step, most)| format!("{step},{most}\n")).collect();
+    if std::env::var_os("BLESS").is_some() {
+        std::fs::write(&path, format!("step,most\n{table}")).unwrap();
+    }
+    let golden = std::fs::read_to_string(&path).unwrap_or_default();
+    let mut golden = golden.lines().skip(1).filter_map(|line| line.split_once(','));
+    for (step, most) in counts {
+        let (name, expected) = golden.next().unwrap_or_else(|| panic!("{}: no row for {step}", path.display()));
+        let expected: f64 = expected.parse().unwrap();
+        assert_eq!(name, *step, "{}", path.display());
+        let ratio = *most as f64 / expected;
+        assert!((ratio - 1.0).abs() < 0.02, "{step}: {most} instructions, {expected} committed; BLESS=1 rewrites");
+    }
+}
+
+#[test]
+fn the_chip_answers_a_campaign_as_the_host_does() {
+    let (ring, recording) = read("paper-vars");
+    let run = compare(&IMAGE, (&ring, &recording), 0.0, true, |_| Ok(())).unwrap();
+    assert_eq!((run.frames, run.different.as_slice()), (346, [].as_slice()));
+    assert_eq!((run.status.refused, run.status.vitals.lost_bytes), (0, 0));
+    assert!(run.status.vitals.stack_bytes <= 32 * 1024, "{} bytes of stack", run.status.vitals.stack_bytes);
+    let counts = largest(&run.counts);
+    let of = |step: &str| counts.iter().find(|(name, _)| *name == step).unwrap().1;
+    assert!(of("ingest") + of("encode") <= 800_000, "{} + {}", of("ingest"), of("encode"));
+    check_instructions(&counts);
+}
+
+#[test]
+fn the_chip_answers_a_drifting_machine_as_the_host_does() {
+    let (ring, mut recording) = read("drift-stream");
+    recording.rows.truncate(500);
+    for process_noise in [0.0, 2e-4] {
+        let run = compare(&IMAGE, (&ring, &recording), process_noise, false, |_| Ok(())).unwrap();
+        assert_eq!((run.frames, run.different.as_slice()), (500, [].as_slice()), "walk {process_noise}");
+        assert_eq!(run.status.vitals.lost_bytes, 0);
+    }
+}
+
+/// A device on the emulated chip, and the core in process that hears the same good frames.
+struct Pair<'e> {
+    link: Link<&'e std::os::unix::net::UnixStream>,
+    core: Core,
+}
+
+impl<'e> Pair<'e> {
+    fn start(emulator: &'e Emulator, ring: &Ring, recording: &Recording) -> Self {
+        let core = stream::estimator(ring, recording, 0.0).unwrap();
+        let mut link = Link::new(emulator.uart());
+        link.restart(&core.setup).unwrap();
+        Self { link, core }
+    }
+
+    /// A good frame, answered alike; the device may count refusals that the core has not seen.
+    fn agree(&mut self, wire: &[u8]) {
+        let heard = self.link.ingest(wire).unwrap();
+        self.expect(wire, heard.estimate);
+    }
+
+    fn expect(&mut self, wire: &[u8], mut answer: estimator::booster::Estimate) {
+        self.core.prepare();
+        let expected = self.core.ingest(&mut wire.to_vec()).unwrap();
+        answer.rejected_frames = expected.rejected_frames;
+        assert!(bits(&answer) == bits(&expected), "frame {}", expected.sequence);
+    }
+
+    fn refused(&mut self) -> Refusal {
+        match self.link.next().unwrap() {
+            Reply::Refused { why, .. } => why,
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+#[test]
+fn faults_on_the_wire_are_counted_and_change_nothing() {
+    let (ring, recording) = read("paper-vars");
+    let good = wires(&recording);
+    let emulator = start();
+    let mut pair = Pair::start(&emulator, &ring, &recording);
+    for (at, wire) in good.iter().take(60).enumerate() {
+        pair.agree(wire);
+        let next = &good[at + 1];
+        let (bytes, expected): (Vec<u8>, &[Refusal]) = match at % 8 {
+            0 => (wire.clone(), &[Refusal::Repeated]),
+            1 if at > 8 => (good[at - 5].clone(), &[Refusal::OutOfOrder]),
+            // a byte dropped, a byte repeated, two exchanged, one changed
+            2 => ([&next[..90], &next[91..]].concat(), &[Refusal::Framing, Refusal::Truncated, Refusal::Corrupted]),
+            3 => ([&next[..90], &next[89..]].concat(), &[Refusal::Framing, Refusal::Oversized, Refusal::Corrupted]),
+            4 => {
+                let mut bytes = next.clone();
+                bytes.swap(100, 103);
+                (bytes, &[Refusal::Framing, Refusal::Corrupted])
+            }
+            5 => {
+                let mut bytes = next.clone();
+                bytes[120] ^= 0x10;
+                (bytes, &[Refusal::Framing, Refusal::Corrupted, Refusal::Truncated])
+            }
+            // reset in mid-frame: the front end begins with a zero
+            6 => {
+                ([&next[..next.len() / 2], &[0]].concat(), &[Refusal::Framing, Refusal::Truncated, Refusal::Corrupted])
+            }
+            // no packet at all
+            _ => ([vec![0x55; 5000], vec![0]].concat(), &[Refusal::Oversized]),
+        };
+        pair.link.write(&bytes).unwrap();
+        let why = pair.refused();
+        assert!(expected.contains(&why) || expected.is_empty(), "after frame {at}: {why:?}, expected {expected:?}");
+    }
+    // a sender that stalls in mid-frame: after two cycles the rest is not waited for
+    pair.link.write(&good[60][..100]).unwrap();
+    assert_eq!(pair.refused(), Refusal::Stalled);
+    pair.agree(&good[60]);
+    let status = pair.link.status().unwrap();
+    assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (61, 61, 0));
+    assert!(status.vitals.silent_cycles >= 2);
+}
+
+/// A whole longest update takes 37 ms at 480 MHz and one instruction a cycle; at 921,600 baud 13 frames of 260 bytes come
+/// meanwhile. The emulated UART has no rate: they are sent at once, just as the chip begins to linearise.
+#[test]
+fn frames_that_come_during_an_update_are_not_lost() {
+    let (ring, recording) = read("paper-vars");
+    let good = wires(&recording);
+    let emulator = start();
+    let mut pair = Pair::start(&emulator, &ring, &recording);
+    let (mut bursts, mut at) = (0, 0);
+    while at + 14 <= good.len() && bursts < 5 {
+        pair.agree(&good[at]);
+        at += 1;
+        // does the chip linearise after this frame?
+        if !pair.core.clone().prepare() {
+            continue;
+        }
+        let burst = good[at..at + 13].concat();
+        pair.link.write(&burst).unwrap();
+        for wire in &good[at..at + 13] {
+            let Reply::Estimate(answer) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
+            pair.expect(wire, answer.estimate().unwrap());
+        }
+        at += 13;
+        bursts += 1;
+    }
+    assert_eq!(bursts, 5);
+    assert_eq!(pair.link.status().unwrap().vitals.lost_bytes, 0);
+}
+
+/// More than any device can take: what was answered is right, what was not is counted, and the device lives.
+#[test]
+fn a_storm_of_frames_is_survived() {
+    let (ring, recording) = read("paper-vars");
+    let good = wires(&recording);
+    let emulator = start();
+    let mut pair = Pair::start(&emulator, &ring, &recording);
+    // covariances with every frame keep the chip busy sending; meanwhile its queue fills
+    let mut request = vec![0; estimator::packet::MAX_WIRE_BYTES];
+    let n = Request::Covariance.encode(&mut request).unwrap();
+    let storm: Vec<u8> = good[..200].iter().flat_map(|wire| [&request[..n], wire].concat()).collect();
+    let status = {
+        let n = Request::Status.encode(&mut request).unwrap();
+        [&[0], &request[..n]].concat()
+    };
+    let mut uart = emulator.uart().try_clone().unwrap();
+    let sender = std::thread::spawn(move || {
+        std::io::Write::write_all(&mut uart, &storm)?;
+        std::thread::sleep(Duration::from_secs(3)); // the queue empties
+        std::io::Write::write_all(&mut uart, &status)
+    });
+    let (mut answered, mut refused) = (0, 0);
+    let status = loop {
+        match pair.link.next().unwrap() {
+            Reply::Estimate(answer) => {
+                let answer = answer.estimate().unwrap();
+                pair.expect(&good[answer.sequence as usize], answer);
+                answered += 1;
+            }
+            Reply::Refused { count, .. } => refused = count,
+            Reply::Covariance { .. } => {}
+            Reply::Status(status) => break status,
+            other => panic!("{other:?}"),
+        }
+    };
+    sender.join().unwrap().unwrap();
+    assert_eq!((status.frames, status.refused), (answered, refused));
+    assert!(answered > 20, "{answered} of 200 frames answered, {refused} packets refused");
+    assert!(answered == 200 || status.vitals.lost_bytes > 0, "what is lost is counted: {status:?}");
+    pair.agree(&good[200]);
+}
+
+#[test]
+fn new_tables_reach_the_chip() {
+    let (ring, recording) = read("paper-vars");
+    let good = wires(&recording);
+    let emulator = start();
+    let mut pair = Pair::start(&emulator, &ring, &recording);
+    good[..30].iter().for_each(|wire| pair.agree(wire));
+    let mut vars = vec![1.0; 48];
+    vars[0] = 1.01;
+    let other: Green = training::green::tables(&ring.with_vars(&vars)).unwrap();
+    pair.link.load(&other, || ()).unwrap();
+    // the host goes over to them after the same frame
+    pair.core.prepare();
+    pair.core.adopt(other.clone()).unwrap();
+    good[30..60].iter().for_each(|wire| pair.agree(wire));
+    let status = pair.link.status().unwrap();
+    assert_eq!((status.loaded, status.tables), (true, other.digest()));
+}
+
+#[test]
+fn the_log_is_decoded_and_a_fault_reported() {
+    // the first instruction of a step replaced by an undefined one, `udf #0`
+    let step = IMAGE.function("Device::ingest").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let image = IMAGE.patched(&step, &[0x00, 0xde], &folder.path().join("firmware")).unwrap();
+    let emulator = Emulator::start(&image, &Options::default()).unwrap();
+    let (_, recording) = read("paper-vars");
+    Link::new(emulator.uart()).write(&wires(&recording)[0]).unwrap();
+    let run = emulator.wait(Duration::from_secs(20)).unwrap();
+    let log = IMAGE.log(&run.stdout).unwrap();
+    let messages: Vec<&str> = log.iter().map(|line| line.message.as_str()).collect();
+    let pc = format!("pc {:#x}", step.address & !1);
+    assert!(messages[0].starts_with("orbitcal device, tables "), "{messages:?}");
+    assert!(messages[1].starts_with("hard fault: ") && messages[1].contains(&pc), "{messages:?}, {pc}");
+    assert_eq!(run.status, Some(1));
+}
+
+/// A panic handler that calls a function that exists nowhere: a path from the core to a panic would not link.
+#[test]
+fn no_path_leads_from_the_core_to_a_panic() {
+    let link = |example: &str| {
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let build = ["build", "--locked", "--profile", "firmware", "-p", "firmware-sim", "--example", example];
+        let mut command = Command::new(cargo);
+        command.args(build).args(["--target", "thumbv7em-none-eabihf"]).current_dir(repository("."));
+        let output = command.output().unwrap();
+        (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let (linked, message) = link("never_panics");
+    assert!(linked, "{message}");
+    let (linked, message) = link("can_panic");
+    assert!(!linked && message.contains("undefined symbol: the_core_can_panic"), "{message}");
+}
