@@ -37,23 +37,18 @@ pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
 }
 
 /// [`add_four`] for two at a time: loads of the rows are shared. What the longer has beyond the other's end is done by
-/// itself.
+/// itself; it is not much.
 #[inline(never)]
 pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
     let [one, other] = to;
     let n = one.len().min(other.len());
-    let (Some((one, one_rest)), Some((other, other_rest))) =
-        (one.split_at_mut_checked(n), other.split_at_mut_checked(n))
-    else {
-        return;
-    };
-    let rests = rows.map(|row| row.get(n..).unwrap_or_default());
-    for (rest, factors) in [one_rest, other_rest].into_iter().zip(factors) {
-        if !rest.is_empty() {
-            add_four(rest, factors, rests);
+    for (to, factors) in [&mut *one, &mut *other].into_iter().zip(factors) {
+        for (i, to) in to.iter_mut().enumerate().skip(n) {
+            let terms = rows.iter().zip(factors);
+            *to = terms.fold(*to, |sum, (row, factor)| sum + factor * row.get(i).copied().unwrap_or(0.0));
         }
     }
-    two_by_four(one, other, factors, rows);
+    two_by_four(one.get_mut(..n).unwrap_or_default(), other.get_mut(..n).unwrap_or_default(), factors, rows);
 }
 
 /// The part of [`add_four_twice`] that both share. The two are arguments of their own, so that the compiler knows them apart

@@ -1,9 +1,9 @@
 //! The image on the emulated chip beside the core in process: the same bits, within its memory and its instructions, and
 //! alive whatever comes over the wire.
 
+use core::time::Duration;
 use std::process::Command;
 use std::sync::LazyLock;
-use std::time::Duration;
 
 use estimator::booster::Green;
 use firmware_sim::link::{Refusal, Reply, Request};
