@@ -33,6 +33,7 @@ test: setup ## format, lint, tests in debug and release, docs, and the core for 
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
 	cargo build --locked --release -p estimator --target $(TARGET)
 	cargo build --locked --release -p firmware-sim --lib --target $(TARGET) # the core with its log lines, and the loop
+	cargo clippy --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET) -- -D warnings
 
 firmware: toolchain ## the image for the chip; PART=stm32h743 links it for that part instead of the emulated board
 	cargo build --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET)

@@ -228,7 +228,7 @@ fn new_tables_change_the_answer_as_they_do_in_process() {
     let replies = replies(&core.tables, &bytes);
     // a core that went by the new tables from its first frame on, linearised at other moments
     let mut expected = core.clone();
-    expected.tables = Box::new(other.clone());
+    *expected.tables = other.clone();
     let mut last = None;
     stream::replay(&mut expected, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     let (last, got) = (last.unwrap(), estimates(&replies).pop().unwrap());

@@ -202,7 +202,7 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
         }
     }
 
-    /// The tables in parcels, the seal last. Lines of more than [`LINE`] entries do not travel: `Q` is 96 at most.
+    /// The tables in parcels, the seal last. Lines of more than 96 entries do not travel.
     pub fn parcels(&self) -> impl Iterator<Item = Parcel> + '_ {
         const { assert!(Q <= LINE && BX <= LINE && BY <= LINE) };
         let seal = core::iter::once_with(|| Parcel::Seal { crc: self.digest() });
