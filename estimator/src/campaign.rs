@@ -51,7 +51,11 @@ impl Setting {
         let (here, there) = (self.current.steps(), other.current.steps());
         self.corrector == other.corrector
             && (here - there).abs() <= here.abs().max(there.abs()) / SAME_CURRENT
-            && (self.rf_offset - other.rf_offset).abs() <= SAME_OFFSET
+            && self.same_offset(other)
+    }
+
+    fn same_offset(&self, other: &Self) -> bool {
+        (self.rf_offset - other.rf_offset).abs() <= SAME_OFFSET
     }
 }
 
@@ -111,6 +115,28 @@ impl<const B: usize, const C: usize> Cell<B, C> {
             kick: self.kick.map(|k| k as f32 / KICK),
             strength: self.strength.map(|s| s as f32 / RATIO),
             rf_offset: self.rf_offset as f32 / RATIO,
+        }
+    }
+
+    /// True if two settings differ by no more than the current of the powered corrector.
+    pub fn is_kind_of(&self, other: &Self) -> bool {
+        self.setting.corrector == other.setting.corrector && self.setting.same_offset(&other.setting)
+    }
+
+    /// The drive without the idle correctors.
+    pub fn alone(&self) -> Drive<C> {
+        let mut drive = self.drive();
+        let powered = self.setting.corrector.map(usize::from);
+        drive.kick.iter_mut().enumerate().filter(|(c, _)| Some(*c) != powered).for_each(|(_, kick)| *kick = 0.0);
+        drive
+    }
+
+    /// Kick of the powered corrector over that at another setting of the kind; 1 where none is powered.
+    pub fn share(&self, of: &Self) -> f32 {
+        let kick = |cell: &Self| cell.kick.get(usize::from(cell.setting.corrector?)).copied();
+        match (kick(self), kick(of)) {
+            (Some(kick), Some(of)) if of != 0 => kick as f32 / of as f32,
+            _ => 1.0,
         }
     }
 

@@ -329,8 +329,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     fn predict(&mut self, model: &Model<'_, G>, drive: &Drive<C>, cell: Option<u16>) {
         let mean = cell.and_then(|index| self.campaign.cells().get(usize::from(index))).map(|cell| cell.drive());
         if let Some(mean) = mean {
-            self.predict_drive(model, &mean);
-            self.at_mean_drive = self.prediction.reading;
+            model.surrogate.orbit(&self.linearised, &about(&mean, &self.supplies), &mut self.at_mean_drive);
         }
         self.predict_drive(model, drive);
         self.rf_offset = drive.rf_offset;

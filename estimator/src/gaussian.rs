@@ -23,11 +23,37 @@ const USUAL: f32 = 2.25e-8;
 /// `ln(2 pi)` of that.
 const LN_USUAL: f32 = -15.771_873;
 
-/// Readings of one monitor that say nothing of the params, merged: a mean innovation [m] and its precision [1/m^2].
+/// Readings of one monitor at settings of one kind: at the share `x` of a drive whose derivative is `h`,
+/// `residual = x h . delta + baseline + noise`. Its fields are sums of precision times `1, x, x^2, residual, x residual`.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Level {
-    mean: f32,
-    precision: f32,
+pub struct Line {
+    one: f32,
+    x: f32,
+    xx: f32,
+    r: f32,
+    xr: f32,
+}
+
+/// Repeats of a reading that enter as their mean.
+#[derive(Debug, Clone, Copy)]
+pub struct Repeats {
+    /// How many.
+    pub number: u32,
+    /// Variance of each about their mean [m^2].
+    pub noise: f32,
+    /// Variance of the mean, errors that all share included [m^2].
+    pub variance: f32,
+}
+
+/// What many readings say of the baselines, before these are eliminated; [`Gaussian::slope`] meanwhile holds sums of
+/// precision times `h`.
+#[derive(Debug, Clone)]
+pub struct Pool<const B: usize> {
+    /// Baselines from which residuals are counted [m].
+    level: [f32; B],
+    precision: [f32; B],
+    /// Sum of precision times residual.
+    pull: [f32; B],
 }
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
@@ -111,6 +137,11 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         libm::sqrtf(dot(baselines, baselines) / baselines.len().max(1) as f32)
     }
 
+    /// Baselines at the origin [m].
+    pub fn baselines(&self) -> &[f32; B] {
+        &self.baseline
+    }
+
     /// Baseline of a monitor at the origin [m].
     pub fn baseline(&self, b: usize) -> f32 {
         self.baseline.get(b).copied().unwrap_or(0.0)
@@ -172,32 +203,77 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         }
     }
 
-    /// Merge a reading that says nothing of the params into a level.
-    pub fn merge(&mut self, level: &mut Level, innovation: f32, variance: f32) {
-        if level.precision > 0.0 {
-            let (distance, s) = (innovation - level.mean, variance + 1.0 / level.precision);
-            self.cost.add(distance * distance / s);
-            self.volume.multiply(s / USUAL);
-            self.readings.add(1.0);
+    /// Begin to take in many readings at once; their residuals are counted from the baselines `level` [m].
+    ///
+    /// Where [`Gaussian::condition`] takes one product of rows a reading, this takes one a line and two a monitor:
+    ///
+    /// `information += sum of x^2/s h h^T - (sum of x/s h)(sum of x/s h)^T / (sum of 1/s)`.
+    pub fn open(&mut self, level: [f32; B]) -> Pool<B> {
+        let mut pool = Pool { level, precision: [0.0; B], pull: [0.0; B] };
+        for b in 0..B {
+            // what is known of a baseline is one more reading
+            let h = core::array::from_fn(|i| column(self.slope.as_slice(), N, b).get(i).copied().unwrap_or(0.0));
+            self.slope.as_mut_slice().iter_mut().skip(b * N).take(N).for_each(|slope| *slope = 0.0);
+            let precision = 1.0 / self.baseline_variance(b);
+            let r = self.baseline(b) - pool.level.get(b).copied().unwrap_or(0.0);
+            self.cost.add(precision * r * r);
+            let line = Line { one: precision, x: precision, xx: precision, r: precision * r, xr: precision * r };
+            self.add_line(&mut pool, b, &line, &h);
         }
-        level.precision += 1.0 / variance;
-        level.mean += (innovation - level.mean) / (variance * level.precision);
+        pool
     }
 
-    /// Add the merged readings of monitor `b`.
-    pub fn condition_level(&mut self, b: usize, level: &Level) {
-        if level.precision > 0.0 {
-            self.condition(b, level.mean, 1.0 / level.precision, &[0.0; N]);
+    /// Count the mean of repeats into a line: its residual [m] at the share `x`.
+    ///
+    /// The density of all `n` repeats is that of their mean, times `n` and the usual densities of `n - 1` (and what their
+    /// scatter adds, [`Gaussian::add_scatter`]).
+    pub fn count(&mut self, line: &mut Line, x: f32, residual: f32, repeats: &Repeats) {
+        let one = 1.0 / repeats.variance;
+        let r = residual * one;
+        line.one += one;
+        line.x += one * x;
+        line.xx += one * x * x;
+        line.r += r;
+        line.xr += r * x;
+        self.cost.add(r * residual);
+        let n = repeats.number as f32;
+        self.volume.multiply(n * repeats.variance / USUAL);
+        if repeats.noise != USUAL {
+            self.volume.add_log((n - 1.0) * libm::logf(repeats.noise / USUAL));
+        }
+        self.readings.add(n);
+    }
+
+    /// Add a line of monitor `b`.
+    pub fn add_line(&mut self, pool: &mut Pool<B>, b: usize, line: &Line, h: &[f32; N]) {
+        let (Some(precision), Some(pull)) = (pool.precision.get_mut(b), pool.pull.get_mut(b)) else { return };
+        *precision += line.one;
+        *pull += line.r;
+        if h.iter().any(|h| *h != 0.0) {
+            self.stage(h, line.xx);
+            add(&mut self.vector, line.xr, h);
+            let slopes = self.slope.as_mut_slice().as_chunks_mut::<N>().0;
+            slopes.get_mut(b).into_iter().for_each(|slope| add(slope, line.x, h));
         }
     }
 
-    /// Normalisation of `n` repeats that entered as one mean: what the mean's own density leaves out.
-    pub fn add_repeats(&mut self, n: u32, variance: f32) {
-        self.volume.multiply(n as f32);
-        if variance != USUAL {
-            self.volume.add_log((n as f32 - 1.0) * libm::logf(variance / USUAL));
+    /// Eliminate the baselines from what a pool has taken in.
+    pub fn close(&mut self, pool: &Pool<B>) {
+        for (b, (precision, (pull, level))) in pool.precision.iter().zip(pool.pull.iter().zip(&pool.level)).enumerate()
+        {
+            let mut slope = [0.0; N];
+            slope.iter_mut().zip(column(self.slope.as_slice(), N, b)).for_each(|(to, sum)| *to = sum / precision);
+            let mean = pull / precision;
+            self.stage(&slope, -precision);
+            add(&mut self.vector, -pull, &slope);
+            self.cost.add(-pull * mean);
+            self.volume.multiply(precision * self.baseline_variance(b));
+            self.baseline.get_mut(b).into_iter().for_each(|to| *to = level + mean);
+            self.slope.as_mut_slice().as_chunks_mut::<N>().0.get_mut(b).into_iter().for_each(|to| *to = slope);
+            let own = self.covariance.as_mut_slice().get_mut(b * B + b);
+            own.into_iter().for_each(|to| *to = 1.0 / precision);
         }
-        self.readings.add(n as f32 - 1.0);
+        self.settle();
     }
 
     /// Squared deviations of repeats from their means, over their variance.
@@ -407,7 +483,11 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         let mut d = [0.0; N];
         let slope = column(self.slope.as_slice(), N, b);
         d.iter_mut().zip(h).zip(slope).for_each(|((d, h), slope)| *d = h - slope);
-        (d, column(self.covariance.as_slice(), B, b).get(b).copied().unwrap_or(0.0))
+        (d, self.baseline_variance(b))
+    }
+
+    fn baseline_variance(&self, b: usize) -> f32 {
+        column(self.covariance.as_slice(), B, b).get(b).copied().unwrap_or(0.0)
     }
 }
 
@@ -441,6 +521,7 @@ mod tests {
     }
 
     const VARIANCE: f32 = 1.5e-4 * 1.5e-4;
+    const SINGLE: Repeats = Repeats { number: 1, noise: VARIANCE, variance: VARIANCE };
 
     fn conditioned() -> Gaussian<2, 2, 3> {
         let mut gaussian = prior();
@@ -486,6 +567,47 @@ mod tests {
     #[test]
     fn eliminated_baselines_leave_the_joint_answer() {
         assert_equal(&conditioned(), &[], 0.0);
+    }
+
+    /// Lines of settings at two shares of one drive, some of it known before, are what the readings are one by one.
+    #[test]
+    fn a_pool_of_lines_is_its_readings() {
+        let (mut one_by_one, mut pooled) = (prior(), prior());
+        let derivative = |b: usize| if b == 0 { [0.05, -0.02] } else { [0.01, 0.04] };
+        let residual = |b: usize, i: usize| 3e-3 + 2e-4 * libm::sinf((7 * b + i) as f32);
+        let share = |i: usize| [1.0, -0.9, 0.0, 0.4][i % 4];
+        for (b, innovation, h) in readings().into_iter().take(4) {
+            one_by_one.condition(b, innovation, VARIANCE, &h);
+            pooled.condition(b, innovation, VARIANCE, &h);
+        }
+        pooled.settle();
+        let mut pool = pooled.open([2.9e-3, 0.0]);
+        for b in 0..2 {
+            let (mut line, level) = (Line::default(), pool.level[b]);
+            for i in 0..20 {
+                pooled.count(&mut line, share(i), residual(b, i) - level, &SINGLE);
+                one_by_one.condition(b, residual(b, i), VARIANCE, &derivative(b).map(|h| share(i) * h));
+            }
+            pooled.add_line(&mut pool, b, &line, &derivative(b));
+        }
+        pooled.close(&pool);
+        one_by_one.settle();
+        let (mut expected, mut solution) = (Solution::BLANK, Solution::BLANK);
+        expected.solve(&one_by_one, &WIDE);
+        solution.solve(&pooled, &WIDE);
+        for i in 0..2 {
+            assert!((solution.delta[i] - expected.delta[i]).abs() < 1e-3 * expected.sigma[i]); // f32 rounding
+            assert!((solution.sigma[i] / expected.sigma[i] - 1.0).abs() < 1e-4);
+            assert!((pooled.baseline[i] - one_by_one.baseline[i]).abs() < 1e-7);
+            assert!((pooled.baseline_variance(i) / one_by_one.baseline_variance(i) - 1.0).abs() < 1e-4);
+        }
+        assert!((pooled.slope - one_by_one.slope).norm() < 1e-5 * one_by_one.slope.norm());
+        assert!(
+            (solution.log_evidence - expected.log_evidence).abs() < 0.02,
+            "{} {}",
+            solution.log_evidence,
+            expected.log_evidence
+        );
     }
 
     #[test]

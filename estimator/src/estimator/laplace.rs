@@ -1,8 +1,9 @@
 //! Linearising anew: the Gaussian at the MAP, rebuilt from all frames so far, and how well it describes them.
 
 use super::{Estimator, Model, about};
+use crate::drive::Drive;
 use crate::estimate::MonitorState;
-use crate::gaussian::Level;
+use crate::gaussian::{Line, Repeats};
 use crate::linear::{column, dot};
 use crate::monitor::Monitor;
 use crate::sum::Sum;
@@ -23,9 +24,6 @@ const MOVED: f32 = 0.5;
 const UPHILL: f32 = 1.0;
 /// Halvings of a step that leads uphill or to an unstable ring.
 const HALVINGS: u32 = 4;
-/// A setting whose information on all params together is less than this share of the prior's on one tells of its
-/// monitor's baseline only. A thousand of them leave a fiftieth of the prior's information on 48 params unused.
-const QUIET: f32 = 1e-3;
 /// While the params have walked less than this share of an error bar, the past still counts as one ring.
 const WALKED: f32 = 0.1;
 
@@ -84,29 +82,44 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// The Gaussian of all frames so far, linearised at `params`.
+    ///
+    /// Settings of one kind differ by the powered corrector's current, so that one derivative serves them all. The 20 mA by
+    /// which idle correctors scatter count in the orbit and not in its derivative, a thousandth of it.
     fn rebuild(&mut self, model: &Model<'_, G>, params: &[f32; N]) {
+        self.gaussian.recentre(params);
+        let level = *self.gaussian.baselines();
         self.gaussian.clone_from(&self.loose);
         self.gaussian.recentre(params);
-        let mut levels = [Level::default(); B];
-        for cell in self.campaign.cells() {
-            let drive = about(&cell.drive(), &self.supplies);
-            model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for (b, level) in levels.iter_mut().enumerate() {
-                let (mean, count) = cell.mean(b);
-                if count == 0 {
-                    continue;
+        let mut pool = self.gaussian.open(level);
+        for (i, first) in self.campaign.cells().iter().enumerate() {
+            let (before, from_here) = self.campaign.cells().split_at_checked(i).unwrap_or_default();
+            if before.iter().any(|cell| cell.is_kind_of(first)) {
+                continue;
+            }
+            model.surrogate.predict(&self.linearised, &first.alone(), &mut self.prediction);
+            let by_family = self.prediction.by_family(model.surrogate.first_family());
+            let mut lines = [Line::default(); B];
+            for cell in from_here.iter().filter(|cell| cell.is_kind_of(first)) {
+                let (drive, share) = (cell.drive(), cell.share(first));
+                let [qh, qv] = about(&drive, &self.supplies).strength;
+                let direct = Drive { strength: [0.0; 2], ..drive };
+                model.surrogate.orbit(&self.linearised, &direct, &mut self.prediction.reading);
+                for (b, (line, [by_qh, by_qv])) in lines.iter_mut().zip(&by_family).enumerate() {
+                    let (mean, number) = cell.mean(b);
+                    let (Some(orbit), Some(level), 1..) = (self.prediction.reading.get(b), level.get(b), number) else {
+                        continue;
+                    };
+                    let residual = mean - orbit - share * (qh * by_qh + qv * by_qv) - level;
+                    let variance = self.variance(model, b, number, drive.rf_offset);
+                    let repeats = Repeats { number, noise: self.noise_variance(b), variance };
+                    self.gaussian.count(line, share, residual, &repeats);
                 }
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let innovation = mean - self.prediction.reading.get(b).copied().unwrap_or(0.0);
-                let variance = self.variance(model, b, count, drive.rf_offset);
-                if dot(slope, slope) < variance * quiet(model) {
-                    self.gaussian.merge(level, innovation, variance);
-                } else {
-                    self.gaussian.condition(b, innovation, variance, slope);
-                }
-                self.gaussian.add_repeats(count, self.noise_variance(b));
+            }
+            for ((b, line), h) in lines.iter().enumerate().zip(self.prediction.jacobian.as_slice().as_chunks().0) {
+                self.gaussian.add_line(&mut pool, b, line, h);
             }
         }
+        self.gaussian.close(&pool);
         for frame in &self.recent {
             let drive = about(&frame.drive, &self.supplies);
             model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
@@ -116,11 +129,10 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                 self.gaussian.condition(b, innovation, self.variance(model, b, 1, drive.rf_offset), slope);
             }
         }
-        for (b, level) in levels.iter().enumerate() {
-            self.gaussian.condition_level(b, level);
+        self.gaussian.settle();
+        for b in 0..B {
             self.gaussian.add_scatter(self.campaign.scatter(b) / self.noise_variance(b));
         }
-        self.gaussian.settle();
     }
 
     /// How well the model describes the readings of monitors in state ok, by the expected noise.
@@ -152,9 +164,4 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         }
         FitQuality { chi_square: sum.value(), degrees_of_freedom: readings - baselines - N as f32 }
     }
-}
-
-/// Information below which a setting says nothing of the params: that of the stray currents of idle correctors.
-fn quiet<G>(model: &Model<'_, G>) -> f32 {
-    QUIET / (model.setup.prior.sigma * model.setup.prior.sigma)
 }

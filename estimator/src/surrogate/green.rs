@@ -140,6 +140,30 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
     pub fn response_y(&self) -> &SMatrix<f32, BY, CY> {
         &self.y.response
     }
+
+    /// Relative momentum that an RF offset makes.
+    fn delta<const C: usize>(&self, drive: &Drive<C>) -> f32 {
+        -drive.rf_offset / self.slip
+    }
+
+    /// Kicks in x and y that a unit of `ln strength` adds at each node: `-k L w strength` times the orbit there [rad].
+    fn pushes<const C: usize>(&self, drive: &Drive<C>) -> [[f32; Q]; 2] {
+        let (kick_x, kick_y) = drive.kick.split_at(CX.min(C));
+        let delta = self.delta(drive);
+        [self.x.push(kick_x, self.node_dispersion.map(|d| d * delta)), self.y.push(kick_y, [0.0; Q])]
+    }
+
+    /// Add the derivative of the momentum through the slip factor, `d(slip)/d(ln strength) = -sum of k L w strength D^2 / C`;
+    /// `scale` is the momentum over the circumference.
+    fn differentiate_slip(&self, scale: f32, jacobian: &mut [f32]) {
+        for (slopes, dispersion) in jacobian.chunks_exact_mut(Q / 2).zip(&self.monitor_dispersion) {
+            let scale = dispersion * scale / self.slip;
+            let nodes = self.node_dispersion.chunks_exact(2).zip(self.x.slope.chunks_exact(2));
+            for (slope, (d, k)) in slopes.iter_mut().zip(nodes) {
+                *slope += scale * (k[0] * d[0] * d[0] + k[1] * d[1] * d[1]);
+            }
+        }
+    }
 }
 
 impl<
@@ -176,21 +200,20 @@ impl<
         Ok(())
     }
 
+    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut [f32; B]) {
+        // without a change of current, what the nodes would add is not needed
+        let pushes = if drive.strength == [0.0; 2] { [[0.0; Q]; 2] } else { at.pushes(drive) };
+        self.read(at, drive, &pushes, into);
+    }
+
     fn predict(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut Prediction<B, N>) {
-        let (kick_x, kick_y) = drive.kick.split_at(CX.min(C));
-        let (reading_x, reading_y) = into.reading.split_at_mut(BX.min(B));
+        let pushes = at.pushes(drive);
+        self.read(at, drive, &pushes, &mut into.reading);
         let (jacobian_x, jacobian_y) = into.jacobian.as_mut_slice().split_at_mut(N * BX.min(B));
-        let delta = -drive.rf_offset / at.slip;
-        let mut orbit = at.node_dispersion.map(|d| d * delta);
-        at.x.predict(kick_x, &mut orbit, reading_x, jacobian_x);
-        at.y.predict(kick_y, &mut [0.0; Q], reading_y, jacobian_y);
+        at.x.differentiate(&pushes[0], jacobian_x);
+        at.y.differentiate(&pushes[1], jacobian_y);
         if drive.rf_offset != 0.0 {
-            self.disperse(at, drive.rf_offset, delta, reading_x, jacobian_x);
-        }
-        // A change of a family's current is a change of ln strength that is known.
-        for (reading, slope) in into.reading.iter_mut().zip(into.jacobian.as_slice().chunks_exact(N)) {
-            let (first, second) = slope.split_at(usize::from(self.first_family).min(N));
-            *reading += drive.strength[0] * first.iter().sum::<f32>() + drive.strength[1] * second.iter().sum::<f32>();
+            at.differentiate_slip(at.delta(drive) / self.dispersion.circumference, jacobian_x);
         }
     }
 
@@ -232,29 +255,43 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
         at.slip = compaction - d.inverse_gamma_squared;
     }
 
-    /// Add the momentum `delta = -offset/slip` that an RF offset makes, with its derivative through the slip factor:
-    /// `d(slip)/d(ln strength) = -sum of k L w strength D^2 / C`.
-    fn disperse(
+    /// The orbit: kicks by the response, a known change of a family's current as a change of `ln strength`, and the
+    /// momentum `delta = -offset/slip` that an RF offset makes.
+    fn read<const C: usize>(
         &self,
         at: &GreenLinearised<BX, BY, CX, CY, Q>,
-        offset: f32,
-        delta: f32,
+        drive: &Drive<C>,
+        pushes: &[[f32; Q]; 2],
         reading: &mut [f32],
-        jacobian: &mut [f32],
     ) {
-        let params = Q / 2;
-        for (b, reading) in reading.iter_mut().enumerate() {
-            let dispersion = at.monitor_dispersion.get(b).copied().unwrap_or(0.0);
-            let second = self.dispersion.second_order.get(b).copied().unwrap_or(0.0);
-            *reading += dispersion * delta + second * offset * offset;
-            let scale = dispersion * delta / (at.slip * self.dispersion.circumference);
-            let slopes = jacobian.iter_mut().skip(b * params).take(params);
-            let nodes = at.node_dispersion.chunks_exact(2).zip(at.x.slope.chunks_exact(2));
-            for (slope, (d, k)) in slopes.zip(nodes) {
-                *slope += scale * (k[0] * d[0] * d[0] + k[1] * d[1] * d[1]);
-            }
+        let (kick_x, kick_y) = drive.kick.split_at(CX.min(C));
+        let (x, y) = reading.split_at_mut(BX.min(reading.len()));
+        let first = 2 * usize::from(self.first_family);
+        at.x.read(kick_x, x);
+        at.y.read(kick_y, y);
+        if drive.strength != [0.0; 2] {
+            at.x.read_nodes(&scaled(&pushes[0], first, drive.strength), x);
+            at.y.read_nodes(&scaled(&pushes[1], first, drive.strength), y);
         }
+        if drive.rf_offset == 0.0 {
+            return;
+        }
+        let change = scaled(&at.x.slope, first, drive.strength);
+        let slip: f32 = change.iter().zip(&at.node_dispersion).map(|(k, d)| k * d * d).sum();
+        let relative = 1.0 + slip / (at.slip * self.dispersion.circumference);
+        let (delta, offset) = (at.delta(drive) * relative, drive.rf_offset);
+        let each = at.monitor_dispersion.iter().zip(&self.dispersion.second_order);
+        x.iter_mut().zip(each).for_each(|(x, (first, second))| *x += first * delta + second * offset * offset);
     }
+}
+
+/// Each node's value times the `ln` factor of its family.
+fn scaled<const Q: usize>(values: &[f32; Q], first_family: usize, strength: [f32; 2]) -> [f32; Q] {
+    let mut scaled = *values;
+    let (first, second) = scaled.split_at_mut(first_family.min(Q));
+    first.iter_mut().for_each(|v| *v *= strength[0]);
+    second.iter_mut().for_each(|v| *v *= strength[1]);
+    scaled
 }
 
 impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<B, C, Q, T> {
@@ -313,19 +350,39 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
 }
 
 impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
-    /// Readings and their derivatives for kicks on top of the `orbit` that the momentum makes at the nodes.
-    fn predict(&self, kick: &[f32], orbit: &mut [f32; Q], reading: &mut [f32], jacobian: &mut [f32]) {
-        reading.fill(0.0);
-        combine(orbit, kick.iter().copied().zip(self.driven.as_slice().chunks_exact(Q)));
-        combine(reading, kick.iter().copied().zip(self.response.as_slice().chunks_exact(B)));
+    /// What a unit of `ln strength` adds at each node to the kicks, on top of the `orbit` that the momentum makes there.
+    fn push(&self, kick: &[f32], mut orbit: [f32; Q]) -> [f32; Q] {
+        combine(&mut orbit, acting(kick, self.driven.as_slice().chunks_exact(Q)));
         orbit.iter_mut().zip(&self.slope).for_each(|(x, k)| *x *= -k);
-        let orbit = orbit.as_chunks::<2>().0;
+        orbit
+    }
+
+    /// Readings for kicks of correctors.
+    fn read(&self, kick: &[f32], reading: &mut [f32]) {
+        reading.fill(0.0);
+        combine(reading, acting(kick, self.response.as_slice().chunks_exact(B)));
+    }
+
+    /// Add readings for kicks of nodes.
+    fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
+        let seen = self.seen.as_slice().chunks_exact(Q);
+        reading.iter_mut().zip(seen).for_each(|(reading, seen)| *reading += dot(seen, kick));
+    }
+
+    /// Derivatives of the readings, one column a monitor, for the pushes of the nodes.
+    fn differentiate(&self, push: &[f32; Q], jacobian: &mut [f32]) {
+        let push = push.as_chunks::<2>().0;
         for (slopes, seen) in jacobian.chunks_exact_mut(Q / 2).zip(self.seen.as_slice().chunks_exact(Q)) {
-            for (slope, (z, x)) in slopes.iter_mut().zip(seen.as_chunks::<2>().0.iter().zip(orbit)) {
+            for (slope, (z, x)) in slopes.iter_mut().zip(seen.as_chunks::<2>().0.iter().zip(push)) {
                 *slope = z[0] * x[0] + z[1] * x[1];
             }
         }
     }
+}
+
+/// The kicks that are not zero, each with its column.
+fn acting<'a>(kick: &'a [f32], columns: impl Iterator<Item = &'a [f32]>) -> impl Iterator<Item = (f32, &'a [f32])> {
+    kick.iter().copied().zip(columns).filter(|(kick, _)| *kick != 0.0)
 }
 
 /// Columns of a table, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a time.

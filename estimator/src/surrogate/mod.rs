@@ -25,6 +25,17 @@ pub struct Prediction<const B: usize, const N: usize> {
 impl<const B: usize, const N: usize> Prediction<B, N> {
     /// Memory for one, all zero.
     pub const BLANK: Self = Self { reading: [0.0; B], jacobian: zeros() };
+
+    /// Derivative with respect to `ln` of the QH and of the QV current at each monitor [m]; the first `first_family` of the
+    /// gradients hang on QH.
+    pub fn by_family(&self, first_family: usize) -> [[f32; 2]; B] {
+        let mut by_family = [[0.0; 2]; B];
+        for (to, slope) in by_family.iter_mut().zip(self.jacobian.as_slice().chunks_exact(N)) {
+            let (first, second) = slope.split_at(first_family.min(N));
+            *to = [first.iter().sum(), second.iter().sum()];
+        }
+        by_family
+    }
 }
 
 /// No linearisation there: the ring would cross an integer resonance on the way from its design.
@@ -45,6 +56,9 @@ pub trait Surrogate<const B: usize, const C: usize, const N: usize> {
     /// # Errors
     /// [`Unstable`]; `into` is then not to be used.
     fn linearise(&self, strength: &[f32; N], into: &mut Self::Linearised) -> Result<(), Unstable>;
+
+    /// The orbit that a drive makes [m].
+    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut [f32; B]);
 
     /// The orbit that a drive makes, and its derivative.
     fn predict(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut Prediction<B, N>);
