@@ -274,7 +274,11 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// [`crate::surrogate::Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
     pub fn adopt(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
         self.stale = true;
-        if !self.started || self.linearise_anew(model) { Ok(()) } else { Err(crate::surrogate::Unstable) }
+        if self.started && !self.linearise_anew(model) {
+            return Err(crate::surrogate::Unstable);
+        }
+        self.news |= self.started;
+        Ok(())
     }
 
     /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
