@@ -2,7 +2,7 @@
 //! with its derivative by all 48 vars (asked for: below 2 ms).
 
 use divan::{Bencher, black_box};
-use twin::{Hold, Optics, Plane, Ring};
+use twin::{Hold, Optics, Plane, Ring, VariedRing};
 
 fn main() {
     divan::main();
@@ -49,5 +49,16 @@ fn response_with_jacobian(bencher: Bencher) {
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
         let jacobian = optics.response_jacobian(&observers, &sources, &optics.quadrupoles());
         (optics.response(&observers, &sources), jacobian)
+    });
+}
+
+/// What one step of a sampler needs: the response, and the gradient of a function of it (asked for: below 0.5 ms).
+#[divan::bench]
+fn response_with_gradient(bencher: Bencher) {
+    let (varied, vars) = (VariedRing::of(&Ring::booster()).unwrap(), [1.0; 48]);
+    bencher.bench_local(|| {
+        let optics = varied.at(black_box(&vars)).unwrap();
+        let response = optics.response();
+        optics.pull_back(&response)
     });
 }

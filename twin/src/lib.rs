@@ -16,8 +16,10 @@ pub mod lattice;
 pub mod map;
 pub mod orbit;
 pub mod response;
+pub mod varied;
 
 pub use effects::{Effect, EffectError, EffectKind, Machine, MachineResponse, Rf};
 pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
+pub use varied::{VariedOptics, VariedRing};

@@ -43,15 +43,15 @@ impl From<usize> for Place {
 /// Something that measures one coordinate of the orbit.
 #[derive(Debug, Clone, Copy)]
 pub struct Observer {
-    place: Place,
-    row: RowVector6<f64>,
+    pub(crate) place: Place,
+    pub(crate) row: RowVector6<f64>,
 }
 
 /// Something that kicks the beam.
 #[derive(Debug, Clone, Copy)]
 pub struct Source {
-    place: Place,
-    column: Vector6<f64>,
+    pub(crate) place: Place,
+    pub(crate) column: Vector6<f64>,
 }
 
 /// An element (or a thin place) whose gradient may change.
@@ -100,14 +100,11 @@ impl<'r> Optics<'r> {
     pub fn of(ring: &'r Ring, hold: Hold) -> Result<Self, OrbitError> {
         let orbit = ClosedOrbit::find(ring, hold)?;
         let (turn, delta) = (*orbit.one_turn(), orbit.at[0][DELTA]);
-        let at_momentum = invert(&Hold::Momentum { delta }.closure(ring, delta, &turn), &turn)?;
-        let closed_at_momentum = closed_orbits(&at_momentum, &turn, 4);
+        let (closed_at_momentum, dispersive) = close_at_momentum(ring, delta, &turn)?;
         let closed = match hold {
             Hold::Momentum { .. } => closed_at_momentum,
             Hold::Frequency { .. } => closed_orbits(&invert(&hold.closure(ring, delta, &turn), &turn)?, &turn, 5),
         };
-        let unit = at_momentum.column(4);
-        let dispersive = Vector6::new(unit[0], unit[1], unit[2], unit[3], 1.0, 0.0);
         Ok(Self { ring, orbit, closed, closed_at_momentum, dispersive })
     }
 
@@ -343,6 +340,17 @@ impl<'r> Optics<'r> {
     }
 }
 
+/// With the momentum held: the matrix `W` of closed orbits at the start, and the dispersion there.
+pub(crate) fn close_at_momentum(
+    ring: &Ring,
+    delta: f64,
+    turn: &Matrix6<f64>,
+) -> Result<(Matrix6<f64>, Vector6<f64>), OrbitError> {
+    let inverse = invert(&Hold::Momentum { delta }.closure(ring, delta, turn), turn)?;
+    let unit = inverse.column(4);
+    Ok((closed_orbits(&inverse, turn, 4), Vector6::new(unit[0], unit[1], unit[2], unit[3], 1.0, 0.0)))
+}
+
 /// The matrix `W` of closed orbits at the start, from the inverse of the closure equations. A source drives their first
 /// `driven` rows: four for the orbit, and with a fixed frequency a fifth, where its path drives the momentum.
 fn closed_orbits(inverse: &Matrix5<f64>, turn: &Matrix6<f64>, driven: usize) -> Matrix6<f64> {
@@ -373,7 +381,7 @@ fn corrector_axis(element: &crate::Element) -> [f64; 2] {
 }
 
 /// Inverse of a transfer map; its determinant is 1.
-fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
+pub(crate) fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
     transfer.try_inverse().expect("maps are symplectic, so their determinant is 1")
 }
 
