@@ -112,7 +112,7 @@ impl Answer {
             vars,
             chi2_per_dof: fit.chi2_per_dof,
             tunes: Some(Tunes { x: fit.tunes.x, y: fit.tunes.y }),
-            monitors: monitors(ring, &fit.health),
+            monitors: monitors(ring, &fit.screened.health),
             log_evidence: None,
             timing: None,
         }

@@ -1,9 +1,18 @@
 //! Offline science of orbitcal: recordings on disk, their frames, and the exact batch answer.
 
+pub mod draws;
 pub mod map;
+pub mod model;
+pub mod nuts;
+pub mod posterior;
+pub mod readings;
 pub mod recording;
+pub mod simulate;
 pub mod stream;
 
 pub use map::{BatchError, BatchFit};
+pub use model::ResponseModel;
+pub use posterior::{Posterior, Width};
+pub use readings::{Campaign, Readings};
 pub use recording::{Layout, Recording, RecordingError};
 pub use stream::{Booster, BoosterEstimate, BoosterFrame, StreamError};

@@ -28,8 +28,10 @@ pub struct BatchFit {
     pub chi2_per_dof: f64,
     /// Tunes at the MAP.
     pub tunes: Tunes,
-    /// State of the monitors.
-    pub health: Vec<Health>,
+    /// State of the monitors, and which readings count.
+    pub screened: Screened,
+    /// Rms of the baselines in x and y [m].
+    pub orbit: [f64; 2],
     /// Gauss-Newton steps taken.
     pub steps: usize,
 }
@@ -138,11 +140,14 @@ struct Problem<'r> {
 }
 
 /// What drove the beam in one frame.
-struct Drive {
-    kick: DVector<f64>,
+#[derive(Debug, Clone)]
+pub struct Drive {
+    /// Kick of each corrector [rad].
+    pub kick: DVector<f64>,
     /// `ln` of the supplies' factors.
-    strength: [f64; 2],
-    rf_offset: f64,
+    pub strength: [f64; 2],
+    /// Relative RF offset [1].
+    pub rf_offset: f64,
     /// Frames with this RF offset: they share the error of the spurious dispersion.
     sharing: f64,
 }
@@ -275,9 +280,8 @@ impl<'r> Problem<'r> {
         self.ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count()
     }
 
-    /// Supply of each quadrupole.
     fn families(&self) -> usize {
-        self.ring.gradients().iter().filter(|k| **k > 0.0).count()
+        first_family(self.ring)
     }
 
     fn linearise(&self, params: &DVector<f64>) -> Result<Linearised, BatchError> {
@@ -317,7 +321,8 @@ impl<'r> Problem<'r> {
             covariance: minimum.covariance,
             chi2_per_dof: normal.chi2.0 / normal.chi2.1,
             tunes: normal.tunes,
-            health: self.screened.health,
+            screened: self.screened,
+            orbit: normal.orbit,
             steps,
         })
     }
@@ -325,7 +330,7 @@ impl<'r> Problem<'r> {
 
 impl Drive {
     /// The header's formulas, in f64: `k1 = var * k1_design * p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`.
-    fn of(recording: &Recording, row: &Row) -> Self {
+    pub fn of(recording: &Recording, row: &Row) -> Self {
         let header = &recording.header;
         let rigidity = row.currents.dipole / header.nominal.dipole;
         let transfer = |r: f64| header.quad_transfer.iter().rev().fold(0.0, |sum, c| sum * r + c);
@@ -359,8 +364,16 @@ impl Linearised {
     }
 }
 
+/// Number of quadrupoles on the first (QH) supply; they come first.
+pub fn first_family(ring: &Ring) -> usize {
+    ring.gradients().iter().filter(|k| **k > 0.0).count()
+}
+
 /// Orbit that an RF offset makes at the read monitors, exactly [m].
-fn rf_orbit(ring: &Ring, offset: f64) -> Result<DVector<f64>, OrbitError> {
+///
+/// # Errors
+/// [`OrbitError`] if there is none.
+pub fn rf_orbit(ring: &Ring, offset: f64) -> Result<DVector<f64>, OrbitError> {
     let orbit = ClosedOrbit::find(ring, Hold::Frequency { offset })?;
     let vertical = |at: usize| matches!(ring.elements[at].kind, twin::Kind::Monitor { plane: Plane::Y });
     let seen = ring.read_monitors.iter().map(|&at| orbit.at[at][if vertical(at) { 2 } else { 0 }]);

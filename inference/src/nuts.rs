@@ -1,0 +1,223 @@
+//! The reference: full NUTS on the exact posterior.
+//!
+//! The sampler is nuts-rs; here it is given the density in whitened coordinates (see [`crate::posterior`]), each chain from
+//! the MAP, and its draws come back as vars. The seed fixes every draw, whatever the number of threads.
+//!
+//! Source: M. D. Hoffman and A. Gelman, J. Mach. Learn. Res. 15 (2014) 1593; A. Seyboldt, nuts-rs.
+
+use core::time::Duration;
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use nuts_rs::{
+    CpuLogpFunc, CpuMath, CpuMathError, DiagNutsSettings, HasDims, HashMapConfig, HashMapResult, HashMapValue,
+    InitPositionError, LogpError, Model, Sampler, SamplerWaitResult,
+};
+
+use rand::Rng;
+use twin::OrbitError;
+
+use crate::draws::{Chain, DrawStats, Draws};
+use crate::posterior::{Laplace, Posterior, params_of};
+
+/// How to sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NutsSettings {
+    /// Independent chains.
+    pub chains: usize,
+    /// Draws of each that adapt the step, thrown away.
+    pub warm_up: usize,
+    /// Draws of each that are kept.
+    pub draws: usize,
+    /// Fixes every draw.
+    pub seed: u64,
+}
+
+impl Default for NutsSettings {
+    fn default() -> Self {
+        Self { chains: 4, warm_up: 1000, draws: 2000, seed: 1 }
+    }
+}
+
+/// Draws of the vars, and what they cost.
+#[derive(Debug, Clone)]
+pub struct NutsRun {
+    /// Draws of every var.
+    pub draws: Draws,
+    /// Evaluations of log-density and gradient, warm-up included.
+    pub evaluations: u64,
+    /// Wall-clock time.
+    pub seconds: f64,
+    /// What happened at each divergence.
+    pub divergences: Vec<String>,
+}
+
+/// Why there are no draws.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum NutsError {
+    /// The sampler stopped.
+    #[error("the sampler stopped: {0}")]
+    Sampler(String),
+    /// The sampler's answer lacks something.
+    #[error("the sampler's answer has no {0}")]
+    Missing(&'static str),
+}
+
+/// Sample a posterior about its Laplace approximation; `progress` hears of finished draws, warm-up included.
+///
+/// # Errors
+/// [`NutsError`].
+pub fn sample(
+    posterior: Arc<Posterior>,
+    laplace: Arc<Laplace>,
+    names: &[String],
+    settings: NutsSettings,
+    mut progress: impl FnMut(usize),
+) -> Result<NutsRun, NutsError> {
+    let mut options = DiagNutsSettings::default();
+    options.num_chains = settings.chains;
+    options.num_tune = settings.warm_up as u64;
+    options.num_draws = settings.draws as u64;
+    options.seed = settings.seed;
+    options.store_divergences = true;
+    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(settings.chains);
+    let start = Instant::now();
+    let model = Arc::new(Whitened { posterior, laplace: Arc::clone(&laplace) });
+    let failed = |error: anyhow::Error| NutsError::Sampler(format!("{error:#}"));
+    let mut sampler = Sampler::new(model, options, HashMapConfig::new(), threads, None).map_err(failed)?;
+    let mut evaluations = 0;
+    let chains = loop {
+        let chains = sampler.progress().map_err(failed)?;
+        progress(chains.iter().map(|chain| chain.finished_draws).sum());
+        evaluations = chains.iter().map(|chain| chain.total_num_gradients as u64).sum::<u64>().max(evaluations);
+        match sampler.wait_timeout(Duration::from_millis(100)) {
+            SamplerWaitResult::Trace(chains) => break chains,
+            SamplerWaitResult::Timeout(more) => sampler = more,
+            SamplerWaitResult::Err(error, _) => return Err(failed(error)),
+        }
+    };
+    let seconds = start.elapsed().as_secs_f64();
+    let explain = |(c, chain)| explained(c, chain, &laplace, names, settings.warm_up);
+    let divergences = chains.iter().enumerate().flat_map(explain).collect();
+    let unpack = |chain| unpack(chain, names.len(), settings.warm_up);
+    let chains = chains.iter().map(unpack).collect::<Result<_, _>>()?;
+    Ok(NutsRun { draws: Draws { names: names.to_vec(), chains }, evaluations, seconds, divergences })
+}
+
+/// The density that the sampler sees.
+#[derive(Debug, Clone)]
+struct Whitened {
+    posterior: Arc<Posterior>,
+    laplace: Arc<Laplace>,
+}
+
+/// A ring without a closed orbit: the trajectory ends there.
+#[derive(Debug, thiserror::Error)]
+#[error("no stable ring: {0}")]
+struct NoRing(#[from] OrbitError);
+
+impl LogpError for NoRing {
+    fn is_recoverable(&self) -> bool {
+        true
+    }
+}
+
+impl HasDims for Whitened {
+    fn dim_sizes(&self) -> HashMap<String, u64> {
+        HashMap::from([("dim".to_owned(), self.posterior.dimension() as u64)])
+    }
+}
+
+impl CpuLogpFunc for Whitened {
+    type LogpError = NoRing;
+    type FlowParameters = ();
+    type ExpandedVector = Vec<f64>;
+
+    fn dim(&self) -> usize {
+        self.posterior.dimension()
+    }
+
+    fn logp(&mut self, position: &[f64], gradient: &mut [f64]) -> Result<f64, NoRing> {
+        let u = self.laplace.unbounded(position);
+        let (value, slope) = self.posterior.of_unbounded(u.as_slice())?;
+        gradient.copy_from_slice(self.laplace.whiten(&slope).as_slice());
+        Ok(value)
+    }
+
+    /// The vars.
+    fn expand_vector<R: Rng + ?Sized>(&mut self, _: &mut R, position: &[f64]) -> Result<Vec<f64>, CpuMathError> {
+        Ok(params_of(self.laplace.unbounded(position).as_slice()).iter().map(|theta| theta.exp()).collect())
+    }
+}
+
+impl Model for Whitened {
+    type Math = CpuMath<Whitened>;
+
+    fn math<R: Rng + ?Sized>(self: Arc<Self>, _: &mut R) -> anyhow::Result<Self::Math> {
+        Ok(CpuMath::new((*self).clone()))
+    }
+
+    /// The MAP.
+    fn init_position<R: Rng + ?Sized>(&self, _: &mut R, _: u64, position: &mut [f64]) -> Result<(), InitPositionError> {
+        position.fill(0.0);
+        Ok(())
+    }
+}
+
+/// One sentence a divergence after the warm-up: where its trajectory began, and which var was nearest its bound there.
+fn explained(chain: usize, result: &HashMapResult, laplace: &Laplace, names: &[String], warm_up: usize) -> Vec<String> {
+    let (Some(HashMapValue::U64(draws)), Some(HashMapValue::String(messages)), Some(HashMapValue::F64(starts))) = (
+        result.stats.get("divergence_draw"),
+        result.stats.get("divergence_message"),
+        result.stats.get("divergence_start"),
+    ) else {
+        return Vec::new();
+    };
+    let each = draws.iter().zip(messages).zip(starts.chunks_exact(names.len()));
+    let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
+    let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
+        let u = laplace.unbounded(start);
+        let nearest = u.icamax();
+        let var = params_of(&[u[nearest]])[0].exp();
+        format!(
+            "chain {}, draw {}: {message}; {} = {var:.4} was nearest its bound",
+            chain + 1,
+            draw + 1,
+            names[nearest]
+        )
+    };
+    kept.map(sentence).collect()
+}
+
+/// The draws after the warm-up.
+fn unpack(chain: &HashMapResult, names: usize, warm_up: usize) -> Result<Chain, NutsError> {
+    let real = |name: &'static str| match chain.stats.get(name) {
+        Some(HashMapValue::F64(values)) => Ok(values),
+        _ => Err(NutsError::Missing(name)),
+    };
+    let whole = |name: &'static str| match chain.stats.get(name) {
+        Some(HashMapValue::U64(values)) => Ok(values),
+        _ => Err(NutsError::Missing(name)),
+    };
+    let Some(HashMapValue::Bool(divergent)) = chain.stats.get("diverging") else {
+        return Err(NutsError::Missing("diverging"));
+    };
+    let Some(HashMapValue::F64(values)) = chain.draws.get("value") else { return Err(NutsError::Missing("value")) };
+    let (lp, energy, step) = (real("logp")?, real("energy")?, real("step_size")?);
+    let (acceptance, depth, leapfrogs) = (real("mean_tree_accept")?, whole("depth")?, whole("n_steps")?);
+    let stats = |i: usize| DrawStats {
+        lp: lp[i],
+        acceptance: acceptance[i],
+        step_size: step[i],
+        depth: depth[i],
+        leapfrogs: leapfrogs[i],
+        divergent: divergent[i],
+        energy: energy[i],
+    };
+    Ok(Chain {
+        draws: values.chunks_exact(names).skip(warm_up).map(<[f64]>::to_vec).collect(),
+        stats: (warm_up..divergent.len()).map(stats).collect(),
+    })
+}

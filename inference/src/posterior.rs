@@ -1,0 +1,259 @@
+//! Log-density of the params given a recording, with its gradient: the twin or a surrogate, every frame or the paper's pairs.
+//!
+//! `ln p(theta) = -chi2(theta)/2 + ln prior(theta)`, `theta = ln var` within `ln 0.94 .. ln 1.06`, up to a constant. A
+//! sampler sees it in coordinates without bounds, whitened by the Laplace covariance:
+//!
+//! `theta = lower + (upper - lower)/(1 + exp(-u))`, `u = u_MAP + L z`, `L L^T` the covariance of u,
+//!
+//! with the Jacobian of the first map in the density.
+
+use nalgebra::{DMatrix, DVector};
+use twin::OrbitError;
+
+use crate::model::ResponseModel;
+use crate::readings::Readings;
+
+/// Prior of every var.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Width {
+    /// Lognormal of mean exactly 1 and this standard deviation: `ln var` is normal with variance `ln(1 + w^2)` and mean
+    /// minus half of it.
+    Lognormal(f64),
+    /// Density `1/var`, the limit of a wide lognormal.
+    Loguniform,
+}
+
+/// The range of every var, the paper's.
+pub const RANGE: [f64; 2] = [0.94, 1.06];
+
+/// The posterior of one recording under one model.
+#[derive(Debug, Clone)]
+pub struct Posterior {
+    /// What predicts.
+    pub model: ResponseModel,
+    /// What was read.
+    pub readings: Readings,
+    /// Prior of every var.
+    pub width: Width,
+}
+
+/// The Gaussian at the best point, in the coordinates without bounds.
+#[derive(Debug, Clone)]
+pub struct Laplace {
+    /// Best point in `u`.
+    pub centre: DVector<f64>,
+    /// Lower Cholesky factor of the covariance of `u`.
+    pub factor: DMatrix<f64>,
+    /// Best point of `theta`, where the density of `u` is largest.
+    pub params: Vec<f64>,
+}
+
+/// Why the posterior has no Laplace approximation.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LaplaceError {
+    /// No stable ring on the way.
+    #[error(transparent)]
+    Orbit(#[from] OrbitError),
+    /// The curvature is not positive.
+    #[error("the curvature of the log-density is not positive")]
+    Degenerate,
+    /// The steps did not settle.
+    #[error("no maximum after {steps} steps; the last one moved by {moved:.2e} standard deviations")]
+    NotConverged {
+        /// Steps taken.
+        steps: usize,
+        /// Largest move of the last step.
+        moved: f64,
+    },
+}
+
+/// Largest move of a param, in standard deviations, at which the steps have settled.
+const SETTLED: f64 = 1e-4;
+const STEPS: usize = 40;
+
+impl Width {
+    /// Mean and precision of theta.
+    fn normal(self) -> (f64, f64) {
+        match self {
+            Self::Lognormal(width) => {
+                let variance = width.powi(2).ln_1p();
+                (-0.5 * variance, 1.0 / variance)
+            }
+            Self::Loguniform => (0.0, 0.0),
+        }
+    }
+}
+
+impl Posterior {
+    /// Number of params.
+    pub fn dimension(&self) -> usize {
+        self.readings.supplies().len()
+    }
+
+    /// Log-density of `theta` and its gradient, bounds left out.
+    ///
+    /// # Errors
+    /// [`OrbitError`] where there is no stable ring.
+    pub fn of_params(&self, params: &[f64]) -> Result<(f64, Vec<f64>), OrbitError> {
+        let strength: Vec<f64> = params.iter().zip(self.readings.supplies()).map(|(theta, s)| theta + s).collect();
+        let (chi_square, mut gradient) =
+            self.model.differentiate(&strength, |response| self.readings.chi_square(response))?;
+        let (mean, precision) = self.width.normal();
+        let mut value = -0.5 * chi_square;
+        for (slope, theta) in gradient.iter_mut().zip(params) {
+            let away = theta - mean;
+            value -= 0.5 * precision * away * away;
+            *slope = -0.5 * *slope - precision * away;
+        }
+        Ok((value, gradient))
+    }
+
+    /// Log-density in the coordinates without bounds, and its gradient.
+    ///
+    /// # Errors
+    /// [`OrbitError`] where there is no stable ring.
+    pub fn of_unbounded(&self, u: &[f64]) -> Result<(f64, Vec<f64>), OrbitError> {
+        let (mut value, mut gradient) = self.of_params(&params_of(u))?;
+        for (slope, u) in gradient.iter_mut().zip(u) {
+            let bound = Bounded::at(*u);
+            value += bound.slope.ln();
+            *slope = *slope * bound.slope + bound.log_slope_slope;
+        }
+        Ok((value, gradient))
+    }
+
+    /// The best point in `u` by damped Gauss-Newton steps from `params`, and the curvature there.
+    ///
+    /// # Errors
+    /// [`LaplaceError`].
+    pub fn laplace(&self, params: &[f64]) -> Result<Laplace, LaplaceError> {
+        let mut u = unbounded_of(params);
+        let (mut value, mut gradient) = self.of_unbounded(u.as_slice())?;
+        let mut moved = f64::INFINITY;
+        for _ in 0..STEPS {
+            let covariance = self.curvature(&u)?.cholesky().ok_or(LaplaceError::Degenerate)?.inverse();
+            if moved < SETTLED {
+                let factor = covariance.cholesky().ok_or(LaplaceError::Degenerate)?.unpack();
+                return Ok(Laplace { params: params_of(u.as_slice()), centre: u, factor });
+            }
+            let mut step = &covariance * DVector::from_column_slice(&gradient);
+            // half the way as long as it leads downhill or to an unstable ring
+            for _ in 0..10 {
+                let next = self.of_unbounded((&u + &step).as_slice());
+                if let Some((higher, slope)) = next.ok().filter(|(next, _)| *next >= value - 1e-9 * value.abs()) {
+                    (value, gradient) = (higher, slope);
+                    break;
+                }
+                step *= 0.5;
+            }
+            u += &step;
+            moved = (0..step.len()).map(|i| step[i].abs() / covariance[(i, i)].sqrt()).fold(0.0, f64::max);
+        }
+        Err(LaplaceError::NotConverged { steps: STEPS, moved })
+    }
+
+    /// Minus the second derivative of the log-density in `u`, that of the response left out (Gauss-Newton).
+    fn curvature(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, OrbitError> {
+        let params = params_of(u.as_slice());
+        let strength: Vec<f64> = params.iter().zip(self.readings.supplies()).map(|(theta, s)| theta + s).collect();
+        let mut curvature = self.readings.curvature(&self.model.jacobian(&strength)?);
+        let (_, precision) = self.width.normal();
+        let (_, slope) = self.of_params(&params)?;
+        (0..u.len()).for_each(|i| curvature[(i, i)] += precision);
+        let bounds: Vec<Bounded> = u.iter().map(|u| Bounded::at(*u)).collect();
+        for i in 0..u.len() {
+            for j in 0..u.len() {
+                curvature[(i, j)] *= bounds[i].slope * bounds[j].slope;
+            }
+            // of the map itself: positive in the middle; towards a bound the density may turn either way
+            let bend = bounds[i].log_curvature - slope[i] * bounds[i].bend;
+            curvature[(i, i)] += bend.max(0.0);
+        }
+        Ok(curvature)
+    }
+}
+
+/// One param as a function of its coordinate without bounds.
+struct Bounded {
+    /// `d theta/du`.
+    slope: f64,
+    /// `d2 theta/du2`.
+    bend: f64,
+    /// `d ln(slope)/du`.
+    log_slope_slope: f64,
+    /// `-d2 ln(slope)/du2`.
+    log_curvature: f64,
+}
+
+impl Bounded {
+    fn at(u: f64) -> Self {
+        let [lower, upper] = RANGE.map(f64::ln);
+        let share = 1.0 / (1.0 + (-u).exp());
+        let both = share * (1.0 - share);
+        Self {
+            slope: (upper - lower) * both,
+            bend: (upper - lower) * both * (1.0 - 2.0 * share),
+            log_slope_slope: 1.0 - 2.0 * share,
+            log_curvature: 2.0 * both,
+        }
+    }
+}
+
+/// Params of coordinates without bounds.
+pub fn params_of(u: &[f64]) -> Vec<f64> {
+    let [lower, upper] = RANGE.map(f64::ln);
+    u.iter().map(|u| lower + (upper - lower) / (1.0 + (-u).exp())).collect()
+}
+
+/// Coordinates without bounds of params; a param at a bound is taken a thousandth of the range inside.
+fn unbounded_of(params: &[f64]) -> DVector<f64> {
+    let [lower, upper] = RANGE.map(f64::ln);
+    let share = |theta: &f64| ((theta - lower) / (upper - lower)).clamp(1e-3, 1.0 - 1e-3);
+    DVector::from_iterator(params.len(), params.iter().map(share).map(|share| (share / (1.0 - share)).ln()))
+}
+
+impl Laplace {
+    /// Coordinates without bounds of whitened ones.
+    pub fn unbounded(&self, z: &[f64]) -> DVector<f64> {
+        &self.centre + &self.factor * DVector::from_column_slice(z)
+    }
+
+    /// The gradient in whitened coordinates.
+    pub fn whiten(&self, gradient: &[f64]) -> DVector<f64> {
+        self.factor.tr_mul(&DVector::from_column_slice(gradient))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coordinates_without_bounds_are_those_of_the_params() {
+        let params = [-0.05, -0.01, 0.0, 0.03, 0.055];
+        let u = unbounded_of(&params);
+        for (i, (theta, back)) in params.iter().zip(params_of(u.as_slice())).enumerate() {
+            assert!((theta - back).abs() < 1e-15);
+            let (h, bound) = (1e-5, Bounded::at(u[i]));
+            let (up, down) = (params_of(&[u[i] + h])[0], params_of(&[u[i] - h])[0]);
+            assert!(((up - down) / (2.0 * h) / bound.slope - 1.0).abs() < 1e-8);
+            assert!(((up - 2.0 * theta + down) / (h * h) - bound.bend).abs() < 1e-6 * bound.slope.max(1e-3) + 1e-7);
+            let (above, below) = (Bounded::at(u[i] + h), Bounded::at(u[i] - h));
+            assert!(((above.slope.ln() - below.slope.ln()) / (2.0 * h) - bound.log_slope_slope).abs() < 1e-8);
+            let curvature = -(above.log_slope_slope - below.log_slope_slope) / (2.0 * h);
+            assert!((curvature - bound.log_curvature).abs() < 1e-8);
+        }
+    }
+
+    /// The lognormal's mean is 1 for any width: integrated over ln var.
+    #[test]
+    fn the_prior_has_mean_one() {
+        for width in [0.01, 0.03, 0.3] {
+            let (mean, precision) = Width::Lognormal(width).normal();
+            assert!(((mean + 0.5 / precision).exp() - 1.0).abs() < 1e-15);
+            // and the width that it says: exp(variance) - 1 = width^2
+            assert!((((1.0 / precision).exp() - 1.0).sqrt() / width - 1.0).abs() < 1e-12);
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
+
+use nalgebra::DVector;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, Normal, StandardNormal};
+use twin::{Hold, Optics, OrbitError, Ring, Tunes};
+
+use crate::map::{Drive, first_family, rf_orbit};
+use crate::model::ResponseModel;
+use crate::posterior::RANGE;
+use crate::recording::Recording;
+
+/// What the simulated monitors do.
+#[derive(Debug, Clone)]
+pub struct Instruments {
+    /// Noise of one reading of each monitor [m].
+    pub noise: Vec<f64>,
+    /// Standard deviation of the monitors' baselines [m].
+    pub baseline: f64,
+}
+
+impl Instruments {
+    /// Every monitor with the noise that the recording's header states, and the closed orbit and offsets of the machine.
+    pub fn healthy(ring: &Ring, recording: &Recording) -> Self {
+        Self { noise: vec![recording.header.bpm_sigma; ring.read_monitors.len()], baseline: 2e-3 }
+    }
+}
+
+/// The recording with readings that the twin at `vars` would have given; `seed` fixes noise and baselines.
+///
+/// Each frame has its own kicks and supply currents (these to first order, see [`crate::readings`]) and the exact orbit of
+/// its RF offset.
+///
+/// # Errors
+/// [`OrbitError`] if the ring at `vars` is not stable.
+pub fn like(
+    recording: &Recording,
+    ring: &Ring,
+    vars: &[f64],
+    instruments: &Instruments,
+    seed: u64,
+) -> Result<Recording, OrbitError> {
+    let mut random = StdRng::seed_from_u64(seed);
+    let normal = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
+    let baselines = DVector::from_fn(instruments.noise.len(), |_, _| instruments.baseline * normal(&mut random));
+    let model = ResponseModel::twin(ring)?;
+    let first = first_family(ring);
+    let orbit = |drive: &Drive| -> Result<DVector<f64>, OrbitError> {
+        let theta = |(q, var): (usize, &f64)| var.ln() + drive.strength[usize::from(q >= first)];
+        let params: Vec<f64> = vars.iter().enumerate().map(theta).collect();
+        let mut orbit = model.response(&params)?.columns(0, drive.kick.len()) * &drive.kick;
+        if drive.rf_offset != 0.0 {
+            let strength: Vec<f64> = params.iter().map(|theta| theta.exp()).collect();
+            orbit += rf_orbit(&ring.with_vars(&strength), drive.rf_offset)?;
+        }
+        Ok(orbit)
+    };
+    let mut simulated = recording.clone();
+    simulated.name = format!("{} (simulated)", recording.name);
+    for (row, given) in simulated.rows.iter_mut().zip(&recording.rows) {
+        let orbit = orbit(&Drive::of(recording, given))? + &baselines;
+        for (b, reading) in row.reading.iter_mut().enumerate() {
+            let noise = instruments.noise[b] * normal(&mut random);
+            *reading = reading.map(|_| orbit[b] + noise);
+        }
+        row.tune = [None; 2];
+    }
+    Ok(simulated)
+}
+
+/// Largest distance of a tune from the design's that the tune cut lets pass.
+pub const TUNE_CUT: f64 = 0.05;
+
+/// Distance of a tune from the next half integer that a ring needs to keep its beam: supplies that fluctuate by 2e-4, and
+/// now and then by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again.
+const STOP_BAND: f64 = 0.03;
+
+/// Vars drawn from the truncated lognormal prior of a width; with the tune cut, those whose ring's tunes are within
+/// [`TUNE_CUT`] of the design's. Without it, those of rings that keep their beam: both tunes between the same half integers
+/// as the design's, and not on one.
+///
+/// # Errors
+/// [`OrbitError`] if the design has no tunes.
+pub fn vars(ring: &Ring, width: f64, tune_cut: bool, seed: u64) -> Result<Vec<f64>, OrbitError> {
+    let mut random = StdRng::seed_from_u64(seed);
+    let variance = width.powi(2).ln_1p();
+    let prior = Normal::new(-0.5 * variance, variance.sqrt()).expect("a width is positive");
+    let design = tunes(ring)?;
+    loop {
+        let one = |random: &mut StdRng| loop {
+            let var = prior.sample(random).exp();
+            if (RANGE[0]..=RANGE[1]).contains(&var) {
+                return var;
+            }
+        };
+        let vars: Vec<f64> = ring.quadrupoles.iter().map(|_| one(&mut random)).collect();
+        let near = |at: f64, design: f64| {
+            let from_below = at - (2.0 * design).floor() / 2.0;
+            (STOP_BAND..=0.5 - STOP_BAND).contains(&from_below) && (!tune_cut || (at - design).abs() < TUNE_CUT)
+        };
+        if let Ok(at) = tunes(&ring.with_vars(&vars))
+            && near(at.x, design.x)
+            && near(at.y, design.y)
+        {
+            return Ok(vars);
+        }
+    }
+}
+
+fn tunes(ring: &Ring) -> Result<Tunes, OrbitError> {
+    Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()
+}
+
+/// A seed for each of many things made from one.
+pub fn seeds(seed: u64) -> impl Iterator<Item = u64> {
+    let mut random = StdRng::seed_from_u64(seed);
+    core::iter::repeat_with(move || random.random())
+}
