@@ -1,7 +1,8 @@
-//! Offline science of orbitcal: recordings on disk, their frames, and the exact batch answer.
+//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, and reports on paper.
 
 pub mod map;
 pub mod recording;
+pub mod report;
 pub mod stream;
 
 pub use map::{BatchError, BatchFit};
