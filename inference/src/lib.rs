@@ -1,4 +1,4 @@
-//! Offline science of orbitcal: recordings on disk, their frames, and the exact batch answer.
+//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, and reports on paper.
 
 pub mod draws;
 pub mod map;
@@ -7,6 +7,7 @@ pub mod nuts;
 pub mod posterior;
 pub mod readings;
 pub mod recording;
+pub mod report;
 pub mod simulate;
 pub mod stream;
 
