@@ -2,8 +2,10 @@
 
 use comfy_table::{CellAlignment, Table, presets};
 use estimator::{FitQuality, Health, Marginal, MonitorState, Setup};
+use inference::nuts::NutsRun;
 use inference::stream::BoosterEstimate;
-use inference::{BatchFit, Recording};
+use inference::study::Sampled;
+use inference::{BatchFit, Campaign, Recording, Summary};
 use serde::Serialize;
 use twin::{Hold, Optics, Ring};
 
@@ -25,6 +27,8 @@ pub struct Answer {
     pub log_evidence: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub timing: Option<Timing>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub nuts: Option<Sampling>,
 }
 
 /// One quadrupole factor: mean, standard deviation and quantiles of its truncated posterior [1].
@@ -69,6 +73,25 @@ pub struct Timing {
     pub update_us_max: f64,
 }
 
+/// How well a posterior was sampled.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Sampling {
+    pub rhat_max: f64,
+    pub ess_min: f64,
+    pub divergences: usize,
+    pub draws: usize,
+    pub seconds: f64,
+}
+
+impl Var {
+    /// Moments and quantiles of draws; the sampler's coordinates never reach a bound.
+    fn of_draws(summary: &Summary) -> Self {
+        let Summary { name, mean, sd, q025, q16, q84, q975, .. } = summary.clone();
+        Self { name, mean, sigma: sd, q025, q16, q84, q975, clipped: false }
+    }
+}
+
 impl Answer {
     /// What a core says after its last frame, here or on a device; `of_params` is the covariance of two `ln var`.
     pub fn of_core(
@@ -95,6 +118,7 @@ impl Answer {
             monitors: monitors(ring, &last.health),
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
+            nuts: None,
         }
     }
 
@@ -115,6 +139,36 @@ impl Answer {
             monitors: monitors(ring, &fit.screened.health),
             log_evidence: None,
             timing: None,
+            nuts: None,
+        }
+    }
+
+    /// What draws of the posterior say.
+    pub fn of_draws(ring: &Ring, campaign: &Campaign, model: &'static str, run: &NutsRun) -> Self {
+        let sampled = Sampled::of(&run.draws);
+        let vars: Vec<Var> = sampled.summary.iter().map(Var::of_draws).collect();
+        let covariance = sampled.covariance();
+        let draws = run.draws.chains.iter().map(|chain| chain.draws.len()).sum();
+        Self {
+            recording: campaign.recording.name.clone(),
+            method: "nuts",
+            model,
+            frames: campaign.recording.rows.len(),
+            rejected_frames: 0,
+            covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
+            tunes: tunes(ring, &vars),
+            vars,
+            chi2_per_dof: campaign.fit.chi2_per_dof,
+            monitors: monitors(ring, &campaign.fit.screened.health),
+            log_evidence: None,
+            timing: None,
+            nuts: Some(Sampling {
+                rhat_max: sampled.summary.iter().map(|s| s.r_hat).fold(0.0, f64::max),
+                ess_min: sampled.summary.iter().map(|s| s.ess_bulk.min(s.ess_tail)).fold(f64::INFINITY, f64::min),
+                divergences: run.draws.divergences(),
+                draws,
+                seconds: run.seconds,
+            }),
         }
     }
 

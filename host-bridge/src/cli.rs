@@ -5,6 +5,7 @@ use core::time::Duration;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use inference::nuts::NutsSettings;
 use twin::Effect;
 
 use crate::link::Source;
@@ -30,6 +31,8 @@ pub enum Command {
     Response(Response),
     /// The host's batch answer for a recording, with the exact twin
     Fit(Fit),
+    /// The published studies of a recording as one report: priors, subsets, correlations, predictions, Laplace against NUTS
+    Study(Study),
     /// Publish the estimates of a device
     Serve(Serve),
     /// Surrogates and their measured errors
@@ -161,9 +164,59 @@ pub struct Fit {
     /// How to fit
     #[arg(long, value_enum, default_value_t = Method::Map)]
     pub method: Method,
-    /// Which prediction
+    /// Which prediction; the fit by Gauss-Newton is the twin's alone
     #[arg(long, value_enum, default_value_t = FitModel::Twin)]
     pub model: FitModel,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub sampling: Sampling,
+    /// Folder for the draws, one CmdStan CSV a chain, as `arviz.from_cmdstan` reads it
+    #[arg(long, value_name = "DIR")]
+    pub save_draws: Option<PathBuf>,
+}
+
+/// `orbitcal study`.
+#[derive(Debug, Args)]
+pub struct Study {
+    /// Folder with header.toml and frames.csv
+    pub recording: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub sampling: Sampling,
+    /// The report, one file with all figures and their numbers
+    #[arg(long, value_name = "FILE.html", default_value = "study.html")]
+    pub report: PathBuf,
+}
+
+/// How NUTS samples.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct Sampling {
+    /// NUTS: independent chains
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..))]
+    pub chains: u16,
+    /// NUTS: draws of each chain that adapt the step
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(50..))]
+    pub warm_up: u32,
+    /// NUTS: draws of each chain that are kept
+    #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u32).range(4..))]
+    pub draws: u32,
+    /// Fixes every random choice
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+}
+
+impl From<Sampling> for NutsSettings {
+    fn from(sampling: Sampling) -> Self {
+        Self {
+            chains: usize::from(sampling.chains),
+            warm_up: sampling.warm_up as usize,
+            draws: sampling.draws as usize,
+            seed: sampling.seed,
+        }
+    }
 }
 
 /// `orbitcal surrogate`.
@@ -203,6 +256,8 @@ pub enum CoreModel {
 pub enum FitModel {
     /// The exact twin
     Twin,
+    /// The Green's function with the core's tables, in f64
+    Green,
 }
 
 /// Ways to fit.
@@ -210,6 +265,8 @@ pub enum FitModel {
 pub enum Method {
     /// Damped Gauss-Newton to the maximum a posteriori, Laplace covariance
     Map,
+    /// Full NUTS, the reference
+    Nuts,
 }
 
 /// What the RF does.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use host_bridge::cli::{Cli, Command};
-use host_bridge::command::{CommandError, fit, replay, response, serve, surrogate, watch};
+use host_bridge::command::{CommandError, fit, replay, response, serve, study, surrogate, watch};
 
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -20,6 +20,7 @@ fn main() -> ExitCode {
         Command::Watch(options) => watch::run(options),
         Command::Response(options) => response::run(options),
         Command::Fit(options) => fit::run(options),
+        Command::Study(options) => study::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Surrogate(options) => surrogate::run(options),
     };

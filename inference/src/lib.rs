@@ -1,5 +1,7 @@
 //! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, and reports on paper.
 
+mod cmdstan;
+pub mod diagnostics;
 pub mod draws;
 pub mod map;
 pub mod model;
@@ -10,7 +12,9 @@ pub mod recording;
 pub mod report;
 pub mod simulate;
 pub mod stream;
+pub mod study;
 
+pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use map::{BatchError, BatchFit};
 pub use model::ResponseModel;
 pub use posterior::{Posterior, Width};

@@ -49,6 +49,8 @@ pub struct NutsRun {
     pub evaluations: u64,
     /// Wall-clock time.
     pub seconds: f64,
+    /// Chains that ran at the same time.
+    pub threads: usize,
     /// What happened at each divergence.
     pub divergences: Vec<String>,
 }
@@ -103,7 +105,7 @@ pub fn sample(
     let divergences = chains.iter().enumerate().flat_map(explain).collect();
     let unpack = |chain| unpack(chain, names.len(), settings.warm_up);
     let chains = chains.iter().map(unpack).collect::<Result<_, _>>()?;
-    Ok(NutsRun { draws: Draws { names: names.to_vec(), chains }, evaluations, seconds, divergences })
+    Ok(NutsRun { draws: Draws { names: names.to_vec(), chains }, evaluations, seconds, threads, divergences })
 }
 
 /// The density that the sampler sees.

@@ -207,7 +207,7 @@ pub fn params_of(u: &[f64]) -> Vec<f64> {
 }
 
 /// Coordinates without bounds of params; a param at a bound is taken a thousandth of the range inside.
-fn unbounded_of(params: &[f64]) -> DVector<f64> {
+pub(crate) fn unbounded_of(params: &[f64]) -> DVector<f64> {
     let [lower, upper] = RANGE.map(f64::ln);
     let share = |theta: &f64| ((theta - lower) / (upper - lower)).clamp(1e-3, 1.0 - 1e-3);
     DVector::from_iterator(params.len(), params.iter().map(share).map(|share| (share / (1.0 - share)).ln()))

@@ -109,6 +109,11 @@ impl Campaign {
         self.reduced[frame][b].filter(|_| self.fit.screened.accepted[frame] >> b & 1 == 1)
     }
 
+    /// The same, whether it counts or not [m].
+    pub fn raw(&self, frame: usize, b: usize) -> Option<f64> {
+        self.reduced[frame][b]
+    }
+
     /// Noise of one reading of a monitor [m].
     pub fn noise(&self, b: usize) -> f64 {
         f64::from(self.fit.screened.health[b].weighted_as)

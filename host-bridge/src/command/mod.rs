@@ -4,13 +4,16 @@ pub mod fit;
 pub mod replay;
 pub mod response;
 pub mod serve;
+pub mod study;
 pub mod surrogate;
 pub mod watch;
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::{Recording, RecordingError, stream};
+use inference::readings::ReadingsError;
+use inference::{BatchError, Recording, RecordingError, stream};
 use twin::{LatticeError, Ring};
 
 use crate::output::OutputError;
@@ -48,6 +51,24 @@ impl From<OutputError> for CommandError {
     }
 }
 
+impl From<BatchError> for CommandError {
+    fn from(error: BatchError) -> Self {
+        match error {
+            BatchError::Stream(error) => error.into(),
+            error => Self::Other(error.to_string()),
+        }
+    }
+}
+
+impl From<ReadingsError> for CommandError {
+    fn from(error: ReadingsError) -> Self {
+        match error {
+            ReadingsError::Fit(error) => error.into(),
+            error => Self::Other(error.to_string()),
+        }
+    }
+}
+
 /// The machine that was asked for, or the built-in one.
 fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
     path.map_or_else(|| Ok(Ring::booster()), Ring::read)
@@ -58,7 +79,7 @@ fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.
-pub fn progress(length: usize, what: &'static str, quiet: bool) -> ProgressBar {
+pub fn progress(length: usize, what: impl Into<Cow<'static, str>>, quiet: bool) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }

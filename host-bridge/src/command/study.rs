@@ -1,0 +1,39 @@
+//! `orbitcal study`: the published studies of a recording, as one report.
+
+use inference::study::{self, Options, StudyError};
+
+use super::{CommandError, machine, progress, recording};
+use crate::cli::Study;
+use crate::output;
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Study) -> Result<(), CommandError> {
+    let ring = machine(options.common.machine.as_deref())?;
+    let recording = recording(&options.recording, &ring)?;
+    let bar = progress(1, "", options.common.quiet);
+    let mut report = |what: &str, done: usize, total: usize| {
+        bar.set_message(what.to_owned());
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+    };
+    let made = study::run(&ring, &recording, Options { nuts: options.sampling.into() }, &mut report);
+    bar.finish_and_clear();
+    let made = made.map_err(|error| match error {
+        StudyError::Readings(error) => error.into(),
+        StudyError::Stream(error) => error.into(),
+        error @ StudyError::NoPairs { .. } => CommandError::Input(error.to_string()),
+        error => CommandError::Other(format!("{}: {error}", recording.name)),
+    })?;
+    let written = made.page.write(&options.report);
+    written.map_err(|error| CommandError::Other(format!("{}: {error}", options.report.display())))?;
+    if let Some(path) = &options.common.json {
+        output::json(path, &made.numbers)?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        println!("{}\n\n{}", made.page.lead, options.report.display());
+    }
+    Ok(())
+}
