@@ -1,5 +1,7 @@
-//! Offline science of orbitcal: recordings on disk, their frames, and the exact batch answer.
+//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, and how far to trust drawn
+//! chains.
 
+pub mod diagnostics;
 pub mod map;
 pub mod recording;
 pub mod stream;
