@@ -1,4 +1,5 @@
-//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, and reports on paper.
+//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, the NUTS reference, and the
+//! published studies as reports.
 
 mod cmdstan;
 pub mod diagnostics;

@@ -1,0 +1,61 @@
+//! Convergence diagnostics against ArviZ 0.23, on chains that have one fault each (`tests/peers/arviz_diagnostics.py`).
+
+use inference::diagnostics::mcse_sd;
+use inference::{Draws, Summary};
+use system_tests::repository;
+
+/// Sums in another order, and ArviZ's autocovariance by FFT; the largest measured is 3e-13, of a quantity that is small
+/// against its mean.
+const ROUNDING: f64 = 1e-11;
+
+/// What ArviZ says of a quantity: name, then `r_hat`, `ess_bulk`, `ess_tail`, `mcse_mean` and `mcse_sd`.
+type Answer = (String, [f64; 5]);
+
+fn draws() -> Draws {
+    Draws::read(&repository("tests/golden/draws")).unwrap()
+}
+
+fn answers() -> Vec<Answer> {
+    let text = std::fs::read_to_string(repository("tests/golden/arviz.csv")).unwrap();
+    let answer = |line: &str| {
+        let (name, figures) = line.split_once(',').unwrap();
+        let figures: Vec<f64> = figures.split(',').map(|figure| figure.parse().unwrap()).collect();
+        (name.to_owned(), figures.try_into().unwrap())
+    };
+    text.lines().skip(1).map(answer).collect()
+}
+
+fn ours(draws: &Draws, index: usize, summary: &Summary) -> Answer {
+    let Summary { name, r_hat, ess_bulk, ess_tail, mcse_mean, .. } = summary;
+    (name.clone(), [*r_hat, *ess_bulk, *ess_tail, *mcse_mean, mcse_sd(&draws.quantity(index))])
+}
+
+#[test]
+fn diagnostics_are_those_of_arviz() {
+    let draws = draws();
+    let ours =
+        draws.summary().iter().enumerate().map(|(index, summary)| ours(&draws, index, summary)).collect::<Vec<_>>();
+    let theirs = answers();
+    assert_eq!(ours.len(), theirs.len());
+    for ((name, ours), (their_name, theirs)) in ours.iter().zip(&theirs) {
+        assert_eq!(name, their_name);
+        let error = ours.iter().zip(theirs).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max);
+        assert!(error < ROUNDING, "{name}: off by {error:.1e}, allowed {ROUNDING:.0e}: {ours:?}, ArviZ {theirs:?}");
+    }
+}
+
+#[test]
+fn statistics_of_the_sampler_are_read() {
+    let draws = draws();
+    assert_eq!((draws.chains.len(), draws.divergences()), (4, 1));
+    assert!(draws.chains[3].stats[100].divergent);
+    let doublings = |chain: &inference::Chain| chain.stats.iter().all(|stats| stats.leapfrogs + 1 == 1 << stats.depth);
+    assert!(draws.chains.iter().all(doublings));
+}
+
+#[test]
+fn every_fault_is_found_where_it_is() {
+    let draws = draws();
+    let found = draws.summary().into_iter().filter(|summary| summary.r_hat > 1.01).map(|summary| summary.name);
+    assert_eq!(found.collect::<Vec<_>>(), ["slow", "shifted", "wide"]);
+}
