@@ -10,6 +10,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
+use nalgebra::DVector;
 use nuts_rs::{
     CpuLogpFunc, CpuMath, CpuMathError, DiagNutsSettings, HasDims, HashMapConfig, HashMapResult, HashMapValue,
     InitPositionError, LogpError, Model, Sampler, SamplerWaitResult,

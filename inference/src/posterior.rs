@@ -3,9 +3,11 @@
 //! `ln p(theta) = -chi2(theta)/2 + ln prior(theta)`, `theta = ln var` within `ln 0.94 .. ln 1.06`, up to a constant. A
 //! sampler sees it in coordinates without bounds, whitened by the Laplace covariance:
 //!
-//! `theta = lower + (upper - lower)/(1 + exp(-u))`, `u = u_MAP + L z`, `L L^T` the covariance of u,
+//! `theta = lower + t softplus((u - lower)/t) - t softplus((u - upper)/t)`, `u = u_MAP + L z`, `L L^T` the covariance of u,
 //!
-//! with the Jacobian of the first map in the density.
+//! with the Jacobian of the first map in the density. Where a bound is more than a few `t` away, `u` is `theta` itself, so
+//! that a posterior that is normal in theta is normal in u. A logistic map of the whole range bends everywhere: on a var at
+//! 0.958 it cost half of the effective draws.
 
 use nalgebra::{DMatrix, DVector};
 use twin::OrbitError;
@@ -186,31 +188,56 @@ struct Bounded {
     log_curvature: f64,
 }
 
+/// Distance from a bound within which the map bends [ln var].
+const BEND: f64 = 0.003;
+
 impl Bounded {
+    /// `slope = s_l (1 - s_u) (1 - e^(-(upper - lower)/t))`, `s` the logistic functions of the distances from both bounds.
     fn at(u: f64) -> Self {
-        let [lower, upper] = RANGE.map(f64::ln);
-        let share = 1.0 / (1.0 + (-u).exp());
-        let both = share * (1.0 - share);
+        let [lower, upper] = bounds();
+        let [above_lower, above_upper] = [logistic((u - lower) / BEND), logistic((u - upper) / BEND)];
+        let [below_lower, below_upper] = [logistic((lower - u) / BEND), logistic((upper - u) / BEND)];
+        let log_slope_slope = (below_lower - above_upper) / BEND;
+        let slope = above_lower * below_upper * -(-(upper - lower) / BEND).exp_m1();
         Self {
-            slope: (upper - lower) * both,
-            bend: (upper - lower) * both * (1.0 - 2.0 * share),
-            log_slope_slope: 1.0 - 2.0 * share,
-            log_curvature: 2.0 * both,
+            slope,
+            bend: slope * log_slope_slope,
+            log_slope_slope,
+            log_curvature: (above_lower * below_lower + above_upper * below_upper) / (BEND * BEND),
         }
     }
 }
 
+fn bounds() -> [f64; 2] {
+    RANGE.map(f64::ln)
+}
+
+fn logistic(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+/// `ln(1 + e^x)`.
+fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
 /// Params of coordinates without bounds.
 pub fn params_of(u: &[f64]) -> Vec<f64> {
-    let [lower, upper] = RANGE.map(f64::ln);
-    u.iter().map(|u| lower + (upper - lower) / (1.0 + (-u).exp())).collect()
+    let [lower, upper] = bounds();
+    u.iter().map(|u| lower + BEND * (softplus((u - lower) / BEND) - softplus((u - upper) / BEND))).collect()
 }
 
 /// Coordinates without bounds of params; a param at a bound is taken a thousandth of the range inside.
 pub(crate) fn unbounded_of(params: &[f64]) -> DVector<f64> {
-    let [lower, upper] = RANGE.map(f64::ln);
-    let share = |theta: &f64| ((theta - lower) / (upper - lower)).clamp(1e-3, 1.0 - 1e-3);
-    DVector::from_iterator(params.len(), params.iter().map(share).map(|share| (share / (1.0 - share)).ln()))
+    let [lower, upper] = bounds();
+    let room = 1e-3 * (upper - lower);
+    let one = |theta: &f64| {
+        let theta = theta.clamp(lower + room, upper - room);
+        // of `e = (1 + a)/(1 + a q)` for `a`, `e` and `q` the exponentials of the distances from lower of theta and upper
+        let e = ((theta - lower) / BEND).exp_m1();
+        lower + BEND * (e / -((theta - upper) / BEND).exp_m1()).ln()
+    };
+    DVector::from_iterator(params.len(), params.iter().map(one))
 }
 
 impl Laplace {
@@ -231,18 +258,18 @@ mod tests {
 
     #[test]
     fn coordinates_without_bounds_are_those_of_the_params() {
-        let params = [-0.05, -0.01, 0.0, 0.03, 0.055];
+        let params = [-0.0605, -0.05, -0.01, 0.0, 0.03, 0.055];
         let u = unbounded_of(&params);
         for (i, (theta, back)) in params.iter().zip(params_of(u.as_slice())).enumerate() {
-            assert!((theta - back).abs() < 1e-15);
-            let (h, bound) = (1e-5, Bounded::at(u[i]));
-            let (up, down) = (params_of(&[u[i] + h])[0], params_of(&[u[i] - h])[0]);
-            assert!(((up - down) / (2.0 * h) / bound.slope - 1.0).abs() < 1e-8);
-            assert!(((up - 2.0 * theta + down) / (h * h) - bound.bend).abs() < 1e-6 * bound.slope.max(1e-3) + 1e-7);
+            assert!((theta - back).abs() < 1e-14);
+            let (h, bound) = (1e-7, Bounded::at(u[i]));
             let (above, below) = (Bounded::at(u[i] + h), Bounded::at(u[i] - h));
-            assert!(((above.slope.ln() - below.slope.ln()) / (2.0 * h) - bound.log_slope_slope).abs() < 1e-8);
+            let (up, down) = (params_of(&[u[i] + h])[0], params_of(&[u[i] - h])[0]);
+            assert!(((up - down) / (2.0 * h) / bound.slope - 1.0).abs() < 1e-7);
+            assert!(((above.slope - below.slope) / (2.0 * h) - bound.bend).abs() < 1e-6 / BEND);
+            assert!(((above.slope.ln() - below.slope.ln()) / (2.0 * h) - bound.log_slope_slope).abs() < 1e-6 / BEND);
             let curvature = -(above.log_slope_slope - below.log_slope_slope) / (2.0 * h);
-            assert!((curvature - bound.log_curvature).abs() < 1e-8);
+            assert!((curvature - bound.log_curvature).abs() < 1e-6 / (BEND * BEND));
         }
     }
 
