@@ -110,12 +110,21 @@ impl<'m> Device<'m> {
             Ok(Request::Restart(setup)) => self.restart(setup, reply),
             Ok(Request::ForgetSequence) => {
                 self.core.forget_sequence();
-                reply(&Reply::SequenceForgotten);
+                say(|| Reply::SequenceForgotten, reply);
             }
             Ok(Request::Covariance) => self.wants_covariance = true,
-            Ok(Request::Status) => reply(&Reply::Status(self.status(vitals()))),
-            Ok(Request::Model(parcel)) => reply(&Reply::Model(self.load(&parcel))),
-            Ok(Request::BuiltIn) => reply(&Reply::Model(self.go_back())),
+            Ok(Request::Status) => {
+                let status = self.status(vitals());
+                say(|| Reply::Status(status), reply);
+            }
+            Ok(Request::Model(parcel)) => {
+                let taken = self.load(&parcel);
+                say(|| Reply::Model(taken), reply);
+            }
+            Ok(Request::BuiltIn) => {
+                let taken = self.go_back();
+                say(|| Reply::Model(taken), reply);
+            }
             Err(error) => self.refuse(error, reply),
         }
     }
@@ -130,13 +139,13 @@ impl<'m> Device<'m> {
         if began.is_err() && self.contents == Contents::InUse {
             // not the setup's fault: the tables that came over the wire have no design, those in flash do
             self.contents = Contents::Nothing;
-            reply(&Reply::Model(Err(ParcelError::Unstable)));
+            say(|| Reply::Model(Err(ParcelError::Unstable)), reply);
             began = self.begin(&setup);
         }
         // a core that has not begun has lost its posterior: it waits for a setup again
         self.setup = began.is_ok().then_some(setup);
         match began {
-            Ok(()) => reply(&Reply::Restarted),
+            Ok(()) => say(|| Reply::Restarted, reply),
             Err(Unstable) => self.refuse(Refusal::NoDesign, reply),
         }
     }
@@ -200,6 +209,13 @@ impl<'m> Device<'m> {
             degrees_of_freedom: quality.map_or(0.0, |q| q.degrees_of_freedom),
         }
     }
+}
+
+/// Say something. Not inlined: room for a reply is more than a kilobyte, which is not to lie on the stack while the core
+/// goes over to other tables.
+#[inline(never)]
+fn say(what: impl FnOnce() -> Reply, reply: &mut impl FnMut(&Reply)) {
+    reply(&what());
 }
 
 /// The tables in use.
