@@ -3,7 +3,7 @@
 //! Each answer is a function of its own, not inlined, so that the stack holds the buffers of one of them at a time.
 
 use estimator::booster::{Estimate, Estimator, Green};
-use estimator::surrogate::{Parcel, ParcelError};
+use estimator::surrogate::{Parcel, ParcelError, Unstable};
 use estimator::{Model, Setup, packet};
 use heapless::Vec;
 
@@ -39,7 +39,13 @@ impl<'m> Device<'m> {
     }
 
     /// Take a packet in; `reply` hears what there is to say, the answer to a frame first. Returns that answer.
-    pub fn hear(&mut self, bytes: &mut [u8], vitals: Vitals, reply: &mut impl FnMut(&Reply)) -> Option<Estimate> {
+    /// `vitals` is asked if the packet asks for the status.
+    pub fn hear(
+        &mut self,
+        bytes: &mut [u8],
+        vitals: impl FnOnce() -> Vitals,
+        reply: &mut impl FnMut(&Reply),
+    ) -> Option<Estimate> {
         if packet::kind(bytes) == Some(REQUEST) {
             self.obey(bytes, vitals, reply);
             return None;
@@ -99,30 +105,53 @@ impl<'m> Device<'m> {
     }
 
     #[inline(never)]
-    fn obey(&mut self, bytes: &mut [u8], vitals: Vitals, reply: &mut impl FnMut(&Reply)) {
+    fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(&Reply)) {
         match packet::unseal::<Request>(REQUEST, bytes) {
             Ok(Request::Restart(setup)) => self.restart(setup, reply),
             Ok(Request::ForgetSequence) => {
                 self.core.forget_sequence();
-                reply(&Reply::SequenceForgotten);
+                say(|| Reply::SequenceForgotten, reply);
             }
             Ok(Request::Covariance) => self.wants_covariance = true,
-            Ok(Request::Status) => reply(&Reply::Status(self.status(vitals))),
-            Ok(Request::Model(parcel)) => reply(&Reply::Model(self.load(&parcel))),
-            Ok(Request::BuiltIn) => reply(&Reply::Model(self.go_back())),
+            Ok(Request::Status) => {
+                let status = self.status(vitals());
+                say(|| Reply::Status(status), reply);
+            }
+            Ok(Request::Model(parcel)) => {
+                let taken = self.load(&parcel);
+                say(|| Reply::Model(taken), reply);
+            }
+            Ok(Request::BuiltIn) => {
+                let taken = self.go_back();
+                say(|| Reply::Model(taken), reply);
+            }
             Err(error) => self.refuse(error, reply),
         }
     }
 
     #[inline(never)]
     fn restart(&mut self, setup: Setup, reply: &mut impl FnMut(&Reply)) {
-        let model = Model { surrogate: tables(self.contents, self.built_in, self.slot), setup: &setup };
-        if !setup.is_sound() || self.core.restart(&model).is_err() {
+        if !setup.is_sound() {
             self.refuse(Refusal::Setup, reply);
             return;
         }
-        self.setup = Some(setup);
-        reply(&Reply::Restarted);
+        let mut began = self.begin(&setup);
+        if began.is_err() && self.contents == Contents::InUse {
+            // not the setup's fault: the tables that came over the wire have no design, those in flash do
+            self.contents = Contents::Nothing;
+            say(|| Reply::Model(Err(ParcelError::Unstable)), reply);
+            began = self.begin(&setup);
+        }
+        // a core that has not begun has lost its posterior: it waits for a setup again
+        self.setup = began.is_ok().then_some(setup);
+        match began {
+            Ok(()) => say(|| Reply::Restarted, reply),
+            Err(Unstable) => self.refuse(Refusal::NoDesign, reply),
+        }
+    }
+
+    fn begin(&mut self, setup: &Setup) -> Result<(), Unstable> {
+        self.core.restart(&Model { surrogate: tables(self.contents, self.built_in, self.slot), setup })
     }
 
     /// Write a part of new tables into the slot; with the last one they are put in use.
@@ -155,10 +184,14 @@ impl<'m> Device<'m> {
 
     #[inline(never)]
     fn go_back(&mut self) -> Result<Taken, ParcelError> {
-        let was = core::mem::replace(&mut self.contents, Contents::Nothing);
-        if let (Contents::InUse, Some(setup)) = (was, &self.setup) {
-            self.core.adopt(&Model { surrogate: self.built_in, setup }).map_err(|_| ParcelError::Unstable)?;
+        if let (Contents::InUse, Some(setup)) = (self.contents, &self.setup)
+            && self.core.adopt(&Model { surrogate: self.built_in, setup }).is_err()
+        {
+            // the tables in the slot have described all frames so far, so they can again
+            let _ = self.core.adopt(&Model { surrogate: &*self.slot, setup });
+            return Err(ParcelError::Unstable);
         }
+        self.contents = Contents::Nothing;
         Ok(Taken::BuiltIn)
     }
 
@@ -176,6 +209,13 @@ impl<'m> Device<'m> {
             degrees_of_freedom: quality.map_or(0.0, |q| q.degrees_of_freedom),
         }
     }
+}
+
+/// Say something. Not inlined: room for a reply is more than a kilobyte, which is not to lie on the stack while the core
+/// goes over to other tables.
+#[inline(never)]
+fn say(what: impl FnOnce() -> Reply, reply: &mut impl FnMut(&Reply)) {
+    reply(&what());
 }
 
 /// The tables in use.

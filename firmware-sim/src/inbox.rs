@@ -15,9 +15,9 @@ pub struct Inbox {
     length: usize,
     /// More came than any packet has; what follows up to the next zero is dropped.
     overflown: bool,
-    /// Cycles since the last byte.
+    /// Ticks of the cycle since the last byte.
     silence: u32,
-    /// Cycles in which nothing came, since power-on.
+    /// Whole cycles in which nothing came, since power-on.
     silent_cycles: u32,
 }
 
@@ -41,7 +41,7 @@ impl Default for Inbox {
 }
 
 impl Inbox {
-    /// Cycles in which nothing came, since power-on.
+    /// Whole cycles, from tick to tick, in which nothing came, since power-on.
     pub fn silent_cycles(&self) -> u32 {
         self.silent_cycles
     }
@@ -60,18 +60,17 @@ impl Inbox {
                 Err(error) if error.kind() == ErrorKind::TimedOut => return Ok(self.wait()),
                 Err(error) => return Err(error),
             }
-            match (byte, self.overflown) {
-                ([0], true) => {
-                    (self.length, self.overflown) = (0, false);
-                    return Ok(Event::Broken(Refusal::Oversized));
-                }
-                ([0], false) if self.length > 0 => {
-                    self.push(0);
+            match byte {
+                [0] if self.length > 0 => {
+                    self.push(0); // for which there may be no room either
                     let length = core::mem::take(&mut self.length);
+                    if core::mem::take(&mut self.overflown) {
+                        return Ok(Event::Broken(Refusal::Oversized));
+                    }
                     return Ok(Event::Packet(self.bytes.get_mut(..length).unwrap_or_default()));
                 }
-                ([0], false) | (_, true) => {} // an empty packet is no packet: a sender may begin with a zero
-                ([other], false) => self.push(other),
+                [0] => {} // an empty packet is no packet: a sender may begin with a zero
+                [other] => self.push(other),
             }
         }
         Ok(Event::Silence)
@@ -85,9 +84,10 @@ impl Inbox {
     }
 
     fn wait(&mut self) -> Event<'static> {
+        // the first tick after a byte ends a cycle in which that came
+        self.silent_cycles = self.silent_cycles.saturating_add(u32::from(self.silence > 0));
         self.silence = self.silence.saturating_add(1);
-        self.silent_cycles = self.silent_cycles.saturating_add(1);
-        if self.silence < PATIENCE || (self.length == 0 && !self.overflown) {
+        if self.silence < PATIENCE || self.length == 0 {
             return Event::Silence;
         }
         (self.length, self.overflown) = (0, false);
@@ -129,13 +129,18 @@ mod tests {
     }
 
     #[test]
-    fn a_packet_that_does_not_end_is_dropped_up_to_the_next_zero() {
-        let mut script = [Some(1); packet::MAX_WIRE_BYTES + 10];
-        script[packet::MAX_WIRE_BYTES + 5] = Some(0);
-        script[packet::MAX_WIRE_BYTES + 7] = Some(0);
-        let (mut source, mut inbox) = (Script(&script), Inbox::default());
-        assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Oversized)));
-        assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [1, 0])));
+    fn a_packet_that_is_too_long_does_not_spoil_the_one_after() {
+        const MOST: usize = packet::MAX_WIRE_BYTES;
+        for length in [MOST - 1, MOST, MOST + 1, MOST + 9] {
+            let mut script = [Some(1); MOST + 12];
+            (script[length], script[length + 2]) = (Some(0), Some(0));
+            let (mut source, mut inbox) = (Script(&script), Inbox::default());
+            match inbox.next(&mut source) {
+                Ok(Event::Packet(bytes)) => assert_eq!((bytes.len(), bytes.last()), (MOST, Some(&0)), "{length} bytes"),
+                other => assert_eq!((other, length >= MOST), (Ok(Event::Broken(Refusal::Oversized)), true), "{length}"),
+            }
+            assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [1, 0])), "after {length} bytes");
+        }
     }
 
     #[test]
@@ -157,6 +162,14 @@ mod tests {
         assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Stalled)));
         assert_eq!(inbox.next(&mut source), Ok(Event::Silence), "nothing is waiting any more");
         assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [7, 0])));
-        assert_eq!(inbox.silent_cycles(), 4);
+        assert_eq!(inbox.silent_cycles(), 2, "of two ticks after a byte and of three");
+    }
+
+    #[test]
+    fn a_stream_of_a_packet_a_cycle_has_no_silent_cycle() {
+        let script = [Some(5), Some(0), None].repeat(20);
+        let (mut source, mut inbox) = (Script(&script), Inbox::default());
+        while inbox.next(&mut source) != Ok(Event::End) {}
+        assert_eq!(inbox.silent_cycles(), 0);
     }
 }

@@ -49,7 +49,7 @@ pub enum Reply {
         /// The entries.
         entries: Vec<f32, PIECE>,
     },
-    /// A packet was refused; the posterior is as it was.
+    /// A packet was refused; the posterior is as it was, except after [`Refusal::NoDesign`].
     Refused {
         /// Why.
         why: Refusal,
@@ -60,7 +60,7 @@ pub enum Reply {
     Restarted,
     /// The next frame may have any number.
     SequenceForgotten,
-    /// A part of new tables was taken, or not.
+    /// A part of new tables was taken, or not; or tables in use have no design, and those in flash are in use from a restart on.
     Model(Result<Taken, ParcelError>),
     /// How the device is.
     Status(Status),
@@ -93,10 +93,12 @@ pub enum Refusal {
     OutOfOrder,
     Beyond,
     NotStarted,
-    /// A setup with a number that is none, or a ring without a design.
+    /// A setup with a number that is none, or a size that is not positive.
     Setup,
     /// The rest of it did not come within two cycles.
     Stalled,
+    /// A setup for tables in flash that have no design; there is no posterior any more.
+    NoDesign,
 }
 
 impl From<FrameError> for Refusal {
@@ -133,7 +135,7 @@ pub struct Vitals {
     pub lost_bytes: u32,
     /// Machine cycles since power-on.
     pub cycles: u32,
-    /// Cycles in which nothing came.
+    /// Whole cycles in which nothing came.
     pub silent_cycles: u32,
     /// Most stack used so far [bytes].
     pub stack_bytes: u32,

@@ -12,7 +12,7 @@ use crate::panel::Panel;
 /// Run until the source ends.
 ///
 /// `source` reports [`embedded_io::ErrorKind::TimedOut`] once a machine cycle while nothing comes; `vitals` asks the board
-/// how it is.
+/// how it is, when a host asks for that.
 ///
 /// # Errors
 /// What the source or the sink report.
@@ -35,7 +35,7 @@ pub fn run<R: Read, W: Write<Error = R::Error>>(
         };
         let refused = device.refused();
         let answer = match event {
-            Event::Packet(bytes) => device.hear(bytes, Vitals { silent_cycles, ..vitals() }, &mut reply),
+            Event::Packet(bytes) => device.hear(bytes, || Vitals { silent_cycles, ..vitals() }, &mut reply),
             Event::Broken(why) => {
                 device.refuse(why, &mut reply);
                 None

@@ -6,6 +6,7 @@ use core::time::Duration;
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
+use std::time::Instant;
 
 use estimator::booster::Green;
 use estimator::surrogate::ParcelError;
@@ -13,8 +14,12 @@ use estimator::{FrameError, Setup, packet};
 use firmware_sim::link::{Refusal, Reply, Request, Status, TRIANGLE, Taken};
 use inference::stream::BoosterEstimate;
 
-/// Longest silence while an answer is due.
+/// Longest wait for an answer that is due, and for a device to take bytes.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// Longest wait for an estimate that nobody here has asked for: five cycles.
+const LULL: Duration = Duration::from_secs(1);
+/// Longest read or write of a line; then the time is looked at.
+const GLANCE: Duration = Duration::from_millis(200);
 /// Rate of a serial line where none is given [baud].
 const BAUD: u32 = 921_600;
 
@@ -73,9 +78,21 @@ pub enum LinkError {
         /// Why.
         error: io::Error,
     },
-    /// The line broke, or nothing came while an answer was due.
+    /// The line broke.
     #[error("the device's line: {0}")]
-    Line(#[from] io::Error),
+    Line(io::Error),
+    /// What was due did not come.
+    #[error("the device has not said what was due for {seconds} s")]
+    Silent {
+        /// How long it was waited for.
+        seconds: u64,
+    },
+    /// The line takes no bytes.
+    #[error("the device has taken no bytes for {seconds} s")]
+    Stuck {
+        /// How long it was waited for.
+        seconds: u64,
+    },
     /// The device has gone.
     #[error("the device has closed its line")]
     Closed,
@@ -103,7 +120,7 @@ pub enum LinkError {
     Tables(ParcelError),
 }
 
-/// An estimate of a device, with the covariance if that was asked for.
+/// An estimate of a device, with the covariance if that followed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Heard {
     /// The estimate.
@@ -112,12 +129,39 @@ pub struct Heard {
     pub covariance: Option<Box<[f32; TRIANGLE]>>,
 }
 
-impl LinkError {
-    /// True if the line is sound, and only nothing came.
-    pub fn is_silence(&self) -> bool {
-        let silent = |error: &io::Error| matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut);
-        matches!(self, Self::Line(error) if silent(error))
+/// An estimate whose covariance may follow.
+struct Coming {
+    estimate: BoosterEstimate,
+    covariance: Box<[f32; TRIANGLE]>,
+    /// Entries of it that are there.
+    place: usize,
+}
+
+impl Coming {
+    fn new(estimate: BoosterEstimate) -> Self {
+        Self { estimate, covariance: Box::new([0.0; TRIANGLE]), place: 0 }
     }
+
+    /// Take a piece of a covariance, if it is the next one of this estimate's.
+    fn add(&mut self, sequence: u32, first: u16, entries: &[f32]) {
+        if sequence == self.estimate.sequence && usize::from(first) == self.place {
+            let room = self.covariance.iter_mut().skip(self.place);
+            self.place += room.zip(entries).map(|(to, entry)| *to = *entry).count();
+        }
+    }
+
+    /// What has come: the estimate, and its covariance if that is whole.
+    fn heard(self) -> Heard {
+        let is_whole = self.place == TRIANGLE;
+        Heard { estimate: self.estimate, covariance: is_whole.then_some(self.covariance) }
+    }
+}
+
+/// What a line brings.
+enum Event {
+    Heard(Heard),
+    /// A reply that is no part of an estimate.
+    Other(Reply),
 }
 
 impl Heard {
@@ -137,6 +181,7 @@ impl<L: Read + Write> Line for L {}
 pub struct Link<L> {
     line: L,
     received: Vec<u8>,
+    coming: Option<Coming>,
 }
 
 impl Link<Box<dyn Line>> {
@@ -155,22 +200,24 @@ fn connect(source: &Source) -> io::Result<Box<dyn Line>> {
         Source::Tcp(address) => {
             let line = TcpStream::connect(address)?;
             line.set_nodelay(true)?;
-            line.set_read_timeout(Some(PATIENCE))?;
+            line.set_read_timeout(Some(GLANCE))?;
+            line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
         Source::Unix(path) => {
             let line = UnixStream::connect(path)?;
-            line.set_read_timeout(Some(PATIENCE))?;
+            line.set_read_timeout(Some(GLANCE))?;
+            line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
-        Source::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(PATIENCE).open()?),
+        Source::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
     })
 }
 
 impl<L: Read + Write> Link<L> {
-    /// A device on a line that is open already.
+    /// A device on a line that is open already. A read of it is to time out now and then, or nothing here ends.
     pub fn new(line: L) -> Self {
-        Self { line, received: Vec::new() }
+        Self { line, received: Vec::new(), coming: None }
     }
 
     /// Let the device begin at the prior.
@@ -181,13 +228,17 @@ impl<L: Read + Write> Link<L> {
         // a zero first: half a packet of somebody before us may be waiting
         self.write(&[0])?;
         self.send(&Request::Restart(*setup))?;
+        self.coming = None;
+        let deadline = Instant::now() + PATIENCE;
         loop {
-            match self.next()? {
-                Reply::Restarted => return Ok(()),
-                Reply::Refused { why: Refusal::Setup, .. } => {
-                    return Err(LinkError::Refused { what: "its setup", why: Refusal::Setup });
+            match self.next_before(deadline, PATIENCE) {
+                Ok(Reply::Restarted) => return Ok(()),
+                Ok(Reply::Refused { why: why @ (Refusal::Setup | Refusal::NoDesign), .. }) => {
+                    return Err(LinkError::Refused { what: "its setup", why });
                 }
-                _ => {} // answers to somebody before us
+                // answers to somebody before us, and the half of one that was on its way when the line was opened
+                Ok(_) | Err(LinkError::Reply(_)) => {}
+                Err(error) => return Err(error),
             }
         }
     }
@@ -199,37 +250,58 @@ impl<L: Read + Write> Link<L> {
     pub fn ingest(&mut self, wire: &[u8]) -> Result<Heard, LinkError> {
         self.send(&Request::Covariance)?;
         self.write(wire)?;
-        self.listen()
+        match self.gather(Instant::now() + PATIENCE, PATIENCE)? {
+            Event::Heard(heard @ Heard { covariance: Some(_), .. }) => Ok(heard),
+            Event::Heard(Heard { estimate, .. }) => Err(LinkError::Unexpected {
+                expected: "an estimate and its covariance",
+                found: format!("only the estimate of frame {}", estimate.sequence),
+            }),
+            Event::Other(Reply::Refused { why, .. }) => Err(LinkError::Refused { what: "a frame", why }),
+            Event::Other(other) => Err(unexpected("an estimate", &other)),
+        }
     }
 
-    /// Wait for an estimate, and for its covariance if that follows.
+    /// Wait a second for an estimate of a frame that somebody else has sent, and for its covariance if that follows. One
+    /// whose covariance does not follow, or not whole, is heard with the next reply or after that second.
     ///
     /// # Errors
-    /// [`LinkError`].
+    /// [`LinkError`]; after [`LinkError::Silent`], [`LinkError::Refused`] and [`LinkError::Reply`] the next estimate can be
+    /// waited for.
     pub fn listen(&mut self) -> Result<Heard, LinkError> {
-        let estimate = |reply| match reply {
-            Reply::Estimate(answer) => answer.estimate().ok_or(LinkError::Reply(FrameError::Malformed)),
-            Reply::Refused { why, .. } => Err(LinkError::Refused { what: "a frame", why }),
-            other => Err(unexpected("an estimate", &other)),
-        };
-        let mut estimate_so_far = estimate(self.next()?)?;
-        let mut covariance = Box::new([0.0; TRIANGLE]);
-        let mut place = 0;
-        while place < TRIANGLE {
-            match self.next()? {
-                Reply::Covariance { sequence, first, entries }
-                    if sequence == estimate_so_far.sequence && usize::from(first) == place && !entries.is_empty() =>
-                {
-                    let room = covariance.iter_mut().skip(place);
-                    room.zip(&entries).for_each(|(to, entry)| *to = *entry);
-                    place += entries.len();
-                }
-                // the frame of that estimate came before the request: the covariance follows this one
-                newer if place == 0 => estimate_so_far = estimate(newer)?,
-                other => return Err(unexpected("the rest of a covariance", &other)),
+        let deadline = Instant::now() + LULL;
+        loop {
+            match self.gather(deadline, LULL)? {
+                Event::Heard(heard) => return Ok(heard),
+                Event::Other(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "a packet", why }),
+                Event::Other(_) => {} // an answer to somebody else
             }
         }
-        Ok(Heard { estimate: estimate_so_far, covariance: Some(covariance) })
+    }
+
+    /// Wait for an estimate, and for its covariance, which follows at once if at all; or for another reply.
+    fn gather(&mut self, deadline: Instant, patience: Duration) -> Result<Event, LinkError> {
+        loop {
+            match self.next_before(deadline, patience) {
+                Ok(Reply::Estimate(answer)) => {
+                    let estimate = answer.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
+                    if let Some(former) = self.coming.replace(Coming::new(estimate)) {
+                        return Ok(Event::Heard(former.heard()));
+                    }
+                }
+                Ok(Reply::Covariance { sequence, first, entries }) => {
+                    if let Some(coming) = &mut self.coming {
+                        coming.add(sequence, first, &entries);
+                    }
+                    if let Some(whole) = self.coming.take_if(|coming| coming.place == TRIANGLE) {
+                        return Ok(Event::Heard(whole.heard()));
+                    }
+                }
+                Ok(other) => return Ok(Event::Other(other)),
+                Err(error @ LinkError::Reply(_)) => return Err(error),
+                // no more will come of it
+                Err(error) => return self.coming.take().map(|coming| Event::Heard(coming.heard())).ok_or(error),
+            }
+        }
     }
 
     /// How the device is.
@@ -270,10 +342,20 @@ impl<L: Read + Write> Link<L> {
     /// Send bytes as they are.
     ///
     /// # Errors
-    /// [`LinkError::Line`].
+    /// [`LinkError::Line`] or [`LinkError::Stuck`].
     pub fn write(&mut self, bytes: &[u8]) -> Result<(), LinkError> {
-        self.line.write_all(bytes)?;
-        Ok(self.line.flush()?)
+        // not flushed: that waits until a serial line has sent all, which one that was pulled out never does
+        let (mut rest, deadline) = (bytes, Instant::now() + PATIENCE);
+        while !rest.is_empty() {
+            match self.line.write(rest) {
+                Ok(0) => return Err(LinkError::Closed),
+                Ok(n) => rest = &rest[n..],
+                Err(error) if !is_lull(&error) => return Err(broken(error)),
+                Err(_) if Instant::now() >= deadline => return Err(LinkError::Stuck { seconds: PATIENCE.as_secs() }),
+                Err(_) => {}
+            }
+        }
+        Ok(())
     }
 
     /// Send a request.
@@ -292,6 +374,11 @@ impl<L: Read + Write> Link<L> {
     /// [`LinkError`].
     #[allow(clippy::should_implement_trait)] // an iterator that ends with the first error would hide it
     pub fn next(&mut self) -> Result<Reply, LinkError> {
+        self.next_before(Instant::now() + PATIENCE, PATIENCE)
+    }
+
+    /// Wait for the next reply until a deadline, after some `patience`.
+    fn next_before(&mut self, deadline: Instant, patience: Duration) -> Result<Reply, LinkError> {
         loop {
             if let Some(end) = self.received.iter().position(|byte| *byte == 0) {
                 let mut packet: Vec<u8> = self.received.drain(..=end).collect();
@@ -300,15 +387,35 @@ impl<L: Read + Write> Link<L> {
                 }
                 continue;
             }
+            let got = self.received.len();
+            if got > packet::MAX_WIRE_BYTES {
+                self.received.clear();
+                return Err(FrameError::Oversized { limit: packet::MAX_WIRE_BYTES, got }.into());
+            }
+            if Instant::now() >= deadline {
+                return Err(LinkError::Silent { seconds: patience.as_secs() });
+            }
             let mut bytes = [0; 4096];
             match self.line.read(&mut bytes) {
                 Ok(0) => return Err(LinkError::Closed),
                 Ok(n) => self.received.extend_from_slice(&bytes[..n]),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(error.into()),
+                Err(error) if is_lull(&error) => {}
+                Err(error) => return Err(broken(error)),
             }
         }
     }
+}
+
+/// True if no byte could be read or written, and the next one may be.
+fn is_lull(error: &io::Error) -> bool {
+    use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
+    matches!(error.kind(), Interrupted | TimedOut | WouldBlock)
+}
+
+/// Why a line is of no more use.
+fn broken(error: io::Error) -> LinkError {
+    use io::ErrorKind::{BrokenPipe, ConnectionReset};
+    if matches!(error.kind(), BrokenPipe | ConnectionReset) { LinkError::Closed } else { LinkError::Line(error) }
 }
 
 fn unexpected(expected: &'static str, found: &Reply) -> LinkError {
@@ -318,6 +425,56 @@ fn unexpected(expected: &'static str, found: &Reply) -> LinkError {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn pair() -> (Link<UnixStream>, UnixStream) {
+        let (line, device) = UnixStream::pair().unwrap();
+        line.set_read_timeout(Some(GLANCE)).unwrap();
+        (Link::new(line), device)
+    }
+
+    fn sealed(reply: &Reply) -> Vec<u8> {
+        let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+        let n = reply.encode(&mut bytes).unwrap();
+        bytes.truncate(n);
+        bytes
+    }
+
+    #[test]
+    fn a_silent_device_is_named() {
+        let (mut link, device) = pair();
+        let error = link.listen().unwrap_err();
+        assert_eq!(error.to_string(), "the device has not said what was due for 1 s");
+        drop(device);
+        assert!(matches!(link.listen(), Err(LinkError::Closed)));
+    }
+
+    #[test]
+    fn others_who_talk_do_not_hold_up_a_deadline() {
+        let (mut link, mut device) = pair();
+        let others = std::thread::spawn(move || {
+            while device.write_all(&sealed(&Reply::SequenceForgotten)).is_ok() {
+                std::thread::sleep(GLANCE / 4);
+            }
+        });
+        assert!(matches!(link.listen(), Err(LinkError::Silent { seconds: 1 })));
+        drop(link);
+        others.join().unwrap();
+    }
+
+    #[test]
+    fn noise_is_not_kept_and_the_reply_after_it_is_heard() {
+        let (mut link, mut device) = pair();
+        device.write_all(&[7; 5000]).unwrap();
+        assert!(matches!(link.next(), Err(LinkError::Reply(FrameError::Oversized { .. }))));
+        device.write_all(&[0]).unwrap();
+        device.write_all(&sealed(&Reply::Restarted)).unwrap();
+        let mut next = link.next();
+        while let Err(LinkError::Reply(_)) = next {
+            next = link.next(); // the rest of it
+        }
+        assert_eq!(next.unwrap(), Reply::Restarted);
+        assert!(link.received.is_empty());
+    }
 
     #[test]
     fn sources_are_tcp_unix_or_serial() {

@@ -1,16 +1,20 @@
 //! `orbitcal serve` with a device at the other end of a socket: what it writes is what `orbitcal replay` writes.
 
+use core::time::Duration;
 use std::io::{Read as _, Write as _};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
-use std::process::{Command, Output};
-use std::thread;
+use std::process::{Command, Output, Stdio};
+use std::thread::{self, JoinHandle};
 
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, Write};
 use estimator::booster::{Estimator, Green};
-use firmware_sim::link::Vitals;
-use firmware_sim::{Device, Panel};
+use estimator::packet;
+use firmware_sim::link::{REQUEST, Request, Vitals};
+use firmware_sim::{Device, Event, Inbox, Panel};
+use host_bridge::publish::Subscriber;
+use inference::{Recording, stream};
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 
@@ -54,21 +58,28 @@ impl OutputPin for NoLamp {
     }
 }
 
-/// A device that serves one host, beside the test.
-fn device(path: &Path) {
+fn tables() -> Green {
+    training::green::tables(&twin::Ring::booster()).unwrap()
+}
+
+/// Something at the other end of a line, beside the test.
+fn beside(path: &Path, run: impl FnOnce(UnixStream) + Send + 'static) -> JoinHandle<()> {
     let listener = UnixListener::bind(path).unwrap();
     thread::Builder::new()
-        .stack_size(16 << 20) // the state is built on it
-        .spawn(move || {
-            let (line, _) = listener.accept().unwrap();
-            let tables = training::green::tables(&twin::Ring::booster()).unwrap();
-            let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-            let mut device = Device::new(&mut core, &tables, &mut slot);
-            let (mut source, mut sink) = (Socket(line.try_clone().unwrap()), Socket(line));
-            let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
-            let _ = firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
-        })
-        .unwrap();
+        .stack_size(16 << 20) // the state of a device is built on it
+        .spawn(move || run(listener.accept().unwrap().0))
+        .unwrap()
+}
+
+/// A device that serves one host.
+fn device(path: &Path, tables: Green) {
+    beside(path, move |line| {
+        let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+        let mut device = Device::new(&mut core, &tables, &mut slot);
+        let (mut source, mut sink) = (Socket(line.try_clone().unwrap()), Socket(line));
+        let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
+        let _ = firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
+    });
 }
 
 fn orbitcal(arguments: &[&str]) -> Output {
@@ -79,7 +90,7 @@ fn orbitcal(arguments: &[&str]) -> Output {
 fn a_device_is_published_as_the_core_in_process_is() {
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name).display().to_string();
-    device(&folder.path().join("uart"));
+    device(&folder.path().join("uart"), tables());
     let service = format!("orbitcal/test/{}/serve", std::process::id());
     let source = format!("unix:{}", file("uart"));
     let feed = ["serve", "--source", &source, "--feed", RECORDING, "--load", "--service", &service];
@@ -100,6 +111,156 @@ fn a_device_is_published_as_the_core_in_process_is() {
         text.lines().filter(|line| !line.starts_with("frame to estimate")).map(str::to_owned).collect::<Vec<_>>()
     };
     assert_eq!(table(&served), table(&replayed));
+}
+
+#[test]
+fn tables_of_another_ring_are_not_answered_by() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut other = tables();
+    other.stated_error[0] *= 2.0;
+    let message = format!("goes by tables {:08x}, this machine has {:08x}; --load", other.digest(), tables().digest());
+    device(&folder.path().join("uart"), other);
+    let source = format!("unix:{}", folder.path().join("uart").display());
+    let service = format!("orbitcal/test/{}/other", std::process::id());
+    let output = orbitcal(&["serve", "--source", &source, "--feed", RECORDING, "--service", &service]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains(&message), "{said}");
+}
+
+/// A line on which a front end and a host talk to one device.
+struct Shared<'d> {
+    device: Device<'d>,
+    host: UnixStream,
+    inbox: Inbox,
+    /// Replies until one that is spoiled on its way.
+    spoiled: Option<u32>,
+}
+
+impl Shared<'_> {
+    /// The front end sends a packet, after which the host asks for covariances this many times.
+    fn send(&mut self, mut bytes: Vec<u8>, requests: u32) {
+        let (host, spoiled) = (&mut self.host, &mut self.spoiled);
+        self.device.hear(&mut bytes, Vitals::default, &mut |reply| {
+            let mut bytes = [0; packet::MAX_WIRE_BYTES];
+            let n = reply.encode(&mut bytes).unwrap();
+            *spoiled = spoiled.and_then(|left| left.checked_sub(1).or_else(|| flip(&mut bytes[5])));
+            host.write_all(&bytes[..n]).unwrap();
+        });
+        self.hear(requests);
+    }
+
+    fn hear(&mut self, requests: u32) {
+        for _ in 0..requests {
+            let mut source = Socket(self.host.try_clone().unwrap());
+            let Event::Packet(bytes) = self.inbox.next(&mut source).unwrap() else { panic!("no request") };
+            let request: Request = packet::unseal(REQUEST, &mut bytes.to_vec()).unwrap();
+            assert_eq!(request, Request::Covariance);
+            self.device.hear(bytes, Vitals::default, &mut |reply| panic!("{reply:?}"));
+        }
+    }
+}
+
+/// Change a byte; there is none to be changed after it.
+fn flip(byte: &mut u8) -> Option<u32> {
+    *byte ^= 0x10;
+    None
+}
+
+fn request(request: &Request) -> Vec<u8> {
+    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+    let n = request.encode(&mut bytes).unwrap();
+    bytes.truncate(n);
+    bytes
+}
+
+/// Everything that may happen while somebody else feeds the device; then the line breaks.
+fn a_day_of_a_front_end(line: UnixStream) {
+    let recording = Recording::read(Path::new(RECORDING), &stream::layout(&twin::Ring::booster())).unwrap();
+    let restart = || request(&Request::Restart(stream::setup(&recording, 0.0).unwrap()));
+    let frame = |at: usize| stream::wire(&recording, &recording.rows[at]).unwrap();
+    let tables = tables();
+    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+    let device = Device::new(&mut core, &tables, &mut slot);
+    let mut shared = Shared { device, host: line, inbox: Inbox::default(), spoiled: None };
+    // the host begins to listen in the middle of a reply
+    shared.host.write_all(&[9, 9, 9, 0]).unwrap();
+    shared.hear(2);
+    // answers to the front end, and frames, of which one is bad
+    shared.send(restart(), 0);
+    shared.send(frame(0), 1);
+    shared.send(request(&Request::Status), 0);
+    shared.send(frame(1), 1);
+    shared.send(frame(1), 1);
+    shared.send(frame(2), 1);
+    // a piece of a covariance is spoiled: its estimate is heard with the next one
+    shared.spoiled = Some(3);
+    shared.send(frame(3), 1);
+    // the device is reset, and knows no more what was asked of it
+    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+    let Shared { host, inbox, .. } = shared;
+    let mut shared = Shared { device: Device::new(&mut core, &tables, &mut slot), host, inbox, spoiled: None };
+    shared.send(restart(), 0);
+    shared.send(frame(4), 1);
+    shared.send(frame(5), 2);
+    // a last estimate whose covariance does not come
+    shared.spoiled = Some(1);
+    shared.send(frame(6), 1);
+}
+
+#[test]
+fn a_front_end_may_do_what_it_likes_and_nothing_is_lost() {
+    let folder = tempfile::tempdir().unwrap();
+    let (uart, trace) = (folder.path().join("uart"), folder.path().join("trace.csv"));
+    let service = format!("orbitcal/test/{}/front-end", std::process::id());
+    let mut subscriber = Subscriber::try_new(&service).unwrap();
+    let front_end = beside(&uart, a_day_of_a_front_end);
+    let source = format!("unix:{}", uart.display());
+    let serve = ["serve", "--source", &source, "--service", &service, "--trace", &trace.display().to_string()];
+    let mut serving = Command::new(env!("CARGO_BIN_EXE_orbitcal")).args(serve).stderr(Stdio::piped()).spawn().unwrap();
+    let mut records = Vec::new();
+    while serving.try_wait().unwrap().is_none() {
+        records.extend(subscriber.wait(Duration::from_millis(20)).unwrap());
+    }
+    records.extend(subscriber.wait(Duration::ZERO).unwrap());
+    let output = serving.wait_with_output().unwrap();
+    front_end.join().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.ends_with("the device has closed its line\n"), "{said}");
+    assert_eq!(said.lines().count(), 5, "two spoiled pieces, half a reply, a refused frame, the end: {said}");
+    let heard: Vec<_> = records.iter().map(|r| (r.sequence, r.covariance[0] > 0.0)).collect();
+    let expected = [(0, true), (1, true), (2, true), (3, false), (4, false), (5, true), (6, false)];
+    assert_eq!(heard, expected, "frames, and whether their covariance came");
+    assert_eq!(std::fs::read_to_string(trace).unwrap().lines().count(), 1 + expected.len());
+}
+
+#[test]
+fn a_silent_device_does_not_hold_up_a_signal() {
+    let folder = tempfile::tempdir().unwrap();
+    let (uart, trace) = (folder.path().join("uart"), folder.path().join("trace.csv"));
+    let (heard, hears) = std::sync::mpsc::channel();
+    beside(&uart, move |mut line| {
+        line.read_exact(&mut [0; 10]).unwrap(); // the request for a covariance
+        heard.send(()).unwrap();
+        let _ = line.read(&mut [0]); // until it is closed
+    });
+    let service = format!("orbitcal/test/{}/silent", std::process::id());
+    let source = format!("unix:{}", uart.display());
+    let serve = ["serve", "--source", &source, "--service", &service, "--trace", &trace.display().to_string()];
+    let mut command = Command::new(env!("CARGO_BIN_EXE_orbitcal"));
+    let mut serving = command.args(serve).stderr(Stdio::null()).spawn().unwrap();
+    hears.recv().unwrap();
+    // the handler is installed after the request, with the first look for a signal
+    thread::sleep(Duration::from_millis(500));
+    assert!(Command::new("kill").arg(serving.id().to_string()).status().unwrap().success());
+    assert_eq!(serving.wait().unwrap().code(), Some(0));
+    assert_eq!(std::fs::read_to_string(trace).unwrap().lines().count(), 1, "the header");
+}
+
+#[test]
+fn an_answer_needs_a_recording() {
+    let output = orbitcal(&["serve", "--source", "unix:/nowhere/uart", "--json", "-"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).starts_with("orbitcal: --json needs --feed: "));
 }
 
 #[test]

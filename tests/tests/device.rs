@@ -5,7 +5,7 @@ use embedded_io::{ErrorKind, ErrorType, Read, Write};
 use estimator::booster::{Estimator, Green};
 use estimator::packet;
 use estimator::surrogate::{Parcel, ParcelError, Table};
-use firmware_sim::link::{Answer, Refusal, Reply, Request, TRIANGLE, Taken, Vitals};
+use firmware_sim::link::{Answer, Refusal, Reply, Request, Status, TRIANGLE, Taken, Vitals};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, BoosterEstimate, Core};
@@ -276,6 +276,83 @@ fn damaged_tables_are_rejected_whole() {
         "{wrong:?}"
     );
     assert!(!disturbed.contains(&Reply::Model(Ok(Taken::InUse))));
+}
+
+/// What the device says of itself at the end.
+fn last_status(replies: &[Reply]) -> Status {
+    match replies.last() {
+        Some(Reply::Status(status)) => *status,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn tables_that_cannot_be_left_stay_in_use() {
+    // given tables in flash that are right at vars = 1 and have no stable ring anywhere else
+    let (ring, recording) = paper_vars();
+    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut steep = (*core.tables).clone();
+    steep.x.weight.iter_mut().for_each(|weight| *weight *= 1e4);
+    // when frames by other tables have moved the vars, and the device is to go back
+    let good = wires(&recording);
+    let mut bytes = start(&core);
+    core.tables.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    good[..60].iter().for_each(|wire| bytes.extend(heard(wire)));
+    bytes.extend(request(&Request::BuiltIn));
+    good[60..90].iter().for_each(|wire| bytes.extend(heard(wire)));
+    bytes.extend(request(&Request::Status));
+    let replies = replies(&steep, &bytes);
+    // then it says that it cannot, and answers on by the tables that it has
+    assert!(replies.contains(&Reply::Model(Err(ParcelError::Unstable))));
+    let status = last_status(&replies);
+    assert_eq!((status.loaded, status.tables, status.frames), (true, core.tables.digest(), 90));
+    let answers = estimates(&replies);
+    for (wire, got) in good[..90].iter().zip(&answers) {
+        core.prepare();
+        let expected = core.ingest(&mut wire.clone()).unwrap();
+        for i in 0..48 {
+            let shift = (got.map_params[i] - expected.map_params[i]) / expected.params_sigma[i];
+            assert!(shift.abs() < 0.1, "frame {}, {i}: {shift}", got.sequence); // linearised once more
+        }
+    }
+}
+
+#[test]
+fn a_restart_by_tables_without_a_design_goes_back_to_those_in_flash() {
+    // given tables whose Green's function between nodes is beyond all numbers
+    let (ring, recording) = paper_vars();
+    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut endless = (*core.tables).clone();
+    endless.x.mutual.scale = f32::MAX;
+    // when they come before the first setup, and then it
+    let mut bytes = Vec::new();
+    endless.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    bytes.extend(start(&core));
+    let wire = &wires(&recording)[0];
+    bytes.extend(heard(wire));
+    bytes.extend(request(&Request::Status));
+    let replies = replies(&core.tables, &bytes);
+    // then they are given up, aloud, and the frame is answered by those in flash
+    let [.., Reply::Model(taken), Reply::Model(Err(ParcelError::Unstable)), Reply::Restarted, answer, _] = &replies[..]
+    else {
+        panic!("{:?}", replies.iter().rev().take(5).collect::<Vec<_>>());
+    };
+    assert_eq!(*taken, Ok(Taken::InUse));
+    assert!(*answer == Reply::Estimate((&core.ingest(&mut wire.clone()).unwrap()).into()));
+    let status = last_status(&replies);
+    assert_eq!((status.loaded, status.tables, status.refused), (false, core.tables.digest(), 0));
+}
+
+#[test]
+fn a_device_without_a_design_says_so() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut endless = (*core.tables).clone();
+    endless.x.mutual.scale = f32::MAX;
+    let bytes = [start(&core), heard(&wires(&recording)[0])].concat();
+    let replies = replies(&endless, &bytes);
+    assert_eq!(replies[0], Reply::Refused { why: Refusal::NoDesign, count: 1 });
+    assert_eq!(replies[1], Reply::Refused { why: Refusal::NotStarted, count: 2 });
 }
 
 #[test]

@@ -8,7 +8,7 @@ use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
 use estimator::booster::Green;
-use firmware_sim::link::{Refusal, Reply, Request};
+use firmware_sim::link::{Refusal, Reply, Request, Status};
 use host_bridge::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core};
@@ -37,10 +37,14 @@ fn start() -> Emulator {
 #[test]
 fn the_image_fits_its_memory() {
     let sizes = IMAGE.sizes().unwrap();
+    // a network of 760 kB has room in what is left of 1 MB
     assert!(sizes.flash <= 256 * 1024, "{} bytes of flash", sizes.flash);
     assert!(sizes.ram <= 192 * 1024, "{} bytes of RAM", sizes.ram);
-    // a network of 760 kB has room in what is left of 1 MB
-    assert!(sizes.flash + 760 * 1024 <= 1024 * 1024, "{} bytes of flash", sizes.flash);
+}
+
+/// The linker grants 32 kB and starts the stack there, so that a count ends at 32: one that is full has to be told by less.
+fn check_stack(status: &Status) {
+    assert!(status.vitals.stack_bytes <= 31 * 1024, "{} bytes of stack", status.vitals.stack_bytes);
 }
 
 /// Most instructions of each step, beside those that were committed; `BLESS=1` rewrites them.
@@ -69,7 +73,7 @@ fn the_chip_answers_a_campaign_as_the_host_does() {
     let run = compare(&IMAGE, (&ring, &recording), 0.0, true, |_| Ok(())).unwrap();
     assert_eq!((run.frames, run.different.as_slice()), (346, [].as_slice()));
     assert_eq!((run.status.refused, run.status.vitals.lost_bytes), (0, 0));
-    assert!(run.status.vitals.stack_bytes <= 32 * 1024, "{} bytes of stack", run.status.vitals.stack_bytes);
+    check_stack(&run.status);
     let counts = largest(&run.counts);
     let of = |step: &str| counts.iter().find(|(name, _)| *name == step).unwrap().1;
     assert!(of("ingest") + of("encode") <= 800_000, "{} + {}", of("ingest"), of("encode"));
@@ -128,6 +132,7 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
+    let before = pair.link.status().unwrap().vitals;
     for (at, wire) in good.iter().take(60).enumerate() {
         pair.agree(wire);
         let next = &good[at + 1];
@@ -156,19 +161,22 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
         };
         pair.link.write(&bytes).unwrap();
         let why = pair.refused();
-        assert!(expected.contains(&why) || expected.is_empty(), "after frame {at}: {why:?}, expected {expected:?}");
+        assert!(expected.contains(&why), "after frame {at}: {why:?}, expected {expected:?}");
     }
+    let after = pair.link.status().unwrap().vitals;
+    let [cycles, silent] = [after.cycles - before.cycles, after.silent_cycles - before.silent_cycles];
+    assert!(silent <= cycles / 4, "{silent} of {cycles} cycles with frames in them were silent");
     // a sender that stalls in mid-frame: after two cycles the rest is not waited for
     pair.link.write(&good[60][..100]).unwrap();
     assert_eq!(pair.refused(), Refusal::Stalled);
     pair.agree(&good[60]);
     let status = pair.link.status().unwrap();
     assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (61, 61, 0));
-    assert!(status.vitals.silent_cycles >= 2);
+    assert!(status.vitals.silent_cycles > after.silent_cycles);
 }
 
-/// A whole longest update takes 37 ms at 480 MHz and one instruction a cycle; at 921,600 baud 13 frames of 260 bytes come
-/// meanwhile. The emulated UART has no rate: they are sent at once, just as the chip begins to linearise.
+/// 13 frames of 260 bytes come in 37 ms at 921,600 baud, longer than linearising anew takes, and far more than a front end
+/// sends in a cycle. The emulated UART has no rate: they are sent at once, just as the chip begins to linearise.
 #[test]
 fn frames_that_come_during_an_update_are_not_lost() {
     let (ring, recording) = read("paper-vars");
@@ -270,6 +278,7 @@ fn new_tables_reach_the_chip() {
     good[30..60].iter().for_each(|wire| pair.agree(wire));
     let status = pair.link.status().unwrap();
     assert_eq!((status.loaded, status.tables), (true, other.digest()));
+    check_stack(&status); // a parcel lies on it while the tables are linearised
 }
 
 #[test]

@@ -22,6 +22,11 @@ use crate::trace::Trace;
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Serve) -> Result<(), CommandError> {
+    if options.common.json.is_some() && options.feed.is_none() {
+        return Err(CommandError::Input(
+            "--json needs --feed: the answer is that to a recording; --trace takes each estimate".into(),
+        ));
+    }
     let ring = machine(options.common.machine.as_deref())?;
     let mut link = Link::open(&options.source).map_err(|e| CommandError::Other(e.to_string()))?;
     let Some(path) = &options.feed else { return listen(options, &ring, &mut link) };
@@ -64,25 +69,34 @@ impl Sinks {
     }
 }
 
-/// Publish what the device says to frames that somebody else sends it, until it or a signal ends that.
+/// Publish what the device says to frames that somebody else sends it, until it or a signal ends that. The trace keeps what
+/// came until then, whatever the end.
 fn listen(options: &Serve, ring: &Ring, link: &mut Link<Box<dyn Line>>) -> Result<(), CommandError> {
     let mut sinks = Sinks::open(options, ring)?;
-    let (mut count, wanted) = (0, options.count.unwrap_or(u64::MAX));
+    let ended = pass_on(options.count.unwrap_or(u64::MAX), link, &mut sinks);
+    let closed = sinks.close();
+    ended.and(closed)
+}
+
+/// Pass estimates on, this many at most.
+fn pass_on(wanted: u64, link: &mut Link<Box<dyn Line>>, sinks: &mut Sinks) -> Result<(), CommandError> {
+    let mut count = 0;
     link.send(&Request::Covariance).map_err(other)?;
     while count < wanted && !sinks.publisher.is_stop_requested() {
         match link.listen() {
             Ok(heard) => {
                 sinks.add(&heard)?;
                 count += 1;
-                link.send(&Request::Covariance).map_err(other)?;
             }
-            Err(error) if error.is_silence() => {}
-            // a bad frame is its sender's concern, and was counted
-            Err(error @ LinkError::Refused { .. }) => eprintln!("orbitcal: {error}"),
+            Err(LinkError::Silent { .. }) => continue,
+            // a packet that is refused is its sender's concern, and was counted; a damaged reply is one lost
+            Err(error @ (LinkError::Refused { .. } | LinkError::Reply(_))) => eprintln!("orbitcal: {error}"),
             Err(error) => return Err(other(error)),
         }
+        // each time anew: the last request may have been damaged, or the device reset. A second one changes nothing
+        link.send(&Request::Covariance).map_err(other)?;
     }
-    sinks.close()
+    Ok(())
 }
 
 /// Send a recording through the device, one frame after the other.
@@ -93,16 +107,17 @@ fn feed(
     link: &mut Link<Box<dyn Line>>,
 ) -> Result<Answer, CommandError> {
     let setup = stream::setup(recording, options.process_noise)?;
-    let tables = match options.model {
-        CoreModel::Green if options.load => Some(training::green::tables(ring).map_err(stream::StreamError::from)?),
-        CoreModel::Green => None,
-    };
-    if let Some(tables) = &tables {
-        let bar = progress(tables.parcels().count(), "tables", options.common.quiet);
-        link.load(tables, || bar.inc(1)).map_err(other)?;
-        bar.finish_and_clear();
-    }
+    let CoreModel::Green = options.model;
+    let tables = training::green::tables(ring).map_err(stream::StreamError::from)?;
     link.restart(&setup).map_err(other)?;
+    if options.load {
+        // restarted already: there are no frames of somebody before us that they would have to describe
+        let bar = progress(tables.parcels().count(), "tables", options.common.quiet);
+        link.load(&tables, || bar.inc(1)).map_err(other)?;
+        bar.finish_and_clear();
+        link.restart(&setup).map_err(other)?;
+    }
+    expect_tables(link, tables.digest())?;
     let mut sinks = Sinks::open(options, ring)?;
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let fed = replay(link, recording, Clock::new(options.rate), |heard| {
@@ -112,6 +127,13 @@ fn feed(
     bar.finish_and_clear();
     sinks.close()?;
     Ok(fed.answer(ring, recording, &setup))
+}
+
+/// A device answers by the tables that it has, whatever ring they are of.
+fn expect_tables<L: Line>(link: &mut Link<L>, expected: u32) -> Result<(), CommandError> {
+    let got = link.status().map_err(other)?.tables;
+    let wrong = || format!("the device goes by tables {got:08x}, this machine has {expected:08x}; --load sends them");
+    if got == expected { Ok(()) } else { Err(other(wrong())) }
 }
 
 /// What a device said at the end of a recording.
