@@ -181,15 +181,10 @@ fn explained(chain: usize, result: &HashMapResult, laplace: &Laplace, names: &[S
     let each = draws.iter().zip(messages).zip(starts.chunks_exact(names.len()));
     let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
     let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
-        let u = laplace.unbounded(start);
-        let nearest = u.icamax();
-        let var = params_of(&[u[nearest]])[0].exp();
-        format!(
-            "chain {}, draw {}: {message}; {} = {var:.4} was nearest its bound",
-            chain + 1,
-            draw + 1,
-            names[nearest]
-        )
+        let params = DVector::from_vec(params_of(laplace.unbounded(start).as_slice()));
+        let nearest = params.icamax();
+        let (name, var) = (&names[nearest], params[nearest].exp());
+        format!("chain {}, draw {}: {message}; {name} = {var:.4} was nearest its bound", chain + 1, draw + 1)
     };
     kept.map(sentence).collect()
 }
