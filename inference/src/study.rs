@@ -62,6 +62,8 @@ pub struct Numbers {
     pub runs: Vec<RunNumbers>,
     /// The reference: all frames, twin.
     pub vars: Vec<VarNumbers>,
+    /// Every subset of the data.
+    pub subsets: Vec<SubsetNumbers>,
     /// Standard deviation of each var in each kind of subset, median over the subsets, and pooled.
     pub widths: Vec<subsets::Widths>,
     /// Laplace approximations beside the reference.
@@ -87,7 +89,18 @@ pub struct RunNumbers {
     pub seconds: f64,
 }
 
-/// One var of the reference.
+/// One subset of the data.
+#[derive(Debug, Clone, Serialize)]
+pub struct SubsetNumbers {
+    /// The settings.
+    pub kind: &'static str,
+    /// Frame pairs in it.
+    pub pairs: usize,
+    /// Each var.
+    pub vars: Vec<VarNumbers>,
+}
+
+/// One var of a posterior.
 #[derive(Debug, Clone, Serialize)]
 pub struct VarNumbers {
     /// Name.
@@ -226,6 +239,7 @@ pub fn run(
         recording: recording.name.clone(),
         runs: bench.runs.clone(),
         vars: reference.summary.iter().map(VarNumbers::of).collect(),
+        subsets: subsets.numbers(),
         widths: subsets.widths(&bench.names()),
         laplace,
         faults,

@@ -12,16 +12,22 @@ pub fn study(bench: &mut Bench, reference: &Sampled, seed: u64) -> Result<Sectio
     let names = bench.names();
     let var = names.iter().position(|name| name == SINGLE).unwrap_or(0);
     let (measured, made) = (reference.correlation(), simulated.correlation());
+    // along the ring, where the oscillation shows
+    let mut along: Vec<usize> = (0..names.len()).collect();
+    along.sort_by_key(|&j| bench.campaign.ring.quadrupoles[j]);
+    let ring_names: Vec<String> = along.iter().map(|&j| names[j].clone()).collect();
     let row = |label: &str, matrix: &nalgebra::DMatrix<f64>| {
-        let y = (0..names.len()).map(|j| if j == var { f64::NAN } else { matrix[(var, j)] });
+        let y = along.iter().map(|&j| if j == var { f64::NAN } else { matrix[(var, j)] });
         Series::points(label, (0..names.len()).map(|j| j as f64).collect(), y.collect())
     };
     let title = format!("Correlation of {} with every other var", names[var]);
-    let axes = Axes::new(&title, "quadrupole", "correlation [1]").named(&names).compared(Reference::Level(0.0));
+    let axes = Axes::new(&title, "quadrupole, along the ring", "correlation [1]")
+        .named(&ring_names)
+        .compared(Reference::Level(0.0));
     let alike = likeness(&measured, &made);
     let answer = if alike > 0.9 {
-        "The pattern is that of the linear optics and of what is read where: it is beam dynamics seen through the monitors, and holds \
-         no information about this machine's errors."
+        "It is there in readings that the twin alone has made: it is beam dynamics, how responses depend on neighbouring quadrupoles, \
+         seen through the settings and monitors at hand, and no anomaly of the machine or of its data."
     } else {
         "A part of the pattern is not in the simulation: it comes from what the recording holds beyond the model."
     };

@@ -169,16 +169,12 @@ fn overview(comparisons: &[Comparison]) -> Table {
             format!("{:.3}", c.mahalanobis_distance),
         ]
     };
-    let header = [
-        "Laplace of",
-        "largest shift [sigma]",
-        "sigma ratio",
-        "largest difference of a correlation",
-        "mean squared distance (48 expected)",
-        "largest distance from chi-square",
-    ];
+    let header = ["Laplace of", "shift [sigma]", "sigma ratio", "correlation", "mean distance²", "from chi-square"];
     Table {
-        caption: "Each approximation against NUTS on the twin.".into(),
+        caption: "Each approximation against NUTS on the twin: largest shift of a mean, range of the sigma ratios, largest difference of \
+                  a correlation, mean squared Mahalanobis distance (one a var expected), and the largest distance of its \
+                  distribution from chi-square."
+            .into(),
         header: header.map(str::to_owned).to_vec(),
         rows: comparisons.iter().map(row).collect(),
     }

@@ -20,7 +20,7 @@ pub fn study(bench: &Bench, by_width: &[(&'static str, Sampled)]) -> Section {
     let posteriors: Vec<Series> = by_width.iter().map(density).collect();
     let likelihood = likelihood(bench, var);
     let below: Vec<String> =
-        by_width.iter().map(|(word, sampled)| format!("{} {word}", share_below_one(sampled, var))).collect();
+        by_width.iter().map(|(word, sampled)| format!("{} (prior {word})", share_below_one(sampled, var))).collect();
     let x_label = format!("var of {} [1]", names[var]);
     Section {
         heading: format!("{} alone", names[var]),

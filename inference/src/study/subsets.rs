@@ -6,7 +6,7 @@ use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use serde::Serialize;
 
-use super::{Bench, Sampled, StudyError, WIDTH};
+use super::{Bench, Sampled, StudyError, SubsetNumbers, VarNumbers, WIDTH};
 use crate::readings::{Campaign, Pair, Readings};
 use crate::report::{Axes, Band, Figure, Reference, Section, Table};
 
@@ -140,6 +140,16 @@ impl Subsets {
     fn pooled(&self, kind: Kind) -> DMatrix<f64> {
         let rows: Vec<_> = self.of(kind).flat_map(|s| s.vars.row_iter()).collect();
         DMatrix::from_rows(&rows)
+    }
+
+    /// Every subset.
+    pub fn numbers(&self) -> Vec<SubsetNumbers> {
+        let one = |(subset, sampled): &(Subset, Sampled)| SubsetNumbers {
+            kind: subset.kind.word(),
+            pairs: subset.pairs.len(),
+            vars: sampled.summary.iter().map(VarNumbers::of).collect(),
+        };
+        self.0.iter().map(one).collect()
     }
 
     /// Standard deviations by kind.
