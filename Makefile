@@ -11,8 +11,9 @@ export CARGO_TERM_COLOR ?= auto
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
 
-demo: build ## the main job on a recording that ships with the repository
+demo: build ## the main job on a recording that ships with the repository, and its studies with few draws
 	$(ORBITCAL) replay $(RECORDING)
+	$(ORBITCAL) study $(RECORDING) --warm-up 300 --draws 500 --report target/study.html
 
 build: toolchain ## the program, at target/release/orbitcal
 	cargo build --release --locked -p host-bridge
