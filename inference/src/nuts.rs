@@ -79,12 +79,14 @@ pub fn sample(
     settings: NutsSettings,
     mut progress: impl FnMut(usize),
 ) -> Result<NutsRun, NutsError> {
-    let mut options = DiagNutsSettings::default();
-    options.num_chains = settings.chains;
-    options.num_tune = settings.warm_up as u64;
-    options.num_draws = settings.draws as u64;
-    options.seed = settings.seed;
-    options.store_divergences = true;
+    let options = DiagNutsSettings {
+        num_chains: settings.chains,
+        num_tune: settings.warm_up as u64,
+        num_draws: settings.draws as u64,
+        seed: settings.seed,
+        store_divergences: true,
+        ..DiagNutsSettings::default()
+    };
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(settings.chains);
     let start = Instant::now();
     let model = Arc::new(Whitened { posterior, laplace: Arc::clone(&laplace) });

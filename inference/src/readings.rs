@@ -190,11 +190,11 @@ impl Readings {
         let of_monitor = |b: usize| {
             let mut form = Form::new(campaign.drives[0].kick.len() + 1);
             let (mut weight, mut pull, mut slope) = (0.0, 0.0, DVector::zeros(form.moment.len()));
-            for frame in 0..campaign.drives.len() {
+            for (frame, &repeats) in repeats.iter().enumerate() {
                 let Some(reading) = campaign.reading(frame, b) else { continue };
                 let (k, offset) = (campaign.drive(frame), campaign.drives[frame].rf_offset);
                 // repeats share the error: their mean has the variance of one over n, plus all of it
-                let shared = campaign.shared_error(model, b, offset).powi(2) * repeats[frame] as f64;
+                let shared = campaign.shared_error(model, b, offset).powi(2) * repeats as f64;
                 let w = 1.0 / (campaign.noise(b).powi(2) + shared);
                 form.add(&k, reading, w);
                 (weight, pull) = (weight + w, pull + w * reading);

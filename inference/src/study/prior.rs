@@ -15,8 +15,11 @@ const WIDTHS: [(&str, Width); 5] = [
     ("loguniform", Width::Loguniform),
 ];
 
+/// A posterior under each prior, by the prior's word.
+pub type ByWidth = Vec<(&'static str, Sampled)>;
+
 /// Sample the first subset of -22 to +22 A under every prior.
-pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<(Section, Vec<(&'static str, Sampled)>), StudyError> {
+pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<(Section, ByWidth), StudyError> {
     let pairs = subsets.first(Kind::MinusToPlus).map_or(Vec::new(), |(subset, _)| subset.pairs.clone());
     let mut by_width = Vec::new();
     for (word, width) in WIDTHS {
