@@ -72,7 +72,11 @@ pub enum LaplaceError {
 
 /// Largest move of a param, in standard deviations, at which the steps have settled.
 const SETTLED: f64 = 1e-4;
+/// The same after the last step, for readings that no ring explains: their steps creep, and what is left of the way is small
+/// beside the width.
+const CLOSE: f64 = 0.05;
 const STEPS: usize = 40;
+const HALVINGS: i32 = 10;
 
 impl Width {
     /// Mean and precision of theta.
@@ -133,24 +137,26 @@ impl Posterior {
         let mut u = unbounded_of(params);
         let (mut value, mut gradient) = self.of_unbounded(u.as_slice())?;
         let mut moved = f64::INFINITY;
-        for _ in 0..STEPS {
+        for taken in 0..=STEPS {
             let covariance = self.curvature(&u)?.cholesky().ok_or(LaplaceError::Degenerate)?.inverse();
-            if moved < SETTLED {
+            let settled = if taken < STEPS { SETTLED } else { CLOSE };
+            if moved < settled {
                 let factor = covariance.cholesky().ok_or(LaplaceError::Degenerate)?.unpack();
                 return Ok(Laplace { params: params_of(u.as_slice()), centre: u, factor });
             }
-            let mut step = &covariance * DVector::from_column_slice(&gradient);
+            let step = &covariance * DVector::from_column_slice(&gradient);
             // half the way as long as it leads downhill or to an unstable ring
-            for _ in 0..10 {
-                let next = self.of_unbounded((&u + &step).as_slice());
-                if let Some((higher, slope)) = next.ok().filter(|(next, _)| *next >= value - 1e-9 * value.abs()) {
-                    (value, gradient) = (higher, slope);
-                    break;
-                }
-                step *= 0.5;
+            let uphill = (0..HALVINGS).map(|k| &step * 0.5_f64.powi(k)).find_map(|step| {
+                let (next, slope) = self.of_unbounded((&u + &step).as_slice()).ok()?;
+                (next >= value - 1e-9 * value.abs()).then_some((step, next, slope))
+            });
+            // uphill nowhere: this is the top, to rounding
+            moved = 0.0;
+            if let Some((step, next, slope)) = uphill {
+                (value, gradient) = (next, slope);
+                u += &step;
+                moved = (0..step.len()).map(|i| step[i].abs() / covariance[(i, i)].sqrt()).fold(0.0, f64::max);
             }
-            u += &step;
-            moved = (0..step.len()).map(|i| step[i].abs() / covariance[(i, i)].sqrt()).fold(0.0, f64::max);
         }
         Err(LaplaceError::NotConverged { steps: STEPS, moved })
     }

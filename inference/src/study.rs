@@ -152,14 +152,12 @@ pub enum StudyError {
     #[error(transparent)]
     Stream(#[from] StreamError),
     /// The recording has not what the paper's data need.
-    #[error("{recording}: no corrector has frames at {from:.0} A and at {to}; the paper's differences need both")]
+    #[error("{recording}: no corrector has frames for a difference {kind}, which the paper's data are made of")]
     NoPairs {
         /// The recording.
         recording: String,
-        /// Initial setting [A].
-        from: f64,
-        /// Final setting.
-        to: &'static str,
+        /// From which setting to which.
+        kind: &'static str,
     },
 }
 

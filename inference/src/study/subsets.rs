@@ -115,7 +115,7 @@ pub fn study(bench: &mut Bench, seeds: &mut impl Iterator<Item = u64>) -> Result
             let subset = Subset::draw(&bench.campaign, kind, seeds.next().unwrap_or(0));
             if subset.pairs.is_empty() {
                 let recording = bench.campaign.recording.name.clone();
-                return Err(StudyError::NoPairs { recording, from: 22.0 * kind.signs().0, to: kind.word() });
+                return Err(StudyError::NoPairs { recording, kind: kind.word() });
             }
             let readings = Readings::of_pairs(&bench.campaign, &bench.twin, &subset.pairs);
             let sampled = bench.sample(&format!("{}, subset {i}", kind.word()), readings, WIDTH)?;
