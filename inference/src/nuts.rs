@@ -20,7 +20,7 @@ use rand::Rng;
 use twin::OrbitError;
 
 use crate::draws::{Chain, DrawStats, Draws};
-use crate::posterior::{Laplace, Posterior, params_of};
+use crate::posterior::{Laplace, Posterior, RANGE, params_of};
 
 /// How to sample.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -92,11 +92,9 @@ pub fn sample(
     let model = Arc::new(Whitened { posterior, laplace: Arc::clone(&laplace) });
     let failed = |error: anyhow::Error| NutsError::Sampler(format!("{error:#}"));
     let mut sampler = Sampler::new(model, options, HashMapConfig::new(), threads, None).map_err(failed)?;
-    let mut evaluations = 0;
     let chains = loop {
         let chains = sampler.progress().map_err(failed)?;
         progress(chains.iter().map(|chain| chain.finished_draws).sum());
-        evaluations = chains.iter().map(|chain| chain.total_num_gradients as u64).sum::<u64>().max(evaluations);
         match sampler.wait_timeout(Duration::from_millis(100)) {
             SamplerWaitResult::Trace(chains) => break chains,
             SamplerWaitResult::Timeout(more) => sampler = more,
@@ -106,6 +104,7 @@ pub fn sample(
     let seconds = start.elapsed().as_secs_f64();
     let explain = |(c, chain)| explained(c, chain, &laplace, names, settings.warm_up);
     let divergences = chains.iter().enumerate().flat_map(explain).collect();
+    let evaluations = chains.iter().map(leapfrogs).sum();
     let unpack = |chain| unpack(chain, names.len(), settings.warm_up);
     let chains = chains.iter().map(unpack).collect::<Result<_, _>>()?;
     Ok(NutsRun { draws: Draws { names: names.to_vec(), chains }, evaluations, seconds, threads, divergences })
@@ -184,11 +183,19 @@ fn explained(chain: usize, result: &HashMapResult, laplace: &Laplace, names: &[S
     let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
     let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
         let params = DVector::from_vec(params_of(laplace.unbounded(start).as_slice()));
-        let nearest = params.icamax();
+        let nearest = params.map(|theta| (theta - RANGE[0].ln()).min(RANGE[1].ln() - theta)).imin();
         let (name, var) = (&names[nearest], params[nearest].exp());
         format!("chain {}, draw {}: {message}; {name} = {var:.4} was nearest its bound", chain + 1, draw + 1)
     };
     kept.map(sentence).collect()
+}
+
+/// Leapfrog steps of all draws, an evaluation each.
+fn leapfrogs(chain: &HashMapResult) -> u64 {
+    match chain.stats.get("n_steps") {
+        Some(HashMapValue::U64(steps)) => steps.iter().sum(),
+        _ => 0,
+    }
 }
 
 /// The draws after the warm-up.

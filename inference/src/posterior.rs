@@ -18,10 +18,10 @@ use crate::readings::Readings;
 /// Prior of every var.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Width {
-    /// Lognormal of mean exactly 1 and this standard deviation: `ln var` is normal with variance `ln(1 + w^2)` and mean
-    /// minus half of it.
+    /// Lognormal, before it ends at the range's bounds of mean exactly 1 and this standard deviation: `ln var` is normal with
+    /// variance `ln(1 + w^2)` and mean minus half of it.
     Lognormal(f64),
-    /// Density `1/var`, the limit of a wide lognormal.
+    /// Flat in `ln var`: the limit of a lognormal of median 1 that grows wide.
     Loguniform,
 }
 
@@ -46,8 +46,6 @@ pub struct Laplace {
     pub centre: DVector<f64>,
     /// Lower Cholesky factor of the covariance of `u`.
     pub factor: DMatrix<f64>,
-    /// Best point of `theta`, where the density of `u` is largest.
-    pub params: Vec<f64>,
 }
 
 /// Why the posterior has no Laplace approximation.
@@ -139,24 +137,20 @@ impl Posterior {
         let mut moved = f64::INFINITY;
         for taken in 0..=STEPS {
             let covariance = self.curvature(&u)?.cholesky().ok_or(LaplaceError::Degenerate)?.inverse();
-            let settled = if taken < STEPS { SETTLED } else { CLOSE };
-            if moved < settled {
+            let full = &covariance * DVector::from_column_slice(&gradient);
+            moved = (0..full.len()).map(|i| full[i].abs() / covariance[(i, i)].sqrt()).fold(0.0, f64::max);
+            if moved < if taken < STEPS { SETTLED } else { CLOSE } {
                 let factor = covariance.cholesky().ok_or(LaplaceError::Degenerate)?.unpack();
-                return Ok(Laplace { params: params_of(u.as_slice()), centre: u, factor });
+                return Ok(Laplace { centre: u, factor });
             }
-            let step = &covariance * DVector::from_column_slice(&gradient);
             // half the way as long as it leads downhill or to an unstable ring
-            let uphill = (0..HALVINGS).map(|k| &step * 0.5_f64.powi(k)).find_map(|step| {
+            let uphill = (0..HALVINGS).map(|k| &full * 0.5_f64.powi(k)).find_map(|step| {
                 let (next, slope) = self.of_unbounded((&u + &step).as_slice()).ok()?;
                 (next >= value - 1e-9 * value.abs()).then_some((step, next, slope))
             });
-            // uphill nowhere: this is the top, to rounding
-            moved = 0.0;
-            if let Some((step, next, slope)) = uphill {
-                (value, gradient) = (next, slope);
-                u += &step;
-                moved = (0..step.len()).map(|i| step[i].abs() / covariance[(i, i)].sqrt()).fold(0.0, f64::max);
-            }
+            let Some((step, next, slope)) = uphill else { break };
+            (value, gradient) = (next, slope);
+            u += &step;
         }
         Err(LaplaceError::NotConverged { steps: STEPS, moved })
     }
@@ -166,7 +160,9 @@ impl Posterior {
         let params = params_of(u.as_slice());
         let strength: Vec<f64> = params.iter().zip(self.readings.supplies()).map(|(theta, s)| theta + s).collect();
         let mut curvature = self.readings.curvature(&self.model.jacobian(&strength)?);
-        let (_, precision) = self.width.normal();
+        // without a width, that of a flat density over the range: a direction that nothing measures is not infinitely wide
+        let flat = 12.0 / (RANGE[1] / RANGE[0]).ln().powi(2);
+        let precision = if self.width == Width::Loguniform { flat } else { self.width.normal().1 };
         let (_, slope) = self.of_params(&params)?;
         (0..u.len()).for_each(|i| curvature[(i, i)] += precision);
         let bounds: Vec<Bounded> = u.iter().map(|u| Bounded::at(*u)).collect();

@@ -51,7 +51,6 @@ struct Form {
     gram: DMatrix<f64>,
     moment: DVector<f64>,
     square: f64,
-    readings: usize,
 }
 
 /// Two frames of one corrector.
@@ -229,11 +228,6 @@ impl Readings {
         &self.supplies
     }
 
-    /// Readings that count.
-    pub fn count(&self) -> usize {
-        self.forms.iter().map(|form| form.readings).sum()
-    }
-
     /// Chi-square at a response, and its derivative with respect to each entry.
     pub fn chi_square(&self, response: &DMatrix<f64>) -> (f64, DMatrix<f64>) {
         let (mut chi_square, mut weights) = (0.0, DMatrix::zeros(response.nrows(), response.ncols()));
@@ -264,14 +258,13 @@ impl Campaign {
 
 impl Form {
     fn new(drives: usize) -> Self {
-        Self { gram: DMatrix::zeros(drives, drives), moment: DVector::zeros(drives), square: 0.0, readings: 0 }
+        Self { gram: DMatrix::zeros(drives, drives), moment: DVector::zeros(drives), square: 0.0 }
     }
 
     fn add(&mut self, k: &DVector<f64>, reading: f64, weight: f64) {
         self.gram.ger(weight, k, k, 1.0);
         self.moment.axpy(weight * reading, k, 1.0);
         self.square += weight * reading * reading;
-        self.readings += 1;
     }
 
     /// Take the best baseline from all readings, given the sums of weight times drive, reading and one.

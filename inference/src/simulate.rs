@@ -41,7 +41,8 @@ pub fn like(
     instruments: &Instruments,
     seed: u64,
 ) -> Result<Recording, OrbitError> {
-    let mut random = StdRng::seed_from_u64(seed);
+    // not the stream from which vars of the same seed are drawn
+    let mut random = StdRng::seed_from_u64(seeds(seed).next().unwrap_or(seed));
     let normal = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
     let baselines = DVector::from_fn(instruments.noise.len(), |_, _| instruments.baseline * normal(&mut random));
     let model = ResponseModel::twin(ring)?;

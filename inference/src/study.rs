@@ -166,6 +166,8 @@ pub struct Bench<'p> {
     campaign: Campaign,
     twin: ResponseModel,
     options: Options,
+    /// A fresh one for whatever is random.
+    seeds: Box<dyn Iterator<Item = u64>>,
     runs: Vec<RunNumbers>,
     progress: &'p mut dyn FnMut(&str, usize, usize),
 }
@@ -179,7 +181,8 @@ impl<'p> Bench<'p> {
     ) -> Result<Self, StudyError> {
         progress("batch fit", 0, 1);
         let campaign = Campaign::of(ring, recording, |_| ())?;
-        Ok(Self { campaign, twin: ResponseModel::twin(ring)?, options, runs: Vec::new(), progress })
+        let seeds = Box::new(simulate::seeds(options.nuts.seed));
+        Ok(Self { campaign, twin: ResponseModel::twin(ring)?, options, seeds, runs: Vec::new(), progress })
     }
 
     /// Sample one posterior of the twin.
@@ -189,7 +192,7 @@ impl<'p> Bench<'p> {
         let laplace = posterior
             .laplace(&self.campaign.fit.map_params)
             .map_err(|source| StudyError::Laplace { run: name.to_owned(), source })?;
-        let settings = self.options.nuts;
+        let settings = NutsSettings { seed: self.seed(), ..self.options.nuts };
         let total = settings.chains * (settings.warm_up + settings.draws);
         let report = &mut *self.progress;
         let run =
@@ -199,12 +202,16 @@ impl<'p> Bench<'p> {
         self.runs.push(RunNumbers {
             name: name.to_owned(),
             rhat_max: sampled.summary.iter().map(|s| s.r_hat).fold(0.0, f64::max),
-            ess_min: sampled.summary.iter().map(|s| s.ess_bulk.min(s.ess_tail)).fold(f64::INFINITY, f64::min),
+            ess_min: sampled.smallest_ess(),
             divergences: run.draws.divergences(),
             draws: settings.chains * settings.draws,
             seconds: run.seconds,
         });
         Ok(sampled)
+    }
+
+    fn seed(&mut self) -> u64 {
+        self.seeds.next().expect("seeds do not end")
     }
 
     fn names(&self) -> Vec<String> {
@@ -225,12 +232,11 @@ pub fn run(
     let mut bench = Bench::new(ring, recording, options, progress)?;
     let frames = Readings::of_frames(&bench.campaign, &bench.twin);
     let reference = bench.sample("all frames", frames, WIDTH)?;
-    let mut seeds = simulate::seeds(options.nuts.seed);
-    let (stability, subsets) = subsets::study(&mut bench, &mut seeds)?;
+    let (stability, subsets) = subsets::study(&mut bench)?;
     let (sensitivity, by_width) = prior::study(&mut bench, &subsets)?;
     let single = single::study(&bench, &by_width);
-    let correlations = correlations::study(&mut bench, &reference, seeds.next().unwrap_or(0))?;
-    let prediction = prediction::study(&bench, &subsets)?;
+    let correlations = correlations::study(&mut bench, &reference)?;
+    let prediction = prediction::study(&mut bench, &subsets)?;
     let (approximations, laplace) = laplace::study(&bench, &reference)?;
     let (trimming, faults) = trimming::study(&bench)?;
     let numbers = Numbers {

@@ -125,11 +125,6 @@ impl VariedRing {
         })
     }
 
-    /// The ring that was taken apart.
-    pub fn design(&self) -> &Ring {
-        &self.design
-    }
-
     /// The optics at given vars [48], each the gradient over that of the ring.
     ///
     /// # Errors

@@ -7,8 +7,8 @@ use crate::report::{Axes, Figure, Reference, Section, Series};
 use crate::simulate::{self, Instruments};
 
 /// The paper's open question: the same with the readings replaced by simulation at the point estimate.
-pub fn study(bench: &mut Bench, reference: &Sampled, seed: u64) -> Result<Section, StudyError> {
-    let simulated = simulated(bench, reference, seed)?;
+pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyError> {
+    let simulated = simulated(bench, reference)?;
     let names = bench.names();
     let var = names.iter().position(|name| name == SINGLE).unwrap_or(0);
     let (measured, made) = (reference.correlation(), simulated.correlation());
@@ -26,18 +26,20 @@ pub fn study(bench: &mut Bench, reference: &Sampled, seed: u64) -> Result<Sectio
         .compared(Reference::Level(0.0));
     let alike = likeness(&measured, &made);
     let answer = if alike > 0.9 {
-        "It is there in readings that the twin alone has made: it is beam dynamics, how responses depend on neighbouring quadrupoles, \
-         seen through the settings and monitors at hand, and no anomaly of the machine or of its data."
+        "Yes: it is there in readings that the twin alone has made. Posterior covariances follow from how responses depend on \
+         neighbouring quadrupoles, from the settings and from the weights, and hardly from the readings themselves, so that this \
+         pattern says nothing for or against errors of the machine."
     } else {
-        "A part of the pattern is not in the simulation: it comes from what the recording holds beyond the model."
+        "The two differ by more than that: few draws, or readings that count in one and not in the other."
     };
     Ok(Section {
         heading: "Correlations".into(),
         text: vec![format!(
             "Posterior correlations of all frames, and the same after every reading was replaced by a simulated one: the twin at the \
              posterior mean, the same settings and read-backs, fresh noise. Entries off the diagonal correlate with {alike:.3} between the two; the \
-             largest difference is {:.2}. Is the long oscillation along the ring beam dynamics? {answer}",
-            largest_difference(&measured, &made)
+             largest difference is {:.2}, of which {:.2} is the sampler's own (three Monte Carlo errors). Is the long oscillation along the ring beam dynamics? {answer}",
+            largest_difference(&measured, &made),
+            3.0 * (2.0 / reference.smallest_ess()).sqrt()
         )],
         figures: vec![
             (
@@ -57,7 +59,8 @@ pub fn study(bench: &mut Bench, reference: &Sampled, seed: u64) -> Result<Sectio
     })
 }
 
-fn simulated(bench: &mut Bench, reference: &Sampled, seed: u64) -> Result<Sampled, StudyError> {
+fn simulated(bench: &mut Bench, reference: &Sampled) -> Result<Sampled, StudyError> {
+    let seed = bench.seed();
     let Campaign { ring, recording, .. } = &bench.campaign;
     let noise = (0..ring.read_monitors.len()).map(|b| bench.campaign.noise(b)).collect();
     let instruments = Instruments { noise, ..Instruments::healthy(ring, recording) };

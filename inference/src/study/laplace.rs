@@ -7,7 +7,7 @@ use statrs::distribution::{ChiSquared, ContinuousCDF};
 use super::sampled::{correlation, largest_difference};
 use super::{Bench, Sampled, StudyError, WIDTH};
 use crate::model::ResponseModel;
-use crate::posterior::{Laplace, Posterior};
+use crate::posterior::{Laplace, LaplaceError, Posterior};
 use crate::readings::Readings;
 use crate::report::{Axes, Figure, Reference, Section, Series, Table};
 use crate::stream;
@@ -97,7 +97,9 @@ fn of_core(bench: &Bench, reference: &Sampled) -> Result<Approximation, StudyErr
     let last = last.expect("a recording has a frame");
     let covariance = DMatrix::from_fn(n, n, |i, j| f64::from(core.covariance(i, j)));
     let centre = DVector::from_fn(n, |i, _| f64::from(last.centre[i]));
-    let precision = covariance.clone().cholesky().map(|c| c.inverse()).unwrap_or_else(|| DMatrix::zeros(n, n));
+    let factor = covariance.clone().cholesky();
+    let degenerate = || StudyError::Laplace { run: "green-on-device".to_owned(), source: LaplaceError::Degenerate };
+    let precision = factor.ok_or_else(degenerate)?.inverse();
     let distance = |row: nalgebra::RowDVector<f64>| {
         let away = row.transpose().map(f64::ln) - &centre;
         away.dot(&(&precision * &away))

@@ -36,8 +36,8 @@ pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<(Section, ByWidth),
     let section = Section {
         heading: "Sensitivity to the prior".into(),
         text: vec![format!(
-            "One subset of -22 to +22 A. Every prior has mean exactly 1 (ln var has mean -sigma^2/2) and the range 0.94 to 1.06; \
-             loguniform is the limit of a wide one. Mean posterior standard deviation: {}.",
+            "One subset of -22 to +22 A. Each lognormal has mean exactly 1 (ln var has mean -sigma^2/2) before it ends at 0.94 and \
+             1.06; loguniform is flat in ln var. Mean posterior standard deviation: {}.",
             widths.join(", ")
         )],
         figures: vec![("What the prior's width does to each var.".into(), Figure::bands(&axes, &bands))],

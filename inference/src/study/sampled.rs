@@ -31,6 +31,11 @@ impl Sampled {
         self.summary.iter().map(|s| s.sd).collect()
     }
 
+    /// Smallest effective sample size of a var, bulk or tail.
+    pub fn smallest_ess(&self) -> f64 {
+        self.summary.iter().map(|s| s.ess_bulk.min(s.ess_tail)).fold(f64::INFINITY, f64::min)
+    }
+
     /// 68 % and 95 % bands of each var.
     pub fn band(&self, label: &str) -> Band {
         Band {

@@ -61,10 +61,10 @@ fn likelihood(bench: &Bench, var: usize) -> Series {
         params[var] = v.ln();
         posterior.of_params(&params).map_or(f64::NEG_INFINITY, |(value, _)| value)
     };
-    // within eight of its own widths, found from the curvature at the best point
-    let (centre, step) = (best[var].exp(), 1e-4);
+    // within five of its own widths, found from the curvature at the best point
+    let (centre, step) = (best[var].exp().clamp(RANGE[0] + 1e-3, RANGE[1] - 1e-3), 1e-4);
     let curvature = (2.0 * at(centre) - at(centre + step) - at(centre - step)) / (step * step);
-    let reach = 5.0 / curvature.max(1.0).sqrt();
+    let reach = (5.0 / curvature.max(1.0).sqrt()).min(RANGE[1] - RANGE[0]);
     let x: Vec<f64> = (0..POINTS)
         .map(|i| centre + reach * (2.0 * i as f64 / (POINTS as f64 - 1.0) - 1.0))
         .filter(|v| (RANGE[0]..=RANGE[1]).contains(v))

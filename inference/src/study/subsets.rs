@@ -90,11 +90,15 @@ impl Subset {
         let sign = |setting: f64| if setting == 0.0 { 0.0 } else { setting.signum() };
         let mut pairs = Vec::new();
         for corrector in campaign.ring.cells(&campaign.ring.correctors) {
+            // of several amplitudes the largest
+            let own = rows.iter().filter(|row| row.corrector.as_ref() == Some(&corrector));
+            let largest = own.map(|row| row.setting.abs()).fold(0.0, f64::max);
             let at = |signs: &[f64]| -> Vec<usize> {
                 let own = |(_, row): &(usize, &crate::recording::Row)| {
                     row.corrector.as_ref() == Some(&corrector)
                         && row.rf_offset == 0.0
                         && signs.contains(&sign(row.setting))
+                        && (row.setting == 0.0 || row.setting.abs() > 0.9 * largest)
                 };
                 rows.iter().enumerate().filter(own).map(|(i, _)| i).collect()
             };
@@ -108,11 +112,12 @@ impl Subset {
 }
 
 /// Sample every subset.
-pub fn study(bench: &mut Bench, seeds: &mut impl Iterator<Item = u64>) -> Result<(Section, Subsets), StudyError> {
+pub fn study(bench: &mut Bench) -> Result<(Section, Subsets), StudyError> {
     let mut all = Vec::new();
     for (kind, times) in DRAWN {
         for i in 1..=times {
-            let subset = Subset::draw(&bench.campaign, kind, seeds.next().unwrap_or(0));
+            let seed = bench.seed();
+            let subset = Subset::draw(&bench.campaign, kind, seed);
             if subset.pairs.is_empty() {
                 let recording = bench.campaign.recording.name.clone();
                 return Err(StudyError::NoPairs { recording, kind: kind.word() });
@@ -197,14 +202,14 @@ impl Subsets {
                 let means: Vec<f64> = each.iter().map(|s| s.summary[i].mean).collect();
                 let mean = means.iter().sum::<f64>() / means.len() as f64;
                 let variance = means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (means.len() as f64 - 1.0);
-                variance / each[0].summary[i].sd.powi(2)
+                variance / (each.iter().map(|s| s.summary[i].sd.powi(2)).sum::<f64>() / each.len() as f64)
             };
             let ratio = (0..names.len()).map(of_var).sum::<f64>() / names.len() as f64;
             format!("{:.2} for {}", ratio.sqrt(), kind.word())
         };
         format!(
-            "The rms scatter of the means between subsets, over the width that each states: {}. It is below 1 where subsets share \
-             frames and prior.",
+            "The rms scatter of the means between subsets, over the width that each states: {}. Subsets share \
+             the prior and, repeats being few, some frames: independent ones would scatter by 1.",
             DRAWN.map(scatter).join(", ")
         )
     }

@@ -1,5 +1,5 @@
-//! Outliers, as the paper's Appendix A finds them: all pairs of repeats, less the model, centred; a frame whose pairs stand
-//! out again and again is at fault.
+//! Outliers, after the paper's Appendix A: all pairs of a corrector's frames, less the model; a reading whose pairs stand out
+//! again and again is at fault.
 
 use serde::Serialize;
 use twin::OrbitError;
@@ -84,7 +84,8 @@ pub fn faults(campaign: &Campaign, model: &ResponseModel) -> Result<Vec<Fault>, 
                 let mut others: Vec<f64> =
                     deviations.iter().filter(|(f, _)| *f != frame).map(|(_, d)| here - d).collect();
                 let out = others.iter().filter(|d| d.abs() > limit).count();
-                if !others.is_empty() && 2 * out > others.len() {
+                // one difference could be the other reading's fault
+                if others.len() > 1 && 2 * out > others.len() {
                     others.sort_by(f64::total_cmp);
                     let row = &campaign.recording.rows[frame];
                     faults.push(Fault {
