@@ -4,6 +4,7 @@ use nalgebra::DVector;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, Normal, StandardNormal};
+use training::{BoosterGreen, TrainingError};
 use twin::{Hold, Optics, OrbitError, Ring, Tunes};
 
 use crate::map::{Drive, first_family, rf_orbit};
@@ -18,12 +19,21 @@ pub struct Instruments {
     pub noise: Vec<f64>,
     /// Standard deviation of the monitors' baselines [m].
     pub baseline: f64,
+    /// Standard deviation of the orbit that misaligned quadrupoles add per unit of RF offset, in x and y [m].
+    pub spurious: [f64; 2],
 }
 
 impl Instruments {
     /// Every monitor with the noise that the recording's header states, and the closed orbit and offsets of the machine.
-    pub fn healthy(ring: &Ring, recording: &Recording) -> Self {
-        Self { noise: vec![recording.header.bpm_sigma; ring.read_monitors.len()], baseline: 2e-3 }
+    ///
+    /// # Errors
+    /// [`TrainingError`] if the ring has no tables, which say how much its dispersion is spurious.
+    pub fn healthy(ring: &Ring, recording: &Recording) -> Result<Self, TrainingError> {
+        let tables: BoosterGreen = training::green::tables(ring)?;
+        let baseline = 2e-3;
+        // the tables give each of two opposite offsets twice the variance
+        let spurious = tables.dispersion.spurious.map(|rms| f64::from(rms) / 2f64.sqrt() * baseline);
+        Ok(Self { noise: vec![recording.header.bpm_sigma; ring.read_monitors.len()], baseline, spurious })
     }
 }
 
@@ -45,6 +55,10 @@ pub fn like(
     let mut random = StdRng::seed_from_u64(seeds(seed).next().unwrap_or(seed));
     let normal = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
     let baselines = DVector::from_fn(instruments.noise.len(), |_, _| instruments.baseline * normal(&mut random));
+    let horizontal = ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count();
+    let spurious = DVector::from_fn(instruments.noise.len(), |b, _| {
+        instruments.spurious[usize::from(b >= horizontal)] * normal(&mut random)
+    });
     let model = ResponseModel::twin(ring)?;
     let first = first_family(ring);
     let orbit = |drive: &Drive| -> Result<DVector<f64>, OrbitError> {
@@ -53,7 +67,7 @@ pub fn like(
         let mut orbit = model.response(&params)?.columns(0, drive.kick.len()) * &drive.kick;
         if drive.rf_offset != 0.0 {
             let strength: Vec<f64> = params.iter().map(|theta| theta.exp()).collect();
-            orbit += rf_orbit(&ring.with_vars(&strength), drive.rf_offset)?;
+            orbit += rf_orbit(&ring.with_vars(&strength), drive.rf_offset)? + &spurious * drive.rf_offset;
         }
         Ok(orbit)
     };

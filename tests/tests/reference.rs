@@ -129,7 +129,7 @@ fn assert_covered(what: &str, nominal: f64, inside: &[f64]) {
 /// Simulated campaigns with vars from the truncated prior, their ring within the tune cut or not.
 fn simulated(count: usize, tune_cut: bool, seed: u64) -> impl Iterator<Item = (Ring, Recording, Vec<f64>)> {
     let (ring, recording) = read("paper-vars");
-    let instruments = Instruments::healthy(&ring, &recording);
+    let instruments = Instruments::healthy(&ring, &recording).unwrap();
     simulate::seeds(seed).take(count).map(move |seed| {
         let vars = simulate::vars(&ring, 0.03, tune_cut, seed).unwrap();
         let made = simulate::like(&recording, &ring, &vars, &instruments, seed).unwrap();

@@ -63,7 +63,7 @@ fn simulated(bench: &mut Bench, reference: &Sampled) -> Result<Sampled, StudyErr
     let seed = bench.seed();
     let Campaign { ring, recording, .. } = &bench.campaign;
     let noise = (0..ring.read_monitors.len()).map(|b| bench.campaign.noise(b)).collect();
-    let instruments = Instruments { noise, ..Instruments::healthy(ring, recording) };
+    let instruments = Instruments { noise, ..Instruments::healthy(ring, recording)? };
     let made = simulate::like(recording, ring, &reference.mean(), &instruments, seed)?;
     let campaign = Campaign::of(ring, &made, |_| ())?;
     let readings = Readings::of_frames(&campaign, &bench.twin);
