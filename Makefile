@@ -6,7 +6,7 @@ RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil train bench peers docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -53,6 +53,15 @@ bench: toolchain .venv ## medians of the hot paths, and pyAT on the same respons
 	python3 -m venv .venv
 	.venv/bin/pip install --quiet numpy accelerator-toolbox==0.9.0
 
+peers: build .venv-peers ## NUTS of numpyro and blackjax beside ours, on the density of a recording; minutes
+	cargo run --locked --release -p system-tests --bin density -- $(RECORDING) --json target/density.json
+	.venv-peers/bin/python tests/peers/numpyro_nuts.py target/density.json $(ORBITCAL) $(RECORDING)
+
+# apart from .venv, as JAX is large
+.venv-peers:
+	python3 -m venv .venv-peers
+	.venv-peers/bin/pip install --quiet numpyro==0.22.0 blackjax==1.7.1 'jax[cpu]==0.10.2' 'arviz==0.23.*'
+
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps
 
@@ -61,4 +70,4 @@ fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv
+	rm -rf .venv .venv-peers

@@ -81,6 +81,7 @@ pub struct Sampling {
     pub ess_min: f64,
     pub divergences: usize,
     pub draws: usize,
+    pub evaluations: u64,
     pub seconds: f64,
 }
 
@@ -167,6 +168,7 @@ impl Answer {
                 ess_min: sampled.summary.iter().map(|s| s.ess_bulk.min(s.ess_tail)).fold(f64::INFINITY, f64::min),
                 divergences: run.draws.divergences(),
                 draws,
+                evaluations: run.evaluations,
                 seconds: run.seconds,
             }),
         }

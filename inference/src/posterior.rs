@@ -10,6 +10,7 @@
 //! 0.958 it cost half of the effective draws.
 
 use nalgebra::{DMatrix, DVector};
+use serde::Serialize;
 use twin::OrbitError;
 
 use crate::model::ResponseModel;
@@ -40,7 +41,7 @@ pub struct Posterior {
 }
 
 /// The Gaussian at the best point, in the coordinates without bounds.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Laplace {
     /// Best point in `u`.
     pub centre: DVector<f64>,
@@ -77,8 +78,8 @@ const STEPS: usize = 40;
 const HALVINGS: i32 = 10;
 
 impl Width {
-    /// Mean and precision of theta.
-    fn normal(self) -> (f64, f64) {
+    /// Mean and precision of theta; both 0 where the density of theta is flat.
+    pub fn normal(self) -> (f64, f64) {
         match self {
             Self::Lognormal(width) => {
                 let variance = width.powi(2).ln_1p();
@@ -191,7 +192,7 @@ struct Bounded {
 }
 
 /// Distance from a bound within which the map bends [ln var].
-const BEND: f64 = 0.003;
+pub const BEND: f64 = 0.003;
 
 impl Bounded {
     /// `slope = s_l (1 - s_u) (1 - e^(-(upper - lower)/t))`, `s` the logistic functions of the distances from both bounds.

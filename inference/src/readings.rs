@@ -13,6 +13,7 @@
 //! a corrector ([`Readings::of_pairs`]).
 
 use nalgebra::{DMatrix, DVector};
+use serde::Serialize;
 use twin::{OrbitError, Ring};
 
 use crate::map::{BatchError, BatchFit, Drive, first_family, rf_orbit};
@@ -39,14 +40,14 @@ pub struct Campaign {
 }
 
 /// The quadratic forms.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Readings {
     forms: Vec<Form>,
     /// `ln` of each quadrupole's supply factor, to be added to the params.
     supplies: Vec<f64>,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 struct Form {
     gram: DMatrix<f64>,
     moment: DVector<f64>,

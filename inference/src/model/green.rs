@@ -7,17 +7,18 @@
 
 use estimator::surrogate::{Block, Green, GreenPlane};
 use nalgebra::{DMatrix, DVector};
+use serde::Serialize;
 use twin::OrbitError;
 
-/// Green's function tables in f64.
-#[derive(Debug, Clone)]
+/// Green's function tables in f64; serialised, they are all that another code needs to predict the same orbits.
+#[derive(Debug, Clone, Serialize)]
 pub struct GreenModel {
     planes: [Plane; 2],
     dispersion: Dispersion,
     stated_error: [f64; 2],
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 struct Plane {
     direct: DMatrix<f64>,
     seen: DMatrix<f64>,
@@ -26,7 +27,7 @@ struct Plane {
     weight: Vec<f64>,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 struct Dispersion {
     monitor: DVector<f64>,
     node: DVector<f64>,
