@@ -2,6 +2,7 @@
 //! published studies as reports.
 
 mod cmdstan;
+pub mod diagnose;
 pub mod diagnostics;
 pub mod draws;
 pub mod map;

@@ -439,6 +439,18 @@ impl Ring {
         self.read_monitors.iter().map(name).collect()
     }
 
+    /// Plane of each monitor that is read, and its index among [`Ring::monitors`].
+    pub fn read_places(&self) -> Vec<(Plane, usize)> {
+        let place = |&at: &usize| {
+            let plane = match self.elements[at].kind {
+                Kind::Monitor { plane } => plane,
+                _ => unreachable!("the list holds monitors"),
+            };
+            (plane, self.monitors.iter().position(|&i| i == at).expect("a read monitor is a monitor"))
+        };
+        self.read_monitors.iter().map(place).collect()
+    }
+
     /// Half-cell names of elements.
     pub fn cells(&self, elements: &[usize]) -> Vec<String> {
         elements.iter().map(|&i| self.elements[i].cell().to_owned()).collect()

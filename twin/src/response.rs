@@ -83,6 +83,11 @@ pub struct Optics<'r> {
     dispersive: Vector6<f64>,
 }
 
+/// `T^-1 E T` of a skew gradient, as a kick taken away.
+fn skew(back: &Matrix6<f64>, map: &Matrix6<f64>) -> Matrix6<f64> {
+    -(back.column(PX) * map.row(Y) + back.column(PY) * map.row(X))
+}
+
 /// Nodes and weights of four-point Gauss-Legendre quadrature on 0..1; exact to better than 1e-10 for the phase advance
 /// of any quadrupole of less than 0.8 rad (test `thick_gradients_are_exact`).
 const NODES: [(f64, f64); 4] = [
@@ -141,16 +146,51 @@ impl<'r> Optics<'r> {
 
     /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one.
     pub fn gradient(&self, element: usize) -> Gradient {
+        self.change(element, |back, map| back.column(PX) * map.row(X) - back.column(PY) * map.row(Y))
+    }
+
+    /// Derivative with respect to the skew gradient of an element, units as in [`Optics::gradient`]: `x' += k1s y`,
+    /// `y' += k1s x`.
+    pub fn skew_gradient(&self, element: usize) -> Gradient {
+        self.change(element, skew)
+    }
+
+    /// Derivative with respect to an integrated gradient [1/m] at one place.
+    pub fn thin_gradient(&self, place: Place) -> Gradient {
+        let map = self.transfer_into(place);
+        let back = inverse(&map);
+        Gradient { place, kernel: back.column(PX) * map.row(X) - back.column(PY) * map.row(Y) }
+    }
+
+    /// Derivative with respect to an integrated skew gradient [1/m] at one place.
+    pub fn thin_skew_gradient(&self, place: Place) -> Gradient {
+        let map = self.transfer_into(place);
+        Gradient { place, kernel: skew(&inverse(&map), &map) }
+    }
+
+    /// `integral of T^-1 E T ds` over an element, `T^-1 E T` of a place given by `field`.
+    fn change(&self, element: usize, field: impl Fn(&Matrix6<f64>, &Matrix6<f64>) -> Matrix6<f64>) -> Gradient {
         let length = self.ring.elements[element].length;
         let nodes: &[(f64, f64)] = if length == 0.0 { &[(0.0, 1.0)] } else { &NODES };
         let mut kernel = Matrix6::zeros();
         for (node, weight) in nodes {
-            let transfer = self.transfer_into(Place { element, depth: node * length });
-            let back = inverse(&transfer);
+            let map = self.transfer_into(Place { element, depth: node * length });
             let weight = if length == 0.0 { *weight } else { weight * length };
-            kernel += (back.column(PX) * transfer.row(X) - back.column(PY) * transfer.row(Y)) * weight;
+            kernel += field(&inverse(&map), &map) * weight;
         }
         Gradient { place: element.into(), kernel }
+    }
+
+    /// Derivative of both tunes with respect to a gradient, the planes not being coupled: with `2 cos(2 pi Q) = tr M`,
+    /// `dQ/dk = tr(M Q_kernel)/(4 pi sin(2 pi Q))`, which is `beta/(4 pi)` for a thin one.
+    pub fn tune_slope(&self, gradient: &Gradient) -> [f64; 2] {
+        let turn = self.orbit.one_turn();
+        let change = turn * gradient.kernel;
+        [X, Y].map(|i| {
+            let cos = 0.5 * (turn[(i, i)] + turn[(i + 1, i + 1)]);
+            let sin = (1.0 - cos * cos).max(f64::MIN_POSITIVE).sqrt().copysign(turn[(i, i + 1)]);
+            (change[(i, i)] + change[(i + 1, i + 1)]) / (2.0 * core::f64::consts::TAU * sin)
+        })
     }
 
     /// Response of one observer to one source [m/rad].

@@ -1,131 +1,11 @@
-//! Physics that a ring may have beyond its design, in the words of the command line: `KIND[@PLACE][=AMPLITUDE]`.
-//!
-//! An effect changes the ring itself, what the machine holds constant, or what its monitors and correctors say; a
-//! [`Machine`] is a ring with effects applied, and answers with the response that would then be measured.
+//! A ring with effects applied, and the response that would then be measured.
 
-use core::str::FromStr;
+use nalgebra::{DMatrix, DVector, Rotation2, Vector2};
 
-use nalgebra::{DMatrix, Rotation2, Vector2};
-
-use crate::lattice::{Kind, LatticeError, Plane, Ring};
+use super::{Effect, EffectError, EffectKind};
+use crate::lattice::{Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Tunes};
-
-/// One effect: kind, place and amplitude.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Effect {
-    /// What happens.
-    pub kind: EffectKind,
-    /// Where, by half-cell or element name; empty where the kind acts on the whole ring.
-    pub place: String,
-    /// How much; the unit is that of the kind.
-    pub amplitude: f64,
-}
-
-macro_rules! kinds {
-    ($($(#[$doc:meta])* $variant:ident = $word:literal,)*) => {
-        /// The kinds of effect.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-        pub enum EffectKind { $($(#[$doc])* $variant,)* }
-        impl EffectKind {
-            /// Every kind, in the order of the list.
-            pub const ALL: &[Self] = &[$(Self::$variant,)*];
-            /// The word for it.
-            pub fn word(self) -> &'static str {
-                match self { $(Self::$variant => $word,)* }
-            }
-        }
-    };
-}
-
-kinds! {
-    /// A monitor reads too much by this fraction.
-    BpmGain = "bpm_gain",
-    /// A corrector kicks too much by this fraction.
-    CorrectorGain = "corrector_gain",
-    /// A monitor is rotated [rad].
-    BpmRoll = "bpm_roll",
-    /// A corrector is rotated [rad].
-    CorrectorRoll = "corrector_roll",
-    /// A quadrupole is rotated [rad].
-    QuadRoll = "quad_roll",
-    /// A monitor reads x (1 + a x^2), a in [1/mm^2]; a response, the limit of small kicks, shows it on a displaced orbit.
-    BpmCubic = "bpm_cubic",
-    /// Two monitors' names are exchanged.
-    BpmSwap = "bpm_swap",
-    /// A corrector's sign is reversed.
-    CorrectorPolarity = "corrector_polarity",
-    /// A corrector's strength differs between its signs; cancels in the difference that a response is.
-    CorrectorEven = "corrector_even",
-    /// A gradient where the model has none, K1L [1/m].
-    StrayGradient = "stray_gradient",
-    /// A skew gradient where the model has none, K1sL [1/m].
-    StraySkewGradient = "stray_skew_gradient",
-    /// A gradient in a dipole's body, K1L [1/m].
-    DipoleGradient = "dipole_gradient",
-    /// Edge angle of one dipole, or of all without a place [rad].
-    DipoleEdge = "dipole_edge",
-    /// A sextupole field, K2L [1/m^2]; a response shows it on a displaced orbit.
-    SextupoleError = "sextupole_error",
-    /// The beam is off momentum.
-    MomentumOffset = "momentum_offset",
-    /// The RF frequency is held instead of the momentum, as a fraction.
-    FixedRfFrequency = "fixed_rf_frequency",
-    /// The mean of two monitors is held instead of the momentum, as a fraction; `@x_D8,x_E6`.
-    RadialLoop = "radial_loop",
-    /// All quadrupoles drift from -a to +a during a run; its mean, which a response is, does not move.
-    QuadDrift = "quad_drift",
-}
-
-/// Why an effect cannot be applied.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum EffectError {
-    /// An unknown kind.
-    #[error("unknown effect {found:?}; known: {}", EffectKind::ALL.iter().map(|k| k.word()).collect::<Vec<_>>().join(", "))]
-    Kind {
-        /// What was written.
-        found: String,
-    },
-    /// An amplitude that is not a finite number.
-    #[error("effect {effect}: expected a finite amplitude, found {found:?}")]
-    Amplitude {
-        /// The effect.
-        effect: String,
-        /// What was written.
-        found: String,
-    },
-    /// A place that the kind cannot act on.
-    #[error("effect {kind}: expected {expected}, found {found:?}")]
-    Place {
-        /// The kind.
-        kind: &'static str,
-        /// What the kind acts on.
-        expected: &'static str,
-        /// What was written.
-        found: String,
-    },
-    /// A place that the ring lacks.
-    #[error(transparent)]
-    Lattice(#[from] LatticeError),
-}
-
-impl FromStr for Effect {
-    type Err = EffectError;
-
-    fn from_str(text: &str) -> Result<Self, EffectError> {
-        let (head, amplitude) = text.split_once('=').unwrap_or((text, "1"));
-        let (word, place) = head.split_once('@').unwrap_or((head, ""));
-        let kind = EffectKind::ALL.iter().copied().find(|k| k.word() == word);
-        let kind = kind.ok_or_else(|| EffectError::Kind { found: word.into() })?;
-        let amplitude: Option<f64> = amplitude.parse().ok().filter(|a: &f64| a.is_finite());
-        let amplitude = amplitude.ok_or_else(|| EffectError::Amplitude {
-            effect: word.into(),
-            found: text.split_once('=').map_or("", |p| p.1).into(),
-        })?;
-        Ok(Self { kind, place: place.into(), amplitude })
-    }
-}
+use crate::response::{Optics, Source, Tunes};
 
 /// What the RF system holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,24 +19,29 @@ pub enum Rf {
 /// A ring with effects applied.
 #[derive(Debug, Clone)]
 pub struct Machine {
-    ring: Ring,
+    pub(super) ring: Ring,
     /// Momentum of the beam.
-    delta: f64,
+    pub(super) delta: f64,
     /// Share of the answer that is given at fixed RF frequency.
-    frequency_share: f64,
+    pub(super) frequency_share: f64,
     /// Monitors (indices among the places) whose mean is held, and the share.
-    radial_loop: Option<([usize; 2], f64)>,
+    pub(super) radial_loop: Option<([usize; 2], f64)>,
     /// What monitors and correctors do to the response, in the order given.
-    instruments: Vec<Instrument>,
+    pub(super) instruments: Vec<Instrument>,
+    /// Sextupole fields beyond the ring's: element, K2L [1/m^2].
+    pub(super) sextupoles: Vec<(usize, f64)>,
+    /// Relative change of all quadrupoles from the first frame (-) to the last (+).
+    pub(super) drift: f64,
 }
 
 #[derive(Debug, Clone)]
-enum Instrument {
+pub(super) enum Instrument {
     Gain { plane: Plane, place: usize, error: f64 },
     Cubic { plane: Plane, place: usize, per_square_mm: f64 },
     Roll { place: usize, angle: f64 },
     Swap { plane: Plane, places: [usize; 2] },
     Kick { corrector: usize, factor: f64 },
+    Even { corrector: usize, share: f64 },
 }
 
 /// What a machine answers: response of x and y at every monitor place to every corrector, and its linear optics.
@@ -181,9 +66,19 @@ impl Machine {
     /// [`EffectError`] if an effect names a place that the ring lacks or that its kind cannot act on.
     pub fn new(ring: Ring, rf: Rf, effects: &[Effect]) -> Result<Self, EffectError> {
         let frequency_share = if rf == Rf::FixedFrequency { 1.0 } else { 0.0 };
-        let mut machine = Self { ring, delta: 0.0, frequency_share, radial_loop: None, instruments: Vec::new() };
+        let mut machine = Self { ring, delta: 0.0, frequency_share, radial_loop: None, instruments: Vec::new(), sextupoles: Vec::new(), drift: 0.0 };
         effects.iter().try_for_each(|effect| machine.apply(effect))?;
         Ok(machine)
+    }
+
+    /// The ring, with the effects that sit in it.
+    pub fn ring(&self) -> &Ring {
+        &self.ring
+    }
+
+    /// Relative change of all gradients from mid-campaign to its end.
+    pub fn drift(&self) -> f64 {
+        self.drift
     }
 
     fn apply(&mut self, effect: &Effect) -> Result<(), EffectError> {
@@ -233,8 +128,14 @@ impl Machine {
                 }
                 self.radial_loop = Some(([one, other], a));
             }
-            // Neither moves the half difference of two signs, averaged over a run.
-            EffectKind::CorrectorEven | EffectKind::QuadDrift => {}
+            EffectKind::CorrectorEven => {
+                let corrector = self.corrector(effect)?;
+                self.instruments.push(Instrument::Even { corrector, share: a });
+            }
+            EffectKind::QuadDrift => {
+                effect.everywhere()?;
+                self.drift += a;
+            }
         }
         Ok(())
     }
@@ -245,23 +146,34 @@ impl Machine {
     /// [`OrbitError`] if the machine is unstable.
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
         let optics = Optics::of(&self.ring, Hold::Momentum { delta: self.delta })?;
-        let (mut x, mut y) = planes(&optics);
+        let (mut x, mut y) = self.held(&self.ring, &optics)?;
+        self.instruments.iter().for_each(|i| self.read(&optics, i, &mut x, &mut y));
+        let dispersion = optics.monitor_places(Plane::X).iter().map(|o| optics.dispersion(o)).collect();
+        Ok(MachineResponse { x, y, dispersion, tunes: optics.tunes()?, gamma_transition: optics.gamma_transition() })
+    }
+
+    /// Response (x, y) at the monitor places with what this machine holds constant.
+    pub(super) fn held(&self, ring: &Ring, optics: &Optics) -> Result<(DMatrix<f64>, DMatrix<f64>), OrbitError> {
+        let (mut x, mut y) = planes(optics, &optics.correctors());
         if self.frequency_share != 0.0 {
             let offset = optics.frequency_offset();
-            let (fixed_x, fixed_y) = planes(&Optics::of(&self.ring, Hold::Frequency { offset })?);
+            let held = Optics::of(ring, Hold::Frequency { offset })?;
+            let (fixed_x, fixed_y) = planes(&held, &held.correctors());
             x += (fixed_x - &x) * self.frequency_share;
             y += (fixed_y - &y) * self.frequency_share;
         }
-        let seen = |plane| optics.monitor_places(plane).iter().map(|o| optics.dispersion(o)).collect::<Vec<_>>();
-        let (dispersion, dispersion_y) = (seen(Plane::X), seen(Plane::Y));
         if let Some(([i, j], share)) = self.radial_loop {
+            let seen = |plane| {
+                let dispersion = optics.monitor_places(plane).iter().map(|o| optics.dispersion(o)).collect();
+                DVector::<f64>::from_vec(dispersion)
+            };
+            let (dispersion, dispersion_y) = (seen(Plane::X), seen(Plane::Y));
             // the momentum that brings the pair's mean back
             let momentum = (x.row(i) + x.row(j)) * (share / (dispersion[i] + dispersion[j]));
-            x -= nalgebra::DVector::from_column_slice(&dispersion) * &momentum;
-            y -= nalgebra::DVector::from_column_slice(&dispersion_y) * &momentum;
+            x -= dispersion * &momentum;
+            y -= dispersion_y * &momentum;
         }
-        self.instruments.iter().for_each(|i| self.read(&optics, i, &mut x, &mut y));
-        Ok(MachineResponse { x, y, dispersion, tunes: optics.tunes()?, gamma_transition: optics.gamma_transition() })
+        Ok((x, y))
     }
 
     fn read(&self, optics: &Optics, instrument: &Instrument, x: &mut DMatrix<f64>, y: &mut DMatrix<f64>) {
@@ -284,6 +196,8 @@ impl Machine {
                 scale(x.column_mut(corrector).iter_mut(), factor);
                 scale(y.column_mut(corrector).iter_mut(), factor);
             }
+            // moves both signs alike: not their half difference, which a response is
+            Instrument::Even { .. } => {}
         }
     }
 
@@ -300,7 +214,7 @@ impl Machine {
     }
 
     /// Plane and index among the places of `x_E4`.
-    fn monitor(&self, effect: &Effect, name: &str) -> Result<(Plane, usize), EffectError> {
+    pub(super) fn monitor(&self, effect: &Effect, name: &str) -> Result<(Plane, usize), EffectError> {
         let wrong = || effect.wrong("a monitor such as x_E4 or y_C5");
         let (plane, cell) = name.split_once('_').ok_or_else(wrong)?;
         let plane = match plane {
@@ -317,7 +231,7 @@ impl Machine {
         Ok((plane, place))
     }
 
-    fn monitor_pair(&self, effect: &Effect) -> Result<[(Plane, usize); 2], EffectError> {
+    pub(super) fn monitor_pair(&self, effect: &Effect) -> Result<[(Plane, usize); 2], EffectError> {
         let (one, other) =
             effect.place.split_once(',').ok_or_else(|| effect.wrong("two monitors such as x_D8,x_E6"))?;
         let pair = [self.monitor(effect, one)?, self.monitor(effect, other)?];
@@ -328,7 +242,7 @@ impl Machine {
     }
 
     /// Index among the correctors of `H_A4` or `V_D3`.
-    fn corrector(&self, effect: &Effect) -> Result<usize, EffectError> {
+    pub(super) fn corrector(&self, effect: &Effect) -> Result<usize, EffectError> {
         let at = match effect.place.split_once('_') {
             Some(("H", cell)) => self.ring.corrector(Plane::X, cell)?,
             Some(("V", cell)) => self.ring.corrector(Plane::Y, cell)?,
@@ -369,24 +283,14 @@ impl Machine {
 
     fn sextupole(&mut self, effect: &Effect) -> Result<(), EffectError> {
         let wanted = cell(&effect.place);
-        let is = |e: &&mut crate::Element| matches!(e.kind, Kind::Sextupole { .. }) && e.cell() == wanted;
-        let element =
-            self.ring.elements.iter_mut().find(is).ok_or_else(|| effect.wrong("a sextupole such as SX_A1"))?;
+        let is = |e: &crate::Element| matches!(e.kind, Kind::Sextupole { .. }) && e.cell() == wanted;
+        let found = self.ring.elements.iter_mut().enumerate().find(|(_, e)| is(e));
+        let (at, element) = found.ok_or_else(|| effect.wrong("a sextupole such as SX_A1"))?;
         if let Kind::Sextupole { k2 } = &mut element.kind {
             *k2 += effect.amplitude / element.length;
         }
+        self.sextupoles.push((at, effect.amplitude));
         Ok(())
-    }
-}
-
-impl Effect {
-    /// An effect on the whole ring takes no place.
-    fn everywhere(&self) -> Result<(), EffectError> {
-        if self.place.is_empty() { Ok(()) } else { Err(self.wrong("no place")) }
-    }
-
-    fn wrong(&self, expected: &'static str) -> EffectError {
-        EffectError::Place { kind: self.kind.word(), expected, found: self.place.clone() }
     }
 }
 
@@ -395,15 +299,13 @@ fn cell(place: &str) -> &str {
     place.split_once('_').map_or(place, |(_, cell)| cell)
 }
 
-fn planes(optics: &Optics) -> (DMatrix<f64>, DMatrix<f64>) {
-    let correctors = optics.correctors();
-    (
-        optics.response(&optics.monitor_places(Plane::X), &correctors),
-        optics.response(&optics.monitor_places(Plane::Y), &correctors),
-    )
+/// Response (x, y) at the monitor places to kicks.
+pub(super) fn planes(optics: &Optics, sources: &[Source]) -> (DMatrix<f64>, DMatrix<f64>) {
+    let respond = |plane| optics.response(&optics.monitor_places(plane), sources);
+    (respond(Plane::X), respond(Plane::Y))
 }
 
-fn rows<'m>(plane: Plane, x: &'m mut DMatrix<f64>, y: &'m mut DMatrix<f64>) -> &'m mut DMatrix<f64> {
+pub(super) fn rows<'m>(plane: Plane, x: &'m mut DMatrix<f64>, y: &'m mut DMatrix<f64>) -> &'m mut DMatrix<f64> {
     if plane == Plane::X { x } else { y }
 }
 
@@ -418,28 +320,6 @@ mod tests {
     fn respond(effects: &[&str]) -> MachineResponse {
         let effects: Vec<Effect> = effects.iter().map(|e| e.parse().unwrap()).collect();
         Machine::new(Ring::booster(), Rf::FixedMomentum, &effects).unwrap().response().unwrap()
-    }
-
-    #[test]
-    fn words_parse_and_unknown_ones_are_refused() {
-        let effect: Effect = "bpm_swap@x_E4,x_E6".parse().unwrap();
-        assert_eq!((effect.kind, effect.place.as_str(), effect.amplitude), (EffectKind::BpmSwap, "x_E4,x_E6", 1.0));
-        assert!(
-            "bpm_gian@x_E4"
-                .parse::<Effect>()
-                .unwrap_err()
-                .to_string()
-                .starts_with("unknown effect \"bpm_gian\"; known: bpm_gain,")
-        );
-        assert_eq!(
-            "bpm_gain@x_E4=nan".parse::<Effect>().unwrap_err().to_string(),
-            "effect bpm_gain: expected a finite amplitude, found \"nan\""
-        );
-        let astray = Machine::new(Ring::booster(), Rf::FixedMomentum, &["stray_gradient@QH_A2".parse().unwrap()]);
-        assert_eq!(
-            astray.unwrap_err().to_string(),
-            "effect stray_gradient: expected a free straight such as SLOT_F6, found \"QH_A2\""
-        );
     }
 
     #[test]

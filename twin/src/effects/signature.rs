@@ -1,0 +1,275 @@
+//! Derivative of the readings with respect to the amplitude of an effect: what a small one looks like.
+//!
+//! Gradients of any kind (stray, skew, of a dipole, of its edges, of a rolled quadrupole, of a sextupole through the orbit)
+//! are one formula, `dR = -a (W + step) Q (W + step) c` of [`crate::response`]; instruments act on rows and columns; what
+//! the ring holds constant is a difference of two exact responses. An effect without an amplitude (a reversed corrector,
+//! exchanged monitors, a held frequency) has its whole change instead.
+
+use nalgebra::{DMatrix, DVector, RowDVector};
+
+use super::drives::{Drives, curved};
+use super::machine::{Instrument, Machine, Rf};
+use super::{Effect, EffectError, EffectKind};
+use crate::lattice::{Kind, Plane};
+use crate::orbit::{Hold, OrbitError};
+use crate::response::{Gradient, Observer, Optics, Place, Source};
+
+/// A machine linearised for the signatures of further effects.
+#[derive(Debug)]
+pub struct Signatures<'m> {
+    machine: &'m Machine,
+    drives: &'m Drives,
+    optics: Optics<'m>,
+    /// Read monitors, each in its plane.
+    observers: Vec<Observer>,
+    sources: Vec<Source>,
+    /// Kicks that the frames really had.
+    kick: DMatrix<f64>,
+    /// Positions at all monitor places, rows frames [m].
+    x: DMatrix<f64>,
+    y: DMatrix<f64>,
+    /// Response of the read monitors, the RF frequency last.
+    response: DMatrix<f64>,
+    monitors: Vec<(Plane, usize)>,
+    correctors: Vec<String>,
+}
+
+/// What a small effect does per unit of its amplitude.
+#[derive(Debug, Clone)]
+pub struct Signature {
+    /// To the readings, rows frames, columns read monitors [m].
+    pub readings: DMatrix<f64>,
+    /// To the tunes.
+    pub tunes: [f64; 2],
+    /// To the tunes at the end of the campaign against its middle.
+    pub tune_drift: [f64; 2],
+}
+
+/// Edge angle for a numerical derivative [rad], and momentum [1].
+const STEP: f64 = 1e-4;
+
+impl<'m> Signatures<'m> {
+    /// Linearise.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the machine is unstable.
+    pub fn of(machine: &'m Machine, drives: &'m Drives) -> Result<Self, OrbitError> {
+        let optics = Optics::of(&machine.ring, Hold::Momentum { delta: machine.delta })?;
+        let seen = machine.seen(&machine.ring)?;
+        let kick = machine.kicks(drives);
+        let (x, y) = drives.positions(&seen, &kick);
+        let monitors = machine.ring.read_places();
+        let rows: Vec<RowDVector<f64>> = monitors
+            .iter()
+            .map(|&(plane, place)| if plane == Plane::X { seen.x.row(place) } else { seen.y.row(place) }.into_owned())
+            .collect();
+        let (observers, sources) = (optics.read_monitors(), optics.correctors());
+        let correctors = machine.ring.corrector_names();
+        let response = DMatrix::from_rows(&rows);
+        Ok(Self { machine, drives, optics, observers, sources, kick, x, y, response, monitors, correctors })
+    }
+
+    /// Derivative of readings and tunes with respect to `ln` of each var.
+    pub fn of_vars(&self) -> Vec<Signature> {
+        let ring = &self.machine.ring;
+        let one = |(&element, k1): (&usize, f64)| self.of_gradient(&self.optics.gradient(element), k1);
+        ring.quadrupoles.iter().zip(ring.gradients()).map(one).map(|signature| self.as_read(signature)).collect()
+    }
+
+    /// Derivative with respect to a gradient (normal, or skew) [1/m] at any place of the ring.
+    pub fn of_thin(&self, place: Place, kind: EffectKind) -> Signature {
+        let gradient = match kind {
+            EffectKind::StraySkewGradient => self.optics.thin_skew_gradient(place),
+            _ => self.optics.thin_gradient(place),
+        };
+        self.of_gradient(&gradient, 1.0)
+    }
+
+    /// What gains and exchanged names, already in the machine, make of a change of the orbit.
+    fn as_read(&self, mut signature: Signature) -> Signature {
+        let of = |plane, place| self.monitors.iter().position(|m| *m == (plane, place));
+        for instrument in &self.machine.instruments {
+            match *instrument {
+                Instrument::Gain { plane, place, error } => {
+                    if let Some(b) = of(plane, place) {
+                        signature.readings.column_mut(b).apply(|r| *r *= 1.0 + error);
+                    }
+                }
+                Instrument::Swap { plane, places: [one, other] } => {
+                    if let (Some(i), Some(j)) = (of(plane, one), of(plane, other)) {
+                        signature.readings.swap_columns(i, j);
+                    }
+                }
+                _ => {}
+            }
+        }
+        signature
+    }
+
+    /// The signature of an effect of unit amplitude.
+    ///
+    /// # Errors
+    /// [`EffectError`] if the ring has no such place; [`OrbitError`], as its text, where it makes the ring unstable.
+    pub fn of_effect(&self, kind: EffectKind, place: &str) -> Result<Signature, EffectError> {
+        self.unread(kind, place).map(|signature| self.as_read(signature))
+    }
+
+    fn unread(&self, kind: EffectKind, place: &str) -> Result<Signature, EffectError> {
+        let effect = Effect { kind, place: place.into(), amplitude: 1.0 };
+        let machine = self.machine;
+        let ring = &machine.ring;
+        let element = |name: &str| ring.element(name).map_err(EffectError::from);
+        Ok(match kind {
+            EffectKind::BpmGain => {
+                let (b, ..) = self.monitor(&effect, place)?;
+                self.of_monitor(b, self.position(b))
+            }
+            EffectKind::BpmRoll => {
+                let (b, plane, at) = self.monitor(&effect, place)?;
+                let other = if plane == Plane::X { self.y.column(at).into_owned() } else { -self.x.column(at) };
+                self.of_monitor(b, other)
+            }
+            EffectKind::BpmCubic => {
+                let (b, plane, at) = self.monitor(&effect, place)?;
+                let base = self.drives.orbit[ring.monitors[at]][usize::from(plane == Plane::Y)];
+                let cube = |p: f64| p * (p * 1e3).powi(2);
+                self.of_monitor(b, self.position(b).map(|p| cube(base + p) - cube(base)))
+            }
+            EffectKind::BpmSwap => {
+                let (one, other) = place.split_once(',').ok_or_else(|| effect.wrong("two monitors"))?;
+                let (i, j) = (self.monitor(&effect, one)?.0, self.monitor(&effect, other)?.0);
+                let difference = self.position(j) - self.position(i);
+                let mut signature = self.of_monitor(i, difference.clone());
+                signature.readings.set_column(j, &-difference);
+                signature
+            }
+            EffectKind::CorrectorGain => self.of_corrector(machine.corrector(&effect)?, |k| k),
+            EffectKind::CorrectorPolarity => self.of_corrector(machine.corrector(&effect)?, |k| -2.0 * k),
+            EffectKind::CorrectorEven => {
+                let nominal = self.drives.nominal_kick;
+                self.of_corrector(machine.corrector(&effect)?, |k| k * k / nominal)
+            }
+            EffectKind::CorrectorRoll => {
+                let c = machine.corrector(&effect)?;
+                let turned = if self.correctors[c].starts_with("H_") { [0.0, 1.0] } else { [-1.0, 0.0] };
+                let source = self.optics.kick(ring.correctors[c], turned);
+                self.of_kick(c, self.optics.response(&self.observers, &[source]).column(0).into_owned(), |k| k)
+            }
+            EffectKind::QuadRoll => {
+                let at = ring.quadrupole(place)?;
+                let Kind::Quadrupole { k1 } = ring.elements[at].kind else { return Err(effect.wrong("a quadrupole")) };
+                // x'' = -k1 (x cos 2a + y sin 2a)
+                self.of_gradient(&self.optics.skew_gradient(at), -2.0 * k1)
+            }
+            EffectKind::StrayGradient | EffectKind::StraySkewGradient => self.of_thin(element(place)?.into(), kind),
+            EffectKind::DipoleGradient => {
+                let at = element(place)?;
+                self.of_gradient(&self.optics.gradient(at), 1.0 / ring.elements[at].length)
+            }
+            EffectKind::DipoleEdge | EffectKind::MomentumOffset => self.of_difference(&effect, STEP)?,
+            EffectKind::FixedRfFrequency | EffectKind::RadialLoop => self.of_difference(&effect, 1.0)?,
+            EffectKind::SextupoleError => self.of_sextupole(&effect)?,
+            EffectKind::QuadDrift => self.of_drift(),
+        })
+    }
+
+    /// Index among the read monitors, plane and place.
+    fn monitor(&self, effect: &Effect, name: &str) -> Result<(usize, Plane, usize), EffectError> {
+        let at = self.machine.monitor(effect, name)?;
+        let read = self.monitors.iter().position(|m| *m == at);
+        Ok((read.ok_or_else(|| effect.wrong("a monitor that is read"))?, at.0, at.1))
+    }
+
+    fn position(&self, b: usize) -> DVector<f64> {
+        let (plane, place) = self.monitors[b];
+        if plane == Plane::X { self.x.column(place).into_owned() } else { self.y.column(place).into_owned() }
+    }
+
+    fn of_monitor(&self, b: usize, change: DVector<f64>) -> Signature {
+        let mut readings = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
+        readings.set_column(b, &change);
+        Signature { readings, tunes: [0.0; 2], tune_drift: [0.0; 2] }
+    }
+
+    fn of_corrector(&self, corrector: usize, change: impl Fn(f64) -> f64) -> Signature {
+        self.of_kick(corrector, self.response.column(corrector).into_owned(), change)
+    }
+
+    fn of_kick(&self, corrector: usize, response: DVector<f64>, change: impl Fn(f64) -> f64) -> Signature {
+        let kick = self.kick.column(corrector).map(change);
+        Signature { readings: kick * response.transpose(), tunes: [0.0; 2], tune_drift: [0.0; 2] }
+    }
+
+    /// A change of gradient by `scale`.
+    fn of_gradient(&self, gradient: &Gradient, scale: f64) -> Signature {
+        let gradients = core::slice::from_ref(gradient);
+        let response = &self.optics.response_jacobian(&self.observers, &self.sources, gradients)[0];
+        let mut readings = &self.kick * response.transpose() * scale;
+        let rf = self.optics.rf_jacobian(&self.observers, gradients) * scale;
+        readings.ger(1.0, &self.drives.rf_offset, &rf.column(0), 1.0);
+        Signature { readings, tunes: self.optics.tune_slope(gradient).map(|t| t * scale), tune_drift: [0.0; 2] }
+    }
+
+    /// Difference of two exact responses.
+    fn of_difference(&self, effect: &Effect, step: f64) -> Result<Signature, EffectError> {
+        let changed = Machine::new(
+            self.machine.ring.clone(),
+            Rf::FixedMomentum,
+            &[Effect { amplitude: step, ..effect.clone() }],
+        )?;
+        let seen = changed.seen(&changed.ring).map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
+        let plain = self.machine.seen(&self.machine.ring);
+        let plain = plain.map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
+        let (x, y) = self.drives.positions(&seen, &self.kick);
+        let readings = (self.machine.own_planes(&x, &y) - self.machine.own_planes(&self.x, &self.y)) / step;
+        let tunes = [(seen.tunes.x - plain.tunes.x) / step, (seen.tunes.y - plain.tunes.y) / step];
+        Ok(Signature { readings, tunes, tune_drift: [0.0; 2] })
+    }
+
+    /// Feed-down of the orbit that passes a sextupole, and the quadratic kick of the orbit that the correctors add.
+    fn of_sextupole(&self, effect: &Effect) -> Result<Signature, EffectError> {
+        let ring = &self.machine.ring;
+        let changed = Machine::new(ring.clone(), Rf::FixedMomentum, core::slice::from_ref(effect))?;
+        let Some(&(at, k2l)) = changed.sextupoles.first() else { return Err(effect.wrong("a sextupole")) };
+        let [x, y] = self.drives.orbit[at];
+        let per_length = 1.0 / ring.elements[at].length;
+        let mut signature = self.of_gradient(&self.optics.gradient(at), k2l * x * per_length);
+        signature.readings += self.of_gradient(&self.optics.skew_gradient(at), k2l * y * per_length).readings;
+        let curved = curved(ring, at, k2l, &self.kick);
+        let [x, y] = curved.map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
+        signature.readings += self.machine.own_planes(&x, &y);
+        Ok(signature)
+    }
+
+    /// All gradients in proportion to the time.
+    fn of_drift(&self) -> Signature {
+        let zero = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
+        let mut sum = Signature { readings: zero, tunes: [0.0; 2], tune_drift: [0.0; 2] };
+        for one in self.of_vars() {
+            sum.readings += one.readings;
+            sum.tune_drift = [sum.tune_drift[0] + one.tunes[0], sum.tune_drift[1] + one.tunes[1]];
+        }
+        sum.readings.row_iter_mut().zip(self.drives.time.iter()).for_each(|(mut row, time)| row *= *time);
+        sum
+    }
+}
+
+impl Optics<'_> {
+    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients.
+    pub fn rf_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
+        let eta = self.slip_factor();
+        let compaction = self.compaction_jacobian(gradients);
+        let mut slope = self.dispersion_jacobian(observers, gradients) * (-1.0 / eta);
+        for (b, observer) in observers.iter().enumerate() {
+            let per_compaction = self.dispersion(observer) / (eta * eta);
+            slope.row_mut(b).iter_mut().zip(&compaction).for_each(|(s, c)| *s += per_compaction * c);
+        }
+        slope
+    }
+}
+
+impl From<OrbitError> for EffectError {
+    fn from(error: OrbitError) -> Self {
+        Self::Orbit { effect: "machine", error }
+    }
+}
