@@ -40,9 +40,13 @@ pub struct Data {
     /// Relative change of the baseline orbit per `ln` of all gradients, in x and y [1].
     pub sensitivity: [f64; 2],
     channels: Vec<Channel>,
+    /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
+    tunes: DMatrix<f64>,
     meter: [Option<Meter>; 2],
-    /// Standard deviation of the unknown factors of each monitor, but for the drift.
+    /// What each monitor's readings share, in standard deviations, but for the drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
+    /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
+    drift: f64,
 }
 
 /// The readings of one monitor that count.
@@ -161,10 +165,15 @@ impl Data {
             ])
         });
         let shared: Vec<_> = shared.collect();
-        let meter = [0, 1].map(|plane| Meter::of(recording, &signatures, first, plane, [&off(0), &off(1)], &drives));
+        let slope = |plane: usize, range: core::ops::Range<usize>| signatures[range].iter().map(|s| s.tunes[plane]).sum::<f64>();
+        let slopes = [0, 1].map(|plane| [slope(plane, 0..first), slope(plane, first..n)]);
+        let (off_x, off_y) = (off(0), off(1));
+        let tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| match recording.rows[i].tune[plane] {
+            Some(tune) if drives.rf_offset[i] == 0.0 => tune - slopes[plane][0] * off_x[i] - slopes[plane][1] * off_y[i],
+            _ => f64::NAN,
+        });
         let mut data = Self {
             ring: ring.clone(),
-            drives,
             orbit_sigma,
             screened,
             supplies,
@@ -172,8 +181,11 @@ impl Data {
             baseline_rms,
             sensitivity,
             channels: Vec::new(),
-            meter,
+            meter: [0, 1].map(|plane| Meter::of(tunes.column(plane).iter().zip(drives.time.iter()))),
+            tunes,
             shared,
+            drift: 0.0,
+            drives,
         };
         data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, 0.0)).collect();
         data.check(recording)?;
@@ -183,23 +195,42 @@ impl Data {
     /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
     pub fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
+        data.drift = amplitude;
         data.channels = (0..self.readings.ncols()).map(|b| self.channel(b, amplitude)).collect();
         data
     }
 
+    /// The same recording without some frames.
+    pub fn without(&self, frames: &[usize]) -> Self {
+        let mut data = self.clone();
+        for &frame in frames {
+            data.screened.accepted[frame] = 0;
+            data.tunes.row_mut(frame).fill(f64::NAN);
+        }
+        data.meter = [0, 1].map(|plane| Meter::of(data.tunes.column(plane).iter().zip(data.drives.time.iter())));
+        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data
+    }
+
     fn channel(&self, b: usize, drift: f64) -> Channel {
-        let accepted = |&frame: &usize| self.screened.accepted[frame] >> b & 1 == 1 && !self.readings[(frame, b)].is_nan();
-        let frames: Vec<usize> = (0..self.readings.nrows()).filter(accepted).collect();
+        let frames: Vec<usize> = (0..self.readings.nrows()).filter(|&frame| self.counts(frame, b)).collect();
+        let shared = self.shared_of(b, &frames, drift);
+        Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
+    }
+
+    /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
+    fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
         let drift = drift * self.sensitivity[plane] * self.baseline_rms[plane];
-        let mut shared = self.shared[b].select_rows(&frames);
-        if drift != 0.0 {
-            let time = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i] * drift));
-            let at = shared.ncols();
-            shared = shared.insert_column(at, 0.0);
-            shared.set_column(at, &time);
+        let shared = self.shared[b].select_rows(frames);
+        if drift == 0.0 {
+            return shared;
         }
-        Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
+        let at = shared.ncols();
+        let time = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i] * drift));
+        let mut shared = shared.insert_column(at, 0.0);
+        shared.set_column(at, &time);
+        shared
     }
 
     fn check(&self, recording: &Recording) -> Result<(), DataError> {
@@ -279,6 +310,36 @@ impl Data {
         self.channels.iter().enumerate().flat_map(of).chain([None; 4]).collect()
     }
 
+    /// First of a monitor's whitened numbers.
+    pub fn start(&self, b: usize) -> usize {
+        self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
+    }
+
+    /// Whiten columns over all frames as readings of one monitor.
+    pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        let channel = &self.channels[b];
+        let mut part = columns.select_rows(&channel.frames) / channel.sigma;
+        let mut along = channel.basis.transpose() * &part;
+        along.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
+        part -= &channel.basis * along;
+        part
+    }
+
+    /// True if a reading counts.
+    pub fn counts(&self, frame: usize, b: usize) -> bool {
+        self.screened.accepted[frame] >> b & 1 == 1 && !self.readings[(frame, b)].is_nan()
+    }
+
+    /// Frames in which a monitor's reading counts.
+    pub fn frames(&self, b: usize) -> &[usize] {
+        &self.channels[b].frames
+    }
+
+    /// What readings of a monitor share in some frames, in standard deviations [frames][factors] [m].
+    pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
+        self.shared_of(b, frames, self.drift)
+    }
+
     /// Noise of one reading of a monitor [m].
     pub fn noise(&self, b: usize) -> f64 {
         self.channels[b].sigma
@@ -305,23 +366,9 @@ impl Channel {
 }
 
 impl Meter {
-    /// Regress the tune of the frames on the supplies (their slopes known) and the time.
-    fn of(
-        recording: &Recording,
-        slopes: &[Signature],
-        first: usize,
-        plane: usize,
-        off: [&DVector<f64>; 2],
-        drives: &Drives,
-    ) -> Option<Self> {
-        let slope = |from: usize, to: usize| slopes[from..to].iter().map(|s| s.tunes[plane]).sum::<f64>();
-        let slope = [slope(0, first), slope(first, slopes.len())];
-        let points: Vec<(f64, f64)> = (recording.rows.iter().enumerate())
-            .filter(|(_, row)| row.rf_offset == 0.0)
-            .filter_map(|(i, row)| {
-                Some((drives.time[i], row.tune[plane]? - slope[0] * off[0][i] - slope[1] * off[1][i]))
-            })
-            .collect();
+    /// A line through the tunes of the frames over time.
+    fn of<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
+        let points: Vec<(f64, f64)> = frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
         // a line needs a few points, and its noise some more
         if points.len() < 8 {
             return None;

@@ -34,8 +34,8 @@ pub struct Fitted {
     pub jacobian: DMatrix<f64>,
     /// Factor of `1 + J^T J`, the inverse of the covariance of u.
     pub factor: Cholesky<f64, Dyn>,
-    /// Standard deviation of the readings' common drift that whitened the data: that of the hypothesis's own amplitude.
-    pub drift: f64,
+    /// The data whitened for this hypothesis, where it says that the baselines drift.
+    drifting: Option<Box<Data>>,
 }
 
 /// Expected decrease of the cost at which the steps have settled.
@@ -58,45 +58,51 @@ struct Point {
 }
 
 impl Fitted {
-    /// Fit, from a guess of the vars (and of the amplitudes, if it is as long).
+    /// Fit, from a guess of the vars (and of the other unknowns, if it is as long).
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine at the guess.
     pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
+        let fitted = Self::minimise(data, hypothesis, guess)?;
+        let Some(term) = hypothesis.terms.iter().position(|term| term.kind == EffectKind::QuadDrift) else {
+            return Ok(fitted);
+        };
+        // the drift of the baselines is as large as that of the quadrupoles
+        let drifting = data.drifting(fitted.amplitude(data, term).0.abs());
+        let fitted = Self::minimise(&drifting, hypothesis, &fitted.u)?;
+        Ok(Self { drifting: Some(Box::new(drifting)), ..fitted })
+    }
+
+    /// The data as this fit whitens them.
+    pub fn data<'d>(&'d self, data: &'d Data) -> &'d Data {
+        self.drifting.as_deref().unwrap_or(data)
+    }
+
+    fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
         let vars = data.ring.quadrupoles.len();
         let unknowns = hypothesis.unknowns(data);
         let mut u = guess.clone().resize_vertically(vars + unknowns.len(), 0.0);
-        // a kick from zero, where some derivatives vanish
         u.rows_mut(0, vars).iter_mut().for_each(|u| *u = bounded(*u));
         let mut here = point(data, hypothesis, u)?;
         let mut jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
+        let mut factor = normal(&jacobian);
         for _ in 0..STEPS {
-            let factor = normal(&jacobian);
             let slope = jacobian.tr_mul(&here.residual) - &here.u;
             let full = factor.solve(&slope);
             let Some((next, expected)) = descend(data, hypothesis, &here, &full, &slope, vars) else { break };
             here = next;
-            jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
             if expected < SETTLED {
                 break;
             }
+            jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
+            factor = normal(&jacobian);
         }
-        let factor = normal(&jacobian);
-        let (mean, sigma) = prior();
-        let params = here.u.rows(0, vars).iter().map(|u| mean + sigma * u).collect();
+        let params = params_of(&here.u, vars);
         let log_det: f64 = 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det());
-        Ok(Self {
-            hypothesis: hypothesis.clone(),
-            params,
-            cost: here.cost,
-            log_evidence,
-            residual: here.residual,
-            jacobian,
-            factor,
-            u: here.u,
-            drift: 0.0,
-        })
+        let hypothesis = hypothesis.clone();
+        let (cost, residual, u) = (here.cost, here.residual, here.u);
+        Ok(Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, u, drifting: None })
     }
 
     /// Amplitude and standard deviation of a term; (1, 0) without one.
@@ -114,11 +120,48 @@ impl Fitted {
         })
     }
 
+    /// Residuals at the best point, measured minus predicted, and the derivative of each prediction with respect to every u,
+    /// rows frames, columns monitors [m].
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn linearise(&self, data: &Data) -> Result<(DMatrix<f64>, Vec<DMatrix<f64>>), EffectError> {
+        let vars = self.params.len();
+        let readings = |u: &DVector<f64>| -> Result<DMatrix<f64>, EffectError> {
+            let (machine, drives) = self.hypothesis.machine(data, &params_of(u, vars), &u.as_slice()[vars..])?;
+            Ok(machine.readings(&drives)?.0)
+        };
+        let (machine, drives) = self.hypothesis.machine(data, &self.params, &self.u.as_slice()[vars..])?;
+        let signatures = Signatures::of(&machine, &drives)?;
+        let mut slopes: Vec<DMatrix<f64>> =
+            signatures.of_vars().into_iter().map(|signature| signature.readings * prior().1).collect();
+        for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
+            slopes.push(match unknown {
+                Unknown::Member(term, width) => signatures.of_effect(term.kind, &term.place)?.readings * *width,
+                _ => {
+                    let at = |step: f64| {
+                        let mut u = self.u.clone();
+                        u[vars + i] += step;
+                        readings(&u)
+                    };
+                    (at(DIFFERENCE)? - at(-DIFFERENCE)?) / (2.0 * DIFFERENCE)
+                }
+            });
+        }
+        Ok((&data.readings - readings(&self.u)?, slopes))
+    }
+
     /// Covariance of `ln` of the vars.
     pub fn covariance(&self) -> DMatrix<f64> {
         let (vars, (_, sigma)) = (self.params.len(), prior());
         self.factor.inverse().view((0, 0), (vars, vars)) * (sigma * sigma)
     }
+}
+
+/// `ln` vars of the first unknowns.
+fn params_of(u: &DVector<f64>, vars: usize) -> Vec<f64> {
+    let (mean, sigma) = prior();
+    u.rows(0, vars).iter().map(|u| mean + sigma * u).collect()
 }
 
 fn bounded(u: f64) -> f64 {
@@ -134,9 +177,7 @@ fn normal(jacobian: &DMatrix<f64>) -> Cholesky<f64, Dyn> {
 
 fn point(data: &Data, hypothesis: &Hypothesis, u: DVector<f64>) -> Result<Point, EffectError> {
     let vars = data.ring.quadrupoles.len();
-    let (mean, sigma) = prior();
-    let params: Vec<f64> = u.rows(0, vars).iter().map(|u| mean + sigma * u).collect();
-    let (machine, drives) = hypothesis.machine(data, &params, &u.as_slice()[vars..])?;
+    let (machine, drives) = hypothesis.machine(data, &params_of(&u, vars), &u.as_slice()[vars..])?;
     let (readings, tunes, tune_drift) = machine.readings(&drives)?;
     let residual = data.residual(&readings, tunes, tune_drift);
     let cost = residual.norm_squared() + u.norm_squared();
@@ -175,9 +216,8 @@ fn differentiate(
     here: &Point,
 ) -> Result<DMatrix<f64>, EffectError> {
     let vars = data.ring.quadrupoles.len();
-    let (mean, sigma) = prior();
-    let params: Vec<f64> = here.u.rows(0, vars).iter().map(|u| mean + sigma * u).collect();
-    let (machine, drives) = hypothesis.machine(data, &params, &here.u.as_slice()[vars..])?;
+    let (_, sigma) = prior();
+    let (machine, drives) = hypothesis.machine(data, &params_of(&here.u, vars), &here.u.as_slice()[vars..])?;
     let signatures = Signatures::of(&machine, &drives)?;
     let mut jacobian = DMatrix::zeros(data.len(), vars + unknowns.len());
     for (q, signature) in signatures.of_vars().iter().enumerate() {
@@ -200,9 +240,4 @@ fn differentiate(
         jacobian.set_column(vars + i, &column);
     }
     Ok(jacobian)
-}
-
-/// True for an effect that also moves the baselines in time.
-pub fn moves_baselines(kind: EffectKind) -> bool {
-    kind == EffectKind::QuadDrift
 }

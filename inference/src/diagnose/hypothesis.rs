@@ -125,6 +125,11 @@ impl Hypothesis {
         terms.chain(self.scatter.iter().flat_map(of_scatter)).collect()
     }
 
+    /// Number of unknowns that are members of a scatter; they stand last.
+    pub fn members(&self, data: &Data) -> usize {
+        self.scatter.iter().map(|scatter| members(scatter.kind, data).len()).sum()
+    }
+
     /// The machine, and what drives it, at given `ln` vars and values of the unknowns in units of their standard deviations.
     ///
     /// # Errors

@@ -71,3 +71,27 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     }
     Ok(all)
 }
+
+/// `ln` Bayes factor of all members of a family having amplitudes of standard deviation `width`, to first order.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn family(data: &Data, fitted: &Fitted, members: &[Term], width: f64) -> Result<f64, EffectError> {
+    let vars = fitted.params.len();
+    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
+    let signatures = Signatures::of(&machine, &drives)?;
+    let columns: Vec<DVector<f64>> = members
+        .iter()
+        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * width))
+        .collect::<Result<_, EffectError>>()?;
+    let columns = DMatrix::from_columns(&columns);
+    let shared = fitted.jacobian.transpose() * &columns;
+    let taken = fitted.factor.solve(&shared);
+    let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
+    let pull = columns.tr_mul(&fitted.residual) - taken.tr_mul(&slope);
+    let mut gram = columns.transpose() * &columns - shared.transpose() * taken;
+    (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0);
+    let Some(factor) = gram.cholesky() else { return Ok(f64::NEG_INFINITY) };
+    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
+    Ok(0.5 * pull.dot(&factor.solve(&pull)) - log_det)
+}

@@ -1,0 +1,329 @@
+//! Something without a class: a part of the data that the fit does not describe, located as well as may be.
+//!
+//! Each place is given freedom of its own: one unknown number of standard deviation `omega` for every setting (or stretch of
+//! time) at a monitor, a corrector or a place in the ring that kicks the beam. With `Z` the whitened pattern of those numbers,
+//! `P` the projection that takes away what the fit can imitate, `g = Z^T P r` and `G = Z^T P Z`:
+//!
+//! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,
+//!
+//! averaged over omega from well below the noise to millimetres. It needs no idea of the physics, and pays for its freedom.
+//!
+//! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{DMatrix, DVector};
+use twin::{EffectError, Plane, Signatures};
+
+use super::data::Data;
+use super::fit::Fitted;
+
+/// Where something sits.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Where {
+    /// At a monitor, setting by setting.
+    Monitor(usize),
+    /// At a monitor, as time goes by.
+    MonitorInTime(usize),
+    /// At a corrector.
+    Corrector(usize),
+    /// At a place in the ring (a quadrupole's entrance) that kicks the beam in a plane.
+    Ring(usize, Plane),
+    /// A quadrupole that changes in time.
+    QuadrupoleInTime(usize),
+    /// All monitors, as time goes by.
+    Time,
+    /// Everywhere.
+    Everywhere,
+}
+
+/// Freedom at one place, and what the data say of it.
+#[derive(Debug, Clone)]
+pub struct Discrepancy {
+    /// The place.
+    pub at: Where,
+    /// `ln` Bayes factor over the fit.
+    pub log_bayes: f64,
+    /// Most likely standard deviation of the unknown numbers [m at the monitors].
+    pub size: f64,
+    /// Places of the same sort.
+    pub sites: usize,
+}
+
+/// Sorts of places, which share the prior.
+pub const SORTS: usize = 7;
+/// Standard deviations tried [m].
+const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
+/// Stretches of time.
+const STRETCHES: usize = 8;
+
+/// Sums of one monitor's whitened numbers over cells (settings or stretches of time).
+struct Cells {
+    /// `E^T S^-1 E`.
+    gram: DMatrix<f64>,
+    /// `E^T S^(-1/2) J`, rows cells.
+    cross: DMatrix<f64>,
+    /// `E^T S^(-1/2) r`.
+    pull: DVector<f64>,
+}
+
+/// Everything that a scan needs of a fit.
+struct Bench<'f> {
+    fitted: &'f Fitted,
+    /// `J^T r - u`, zero at the best point.
+    slope: DVector<f64>,
+}
+
+/// Give freedom to every place in turn.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectError> {
+    let data = fitted.data(data);
+    let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
+    let bench = Bench { fitted, slope };
+    let settings = Settings::of(data);
+    let monitors = data.readings.ncols();
+    let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
+    let stretches = stretches(data);
+    let steps: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &stretches)).collect();
+    let speaking = data.speaking_monitors();
+    let mut all = Vec::new();
+    for &b in &speaking {
+        all.push(bench.judge(Where::Monitor(b), &cells[b], speaking.len()));
+        all.push(bench.judge(Where::MonitorInTime(b), &steps[b], speaking.len()));
+    }
+    let driven = data.driven_correctors();
+    for &c in &driven {
+        let of_corrector = settings.of_corrector(c);
+        all.push(bench.judge(Where::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
+    }
+    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+    let patterns = kicked(&machine)?;
+    let sites = patterns.len();
+    for (quadrupole, plane, pattern) in patterns {
+        all.push(bench.judge(Where::Ring(quadrupole, plane), &weighted(&cells, &speaking, &pattern), sites));
+    }
+    let signatures = Signatures::of(&machine, &drives)?;
+    let of_vars = signatures.of_vars();
+    for (q, signature) in of_vars.iter().enumerate() {
+        let pattern = data.stepped(signature, fitted, &stretches);
+        all.push(bench.judge(Where::QuadrupoleInTime(q), &pattern, of_vars.len()));
+    }
+    all.push(bench.judge_apart(Where::Time, speaking.iter().map(|&b| &steps[b])));
+    all.push(bench.judge_apart(Where::Everywhere, speaking.iter().map(|&b| &cells[b])));
+    Ok(all)
+}
+
+impl Bench<'_> {
+    /// Projected pull and Gram matrix of some numbers.
+    fn project(&self, cells: &Cells) -> (DVector<f64>, DMatrix<f64>) {
+        let taken = self.fitted.factor.solve(&cells.cross.transpose());
+        let pull = &cells.pull - taken.tr_mul(&self.slope);
+        (pull, &cells.gram - &cells.cross * taken)
+    }
+
+    fn judge(&self, at: Where, cells: &Cells, sites: usize) -> Discrepancy {
+        let (pull, gram) = self.project(cells);
+        let logs = SIZES.map(|size| marginal(&pull, &gram, size));
+        Discrepancy::of(at, logs, sites)
+    }
+
+    /// Many monitors with one size, as if each had the fit's unknowns for itself.
+    fn judge_apart<'c>(&self, at: Where, each: impl Iterator<Item = &'c Cells>) -> Discrepancy {
+        let mut logs = [0.0; SIZES.len()];
+        for cells in each {
+            let (pull, gram) = self.project(cells);
+            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&pull, &gram, size));
+        }
+        Discrepancy::of(at, logs, 1)
+    }
+}
+
+impl Discrepancy {
+    fn of(at: Where, logs: [f64; SIZES.len()], sites: usize) -> Self {
+        let (best, largest) = logs.iter().enumerate().fold((0, f64::NEG_INFINITY), |best, (i, &log)| {
+            if log > best.1 { (i, log) } else { best }
+        });
+        let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
+        Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites }
+    }
+}
+
+/// `ln` Bayes factor of unknown numbers of one size.
+fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
+    let variance = size * size;
+    let mut grown = gram * variance;
+    (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
+    let Some(factor) = grown.cholesky() else { return f64::NEG_INFINITY };
+    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
+    0.5 * variance * pull.dot(&factor.solve(pull)) - log_det
+}
+
+/// The settings of a campaign, each a corrector at one value, or an RF offset.
+struct Settings {
+    of_frame: Vec<usize>,
+    /// Corrector that is powered (the strongest kick), and how much, in fifths of the nominal setting.
+    powered: Vec<Option<(usize, i64)>>,
+}
+
+impl Settings {
+    fn of(data: &Data) -> Self {
+        let (mut known, mut of_frame, mut powered) = (BTreeMap::new(), Vec::new(), Vec::new());
+        for frame in 0..data.readings.nrows() {
+            let kick = data.drives.kick.row(frame).transpose();
+            let c = kick.iamax();
+            let fifths = (5.0 * kick[c] / data.drives.nominal_kick).round() as i64;
+            let key = ((fifths != 0).then_some((c, fifths)), data.drives.rf_offset[frame].to_bits());
+            let setting = *known.entry(key).or_insert_with(|| {
+                powered.push(key.0);
+                powered.len() - 1
+            });
+            of_frame.push(setting);
+        }
+        Self { of_frame, powered }
+    }
+
+    /// Rows frames, columns settings.
+    fn indicator(&self) -> DMatrix<f64> {
+        let mut indicator = DMatrix::zeros(self.of_frame.len(), self.powered.len());
+        self.of_frame.iter().enumerate().for_each(|(frame, &setting)| indicator[(frame, setting)] = 1.0);
+        indicator
+    }
+
+    fn of_corrector(&self, c: usize) -> Vec<usize> {
+        let powered = |&i: &usize| self.powered[i].is_some_and(|(of, _)| of == c);
+        (0..self.powered.len()).filter(powered).collect()
+    }
+}
+
+/// Steps at the edges of the stretches of time: rows frames, columns edges.
+fn stretches(data: &Data) -> DMatrix<f64> {
+    let edge = |i: usize| -1.0 + 2.0 * (i + 1) as f64 / STRETCHES as f64;
+    DMatrix::from_fn(data.readings.nrows(), STRETCHES - 1, |frame, i| {
+        f64::from(u8::from(data.drives.time[frame] >= edge(i))) - 0.5
+    })
+}
+
+/// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
+fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, EffectError> {
+    let ring = machine.ring();
+    let optics = twin::Optics::of(ring, twin::Hold::Momentum { delta: 0.0 })?;
+    let observers = optics.read_monitors();
+    let of_plane = |plane: Plane| {
+        let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
+        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
+        let response = optics.response(&observers, &sources);
+        (0..sources.len()).map(move |q| {
+            let column = response.column(q).into_owned();
+            let read = column.iter().filter(|r| r.abs() > 0.0).count().max(1) as f64;
+            let rms = (column.norm_squared() / read).sqrt().max(f64::MIN_POSITIVE);
+            (q, plane, column / rms)
+        })
+    };
+    Ok(of_plane(Plane::X).chain(of_plane(Plane::Y)).collect())
+}
+
+/// One number for each setting that all monitors see by a pattern.
+fn weighted(cells: &[Cells], monitors: &[usize], pattern: &DVector<f64>) -> Cells {
+    let first = &cells[monitors[0]];
+    let (n, p) = first.cross.shape();
+    let mut sum = Cells { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
+    for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
+        sum.gram += &cells[b].gram * (pattern[b] * pattern[b]);
+        sum.cross += &cells[b].cross * pattern[b];
+        sum.pull += &cells[b].pull * pattern[b];
+    }
+    sum
+}
+
+/// One number for each monitor and each of some settings.
+fn blocks(cells: &[Cells], monitors: &[usize], settings: &[usize]) -> Cells {
+    let (m, p) = (settings.len(), cells[monitors[0]].cross.ncols());
+    let n = m * monitors.len();
+    let mut all = Cells { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
+    for (k, &b) in monitors.iter().enumerate() {
+        for (i, &one) in settings.iter().enumerate() {
+            for (j, &other) in settings.iter().enumerate() {
+                all.gram[(k * m + i, k * m + j)] = cells[b].gram[(one, other)];
+            }
+            all.cross.row_mut(k * m + i).copy_from(&cells[b].cross.row(one));
+            all.pull[k * m + i] = cells[b].pull[one];
+        }
+    }
+    all
+}
+
+impl Data {
+    /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
+    fn cells(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Cells {
+        let whitened = self.whiten_columns(b, indicator);
+        let (start, n) = (self.start(b), self.frames(b).len());
+        let back = whitened.transpose();
+        Cells {
+            gram: &back * &whitened,
+            cross: &back * fitted.jacobian.rows(start, n),
+            pull: back * fitted.residual.rows(start, n),
+        }
+    }
+
+    /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
+    fn stepped(&self, signature: &twin::Signature, fitted: &Fitted, stretches: &DMatrix<f64>) -> Cells {
+        let (edges, p) = (stretches.ncols(), fitted.jacobian.ncols());
+        let mut sum =
+            Cells { gram: DMatrix::zeros(edges, edges), cross: DMatrix::zeros(edges, p), pull: DVector::zeros(edges) };
+        let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
+        for b in self.speaking_monitors() {
+            let mut columns = stretches.clone();
+            for (i, mut row) in columns.row_iter_mut().enumerate() {
+                row *= signature.readings[(i, b)] / rms;
+            }
+            let cells = self.cells(b, fitted, &columns);
+            sum.gram += cells.gram;
+            sum.cross += cells.cross;
+            sum.pull += cells.pull;
+        }
+        sum
+    }
+}
+
+impl Where {
+    /// The name of the place: a monitor, a corrector, a half-cell, or a stretch.
+    pub fn label(&self, data: &Data) -> String {
+        let ring = &data.ring;
+        match *self {
+            Self::Monitor(b) | Self::MonitorInTime(b) => ring.monitor_names()[b].clone(),
+            Self::Corrector(c) => ring.corrector_names()[c].clone(),
+            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
+            Self::Time => "time".into(),
+            Self::Everywhere => "everywhere".into(),
+        }
+    }
+
+    /// What is said of it.
+    pub fn phrase(&self, data: &Data) -> String {
+        let name = self.label(data);
+        match self {
+            Self::Monitor(_) => format!("monitor {name} does not follow the orbit"),
+            Self::MonitorInTime(_) => format!("monitor {name} changes with time"),
+            Self::Corrector(_) => format!("corrector {name} does something else than one kick"),
+            Self::Ring(_, Plane::X) => format!("something near {name} kicks the beam horizontally"),
+            Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
+            Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
+            Self::Time => "the orbit changes with time at many monitors".into(),
+            Self::Everywhere => "the readings scatter more from setting to setting than from repeat to repeat, everywhere".into(),
+        }
+    }
+
+    /// Where it is along the beam [m].
+    pub fn position(&self, data: &Data) -> Option<f64> {
+        let ring = &data.ring;
+        let at = match *self {
+            Self::Monitor(b) | Self::MonitorInTime(b) => ring.read_monitors[b],
+            Self::Corrector(c) => ring.correctors[c],
+            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q],
+            Self::Time | Self::Everywhere => return None,
+        };
+        Some(ring.elements[at].s)
+    }
+}

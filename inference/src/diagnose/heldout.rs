@@ -1,0 +1,167 @@
+//! How well a hypothesis predicts frames that it was not fitted to.
+//!
+//! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
+//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z` has a normal density: the mean is the
+//! prediction `h` with what the monitor's kept readings say of its shared factors (baseline and the like, `U`, known to `C`),
+//!
+//! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less what the factors take.
+//!
+//! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
+//! standard error of its mean over frames.
+//!
+//! Source: A. Vehtari, A. Gelman and J. Gabry, Stat. Comput. 27 (2017) 1413, eq. 4 and 23.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{DMatrix, DVector};
+use twin::EffectError;
+
+use super::data::Data;
+use super::fit::Fitted;
+use super::hypothesis::Hypothesis;
+use crate::recording::Recording;
+
+/// Frames that are left out together.
+pub type Fold = Vec<usize>;
+
+/// Folds at most.
+const FOLDS: usize = 5;
+
+/// One repeat of every setting in each fold.
+pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
+    let mut seen: BTreeMap<(Option<&str>, u64, u64), usize> = BTreeMap::new();
+    let mut folds = vec![Fold::new(); FOLDS];
+    for (i, row) in recording.rows.iter().enumerate() {
+        let key = (row.corrector.as_deref(), row.setting.to_bits(), row.rf_offset.to_bits());
+        let repeat = seen.entry(key).or_insert(0);
+        folds[*repeat % FOLDS].push(i);
+        *repeat += 1;
+    }
+    // settings that are never repeated: every fifth frame
+    if seen.values().all(|&repeats| repeats == 1) {
+        folds = (0..FOLDS).map(|fold| (fold..recording.rows.len()).step_by(FOLDS).collect()).collect();
+    }
+    folds.retain(|fold| !fold.is_empty());
+    folds
+}
+
+/// All frames of every fifth corrector in each fold.
+pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
+    let mut order: Vec<&str> = Vec::new();
+    let mut folds = vec![Fold::new(); FOLDS];
+    for (i, row) in recording.rows.iter().enumerate() {
+        let Some(corrector) = row.corrector.as_deref() else { continue };
+        let at = order.iter().position(|name| *name == corrector).unwrap_or_else(|| {
+            order.push(corrector);
+            order.len() - 1
+        });
+        folds[at % FOLDS].push(i);
+    }
+    folds.retain(|fold| !fold.is_empty());
+    folds
+}
+
+/// What the left-out readings say of a hypothesis.
+#[derive(Debug, Clone, Default)]
+pub struct Score {
+    /// Log density of each frame, 0 for one without readings that count.
+    pub log_density: Vec<f64>,
+    /// Readings.
+    pub readings: usize,
+    /// Rms of measured minus predicted, monitors in state ok [m].
+    pub rms: f64,
+    /// Fraction of readings within the central 68.3 % and 95.4 % of their density.
+    pub inside: [f64; 2],
+}
+
+impl Score {
+    /// Score a hypothesis that has been fitted to all frames.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, EffectError> {
+        let mut score = Self { log_density: vec![0.0; data.readings.nrows()], ..Self::default() };
+        let (mut squares, mut plain) = (0.0, 0usize);
+        for fold in folds {
+            let kept = data.without(fold);
+            let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
+            for left in predict(data, fit.data(&kept), &fit, fold)? {
+                let z = left.innovation / left.variance.sqrt();
+                score.log_density[left.frame] -=
+                    0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
+                score.readings += 1;
+                score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
+                score.inside[1] += f64::from(u8::from(z.abs() < 2.0));
+                if data.health()[left.monitor].state == estimator::MonitorState::Ok {
+                    squares += left.innovation.powi(2);
+                    plain += 1;
+                }
+            }
+        }
+        score.rms = (squares / plain.max(1) as f64).sqrt();
+        score.inside = score.inside.map(|n| n / score.readings.max(1) as f64);
+        Ok(score)
+    }
+
+    /// Expected log predictive density.
+    pub fn elpd(&self) -> f64 {
+        self.log_density.iter().sum()
+    }
+
+    /// Gain over another, and its standard error.
+    pub fn gain_over(&self, other: &Self) -> (f64, f64) {
+        let pairs = self.log_density.iter().zip(&other.log_density);
+        let gains: Vec<f64> = pairs.filter(|(one, _)| **one != 0.0).map(|(one, other)| one - other).collect();
+        let n = gains.len() as f64;
+        let gain: f64 = gains.iter().sum();
+        let spread: f64 = gains.iter().map(|g| (g - gain / n).powi(2)).sum();
+        (gain, (spread * n / (n - 1.0).max(1.0)).sqrt())
+    }
+}
+
+/// One reading that was left out.
+struct Left {
+    frame: usize,
+    monitor: usize,
+    innovation: f64,
+    variance: f64,
+}
+
+/// Predict the left-out readings by a fit to the kept ones.
+fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, EffectError> {
+    let (residual, slopes) = fit.linearise(kept)?;
+    let mut left = Vec::new();
+    for b in all.speaking_monitors() {
+        let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
+        if out.is_empty() {
+            continue;
+        }
+        let within = kept.frames(b);
+        let noise = kept.noise(b).powi(2);
+        let (u_in, u_out) = (kept.shared(b, within), kept.shared(b, &out));
+        let mut normal = u_in.tr_mul(&u_in) / noise;
+        (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
+        let Some(normal) = normal.cholesky() else { continue };
+        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], b)]);
+        let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, b)]));
+        // what the kept readings say of the factors, of the residual and of each derivative
+        let back = u_in.transpose() / noise;
+        let factors = normal.solve(&(&back * of(within)));
+        let innovation = of(&out) - &u_out * factors;
+        let d = rows(&out) - &u_out * normal.solve(&(back * rows(within)));
+        let unknown = normal.l().solve_lower_triangular(&u_out.transpose()).unwrap_or_else(|| u_out.transpose() * 0.0);
+        let params = fit.factor.l().solve_lower_triangular(&d.transpose()).unwrap_or_else(|| d.transpose() * 0.0);
+        for (i, &frame) in out.iter().enumerate() {
+            let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
+            left.push(Left { frame, monitor: b, innovation: innovation[i], variance });
+        }
+    }
+    Ok(left)
+}
+
+/// The same fit without one of its terms.
+pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, EffectError> {
+    let vars = fitted.params.len();
+    let without: Hypothesis = fitted.hypothesis.without(term);
+    Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned())
+}

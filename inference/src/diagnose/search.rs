@@ -1,0 +1,301 @@
+//! From all candidates to the few that the data speak for, the price of the search paid.
+//!
+//! Prior: nothing is missing in half of all campaigns. Where something is, it is one effect, or more with odds of 1 to 4 each; it
+//! is something that the library does not hold with 15 %, else each kind is as likely as the other, and each place of a kind.
+//! The posterior weight of a candidate is its prior times its evidence: exact twin, everything refitted, for the leaders; first
+//! order for the rest.
+//!
+//! Forward: the best candidate is taken up as long as "one more" is more likely than "no more". Backward: each is taken out
+//! again and all candidates compete for its slot, given the others.
+
+use std::collections::BTreeMap;
+
+use nalgebra::DVector;
+use twin::{EffectError, EffectKind};
+
+use super::data::Data;
+use super::discrepancy::{self, Discrepancy, SORTS};
+use super::fit::Fitted;
+use super::hypothesis::{Hypothesis, Scatter, Term, members};
+use super::scan::{Candidate, scan};
+
+/// Prior odds of one (more) effect.
+const ODDS: f64 = 1.0;
+const ODDS_FURTHER: f64 = 0.25;
+/// Share of what the library does not hold.
+const UNKNOWN: f64 = 0.15;
+/// Effects at most.
+const MOST: usize = 4;
+/// Leaders that are refitted exactly, and how far behind the first a candidate may be, in nat and relative to the first.
+const LEADERS: usize = 10;
+const BEHIND: f64 = 7.0;
+const BEHIND_SHARE: f64 = 0.3;
+
+/// What may fill a slot.
+#[derive(Debug, Clone)]
+pub enum Cause {
+    /// An effect of the library.
+    Effect(Term),
+    /// Something else.
+    Unknown(Discrepancy),
+}
+
+/// One cause that competes for a slot.
+#[derive(Debug, Clone)]
+pub struct Alternative {
+    /// The cause.
+    pub cause: Cause,
+    /// `ln` evidence over the fit without it.
+    pub log_gain: f64,
+    /// Posterior probability within the slot.
+    pub probability: f64,
+    /// Amplitude and its standard deviation, in the unit of the kind.
+    pub amplitude: (f64, f64),
+    /// The exact fit with it, for the leaders.
+    pub fitted: Option<Fitted>,
+}
+
+/// One effect, given the others: who competes for it.
+#[derive(Debug, Clone)]
+pub struct Slot {
+    /// Most likely first; those of any weight.
+    pub alternatives: Vec<Alternative>,
+    /// Probability that nothing fills it.
+    pub nothing: f64,
+    /// The fit without it.
+    pub without: Fitted,
+}
+
+/// What the search found.
+#[derive(Debug, Clone)]
+pub struct Found {
+    /// The fit without any effect (ordinary scatter included).
+    pub null: Fitted,
+    /// The fit with all that were taken up.
+    pub best: Fitted,
+    /// One for each effect of `best`, in its order.
+    pub slots: Vec<Slot>,
+    /// Who would be next.
+    pub next: Slot,
+}
+
+/// The candidates of a recording, and what they are worth beforehand.
+pub struct Search<'d> {
+    data: &'d Data,
+    terms: Vec<Term>,
+    /// `ln` prior of each candidate, given that the library holds the effect.
+    log_prior: Vec<f64>,
+}
+
+impl<'d> Search<'d> {
+    /// A search among candidates.
+    pub fn new(data: &'d Data, terms: Vec<Term>) -> Self {
+        let mut count: BTreeMap<&str, usize> = BTreeMap::new();
+        terms.iter().for_each(|term| *count.entry(term.kind.word()).or_default() += 1);
+        let kinds = count.len() as f64;
+        let log_prior = terms.iter().map(|term| -(kinds * count[term.kind.word()] as f64).ln()).collect();
+        Self { data, terms, log_prior }
+    }
+
+    /// Search.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn run(&self) -> Result<Found, EffectError> {
+        let zero = DVector::zeros(self.data.ring.quadrupoles.len());
+        let mut null = Fitted::of(self.data, &Hypothesis::default(), &zero)?;
+        let mut best = null.clone();
+        let mut next = self.slot(&best, 0)?;
+        if let Some(scatter) = self.scatter(&best, &next)? {
+            let hypothesis = Hypothesis { scatter, ..Hypothesis::default() };
+            null = Fitted::of(self.data, &hypothesis, &best.u)?;
+            best = null.clone();
+            next = self.slot(&best, 0)?;
+        }
+        while best.hypothesis.terms.len() < MOST && next.library() > next.nothing {
+            let Some(fitted) = next.leader() else { break };
+            best = self.settle(fitted)?;
+            next = self.slot(&best, best.hypothesis.terms.len())?;
+        }
+        let slots: Vec<Slot> =
+            (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
+        Ok(Found { null, best, slots, next })
+    }
+
+    /// Let all candidates compete for each slot, until the best one is in each.
+    fn settle(&self, fitted: Fitted) -> Result<Fitted, EffectError> {
+        let mut best = fitted;
+        for _ in 0..2 {
+            let mut changed = false;
+            for i in 0..best.hypothesis.terms.len() {
+                if best.hypothesis.terms.len() == 1 {
+                    break; // the forward step was this competition
+                }
+                let slot = self.without(&best, i)?;
+                let Some(fitted) = slot.leader() else { continue };
+                if fitted.log_evidence > best.log_evidence + 1e-3 {
+                    (best, changed) = (fitted, true);
+                }
+            }
+            if !changed {
+                break;
+            }
+        }
+        Ok(best)
+    }
+
+    /// The competition for one of the effects of a fit.
+    fn without(&self, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
+        let rest = super::heldout::reduced(self.data, fitted, term)?;
+        self.slot(&rest, fitted.hypothesis.terms.len() - 1)
+    }
+
+    /// The competition for one more effect beside those of a fit.
+    fn slot(&self, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
+        let odds = if effects == 0 { ODDS } else { ODDS_FURTHER };
+        let mut ranked: Vec<(Candidate, f64)> = scan(fitted.data(self.data), fitted, &self.terms)?
+            .into_iter()
+            .zip(&self.log_prior)
+            .map(|(candidate, prior)| (candidate, prior + ((1.0 - UNKNOWN) * odds).ln()))
+            .filter(|(candidate, _)| !fitted.hypothesis.terms.contains(&candidate.term))
+            .collect();
+        ranked.sort_by(|one, other| (other.0.log_bayes + other.1).total_cmp(&(one.0.log_bayes + one.1)));
+        let first = ranked.first().map_or(0.0, |(candidate, _)| candidate.log_bayes);
+        let prior_of_first = ranked.first().map_or(0.0, |(_, prior)| *prior);
+        let behind = BEHIND.max(BEHIND_SHARE * first);
+        let mut weights: Vec<(Alternative, f64)> = Vec::new();
+        for (rank, (candidate, prior)) in ranked.into_iter().enumerate() {
+            let near = candidate.log_bayes + prior > first + prior_of_first - behind && candidate.log_bayes > 0.5;
+            let alternative = if rank < LEADERS && near {
+                self.refit(fitted, &candidate)
+            } else {
+                Alternative::of(&candidate)
+            };
+            let weight = alternative.log_gain + prior;
+            weights.push((alternative, weight));
+        }
+        for discrepancy in discrepancy::scan(self.data, fitted)? {
+            let prior = (UNKNOWN * odds / (SORTS * discrepancy.sites) as f64).ln();
+            let weight = discrepancy.log_bayes + prior;
+            weights.push((Alternative::unknown(discrepancy), weight));
+        }
+        Ok(Slot::of(weights, fitted.clone()))
+    }
+
+    fn refit(&self, fitted: &Fitted, candidate: &Candidate) -> Alternative {
+        let hypothesis = fitted.hypothesis.with(candidate.term.clone());
+        let vars = fitted.params.len();
+        // the new unknowns of a term stand before those of scatter
+        let at = vars + fitted.hypothesis.unknowns(self.data).len() - fitted.hypothesis.members(self.data);
+        let new = hypothesis.unknowns(self.data).len() - fitted.hypothesis.unknowns(self.data).len();
+        let mut guess = fitted.u.clone().insert_rows(at, new, 0.0);
+        if new > 0 {
+            guess[at] = candidate.amplitude;
+        }
+        // a candidate that leads to no stable machine is none
+        let Ok(refitted) = Fitted::of(self.data, &hypothesis, &guess) else {
+            return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
+        };
+        Alternative {
+            cause: Cause::Effect(candidate.term.clone()),
+            log_gain: refitted.log_evidence - fitted.log_evidence,
+            probability: 0.0,
+            amplitude: refitted.amplitude(self.data, fitted.hypothesis.terms.len()),
+            fitted: Some(refitted),
+        }
+    }
+
+    /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
+    fn scatter(&self, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
+        let single = next.log_odds();
+        let mut best: Option<(Scatter, f64)> = None;
+        for &(kind, widths) in &FAMILIES {
+            let terms = members(kind, self.data);
+            for &width in widths {
+                let log_bayes = super::scan::family(self.data, fitted, &terms, width)?;
+                if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
+                    best = Some((Scatter { kind, width }, log_bayes));
+                }
+            }
+        }
+        let price = ((FAMILIES.len() * 4) as f64).ln();
+        Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
+    }
+}
+
+/// Families whose members all scatter a little, and the widths tried, in the unit of the kind.
+///
+/// Source: alignment and calibration tolerances, from good to poor (1 to 5 % of gain, 5 to 30 mrad; 1 to 5 mrad of a quadrupole).
+const FAMILIES: [(EffectKind, &[f64]); 5] = [
+    (EffectKind::BpmGain, &[0.01, 0.02, 0.04]),
+    (EffectKind::CorrectorGain, &[0.01, 0.02, 0.04]),
+    (EffectKind::BpmRoll, &[0.01, 0.02, 0.04]),
+    (EffectKind::CorrectorRoll, &[0.01, 0.02, 0.04]),
+    (EffectKind::QuadRoll, &[0.001, 0.002, 0.004]),
+];
+
+impl Alternative {
+    fn of(candidate: &Candidate) -> Self {
+        let scale = candidate.term.kind.prior_scale();
+        let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
+        Self {
+            amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
+            cause: Cause::Effect(candidate.term.clone()),
+            log_gain: candidate.log_bayes,
+            probability: 0.0,
+            fitted: None,
+        }
+    }
+
+    fn unknown(discrepancy: Discrepancy) -> Self {
+        Self {
+            amplitude: (discrepancy.size, 0.0),
+            log_gain: discrepancy.log_bayes,
+            cause: Cause::Unknown(discrepancy),
+            probability: 0.0,
+            fitted: None,
+        }
+    }
+
+    /// True for an effect of the library.
+    pub fn is_of_library(&self) -> bool {
+        matches!(self.cause, Cause::Effect(_))
+    }
+}
+
+/// Probability below which an alternative is not listed.
+const LISTED: f64 = 1e-4;
+
+impl Slot {
+    /// Normalise posterior weights (`ln`, "nothing" having 0).
+    fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted) -> Self {
+        let largest = weights.iter().map(|(_, weight)| *weight).fold(0.0, f64::max);
+        let nothing = (-largest).exp();
+        let sum = nothing + weights.iter().map(|(_, weight)| (weight - largest).exp()).sum::<f64>();
+        weights.iter_mut().for_each(|(alternative, weight)| alternative.probability = (*weight - largest).exp() / sum);
+        let mut alternatives: Vec<Alternative> = weights.into_iter().map(|(alternative, _)| alternative).collect();
+        alternatives.sort_by(|one, other| other.probability.total_cmp(&one.probability));
+        alternatives.retain(|alternative| alternative.probability > LISTED);
+        Self { alternatives, nothing: nothing / sum, without }
+    }
+
+    /// Probability of an effect of the library.
+    pub fn library(&self) -> f64 {
+        self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
+    }
+
+    /// Probability of something else.
+    pub fn unknown(&self) -> f64 {
+        self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
+    }
+
+    /// `ln` posterior odds of something over nothing.
+    fn log_odds(&self) -> f64 {
+        ((1.0 - self.nothing).max(f64::MIN_POSITIVE) / self.nothing.max(f64::MIN_POSITIVE)).ln()
+    }
+
+    /// The exact fit with the most likely effect of the library.
+    fn leader(&self) -> Option<Fitted> {
+        self.alternatives.iter().filter(|a| a.is_of_library()).find_map(|a| a.fitted.clone())
+    }
+}
