@@ -232,6 +232,19 @@ impl Var {
     }
 }
 
+/// Vars from means and standard deviations of `ln var`, truncated to the prior's range.
+pub fn vars_of(ring: &Ring, mean: &[f64], sigma: &[f64]) -> Vec<Var> {
+    let prior = estimator::Prior::lognormal(inference::stream::PRIOR_WIDTH);
+    let marginal = |(mean, sigma): (&f64, &f64)| Marginal {
+        mean: *mean as f32,
+        sigma: *sigma as f32,
+        lower: prior.lower,
+        upper: prior.upper,
+    };
+    let marginals: Vec<Marginal> = mean.iter().zip(sigma).map(marginal).collect();
+    vars(ring, &marginals, |_| false)
+}
+
 fn vars(ring: &Ring, marginals: &[Marginal], clipped: impl Fn(usize) -> bool) -> Vec<Var> {
     let var = |(i, (name, marginal)): (usize, (String, &Marginal))| {
         let (mean, sigma) = marginal.moments();
@@ -264,7 +277,8 @@ fn tunes(ring: &Ring, vars: &[Var]) -> Option<Tunes> {
     Some(Tunes { x: tunes.x, y: tunes.y })
 }
 
-fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
+/// State of the monitors of a ring.
+pub fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
     let monitor = |(name, health): (String, &Health)| Monitor {
         name,
         state: word(health.state),

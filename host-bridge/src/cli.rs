@@ -33,6 +33,10 @@ pub enum Command {
     Fit(Fit),
     /// The published studies of a recording as one report: priors, subsets, correlations, predictions, Laplace against NUTS
     Study(Study),
+    /// What is missing in the model of a recording, in a sentence, with proof on held-out frames
+    Diagnose(Diagnose),
+    /// Diagnose every recording below a folder and score it against the truth.json beside it
+    Challenge(Challenge),
     /// Publish the estimates of a device
     Serve(Serve),
     /// Surrogates and their measured errors
@@ -189,6 +193,29 @@ pub struct Study {
     /// The report, one file with all figures and their numbers
     #[arg(long, value_name = "FILE.html", default_value = "study.html")]
     pub report: PathBuf,
+}
+
+/// `orbitcal diagnose`.
+#[derive(Debug, Args)]
+pub struct Diagnose {
+    /// Folder with header.toml and frames.csv
+    pub recording: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// The report, one file with all figures and their numbers
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
+}
+
+/// `orbitcal challenge`.
+#[derive(Debug, Args)]
+pub struct Challenge {
+    /// Folder of recordings, each a folder with header.toml, frames.csv and truth.json
+    pub folder: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
 }
 
 /// How NUTS samples.

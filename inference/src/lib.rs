@@ -12,6 +12,7 @@ pub mod posterior;
 pub mod readings;
 pub mod recording;
 pub mod report;
+pub mod score;
 pub mod simulate;
 pub mod stream;
 pub mod study;

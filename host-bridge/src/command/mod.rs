@@ -1,5 +1,7 @@
 //! The commands, one file each.
 
+pub mod challenge;
+pub mod diagnose;
 pub mod fit;
 pub mod replay;
 pub mod response;

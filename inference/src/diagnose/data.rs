@@ -35,6 +35,8 @@ pub struct Data {
     pub supplies: Vec<f64>,
     /// Readings at the mean supply currents, first order in the RF offset, rows frames, columns monitors [m].
     pub readings: DMatrix<f64>,
+    /// Noise of a reading by the recording's header [m].
+    pub expected_noise: f64,
     /// Rms of the baselines in x and y [m].
     pub baseline_rms: [f64; 2],
     /// Relative change of the baseline orbit per `ln` of all gradients, in x and y [1].
@@ -178,6 +180,7 @@ impl Data {
             screened,
             supplies,
             readings,
+            expected_noise: recording.header.bpm_sigma,
             baseline_rms,
             sensitivity,
             channels: Vec::new(),

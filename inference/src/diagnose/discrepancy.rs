@@ -150,8 +150,8 @@ impl Discrepancy {
     }
 }
 
-/// `ln` Bayes factor of unknown numbers of one size.
-fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
+/// `ln` Bayes factor of unknown numbers of one size, given their projected pull and Gram matrix.
+pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let variance = size * size;
     let mut grown = gram * variance;
     (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);

@@ -7,6 +7,7 @@
 //! minimised by damped Gauss-Newton. The normalisation of the data is the same for all hypotheses but those that change their
 //! covariance, and is counted.
 
+use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{EffectError, EffectKind, Signatures};
 
@@ -149,6 +150,27 @@ impl Fitted {
             });
         }
         Ok((&data.readings - readings(&self.u)?, slopes))
+    }
+
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines taken out, per degree of freedom
+    /// (readings less baselines less vars).
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
+        let (machine, drives) = self.hypothesis.machine(data, &self.params, &self.u.as_slice()[self.params.len()..])?;
+        let residual = &data.readings - machine.readings(&drives)?.0;
+        let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
+        for b in data.speaking_monitors() {
+            if data.health()[b].state != MonitorState::Ok {
+                continue;
+            }
+            let of: Vec<f64> = data.frames(b).iter().map(|&i| residual[(i, b)]).collect();
+            let mean = of.iter().sum::<f64>() / of.len() as f64;
+            sum += of.iter().map(|r| (r - mean).powi(2)).sum::<f64>();
+            freedom += of.len() as f64 - 1.0;
+        }
+        Ok(sum / data.expected_noise.powi(2) / freedom)
     }
 
     /// Covariance of `ln` of the vars.

@@ -25,6 +25,8 @@ pub struct Candidate {
     pub log_bayes: f64,
     /// What the fit cannot imitate: `d P d`, per prior standard deviation.
     pub power: f64,
+    /// How the fit's unknowns adapt to an amplitude of one prior standard deviation.
+    pub adapting: DVector<f64>,
 }
 
 const BATCH: usize = 64;
@@ -66,32 +68,29 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
                 Some(_) => (g / (1.0 + h), 0.5 * g * g / (1.0 + h) - 0.5 * h.ln_1p()),
                 None => (1.0, g - 0.5 * h),
             };
-            all.push(Candidate { term: term.clone(), amplitude, log_bayes, power: h });
+            all.push(Candidate { term: term.clone(), amplitude, log_bayes, power: h, adapting: -taken.column(i) });
         }
     }
     Ok(all)
 }
 
-/// `ln` Bayes factor of all members of a family having amplitudes of standard deviation `width`, to first order.
+/// `ln` Bayes factor of all members of a family having amplitudes of one of some standard deviations, to first order.
 ///
 /// # Errors
 /// [`EffectError`].
-pub fn family(data: &Data, fitted: &Fitted, members: &[Term], width: f64) -> Result<f64, EffectError> {
+pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, EffectError> {
     let vars = fitted.params.len();
     let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
     let signatures = Signatures::of(&machine, &drives)?;
     let columns: Vec<DVector<f64>> = members
         .iter()
-        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * width))
+        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?)))
         .collect::<Result<_, EffectError>>()?;
     let columns = DMatrix::from_columns(&columns);
     let shared = fitted.jacobian.transpose() * &columns;
     let taken = fitted.factor.solve(&shared);
     let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
     let pull = columns.tr_mul(&fitted.residual) - taken.tr_mul(&slope);
-    let mut gram = columns.transpose() * &columns - shared.transpose() * taken;
-    (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0);
-    let Some(factor) = gram.cholesky() else { return Ok(f64::NEG_INFINITY) };
-    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
-    Ok(0.5 * pull.dot(&factor.solve(&pull)) - log_det)
+    let gram = columns.transpose() * &columns - shared.transpose() * taken;
+    Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pull, &gram, width)).collect())
 }

@@ -51,6 +51,8 @@ pub struct Alternative {
     pub probability: f64,
     /// Amplitude and its standard deviation, in the unit of the kind.
     pub amplitude: (f64, f64),
+    /// How the vars and other unknowns adapt to it, to first order, in units of their prior standard deviations.
+    pub adapting: DVector<f64>,
     /// The exact fit with it, for the leaders.
     pub fitted: Option<Fitted>,
 }
@@ -62,6 +64,10 @@ pub struct Slot {
     pub alternatives: Vec<Alternative>,
     /// Probability that nothing fills it.
     pub nothing: f64,
+    /// `ln` posterior odds of something over nothing.
+    pub log_odds: f64,
+    /// All candidates, to first order.
+    pub scanned: Vec<Candidate>,
     /// The fit without it.
     pub without: Fitted,
 }
@@ -112,7 +118,7 @@ impl<'d> Search<'d> {
             best = null.clone();
             next = self.slot(&best, 0)?;
         }
-        while best.hypothesis.terms.len() < MOST && next.library() > next.nothing {
+        while best.hypothesis.terms.len() < MOST && next.library() > next.nothing.max(next.unknown()) {
             let Some(fitted) = next.leader() else { break };
             best = self.settle(fitted)?;
             next = self.slot(&best, best.hypothesis.terms.len())?;
@@ -153,8 +159,10 @@ impl<'d> Search<'d> {
     /// The competition for one more effect beside those of a fit.
     fn slot(&self, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
         let odds = if effects == 0 { ODDS } else { ODDS_FURTHER };
-        let mut ranked: Vec<(Candidate, f64)> = scan(fitted.data(self.data), fitted, &self.terms)?
-            .into_iter()
+        let scanned = scan(fitted.data(self.data), fitted, &self.terms)?;
+        let mut ranked: Vec<(Candidate, f64)> = scanned
+            .iter()
+            .cloned()
             .zip(&self.log_prior)
             .map(|(candidate, prior)| (candidate, prior + ((1.0 - UNKNOWN) * odds).ln()))
             .filter(|(candidate, _)| !fitted.hypothesis.terms.contains(&candidate.term))
@@ -179,7 +187,7 @@ impl<'d> Search<'d> {
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unknown(discrepancy), weight));
         }
-        Ok(Slot::of(weights, fitted.clone()))
+        Ok(Slot::of(weights, fitted.clone(), scanned))
     }
 
     fn refit(&self, fitted: &Fitted, candidate: &Candidate) -> Alternative {
@@ -201,18 +209,19 @@ impl<'d> Search<'d> {
             log_gain: refitted.log_evidence - fitted.log_evidence,
             probability: 0.0,
             amplitude: refitted.amplitude(self.data, fitted.hypothesis.terms.len()),
+            adapting: DVector::zeros(0),
             fitted: Some(refitted),
         }
     }
 
     /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
     fn scatter(&self, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
-        let single = next.log_odds();
+        let single = next.log_odds;
         let mut best: Option<(Scatter, f64)> = None;
         for &(kind, widths) in &FAMILIES {
             let terms = members(kind, self.data);
-            for &width in widths {
-                let log_bayes = super::scan::family(self.data, fitted, &terms, width)?;
+            let logs = super::scan::family(self.data, fitted, &terms, widths)?;
+            for (&width, log_bayes) in widths.iter().zip(logs) {
                 if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
                     best = Some((Scatter { kind, width }, log_bayes));
                 }
@@ -243,6 +252,7 @@ impl Alternative {
             cause: Cause::Effect(candidate.term.clone()),
             log_gain: candidate.log_bayes,
             probability: 0.0,
+            adapting: &candidate.adapting * candidate.amplitude,
             fitted: None,
         }
     }
@@ -253,6 +263,7 @@ impl Alternative {
             log_gain: discrepancy.log_bayes,
             cause: Cause::Unknown(discrepancy),
             probability: 0.0,
+            adapting: DVector::zeros(0),
             fitted: None,
         }
     }
@@ -268,15 +279,17 @@ const LISTED: f64 = 1e-4;
 
 impl Slot {
     /// Normalise posterior weights (`ln`, "nothing" having 0).
-    fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted) -> Self {
+    fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
         let largest = weights.iter().map(|(_, weight)| *weight).fold(0.0, f64::max);
         let nothing = (-largest).exp();
-        let sum = nothing + weights.iter().map(|(_, weight)| (weight - largest).exp()).sum::<f64>();
+        let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
+        let sum = nothing + something;
         weights.iter_mut().for_each(|(alternative, weight)| alternative.probability = (*weight - largest).exp() / sum);
         let mut alternatives: Vec<Alternative> = weights.into_iter().map(|(alternative, _)| alternative).collect();
         alternatives.sort_by(|one, other| other.probability.total_cmp(&one.probability));
         alternatives.retain(|alternative| alternative.probability > LISTED);
-        Self { alternatives, nothing: nothing / sum, without }
+        let log_odds = largest + something.ln();
+        Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
     }
 
     /// Probability of an effect of the library.
@@ -287,11 +300,6 @@ impl Slot {
     /// Probability of something else.
     pub fn unknown(&self) -> f64 {
         self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
-    }
-
-    /// `ln` posterior odds of something over nothing.
-    fn log_odds(&self) -> f64 {
-        ((1.0 - self.nothing).max(f64::MIN_POSITIVE) / self.nothing.max(f64::MIN_POSITIVE)).ln()
     }
 
     /// The exact fit with the most likely effect of the library.

@@ -1,0 +1,157 @@
+//! `orbitcal challenge`: every recording below a folder diagnosed, and scored against the answer key beside it.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use comfy_table::{Table, presets};
+use inference::diagnose::Diagnosis;
+use inference::score::{Grade, Truth};
+use serde::Serialize;
+
+use super::{CommandError, machine, progress, recording};
+use crate::cli::Challenge;
+use crate::output;
+
+/// Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+struct Answer {
+    recordings: Vec<Scored>,
+    /// Number of recordings by grade.
+    right: usize,
+    listed: usize,
+    open: usize,
+    missed: usize,
+    wrong: usize,
+    /// Sum of squares of the pulls of all named amplitudes, and their number.
+    amplitude_chi2: f64,
+    amplitudes: usize,
+}
+
+#[derive(Debug, Serialize)]
+struct Scored {
+    recording: String,
+    verdict: &'static str,
+    sentence: String,
+    found: Vec<String>,
+    truth: Vec<String>,
+    oracle_gain: Option<f64>,
+    grade: Grade,
+    amplitude_pulls: Vec<f64>,
+    nees_per_var_before: f64,
+    nees_per_var_after: f64,
+    elpd_gain: [f64; 2],
+    seconds: f64,
+}
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Challenge) -> Result<(), CommandError> {
+    let ring = machine(options.common.machine.as_deref())?;
+    let folders = folders(&options.folder)?;
+    let bar = progress(folders.len(), "recordings", options.common.quiet);
+    let mut recordings = Vec::new();
+    for folder in &folders {
+        let recording = recording(folder, &ring)?;
+        let started = Instant::now();
+        let diagnosis = Diagnosis::of(&ring, &recording, |_| {})?;
+        let seconds = started.elapsed().as_secs_f64();
+        let truth = Truth::read(folder).map_err(|error| CommandError::Input(error.to_string()))?;
+        recordings.push(Scored::of(&ring.var_names(), &recording.name, &diagnosis, &truth, seconds));
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let answer = Answer::of(recordings);
+    if let Some(path) = &options.common.json {
+        output::json(path, &answer)?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        answer.print();
+    }
+    Ok(())
+}
+
+/// Folders below (or the folder itself) that hold a recording and its key, sorted.
+fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
+    let wrong = |error: std::io::Error| CommandError::Input(format!("{}: {error}", root.display()));
+    let is_one = |folder: &Path| folder.join("frames.csv").is_file() && folder.join("truth.json").is_file();
+    if is_one(root) {
+        return Ok(vec![root.to_owned()]);
+    }
+    let entries: Vec<PathBuf> =
+        std::fs::read_dir(root).map_err(wrong)?.map(|entry| Ok(entry.map_err(wrong)?.path())).collect::<Result<_, CommandError>>()?;
+    let mut found: Vec<PathBuf> = entries.into_iter().filter(|folder| is_one(folder)).collect();
+    found.sort();
+    if found.is_empty() {
+        let what = "expected folders with frames.csv and truth.json, found none";
+        return Err(CommandError::Input(format!("{}: {what}", root.display())));
+    }
+    Ok(found)
+}
+
+impl Scored {
+    fn of(names: &[String], recording: &str, diagnosis: &Diagnosis, truth: &Truth, seconds: f64) -> Self {
+        Self {
+            recording: recording.into(),
+            verdict: diagnosis.verdict.word(),
+            sentence: diagnosis.sentence.clone(),
+            found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
+            truth: truth.effects.iter().map(inference::score::TrueEffect::label).collect(),
+            oracle_gain: truth.oracle_gain,
+            grade: truth.grade(diagnosis),
+            amplitude_pulls: truth.pulls(diagnosis),
+            nees_per_var_before: truth.nees(names, &diagnosis.vars_before),
+            nees_per_var_after: truth.nees(names, &diagnosis.vars_after),
+            elpd_gain: diagnosis.gain().into(),
+            seconds,
+        }
+    }
+}
+
+impl Answer {
+    fn of(recordings: Vec<Scored>) -> Self {
+        let count = |grade| recordings.iter().filter(|scored| scored.grade == grade).count();
+        let pulls: Vec<f64> = recordings
+            .iter()
+            .filter(|scored| scored.verdict == "identified")
+            .flat_map(|scored| scored.amplitude_pulls.iter().copied())
+            .collect();
+        Self {
+            right: count(Grade::Right),
+            listed: count(Grade::Listed),
+            open: count(Grade::Open),
+            missed: count(Grade::Missed),
+            wrong: count(Grade::Wrong),
+            amplitude_chi2: pulls.iter().map(|p| p * p).sum(),
+            amplitudes: pulls.len(),
+            recordings,
+        }
+    }
+
+    fn print(&self) {
+        let mut table = Table::new();
+        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.set_header(["recording", "verdict", "found", "truth", "oracle", "grade", "pull", "NEES/var", "held-out", "s"]);
+        for scored in &self.recordings {
+            let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
+            table.add_row([
+                scored.recording.clone(),
+                scored.verdict.into(),
+                scored.found.join(" + "),
+                scored.truth.join(" + "),
+                scored.oracle_gain.map_or_else(String::new, |gain| format!("{gain:.1}")),
+                format!("{:?}", scored.grade).to_lowercase(),
+                pulls.join(" "),
+                format!("{:.2} -> {:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
+                format!("{:.1} ± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
+                format!("{:.1}", scored.seconds),
+            ]);
+        }
+        println!("{table}");
+        println!(
+            "{} right, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
+            self.right, self.listed, self.open, self.missed, self.wrong, self.amplitude_chi2, self.amplitudes
+        );
+    }
+}

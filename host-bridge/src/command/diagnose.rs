@@ -1,0 +1,223 @@
+//! `orbitcal diagnose`: what is missing in the model of a recording.
+
+use comfy_table::{Table, presets};
+use inference::diagnose::average::Vars;
+use inference::diagnose::data::DataError;
+use inference::diagnose::heldout::Score;
+use inference::diagnose::{Diagnosis, Finding};
+use serde::Serialize;
+use twin::Ring;
+
+use super::{CommandError, machine, progress, recording};
+use crate::answer::{Monitor, Var, monitors, vars_of};
+use crate::cli::Diagnose;
+use crate::output;
+
+/// Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+struct Answer {
+    recording: String,
+    verdict: &'static str,
+    sentence: String,
+    findings: Vec<FindingAnswer>,
+    monitors: Vec<Monitor>,
+    fit: Fits,
+    vars_before: Vec<Var>,
+    vars_after: Vec<Var>,
+    next_measurement: Option<String>,
+    /// Probability that nothing (more) is missing, that an effect of the library is, and that something else is.
+    probabilities: Probabilities,
+    /// Ordinary scatter of families that the fits include.
+    scatter: Vec<ScatterAnswer>,
+}
+
+#[derive(Debug, Serialize)]
+struct FindingAnswer {
+    kind: &'static str,
+    at: String,
+    s_m: Option<f64>,
+    amplitude: f64,
+    sigma: f64,
+    unit: &'static str,
+    log_evidence_gain: f64,
+    probability: f64,
+    sentence: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heldout_gain: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    alternatives: Vec<FindingAnswer>,
+}
+
+#[derive(Debug, Serialize)]
+struct Fits {
+    before: FitAnswer,
+    after: FitAnswer,
+    elpd_gain: f64,
+    elpd_gain_se: f64,
+    /// The same with whole correctors held out, where no effect is a corrector's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    corrector_elpd_gain: Option<[f64; 2]>,
+}
+
+#[derive(Debug, Serialize)]
+struct FitAnswer {
+    chi2_per_dof: f64,
+    heldout_rms_mm: f64,
+    heldout_elpd: f64,
+    heldout_inside_68: f64,
+    heldout_inside_95: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Probabilities {
+    nothing_more: f64,
+    library: f64,
+    unknown: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct ScatterAnswer {
+    kind: &'static str,
+    width: f64,
+}
+
+impl From<DataError> for CommandError {
+    fn from(error: DataError) -> Self {
+        match error {
+            DataError::Stream(error) => error.into(),
+            error @ DataError::TooLittle { .. } => Self::Input(error.to_string()),
+            error => Self::Other(error.to_string()),
+        }
+    }
+}
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Diagnose) -> Result<(), CommandError> {
+    let ring = machine(options.common.machine.as_deref())?;
+    let recording = recording(&options.recording, &ring)?;
+    let bar = progress(5, "", options.common.quiet);
+    let made = Diagnosis::of(&ring, &recording, |what| {
+        bar.set_message(what.to_owned());
+        bar.inc(1);
+    });
+    bar.finish_and_clear();
+    let diagnosis = made?;
+    let answer = Answer::of(&ring, &recording.name, &diagnosis)?;
+    if let Some(path) = &options.common.json {
+        output::json(path, &answer)?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        answer.print();
+    }
+    Ok(())
+}
+
+impl Answer {
+    fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
+        let failed = |error: twin::EffectError| CommandError::Other(format!("{recording}: {error}"));
+        let Diagnosis { found, data, before, after, .. } = diagnosis;
+        let (gain, error) = diagnosis.gain();
+        let fit = |fitted: &inference::diagnose::fit::Fitted, score: &Score| -> Result<FitAnswer, CommandError> {
+            Ok(FitAnswer {
+                chi2_per_dof: fitted.chi2_per_dof(data).map_err(failed)?,
+                heldout_rms_mm: score.rms * 1e3,
+                heldout_elpd: score.elpd(),
+                heldout_inside_68: score.inside[0],
+                heldout_inside_95: score.inside[1],
+            })
+        };
+        let next = &found.next;
+        Ok(Self {
+            recording: recording.into(),
+            verdict: diagnosis.verdict.word(),
+            sentence: diagnosis.sentence.clone(),
+            findings: diagnosis.findings.iter().map(FindingAnswer::of).collect(),
+            monitors: monitors(ring, data.health()),
+            fit: Fits {
+                before: fit(&found.null, before)?,
+                after: fit(&found.best, after)?,
+                elpd_gain: gain,
+                elpd_gain_se: error,
+                corrector_elpd_gain: diagnosis.correctors.as_ref().map(|(before, after)| after.gain_over(before).into()),
+            },
+            vars_before: vars(ring, &diagnosis.vars_before),
+            vars_after: vars(ring, &diagnosis.vars_after),
+            next_measurement: diagnosis.next_measurement.clone(),
+            probabilities: Probabilities {
+                nothing_more: next.nothing,
+                library: next.library(),
+                unknown: next.unknown(),
+            },
+            scatter: (found.null.hypothesis.scatter.iter())
+                .map(|scatter| ScatterAnswer { kind: scatter.kind.word(), width: scatter.width })
+                .collect(),
+        })
+    }
+
+    fn print(&self) {
+        println!("{}: {}\n\n{}\n", self.recording, self.verdict, self.sentence);
+        let mut table = Table::new();
+        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
+        table.set_header(["effect", "at", "s/m", "amplitude", "unit", "ln evidence", "probability", "held-out gain"]);
+        for finding in &self.findings {
+            table.add_row(finding.row(""));
+            finding.alternatives.iter().take(5).for_each(|other| {
+                table.add_row(other.row("or "));
+            });
+        }
+        if !self.findings.is_empty() {
+            println!("{table}\n");
+        }
+        let Fits { before, after, elpd_gain, elpd_gain_se, .. } = &self.fit;
+        println!(
+            "chi2/dof {:.4} -> {:.4}, held-out rms {:.2} -> {:.2} um, log predictive density {elpd_gain:+.1} ± {elpd_gain_se:.1}",
+            before.chi2_per_dof,
+            after.chi2_per_dof,
+            before.heldout_rms_mm * 1e3,
+            after.heldout_rms_mm * 1e3,
+        );
+        if let Some(next) = &self.next_measurement {
+            println!("\n{next}");
+        }
+    }
+}
+
+impl FindingAnswer {
+    fn of(finding: &Finding) -> Self {
+        Self {
+            kind: finding.kind,
+            at: finding.at.clone(),
+            s_m: finding.s,
+            amplitude: finding.amplitude.0,
+            sigma: finding.amplitude.1,
+            unit: finding.unit,
+            log_evidence_gain: finding.log_evidence_gain,
+            probability: finding.probability,
+            sentence: finding.phrase.clone(),
+            heldout_gain: finding.heldout.map(Into::into),
+            alternatives: finding.alternatives.iter().map(Self::of).collect(),
+        }
+    }
+
+    fn row(&self, before: &str) -> [String; 8] {
+        let gain = self.heldout_gain.map_or_else(String::new, |[gain, error]| format!("{gain:.1} ± {error:.1}"));
+        [
+            format!("{before}{}", self.kind),
+            self.at.clone(),
+            self.s_m.map_or_else(String::new, |s| format!("{s:.2}")),
+            format!("{:.3e} ± {:.1e}", self.amplitude, self.sigma),
+            self.unit.into(),
+            format!("{:.1}", self.log_evidence_gain),
+            format!("{:.3}", self.probability),
+            gain,
+        ]
+    }
+}
+
+fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {
+    let sigma = vars.covariance.diagonal().map(f64::sqrt);
+    vars_of(ring, vars.mean.as_slice(), sigma.as_slice())
+}
