@@ -103,7 +103,14 @@ impl<'r> Optics<'r> {
     /// # Errors
     /// [`OrbitError`]; unstable motion is found by [`Optics::tunes`].
     pub fn of(ring: &'r Ring, hold: Hold) -> Result<Self, OrbitError> {
-        let orbit = ClosedOrbit::find(ring, hold)?;
+        Self::about(ring, hold, ClosedOrbit::find(ring, hold)?)
+    }
+
+    /// Linearise about a closed orbit that is known.
+    ///
+    /// # Errors
+    /// [`OrbitError::Integer`].
+    pub fn about(ring: &'r Ring, hold: Hold, orbit: ClosedOrbit) -> Result<Self, OrbitError> {
         let (turn, delta) = (*orbit.one_turn(), orbit.at[0][DELTA]);
         let (closed_at_momentum, dispersive) = close_at_momentum(ring, delta, &turn)?;
         let closed = match hold {
@@ -116,6 +123,11 @@ impl<'r> Optics<'r> {
     /// The closed orbit at a place.
     pub fn orbit(&self, element: usize) -> &Phase<f64> {
         &self.orbit.at[element]
+    }
+
+    /// The closed orbit everywhere.
+    pub fn closed_orbit(&self) -> &ClosedOrbit {
+        &self.orbit
     }
 
     /// Linear map from the start to a place: at an entrance in the ring's frame, inside in the element's own.
