@@ -9,6 +9,7 @@ pub mod map;
 pub mod model;
 pub mod nuts;
 pub mod posterior;
+pub mod prove;
 pub mod readings;
 pub mod recording;
 pub mod report;

@@ -245,6 +245,19 @@ impl fmt::Display for Mismatch {
 }
 
 impl Recording {
+    /// Time of each frame within the campaign, from -1 for the first to 1 for the last.
+    pub fn times(&self) -> Vec<f64> {
+        let (start, end) = (self.rows.first().map_or(0.0, |r| r.time), self.rows.last().map_or(0.0, |r| r.time));
+        let within = |row: &Row| if end > start { 2.0 * (row.time - start) / (end - start) - 1.0 } else { 0.0 };
+        self.rows.iter().map(within).collect()
+    }
+
+    /// Kick of a corrector at the campaign's largest setting [rad]; 1 where none was set.
+    pub fn nominal_kick(&self) -> f64 {
+        let largest = self.rows.iter().map(|row| row.setting.abs()).fold(0.0, f64::max);
+        if largest > 0.0 { largest * self.header.kick_per_ampere } else { 1.0 }
+    }
+
     /// Reads `header.toml` and `frames.csv` of a campaign's folder.
     ///
     /// # Errors

@@ -1,4 +1,9 @@
 //! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
+//!
+//! [`like`] is the machine that the estimator believes in: linear optics, constant baselines, and nothing missing.
+//! [`campaign()`] is one that nobody has linearised, with any effects.
+
+mod campaign;
 
 use nalgebra::DVector;
 use rand::rngs::StdRng;
@@ -11,6 +16,10 @@ use crate::map::{Drive, first_family, rf_orbit};
 use crate::model::ResponseModel;
 use crate::posterior::RANGE;
 use crate::recording::Recording;
+
+#[cfg(test)]
+pub(crate) use campaign::tests as campaign_tests;
+pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
 
 /// What the simulated monitors do.
 #[derive(Debug, Clone)]

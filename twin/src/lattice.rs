@@ -88,6 +88,11 @@ pub enum Kind {
         /// Integrated sextupole [1/m^2].
         k2l: f64,
     },
+    /// Thin octupole, `x' -= K3L (x^3 - 3 x y^2)/6`, `y' -= K3L (y^3 - 3 x^2 y)/6`; no machine file has one yet.
+    Octupole {
+        /// Integrated third derivative of the field over the rigidity [1/m^3].
+        k3l: f64,
+    },
     /// Solenoid of field over rigidity `ks` [1/m].
     Solenoid {
         /// Field over the rigidity [1/m].
@@ -461,7 +466,7 @@ impl Ring {
         self.quadrupoles.iter().map(|&i| self.k1(i)).collect()
     }
 
-    fn k1(&self, element: usize) -> f64 {
+    pub(crate) fn k1(&self, element: usize) -> f64 {
         match self.elements[element].kind {
             Kind::Quadrupole { k1 } => k1,
             _ => unreachable!("only quadrupoles carry a var"),

@@ -61,6 +61,7 @@ impl Element {
             Kind::Sextupole { k2 } if *k2 == 0.0 => drift(z, depth),
             Kind::Sextupole { k2 } => integrate(z, depth, drift, |z, length| thin(z, 0.0, 0.0, k2 * length)),
             Kind::Multipole { k1l, k1sl, k2l } => thin(z, *k1l, *k1sl, *k2l),
+            Kind::Octupole { k3l } => octupole(z, *k3l),
             Kind::Solenoid { ks } => solenoid(z, *ks, depth),
             Kind::Bend(bend) => {
                 bend.enter(z);
@@ -145,6 +146,13 @@ fn thin<T: Scalar>(z: &mut Phase<T>, k1l: f64, k1sl: f64, k2l: f64) {
     let (x, y) = (z[X], z[Y]);
     z[PX] += y * k1sl - x * k1l - (x * x - y * y) * (0.5 * k2l);
     z[PY] += x * k1sl + y * k1l + x * y * k2l;
+}
+
+/// Thin octupole: the real and imaginary part of `-K3L (x + i y)^3/6`, the latter reversed.
+fn octupole<T: Scalar>(z: &mut Phase<T>, k3l: f64) {
+    let (x, y) = (z[X], z[Y]);
+    z[PX] -= x * (x * x - y * y * 3.0) * (k3l / 6.0);
+    z[PY] -= y * (y * y - x * x * 3.0) * (k3l / 6.0);
 }
 
 /// Focusing functions `C = cos(sqrt(k) L)` and `S = sin(sqrt(k) L)/sqrt(k)`, hyperbolic for k < 0.
@@ -369,6 +377,7 @@ mod tests {
             element(Kind::Solenoid { ks: 0.3 }, 0.7),
             element(Kind::Sextupole { k2: 3.0 }, 0.3),
             element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0 }, 0.0),
+            element(Kind::Octupole { k3l: 50.0 }, 0.0),
             bend(0.0, 0.0),
             bend(0.4, 0.1),
         ];

@@ -6,7 +6,8 @@
 
 use super::machine::{Instrument, Machine};
 use crate::lattice::{Kind, Plane, Ring};
-use crate::orbit::{Hold, OrbitError};
+use crate::map::{DELTA, X, Y};
+use crate::orbit::{ClosedOrbit, Hold, OrbitError};
 use crate::response::{Optics, Tunes};
 
 /// What drives one machine cycle.
@@ -28,6 +29,8 @@ pub struct Tracked {
     machine: Machine,
     gradients: Vec<f64>,
     nominal_kick: f64,
+    /// The orbit without kicks, from which that of a cycle is sought.
+    plain: ClosedOrbit,
     /// Relative frequency at which the ring closes without kicks.
     frequency: f64,
     /// Mean of the pair of a radial loop without kicks [m], and its dispersion [m].
@@ -43,10 +46,11 @@ impl Tracked {
         let optics = Optics::of(&machine.ring, Hold::Momentum { delta: machine.delta })?;
         let radial = machine.radial_loop.map_or([0.0, 1.0], |(pair, _)| {
             let dispersion = |place: usize| optics.dispersion(&optics.observe(machine.ring.monitors[place], Plane::X));
-            [mean(&machine.ring, pair, &optics), 0.5 * (dispersion(pair[0]) + dispersion(pair[1]))]
+            let orbit = optics.closed_orbit();
+            [mean(&machine.ring, pair, orbit), 0.5 * (dispersion(pair[0]) + dispersion(pair[1]))]
         });
-        let (frequency, gradients) = (optics.frequency_offset(), machine.ring.gradients());
-        Ok(Self { gradients, nominal_kick, frequency, radial, machine })
+        let (plain, frequency) = (optics.closed_orbit().clone(), optics.frequency_offset());
+        Ok(Self { gradients: machine.ring.gradients(), nominal_kick, plain, frequency, radial, machine })
     }
 
     /// What the read monitors make of the orbit of one cycle [m], offsets and noise left out, and the tunes.
@@ -55,12 +59,13 @@ impl Tracked {
     /// [`OrbitError`] if the ring keeps no beam in this cycle.
     pub fn cycle(&self, cycle: &Cycle) -> Result<(Vec<f64>, Tunes), OrbitError> {
         let ring = self.driven(cycle);
-        let delta = self.momentum(&ring, cycle)?;
-        let optics = Optics::of(&ring, Hold::Momentum { delta })?;
-        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(|&i| [optics.orbit(i)[0], optics.orbit(i)[2]]).collect();
+        let orbit = self.closed(&ring, cycle)?;
+        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(|&i| [orbit.at[i][X], orbit.at[i][Y]]).collect();
         self.machine.instruments.iter().for_each(|instrument| instrument.read_orbit(&mut at));
         let read = |(plane, place): (Plane, usize)| at[place][usize::from(plane == Plane::Y)];
-        Ok((ring.read_places().into_iter().map(read).collect(), optics.tunes()?))
+        let readings = ring.read_places().into_iter().map(read).collect();
+        let hold = Hold::Momentum { delta: orbit.at[0][DELTA] };
+        Ok((readings, Optics::about(&ring, hold, orbit)?.tunes()?))
     }
 
     /// The ring with the kicks and gradients of a cycle.
@@ -73,7 +78,9 @@ impl Tracked {
         for (c, (&at, &believed)) in self.machine.ring.correctors.iter().zip(&cycle.kick).enumerate() {
             let given = self.machine.instruments.iter().fold(believed, |kick, instrument| match *instrument {
                 Instrument::Kick { corrector, factor } if corrector == c => kick * factor,
-                Instrument::Even { corrector, share } if corrector == c => kick + share * kick * kick / self.nominal_kick,
+                Instrument::Even { corrector, share } if corrector == c => {
+                    kick + share * kick * kick / self.nominal_kick
+                }
                 _ => kick,
             });
             if let Kind::Corrector { plane, kick } = &mut ring.elements[at].kind {
@@ -83,30 +90,28 @@ impl Tracked {
         ring
     }
 
-    /// Momentum at which the beam runs in a cycle.
-    fn momentum(&self, ring: &Ring, cycle: &Cycle) -> Result<f64, OrbitError> {
+    /// The orbit on which the beam runs in a cycle, with whatever the machine holds.
+    fn closed(&self, ring: &Ring, cycle: &Cycle) -> Result<ClosedOrbit, OrbitError> {
         let held = self.machine.delta;
-        let at = |offset: f64| -> Result<f64, OrbitError> {
-            let optics = Optics::of(ring, Hold::Frequency { offset: self.frequency + offset })?;
-            Ok(optics.orbit(0)[crate::map::DELTA])
-        };
+        let at = |hold: Hold| ClosedOrbit::near(ring, hold, &self.plain);
+        let at_frequency = |offset: f64| at(Hold::Frequency { offset: self.frequency + offset });
+        let at_momentum = |delta: f64| at(Hold::Momentum { delta });
         if cycle.rf_offset != 0.0 {
-            return at(cycle.rf_offset);
+            return at_frequency(cycle.rf_offset);
         }
         if self.machine.frequency_share != 0.0 {
-            return Ok(held + self.machine.frequency_share * (at(0.0)? - held));
+            let full = at_frequency(0.0)?.at[0][DELTA];
+            return at_momentum(held + self.machine.frequency_share * (full - held));
         }
-        if let Some((pair, share)) = self.machine.radial_loop {
-            let optics = Optics::of(ring, Hold::Momentum { delta: held })?;
-            return Ok(held - share * (mean(ring, pair, &optics) - self.radial[0]) / self.radial[1]);
-        }
-        Ok(held)
+        let orbit = at_momentum(held)?;
+        let Some((pair, share)) = self.machine.radial_loop else { return Ok(orbit) };
+        at_momentum(held - share * (mean(ring, pair, &orbit) - self.radial[0]) / self.radial[1])
     }
 }
 
 /// Mean horizontal orbit of two monitors.
-fn mean(ring: &Ring, pair: [usize; 2], optics: &Optics) -> f64 {
-    0.5 * pair.map(|place| optics.orbit(ring.monitors[place])[0]).iter().sum::<f64>()
+fn mean(ring: &Ring, pair: [usize; 2], orbit: &ClosedOrbit) -> f64 {
+    0.5 * pair.map(|place| orbit.at[ring.monitors[place]][X]).iter().sum::<f64>()
 }
 
 impl Instrument {
