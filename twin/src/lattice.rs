@@ -466,7 +466,7 @@ impl Ring {
         self.quadrupoles.iter().map(|&i| self.k1(i)).collect()
     }
 
-    fn k1(&self, element: usize) -> f64 {
+    pub(crate) fn k1(&self, element: usize) -> f64 {
         match self.elements[element].kind {
             Kind::Quadrupole { k1 } => k1,
             _ => unreachable!("only quadrupoles carry a var"),

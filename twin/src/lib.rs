@@ -18,7 +18,9 @@ pub mod orbit;
 pub mod response;
 pub mod varied;
 
-pub use effects::{Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked};
+pub use effects::{
+    Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked,
+};
 pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};

@@ -542,6 +542,51 @@ mod tests {
     }
 
     #[test]
+    fn tunes_follow_their_slopes() {
+        let ring = Ring::booster();
+        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        for (n, &at) in ring.quadrupoles.iter().enumerate().filter(|(n, _)| n % 7 == 0) {
+            let tunes = |factor: f64| {
+                let mut vars = [1.0; 48];
+                vars[n] = factor;
+                Optics::of(&ring.with_vars(&vars), ON_MOMENTUM).unwrap().tunes().unwrap()
+            };
+            let (h, k1) = (1e-4, ring.gradients()[n]);
+            let (up, down, slope) = (tunes(1.0 + h), tunes(1.0 - h), optics.tune_slope(&optics.gradient(at)));
+            for (ours, change) in slope.into_iter().zip([up.x - down.x, up.y - down.y]) {
+                let known = change / (2.0 * h * k1);
+                assert!((ours - known).abs() < 1e-6 * known.abs(), "{ours} {known}"); // truncation h^2, rounding 1e-13/h
+            }
+        }
+        // beta/(4 pi) of a thin gradient, and nothing of a skew one to first order
+        let slot = ring.element("SLOT_F6").unwrap();
+        let beta = [optics.beta(slot, Plane::X), -optics.beta(slot, Plane::Y)];
+        let slope = optics.tune_slope(&optics.thin_gradient(slot.into()));
+        slope.into_iter().zip(beta).for_each(|(s, b)| assert!((s * 2.0 * core::f64::consts::TAU - b).abs() < 1e-9));
+        assert!(optics.tune_slope(&optics.thin_skew_gradient(slot.into())).iter().all(|s| s.abs() < 1e-12));
+    }
+
+    /// A rolled quadrupole is one of `k1 cos 2a` with a skew gradient of `-k1 sin 2a`; against differences of the exact twin.
+    #[test]
+    fn skew_gradients_are_exact() {
+        let ring = Ring::booster();
+        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        let (observers, sources) = (both_planes(&optics), optics.correctors());
+        for &at in ring.quadrupoles.iter().step_by(7) {
+            let respond = |roll: f64| {
+                let mut ring = ring.clone();
+                ring.elements[at].misalignment.roll = roll;
+                let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+                optics.response(&both_planes(&optics), &optics.correctors())
+            };
+            let exact = &optics.response_jacobian(&observers, &sources, &[optics.skew_gradient(at)])[0];
+            let numeric = (respond(1e-4) - respond(-1e-4)) / (-4e-4 * ring.k1(at));
+            let error = (exact - &numeric).abs().max() / exact.abs().max();
+            assert!(error < 1e-6, "{}: {error:e}", ring.elements[at].name); // truncation (2e-4)^2
+        }
+    }
+
+    #[test]
     fn instability_names_its_trace() {
         let ring = Ring::booster();
         let strong = ring.with_vars(&[2.2; 48]);

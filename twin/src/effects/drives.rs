@@ -9,10 +9,10 @@
 //! against the orbit without kicks, whose own reading is unknown and constant. A sextupole field and a cubic term depend on
 //! that orbit: it is part of [`Drives`].
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, RowVector2};
 
 use super::machine::{Instrument, Machine, planes, rows};
-use crate::lattice::{Plane, Ring};
+use crate::lattice::{Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
 use crate::response::{Optics, Place, Tunes};
 
@@ -60,7 +60,8 @@ impl Machine {
             tune_drift = change;
         }
         for &(element, k2l) in &self.sextupoles {
-            let [dx, dy] = curved(&ring, element, k2l, &kick)?;
+            // seen by the ring without its gradient: what that changes is of third order
+            let [dx, dy] = curved(&self.ring, element, k2l, drives, &kick)?;
             x += dx;
             y += dy;
         }
@@ -83,12 +84,16 @@ impl Machine {
         kick
     }
 
-    /// The ring with each stray sextupole displaced by the orbit that passes it, so that it feeds down.
+    /// The ring with what each stray sextupole is to a small deviation from the orbit (x, y) that passes it: a gradient
+    /// `k2 x` and a skew gradient `k2 y`, which together are a rolled quadrupole. Its dipole part is in the orbit already.
     fn on_orbit(&self, orbit: &[[f64; 2]]) -> Ring {
         let mut ring = self.ring.clone();
-        for &(element, _) in &self.sextupoles {
-            let misalignment = &mut ring.elements[element].misalignment;
-            (misalignment.dx, misalignment.dy) = (-orbit[element][0], -orbit[element][1]);
+        for &(at, _) in &self.sextupoles {
+            let ([x, y], element) = (orbit[at], &mut ring.elements[at]);
+            if let Kind::Sextupole { k2 } = element.kind {
+                element.kind = Kind::Quadrupole { k1: k2 * x.hypot(y) };
+                element.misalignment.roll = -0.5 * y.atan2(x);
+            }
         }
         ring
     }
@@ -130,13 +135,13 @@ impl Machine {
     /// What one monitor makes of the positions at its place.
     fn read_frames(&self, instrument: &Instrument, drives: &Drives, x: &mut DMatrix<f64>, y: &mut DMatrix<f64>) {
         match *instrument {
-            Instrument::Gain { plane, place, error } => rows(plane, x, y).column_mut(place).apply(|p| *p *= 1.0 + error),
+            Instrument::Gain { plane, place, error } => {
+                rows(plane, x, y).column_mut(place).apply(|p| *p *= 1.0 + error)
+            }
             Instrument::Cubic { plane, place, per_square_mm } => {
                 let base = drives.orbit[self.ring.monitors[place]][usize::from(plane == Plane::Y)];
                 let cube = |position: f64| position * (position * 1e3).powi(2);
-                rows(plane, x, y)
-                    .column_mut(place)
-                    .apply(|p| *p += per_square_mm * (cube(base + *p) - cube(base)));
+                rows(plane, x, y).column_mut(place).apply(|p| *p += per_square_mm * (cube(base + *p) - cube(base)));
             }
             Instrument::Roll { place, angle } => {
                 let (sin, cos) = angle.sin_cos();
@@ -176,20 +181,24 @@ impl Drives {
 }
 
 /// Orbit that the quadratic terms of a sextupole field make: `dx' = -K2L (dx^2 - dy^2)/2`, `dy' = K2L dx dy`, with (dx, dy) the
-/// orbit that the kicks make in its middle.
+/// orbit that the kicks and the RF offset make in its middle.
 pub(super) fn curved(
     ring: &Ring,
     element: usize,
     k2l: f64,
+    drives: &Drives,
     kick: &DMatrix<f64>,
 ) -> Result<[DMatrix<f64>; 2], OrbitError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let middle = Place { element, depth: 0.5 * ring.elements[element].length };
-    let at = optics.response(&[optics.observe(middle, Plane::X), optics.observe(middle, Plane::Y)], &optics.correctors());
-    let orbit = kick * at.transpose();
+    let observers = [optics.observe(middle, Plane::X), optics.observe(middle, Plane::Y)];
+    let mut orbit = kick * optics.response(&observers, &optics.correctors()).transpose();
+    let rf = RowVector2::from(observers.map(|o| -optics.dispersion(&o) / optics.slip_factor()));
+    orbit += &drives.rf_offset * rf;
     let from = [[1.0, 0.0], [0.0, 1.0]].map(|direction| optics.kick(middle, direction));
     let strength = |[a, b]: [f64; 2]| [-0.5 * k2l * (a * a - b * b), k2l * a * b];
-    let kicks = DMatrix::from_fn(orbit.nrows(), 2, |frame, plane| strength([orbit[(frame, 0)], orbit[(frame, 1)]])[plane]);
+    let kicks =
+        DMatrix::from_fn(orbit.nrows(), 2, |frame, plane| strength([orbit[(frame, 0)], orbit[(frame, 1)]])[plane]);
     let (x, y) = planes(&optics, &from);
     Ok([&kicks * x.transpose(), kicks * y.transpose()])
 }

@@ -20,7 +20,9 @@ impl EffectKind {
             Self::QuadRoll => ring.var_names(),
             Self::StrayGradient | Self::StraySkewGradient => named(|kind| matches!(kind, Kind::Marker)),
             Self::DipoleGradient => named(|kind| matches!(kind, Kind::Bend(_))),
-            Self::DipoleEdge => named(|kind| matches!(kind, Kind::Bend(_))).into_iter().chain([String::new()]).collect(),
+            Self::DipoleEdge => {
+                named(|kind| matches!(kind, Kind::Bend(_))).into_iter().chain([String::new()]).collect()
+            }
             Self::SextupoleError => {
                 let sextupoles = ring.elements.iter().filter(|e| matches!(e.kind, Kind::Sextupole { .. }));
                 sextupoles.map(|e| format!("SX_{}", e.cell())).collect()
@@ -72,18 +74,13 @@ impl EffectKind {
 
     /// True for what one corrector does: a held-out corrector could not show it.
     pub fn is_of_a_corrector(self) -> bool {
-        matches!(
-            self,
-            Self::CorrectorGain | Self::CorrectorRoll | Self::CorrectorEven | Self::CorrectorPolarity
-        )
+        matches!(self, Self::CorrectorGain | Self::CorrectorRoll | Self::CorrectorEven | Self::CorrectorPolarity)
     }
 
     /// What is said of it: place, amplitude and error bar in the words of a control room.
     pub fn phrase(self, place: &str, amplitude: f64, sigma: f64) -> String {
         let of = |scale: f64| format!("{} ± {}", short((amplitude * scale).abs(), sigma * scale), error(sigma * scale));
-        let signed = |scale: f64| {
-            format!("{}{}", if amplitude < 0.0 { "-" } else { "+" }, of(scale))
-        };
+        let signed = |scale: f64| format!("{}{}", if amplitude < 0.0 { "-" } else { "+" }, of(scale));
         let more = |up: &'static str, down: &'static str| if amplitude < 0.0 { down } else { up };
         match self {
             Self::BpmGain => format!("BPM {place} reads {} % {}", of(100.0), more("high", "low")),
@@ -105,7 +102,9 @@ impl EffectKind {
             Self::SextupoleError => format!("sextupole {place} has a field K2L = {} /m2", signed(1.0)),
             Self::MomentumOffset => format!("the beam is off momentum by {} per mille", signed(1e3)),
             Self::FixedRfFrequency => "the RF frequency was held, not the momentum".into(),
-            Self::RadialLoop => format!("a radial loop held the mean of {}, not the momentum", place.replace(',', " and ")),
+            Self::RadialLoop => {
+                format!("a radial loop held the mean of {}, not the momentum", place.replace(',', " and "))
+            }
             Self::QuadDrift => {
                 format!("all quadrupoles drifted by {} per mille from start to end", signed(2e3))
             }
@@ -144,4 +143,84 @@ fn error(sigma: f64) -> String {
 
 fn digits(sigma: f64) -> usize {
     if sigma > 0.0 { (1.0 - sigma.log10().floor()).clamp(0.0, 6.0) as usize } else { 3 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Effect, Machine, Rf};
+
+    #[test]
+    fn every_site_is_a_place_of_its_kind() {
+        let ring = Ring::booster();
+        for &kind in EffectKind::ALL {
+            let sites = kind.sites(&ring);
+            assert_eq!(sites.is_empty(), kind == EffectKind::RadialLoop, "{}", kind.word());
+            for place in sites {
+                let effect = Effect { kind, place, amplitude: 1e-6 };
+                assert!(
+                    Machine::new(ring.clone(), Rf::FixedMomentum, core::slice::from_ref(&effect)).is_ok(),
+                    "{effect:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn phrases_are_those_of_a_control_room() {
+        let cases = [
+            (EffectKind::BpmGain, "x_E4", -0.0721, 0.0081, "BPM x_E4 reads 7.21 ± 0.81 % low"),
+            (EffectKind::CorrectorGain, "V_D3", 0.05, 0.01, "corrector V_D3 kicks 5.0 ± 1.0 % too much"),
+            (EffectKind::BpmRoll, "y_C5", -0.03, 0.004, "BPM y_C5 is rolled by -30.0 ± 4.0 mrad"),
+            (EffectKind::CorrectorRoll, "H_A4", 0.02, 0.003, "corrector H_A4 is rolled by +20.0 ± 3.0 mrad"),
+            (EffectKind::QuadRoll, "D8", 0.01, 0.0005, "quadrupole D8 is rolled by +10.00 ± 0.50 mrad"),
+            (
+                EffectKind::BpmCubic,
+                "x_A6",
+                1e-3,
+                1e-4,
+                "BPM x_A6 is not linear: +2.50 ± 0.25 % of the position at 5 mm",
+            ),
+            (EffectKind::BpmSwap, "x_E4,x_E6", 1.0, 0.0, "BPMs x_E4 and x_E6 are exchanged"),
+            (EffectKind::CorrectorPolarity, "H_A4", 1.0, 0.0, "corrector H_A4 has the wrong polarity"),
+            (EffectKind::CorrectorEven, "H_A4", 0.04, 0.01, "corrector H_A4 kicks 8.0 ± 2.0 % more at + than at -"),
+            (
+                EffectKind::StrayGradient,
+                "SLOT_F6",
+                0.02,
+                0.001,
+                "there is a gradient K1L = +0.0200 ± 0.0010 /m at SLOT_F6",
+            ),
+            (
+                EffectKind::StraySkewGradient,
+                "SLOT_F6",
+                -0.02,
+                0.001,
+                "there is a skew gradient K1sL = -0.0200 ± 0.0010 /m at SLOT_F6",
+            ),
+            (EffectKind::DipoleGradient, "B_C4", 0.01, 0.002, "dipole B_C4 has a gradient K1L = +0.0100 ± 0.0020 /m"),
+            (EffectKind::DipoleEdge, "", 0.01, 0.001, "all dipoles have edge angles of +10.0 ± 1.0 mrad"),
+            (EffectKind::SextupoleError, "SX_A1", 1.5, 0.2, "sextupole SX_A1 has a field K2L = +1.50 ± 0.20 /m2"),
+            (EffectKind::MomentumOffset, "", -2e-3, 1e-4, "the beam is off momentum by -2.00 ± 0.10 per mille"),
+            (EffectKind::FixedRfFrequency, "", 1.0, 0.0, "the RF frequency was held, not the momentum"),
+            (
+                EffectKind::RadialLoop,
+                "x_D8,x_E6",
+                1.0,
+                0.0,
+                "a radial loop held the mean of x_D8 and x_E6, not the momentum",
+            ),
+            (
+                EffectKind::QuadDrift,
+                "",
+                1e-3,
+                1e-4,
+                "all quadrupoles drifted by +2.00 ± 0.20 per mille from start to end",
+            ),
+        ];
+        assert!(EffectKind::ALL.iter().all(|kind| cases.iter().any(|case| case.0 == *kind)));
+        for (kind, place, amplitude, sigma, words) in cases {
+            assert_eq!(kind.phrase(place, amplitude, sigma), words);
+        }
+    }
 }

@@ -66,7 +66,15 @@ impl Machine {
     /// [`EffectError`] if an effect names a place that the ring lacks or that its kind cannot act on.
     pub fn new(ring: Ring, rf: Rf, effects: &[Effect]) -> Result<Self, EffectError> {
         let frequency_share = if rf == Rf::FixedFrequency { 1.0 } else { 0.0 };
-        let mut machine = Self { ring, delta: 0.0, frequency_share, radial_loop: None, instruments: Vec::new(), sextupoles: Vec::new(), drift: 0.0 };
+        let mut machine = Self {
+            ring,
+            delta: 0.0,
+            frequency_share,
+            radial_loop: None,
+            instruments: Vec::new(),
+            sextupoles: Vec::new(),
+            drift: 0.0,
+        };
         effects.iter().try_for_each(|effect| machine.apply(effect))?;
         Ok(machine)
     }
@@ -81,7 +89,7 @@ impl Machine {
         self.drift
     }
 
-    fn apply(&mut self, effect: &Effect) -> Result<(), EffectError> {
+    pub(super) fn apply(&mut self, effect: &Effect) -> Result<(), EffectError> {
         let (place, a) = (effect.place.as_str(), effect.amplitude);
         match effect.kind {
             EffectKind::BpmGain => {

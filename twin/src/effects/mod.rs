@@ -3,6 +3,8 @@
 //! An effect changes the ring itself, what the machine holds constant, or what its monitors and correctors say; a
 //! [`Machine`] is a ring with effects applied, and answers with the response that would then be measured.
 
+#[cfg(test)]
+mod agreement;
 mod drives;
 mod library;
 mod machine;

@@ -7,8 +7,8 @@
 
 use nalgebra::{DMatrix, DVector, RowDVector};
 
-use super::drives::{Drives, curved};
-use super::machine::{Instrument, Machine, Rf};
+use super::drives::{Drives, Seen, curved};
+use super::machine::{Instrument, Machine};
 use super::{Effect, EffectError, EffectKind};
 use crate::lattice::{Kind, Plane};
 use crate::orbit::{Hold, OrbitError};
@@ -71,9 +71,14 @@ impl<'m> Signatures<'m> {
 
     /// Derivative of readings and tunes with respect to `ln` of each var.
     pub fn of_vars(&self) -> Vec<Signature> {
+        self.unread_vars().map(|signature| self.as_read(signature)).collect()
+    }
+
+    /// The same, of the orbit itself.
+    fn unread_vars(&self) -> impl Iterator<Item = Signature> {
         let ring = &self.machine.ring;
         let one = |(&element, k1): (&usize, f64)| self.of_gradient(&self.optics.gradient(element), k1);
-        ring.quadrupoles.iter().zip(ring.gradients()).map(one).map(|signature| self.as_read(signature)).collect()
+        ring.quadrupoles.iter().zip(ring.gradients()).map(one)
     }
 
     /// Derivative with respect to a gradient (normal, or skew) [1/m] at any place of the ring.
@@ -166,8 +171,8 @@ impl<'m> Signatures<'m> {
                 let at = element(place)?;
                 self.of_gradient(&self.optics.gradient(at), 1.0 / ring.elements[at].length)
             }
-            EffectKind::DipoleEdge | EffectKind::MomentumOffset => self.of_difference(&effect, STEP)?,
-            EffectKind::FixedRfFrequency | EffectKind::RadialLoop => self.of_difference(&effect, 1.0)?,
+            EffectKind::DipoleEdge | EffectKind::MomentumOffset => self.of_slope(&effect)?,
+            EffectKind::FixedRfFrequency | EffectKind::RadialLoop => self.of_change(&effect)?,
             EffectKind::SextupoleError => self.of_sextupole(&effect)?,
             EffectKind::QuadDrift => self.of_drift(),
         })
@@ -210,32 +215,45 @@ impl<'m> Signatures<'m> {
         Signature { readings, tunes: self.optics.tune_slope(gradient).map(|t| t * scale), tune_drift: [0.0; 2] }
     }
 
-    /// Difference of two exact responses.
-    fn of_difference(&self, effect: &Effect, step: f64) -> Result<Signature, EffectError> {
-        let changed = Machine::new(
-            self.machine.ring.clone(),
-            Rf::FixedMomentum,
-            &[Effect { amplitude: step, ..effect.clone() }],
-        )?;
-        let seen = changed.seen(&changed.ring).map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
-        let plain = self.machine.seen(&self.machine.ring);
-        let plain = plain.map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
-        let (x, y) = self.drives.positions(&seen, &self.kick);
-        let readings = (self.machine.own_planes(&x, &y) - self.machine.own_planes(&self.x, &self.y)) / step;
-        let tunes = [(seen.tunes.x - plain.tunes.x) / step, (seen.tunes.y - plain.tunes.y) / step];
-        Ok(Signature { readings, tunes, tune_drift: [0.0; 2] })
+    /// Central difference of two exact responses.
+    fn of_slope(&self, effect: &Effect) -> Result<Signature, EffectError> {
+        self.between(&self.with(effect, STEP)?, &self.with(effect, -STEP)?, 2.0 * STEP, effect)
+    }
+
+    /// Whole change of the exact response.
+    fn of_change(&self, effect: &Effect) -> Result<Signature, EffectError> {
+        self.between(&self.with(effect, 1.0)?, self.machine, 1.0, effect)
+    }
+
+    /// The machine with one more effect.
+    fn with(&self, effect: &Effect, amplitude: f64) -> Result<Machine, EffectError> {
+        let mut changed = self.machine.clone();
+        changed.apply(&Effect { amplitude, ..effect.clone() })?;
+        Ok(changed)
+    }
+
+    fn between(&self, up: &Machine, down: &Machine, width: f64, effect: &Effect) -> Result<Signature, EffectError> {
+        let unstable = |error| EffectError::Orbit { effect: effect.kind.word(), error };
+        let seen = |machine: &Machine| machine.seen(&machine.ring).map_err(unstable);
+        let (up, down) = (seen(up)?, seen(down)?);
+        let positions = |seen: &Seen| {
+            let (x, y) = self.drives.positions(seen, &self.kick);
+            self.machine.own_planes(&x, &y)
+        };
+        let tunes = [(up.tunes.x - down.tunes.x) / width, (up.tunes.y - down.tunes.y) / width];
+        Ok(Signature { readings: (positions(&up) - positions(&down)) / width, tunes, tune_drift: [0.0; 2] })
     }
 
     /// Feed-down of the orbit that passes a sextupole, and the quadratic kick of the orbit that the correctors add.
     fn of_sextupole(&self, effect: &Effect) -> Result<Signature, EffectError> {
         let ring = &self.machine.ring;
-        let changed = Machine::new(ring.clone(), Rf::FixedMomentum, core::slice::from_ref(effect))?;
-        let Some(&(at, k2l)) = changed.sextupoles.first() else { return Err(effect.wrong("a sextupole")) };
+        let changed = self.with(effect, 1.0)?;
+        let Some(&(at, k2l)) = changed.sextupoles.last() else { return Err(effect.wrong("a sextupole")) };
         let [x, y] = self.drives.orbit[at];
         let per_length = 1.0 / ring.elements[at].length;
         let mut signature = self.of_gradient(&self.optics.gradient(at), k2l * x * per_length);
         signature.readings += self.of_gradient(&self.optics.skew_gradient(at), k2l * y * per_length).readings;
-        let curved = curved(ring, at, k2l, &self.kick);
+        let curved = curved(ring, at, k2l, self.drives, &self.kick);
         let [x, y] = curved.map_err(|error| EffectError::Orbit { effect: effect.kind.word(), error })?;
         signature.readings += self.machine.own_planes(&x, &y);
         Ok(signature)
@@ -245,7 +263,7 @@ impl<'m> Signatures<'m> {
     fn of_drift(&self) -> Signature {
         let zero = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
         let mut sum = Signature { readings: zero, tunes: [0.0; 2], tune_drift: [0.0; 2] };
-        for one in self.of_vars() {
+        for one in self.unread_vars() {
             sum.readings += one.readings;
             sum.tune_drift = [sum.tune_drift[0] + one.tunes[0], sum.tune_drift[1] + one.tunes[1]];
         }

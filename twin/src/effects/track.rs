@@ -78,7 +78,9 @@ impl Tracked {
         for (c, (&at, &believed)) in self.machine.ring.correctors.iter().zip(&cycle.kick).enumerate() {
             let given = self.machine.instruments.iter().fold(believed, |kick, instrument| match *instrument {
                 Instrument::Kick { corrector, factor } if corrector == c => kick * factor,
-                Instrument::Even { corrector, share } if corrector == c => kick + share * kick * kick / self.nominal_kick,
+                Instrument::Even { corrector, share } if corrector == c => {
+                    kick + share * kick * kick / self.nominal_kick
+                }
                 _ => kick,
             });
             if let Kind::Corrector { plane, kick } = &mut ring.elements[at].kind {
