@@ -17,7 +17,7 @@ fn main() {
         let data = match Data::of(&ring, &rec) { Ok(d) => d, Err(e) => { println!("{name}: {e}"); continue } };
         let t1 = Instant::now();
         let terms = scan::candidates(&data, rec.header.radial_loop_monitors.as_ref());
-        let found = Search::new(&data, terms).run().unwrap();
+        let found = Search::new(data.clone(), terms).run().unwrap(); let data = found.data.clone();
         let t2 = Instant::now();
         println!("{name}: {} data {:?} search {:?}", found.best.hypothesis.label(), t1-t0, t2-t1);
         for s in &found.null.hypothesis.scatter { println!("   scatter {} {}", s.kind.word(), s.width); }
@@ -32,6 +32,23 @@ fn main() {
                 print!("   NEES {nees:.2}");
             }
             println!("  truth {}", v["effects"]);
+        }
+        if std::env::var("RES").is_ok() { 
+            println!("baseline rms {:?}", data.baseline_rms);
+            let pol = inference::diagnose::hypothesis::Term::new(twin::EffectKind::CorrectorPolarity, "H_D4");
+            let f1 = inference::diagnose::fit::Fitted::of(&data, &Default::default(), &nalgebra::DVector::zeros(48)).unwrap();
+            let hyp = inference::diagnose::hypothesis::Hypothesis::default().with(pol);
+            for g in [&f1.u, &nalgebra::DVector::zeros(48)] {
+            let f = inference::diagnose::fit::Fitted::of(&data, &hyp, g).unwrap();
+            println!("polarity from guess: cost {} ev {} umax {}", f.cost, f.log_evidence, f.u.amax());
+            let mut c = scan::scan(&data, &f, &scan::candidates(&data, None)).unwrap(); c.sort_by(|a,b| b.log_bayes.total_cmp(&a.log_bayes));
+            for k in c.iter().take(8) { println!("     {} {} {} power {}", k.term.label(), k.log_bayes, k.amplitude, k.power); }
+            }
+
+            let f = &found.slots[0].without; let f = if found.slots.len()>1 {&found.slots[1].without} else {&found.best};
+            let _ = f;
+            for (r, p) in f.residual.iter().zip(data.places()) { if r.abs() > 4.0 { if let Some((i,b)) = p { println!("    frame {i} {:?} {} monitor {} z {r:.1}", rec.rows[i].corrector, rec.rows[i].setting, ring.monitor_names()[b]); } } }
+            for (b, h) in data.health().iter().enumerate() { println!("   {} {:?} {:.3} rej {} counted {}", ring.monitor_names()[b], h.state, h.weighted_as*1e3, h.rejected, data.frames(b).len()); }
         }
         let folds = heldout::by_repeat(&rec);
         let t3 = Instant::now();

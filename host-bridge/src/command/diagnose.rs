@@ -118,7 +118,8 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
 impl Answer {
     fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
         let failed = |error: twin::EffectError| CommandError::Other(format!("{recording}: {error}"));
-        let Diagnosis { found, data, before, after, .. } = diagnosis;
+        let Diagnosis { found, before, after, .. } = diagnosis;
+        let data = &found.data;
         let (gain, error) = diagnosis.gain();
         let fit = |fitted: &inference::diagnose::fit::Fitted, score: &Score| -> Result<FitAnswer, CommandError> {
             Ok(FitAnswer {

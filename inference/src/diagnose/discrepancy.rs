@@ -10,13 +10,12 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{DMatrix, DVector};
 use twin::{EffectError, Plane, Signatures};
 
 use super::data::Data;
 use super::fit::Fitted;
+use super::settings::Settings;
 
 /// Where something sits.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,7 +81,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     let data = fitted.data(data);
     let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
     let bench = Bench { fitted, slope };
-    let settings = Settings::of(data);
+    let settings = Settings::of(&data.drives);
     let monitors = data.readings.ncols();
     let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
     let stretches = stretches(data);
@@ -158,43 +157,6 @@ pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let Some(factor) = grown.cholesky() else { return f64::NEG_INFINITY };
     let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
     0.5 * variance * pull.dot(&factor.solve(pull)) - log_det
-}
-
-/// The settings of a campaign, each a corrector at one value, or an RF offset.
-struct Settings {
-    of_frame: Vec<usize>,
-    /// Corrector that is powered (the strongest kick), and how much, in fifths of the nominal setting.
-    powered: Vec<Option<(usize, i64)>>,
-}
-
-impl Settings {
-    fn of(data: &Data) -> Self {
-        let (mut known, mut of_frame, mut powered) = (BTreeMap::new(), Vec::new(), Vec::new());
-        for frame in 0..data.readings.nrows() {
-            let kick = data.drives.kick.row(frame).transpose();
-            let c = kick.iamax();
-            let fifths = (5.0 * kick[c] / data.drives.nominal_kick).round() as i64;
-            let key = ((fifths != 0).then_some((c, fifths)), data.drives.rf_offset[frame].to_bits());
-            let setting = *known.entry(key).or_insert_with(|| {
-                powered.push(key.0);
-                powered.len() - 1
-            });
-            of_frame.push(setting);
-        }
-        Self { of_frame, powered }
-    }
-
-    /// Rows frames, columns settings.
-    fn indicator(&self) -> DMatrix<f64> {
-        let mut indicator = DMatrix::zeros(self.of_frame.len(), self.powered.len());
-        self.of_frame.iter().enumerate().for_each(|(frame, &setting)| indicator[(frame, setting)] = 1.0);
-        indicator
-    }
-
-    fn of_corrector(&self, c: usize) -> Vec<usize> {
-        let powered = |&i: &usize| self.powered[i].is_some_and(|(of, _)| of == c);
-        (0..self.powered.len()).filter(powered).collect()
-    }
 }
 
 /// Steps at the edges of the stretches of time: rows frames, columns edges.

@@ -107,6 +107,12 @@ impl Hypothesis {
         less
     }
 
+    /// The effects without an amplitude alone: what is large enough to matter for the curvature of the orbits.
+    pub fn of_switches(&self) -> Self {
+        let large = |term: &&Term| term.kind.prior_scale().is_none() && term.kind != EffectKind::BpmSwap;
+        Self { terms: self.terms.iter().filter(large).cloned().collect(), scatter: Vec::new() }
+    }
+
     /// What is unknown beside the vars.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {

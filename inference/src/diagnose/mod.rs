@@ -14,6 +14,7 @@ pub mod hypothesis;
 pub mod next;
 pub mod scan;
 pub mod search;
+pub mod settings;
 pub mod verdict;
 
 use twin::Ring;
@@ -33,8 +34,6 @@ pub const PROVEN: f64 = 2.0;
 /// What is missing in the model of a recording.
 #[derive(Debug, Clone)]
 pub struct Diagnosis {
-    /// The recording, whitened.
-    pub data: Data,
     /// All that was found, with its fits.
     pub found: Found,
     /// The verdict.
@@ -67,28 +66,28 @@ impl Diagnosis {
         let data = Data::of(ring, recording)?;
         let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
         progress("searching");
-        let found = Search::new(&data, candidates).run()?;
+        let found = Search::new(data, candidates).run()?;
+        let data = &found.data;
         progress("held-out frames");
         let folds = heldout::by_repeat(recording);
-        let before = Score::of(&data, &found.null, &folds)?;
-        let after = if found.slots.is_empty() { before.clone() } else { Score::of(&data, &found.best, &folds)? };
-        let gains = verdict::gains(&data, &found, &before, &after, &folds)?;
+        let before = Score::of(data, &found.null, &folds)?;
+        let after = if found.slots.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
+        let gains = verdict::gains(data, &found, &before, &after, &folds)?;
         let verdict = Verdict::of(&found, &gains);
-        let findings = verdict::findings(&data, &found, &gains, verdict);
+        let findings = verdict::findings(data, &found, &gains, verdict);
         progress("held-out correctors");
         let whole = !found.slots.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {
             let folds = heldout::by_corrector(recording);
-            Some((Score::of(&data, &found.null, &folds)?, Score::of(&data, &found.best, &folds)?))
+            Some((Score::of(data, &found.null, &folds)?, Score::of(data, &found.best, &folds)?))
         } else {
             None
         };
         progress("what to measure next");
-        let next_measurement = verdict::next_measurement(&data, &found, verdict)?;
-        let sentence = verdict::sentence(&data, &found, verdict, &findings);
+        let next_measurement = verdict::next_measurement(data, &found, verdict)?;
+        let sentence = verdict::sentence(data, &found, verdict, &findings);
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
         Ok(Self {
-            data,
             found,
             verdict,
             sentence,

@@ -75,6 +75,8 @@ pub struct Slot {
 /// What the search found.
 #[derive(Debug, Clone)]
 pub struct Found {
+    /// The recording, its curvature taken from the machine that was found.
+    pub data: Data,
     /// The fit without any effect (ordinary scatter included).
     pub null: Fitted,
     /// The fit with all that were taken up.
@@ -86,16 +88,16 @@ pub struct Found {
 }
 
 /// The candidates of a recording, and what they are worth beforehand.
-pub struct Search<'d> {
-    data: &'d Data,
+pub struct Search {
+    data: Data,
     terms: Vec<Term>,
     /// `ln` prior of each candidate, given that the library holds the effect.
     log_prior: Vec<f64>,
 }
 
-impl<'d> Search<'d> {
+impl Search {
     /// A search among candidates.
-    pub fn new(data: &'d Data, terms: Vec<Term>) -> Self {
+    pub fn new(data: Data, terms: Vec<Term>) -> Self {
         let mut count: BTreeMap<&str, usize> = BTreeMap::new();
         terms.iter().for_each(|term| *count.entry(term.kind.word()).or_default() += 1);
         let kinds = count.len() as f64;
@@ -107,25 +109,38 @@ impl<'d> Search<'d> {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn run(&self) -> Result<Found, EffectError> {
-        let zero = DVector::zeros(self.data.ring.quadrupoles.len());
-        let mut null = Fitted::of(self.data, &Hypothesis::default(), &zero)?;
-        let mut best = null.clone();
-        let mut next = self.slot(&best, 0)?;
-        if let Some(scatter) = self.scatter(&best, &next)? {
-            let hypothesis = Hypothesis { scatter, ..Hypothesis::default() };
-            null = Fitted::of(self.data, &hypothesis, &best.u)?;
-            best = null.clone();
-            next = self.slot(&best, 0)?;
+    pub fn run(mut self) -> Result<Found, EffectError> {
+        let mut null = self.straighten(&Hypothesis::default())?;
+        let mut next = self.slot(&null, 0)?;
+        if let Some(scatter) = self.scatter(&null, &next)? {
+            null = self.straighten(&Hypothesis { scatter, ..Hypothesis::default() })?;
+            next = self.slot(&null, 0)?;
         }
+        let mut best = null.clone();
         while best.hypothesis.terms.len() < MOST && next.library() > next.nothing.max(next.unknown()) {
             let Some(fitted) = next.leader() else { break };
             best = self.settle(fitted)?;
+            best = self.straighten(&best.hypothesis)?;
             next = self.slot(&best, best.hypothesis.terms.len())?;
         }
         let slots: Vec<Slot> =
             (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
-        Ok(Found { null, best, slots, next })
+        if !slots.is_empty() {
+            null = Fitted::of(&self.data, &null.hypothesis, &null.u)?;
+        }
+        Ok(Found { data: self.data, null, best, slots, next })
+    }
+
+    /// Fit, and take the curvature of the orbits from the machine that was found.
+    fn straighten(&mut self, hypothesis: &Hypothesis) -> Result<Fitted, EffectError> {
+        let zero = DVector::zeros(self.data.ring.quadrupoles.len());
+        let fitted = Fitted::of(&self.data, hypothesis, &zero)?;
+        let machine = hypothesis.of_switches().machine(&self.data, &fitted.params, &[])?.0;
+        // a machine that keeps no beam in one of the settings is not the one that was recorded
+        if self.data.bend(&machine).is_err() {
+            return Ok(fitted);
+        }
+        Fitted::of(&self.data, hypothesis, &fitted.u)
     }
 
     /// Let all candidates compete for each slot, until the best one is in each.
@@ -152,14 +167,14 @@ impl<'d> Search<'d> {
 
     /// The competition for one of the effects of a fit.
     fn without(&self, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
-        let rest = super::heldout::reduced(self.data, fitted, term)?;
+        let rest = super::heldout::reduced(&self.data, fitted, term)?;
         self.slot(&rest, fitted.hypothesis.terms.len() - 1)
     }
 
     /// The competition for one more effect beside those of a fit.
     fn slot(&self, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
         let odds = if effects == 0 { ODDS } else { ODDS_FURTHER };
-        let scanned = scan(fitted.data(self.data), fitted, &self.terms)?;
+        let scanned = scan(fitted.data(&self.data), fitted, &self.terms)?;
         let mut ranked: Vec<(Candidate, f64)> = scanned
             .iter()
             .cloned()
@@ -182,7 +197,7 @@ impl<'d> Search<'d> {
             let weight = alternative.log_gain + prior;
             weights.push((alternative, weight));
         }
-        for discrepancy in discrepancy::scan(self.data, fitted)? {
+        for discrepancy in discrepancy::scan(&self.data, fitted)? {
             let prior = (UNKNOWN * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unknown(discrepancy), weight));
@@ -194,21 +209,21 @@ impl<'d> Search<'d> {
         let hypothesis = fitted.hypothesis.with(candidate.term.clone());
         let vars = fitted.params.len();
         // the new unknowns of a term stand before those of scatter
-        let at = vars + fitted.hypothesis.unknowns(self.data).len() - fitted.hypothesis.members(self.data);
-        let new = hypothesis.unknowns(self.data).len() - fitted.hypothesis.unknowns(self.data).len();
+        let at = vars + fitted.hypothesis.unknowns(&self.data).len() - fitted.hypothesis.members(&self.data);
+        let new = hypothesis.unknowns(&self.data).len() - fitted.hypothesis.unknowns(&self.data).len();
         let mut guess = fitted.u.clone().insert_rows(at, new, 0.0);
         if new > 0 {
             guess[at] = candidate.amplitude;
         }
         // a candidate that leads to no stable machine is none
-        let Ok(refitted) = Fitted::of(self.data, &hypothesis, &guess) else {
+        let Ok(refitted) = Fitted::of(&self.data, &hypothesis, &guess) else {
             return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
         };
         Alternative {
             cause: Cause::Effect(candidate.term.clone()),
             log_gain: refitted.log_evidence - fitted.log_evidence,
             probability: 0.0,
-            amplitude: refitted.amplitude(self.data, fitted.hypothesis.terms.len()),
+            amplitude: refitted.amplitude(&self.data, fitted.hypothesis.terms.len()),
             adapting: DVector::zeros(0),
             fitted: Some(refitted),
         }
@@ -219,8 +234,8 @@ impl<'d> Search<'d> {
         let single = next.log_odds;
         let mut best: Option<(Scatter, f64)> = None;
         for &(kind, widths) in &FAMILIES {
-            let terms = members(kind, self.data);
-            let logs = super::scan::family(self.data, fitted, &terms, widths)?;
+            let terms = members(kind, &self.data);
+            let logs = super::scan::family(&self.data, fitted, &terms, widths)?;
             for (&width, log_bayes) in widths.iter().zip(logs) {
                 if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
                     best = Some((Scatter { kind, width }, log_bayes));

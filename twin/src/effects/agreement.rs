@@ -166,6 +166,8 @@ fn linear_readings_are_those_of_exact_orbits() {
         let second = match effect.kind {
             EffectKind::FixedRfFrequency => 2.5e-6,
             EffectKind::RadialLoop => 1e-5,
+            // second order in the drift itself: 1e-3 of all gradients, times the slope's own relative change of 30
+            EffectKind::QuadDrift => 2.5e-6,
             _ => 0.0,
         };
         // measured 6e-4: kinematic terms of slopes of 1 mrad

@@ -158,7 +158,10 @@ mod tests {
             assert_eq!(sites.is_empty(), kind == EffectKind::RadialLoop, "{}", kind.word());
             for place in sites {
                 let effect = Effect { kind, place, amplitude: 1e-6 };
-                assert!(Machine::new(ring.clone(), Rf::FixedMomentum, &[effect.clone()]).is_ok(), "{effect:?}");
+                assert!(
+                    Machine::new(ring.clone(), Rf::FixedMomentum, core::slice::from_ref(&effect)).is_ok(),
+                    "{effect:?}"
+                );
             }
         }
     }
