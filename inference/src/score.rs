@@ -82,7 +82,9 @@ impl Truth {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
             Verdict::Consistent => Grade::Missed,
             Verdict::Identified
-                if self.effects.len() == effects.len() && !self.effects.is_empty() && self.effects.iter().all(named) =>
+                if self.effects.len() == effects.len()
+                    && !self.effects.is_empty()
+                    && self.effects.iter().all(named) =>
             {
                 Grade::Right
             }

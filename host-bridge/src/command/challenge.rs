@@ -79,8 +79,10 @@ fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
     if is_one(root) {
         return Ok(vec![root.to_owned()]);
     }
-    let entries: Vec<PathBuf> =
-        std::fs::read_dir(root).map_err(wrong)?.map(|entry| Ok(entry.map_err(wrong)?.path())).collect::<Result<_, CommandError>>()?;
+    let entries: Vec<PathBuf> = std::fs::read_dir(root)
+        .map_err(wrong)?
+        .map(|entry| Ok(entry.map_err(wrong)?.path()))
+        .collect::<Result<_, CommandError>>()?;
     let mut found: Vec<PathBuf> = entries.into_iter().filter(|folder| is_one(folder)).collect();
     found.sort();
     if found.is_empty() {
@@ -132,7 +134,18 @@ impl Answer {
     fn print(&self) {
         let mut table = Table::new();
         table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header(["recording", "verdict", "found", "truth", "oracle", "grade", "pull", "NEES/var", "held-out", "s"]);
+        table.set_header([
+            "recording",
+            "verdict",
+            "found",
+            "truth",
+            "oracle",
+            "grade",
+            "pull",
+            "NEES/var",
+            "held-out",
+            "s",
+        ]);
         for scored in &self.recordings {
             let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
             table.add_row([

@@ -142,7 +142,10 @@ impl Answer {
                 after: fit(&found.best, after)?,
                 elpd_gain: gain,
                 elpd_gain_se: error,
-                corrector_elpd_gain: diagnosis.correctors.as_ref().map(|(before, after)| after.gain_over(before).into()),
+                corrector_elpd_gain: diagnosis
+                    .correctors
+                    .as_ref()
+                    .map(|(before, after)| after.gain_over(before).into()),
             },
             vars_before: vars(ring, &diagnosis.vars_before),
             vars_after: vars(ring, &diagnosis.vars_after),

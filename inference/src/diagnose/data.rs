@@ -13,7 +13,10 @@
 use estimator::Health;
 use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
 use training::BoosterGreen;
-use twin::{Cycle, Drives, EffectError, Hold, Machine, Optics, OrbitError, Plane, Ring, Rf, Signature, Signatures, Tracked, Tunes};
+use twin::{
+    Cycle, Drives, EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring, Signature, Signatures, Tracked,
+    Tunes,
+};
 
 use super::settings::Settings;
 use crate::map::{Drive, Screened, first_family, screen};
@@ -131,9 +134,13 @@ impl Data {
         let signatures = Signatures::of(&design, &drives)?.of_vars();
         let mut readings = raw(recording, ring);
         // what the supplies' fluctuations do to the kicked orbit, and the second order of the RF orbit
-        let off = |family: usize| DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]));
+        let off = |family: usize| {
+            DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
+        };
         for (family, range) in [(0, 0..first), (1, first..n)] {
-            let slope = signatures[range].iter().fold(DMatrix::zeros(driven.len(), readings.ncols()), |sum, one| sum + &one.readings);
+            let slope = signatures[range]
+                .iter()
+                .fold(DMatrix::zeros(driven.len(), readings.ncols()), |sum, one| sum + &one.readings);
             let off = off(family);
             readings -= DMatrix::from_fn(slope.nrows(), slope.ncols(), |i, b| off[i] * slope[(i, b)]);
         }
@@ -169,11 +176,15 @@ impl Data {
             ])
         });
         let shared: Vec<_> = shared.collect();
-        let slope = |plane: usize, range: core::ops::Range<usize>| signatures[range].iter().map(|s| s.tunes[plane]).sum::<f64>();
+        let slope = |plane: usize, range: core::ops::Range<usize>| {
+            signatures[range].iter().map(|s| s.tunes[plane]).sum::<f64>()
+        };
         let slopes = [0, 1].map(|plane| [slope(plane, 0..first), slope(plane, first..n)]);
         let (off_x, off_y) = (off(0), off(1));
         let tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| match recording.rows[i].tune[plane] {
-            Some(tune) if drives.rf_offset[i] == 0.0 => tune - slopes[plane][0] * off_x[i] - slopes[plane][1] * off_y[i],
+            Some(tune) if drives.rf_offset[i] == 0.0 => {
+                tune - slopes[plane][0] * off_x[i] - slopes[plane][1] * off_y[i]
+            }
             _ => f64::NAN,
         });
         let mut data = Self {
@@ -401,7 +412,8 @@ impl Channel {
 impl Meter {
     /// A line through the tunes of the frames over time.
     fn of<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
-        let points: Vec<(f64, f64)> = frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
+        let points: Vec<(f64, f64)> =
+            frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
         // a line needs a few points, and its noise some more
         if points.len() < 8 {
             return None;
@@ -487,4 +499,3 @@ fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<(Vec<[
     }
     Ok((orbit, sigma))
 }
-

@@ -97,7 +97,8 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
         let of_corrector = settings.of_corrector(c);
         all.push(bench.judge(Where::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
     }
-    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+    let (machine, drives) =
+        fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
     for (quadrupole, plane, pattern) in patterns {
@@ -141,9 +142,10 @@ impl Bench<'_> {
 
 impl Discrepancy {
     fn of(at: Where, logs: [f64; SIZES.len()], sites: usize) -> Self {
-        let (best, largest) = logs.iter().enumerate().fold((0, f64::NEG_INFINITY), |best, (i, &log)| {
-            if log > best.1 { (i, log) } else { best }
-        });
+        let (best, largest) = logs
+            .iter()
+            .enumerate()
+            .fold((0, f64::NEG_INFINITY), |best, (i, &log)| if log > best.1 { (i, log) } else { best });
         let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
         Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites }
     }
@@ -273,7 +275,9 @@ impl Where {
             Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
             Self::Time => "the orbit changes with time at many monitors".into(),
-            Self::Everywhere => "the readings scatter more from setting to setting than from repeat to repeat, everywhere".into(),
+            Self::Everywhere => {
+                "the readings scatter more from setting to setting than from repeat to repeat, everywhere".into()
+            }
         }
     }
 

@@ -247,9 +247,7 @@ fn differentiate(
     }
     for (i, unknown) in unknowns.iter().enumerate() {
         let column = match unknown {
-            Unknown::Member(term, width) => {
-                data.signature(&signatures.of_effect(term.kind, &term.place)?) * *width
-            }
+            Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, &term.place)?) * *width,
             _ => {
                 let at = |step: f64| {
                     let mut u = here.u.clone();

@@ -87,8 +87,7 @@ impl Score {
             let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
             for left in predict(data, fit.data(&kept), &fit, fold)? {
                 let z = left.innovation / left.variance.sqrt();
-                score.log_density[left.frame] -=
-                    0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
+                score.log_density[left.frame] -= 0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
                 score.readings += 1;
                 score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
                 score.inside[1] += f64::from(u8::from(z.abs() < 2.0));

@@ -75,7 +75,9 @@ impl Term {
             "y" => ring.monitor(Plane::Y, cell).ok(),
             "H" => ring.corrector(Plane::X, cell).ok(),
             "V" => ring.corrector(Plane::Y, cell).ok(),
-            "SX" => ring.elements.iter().position(|e| matches!(e.kind, twin::Kind::Sextupole { .. }) && e.cell() == cell),
+            "SX" => {
+                ring.elements.iter().position(|e| matches!(e.kind, twin::Kind::Sextupole { .. }) && e.cell() == cell)
+            }
             "" => ring.quadrupole(cell).ok(),
             _ => ring.element(first).ok(),
         }
@@ -141,7 +143,8 @@ impl Hypothesis {
     /// # Errors
     /// [`EffectError`] if a place is none.
     pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
-        let strength: Vec<f64> = params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
+        let strength: Vec<f64> =
+            params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
         let mut effects: Vec<Effect> =
             self.terms.iter().map(|t| Effect { kind: t.kind, place: t.place.clone(), amplitude: 1.0 }).collect();
         let mut drives = data.drives.clone();

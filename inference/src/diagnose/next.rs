@@ -112,7 +112,12 @@ fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec
     }
     let alternating = DVector::from_fn(drives.rf_offset.len(), |i, _| if i % 2 == 0 { RF_STEP } else { -RF_STEP });
     let stepped = Drives { rf_offset: alternating, ..drives.clone() };
-    all.push((format!("with the RF frequency stepped by ±{RF_STEP:.0e} in every frame"), machine.clone(), stepped, 1.0));
+    all.push((
+        format!("with the RF frequency stepped by ±{RF_STEP:.0e} in every frame"),
+        machine.clone(),
+        stepped,
+        1.0,
+    ));
     if let Some(others) = other_correctors(data, drives) {
         all.push(("with the correctors that were not used".into(), machine.clone(), others, 1.0));
     }

@@ -189,11 +189,8 @@ impl Search {
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
         for (rank, (candidate, prior)) in ranked.into_iter().enumerate() {
             let near = candidate.log_bayes + prior > first + prior_of_first - behind && candidate.log_bayes > 0.5;
-            let alternative = if rank < LEADERS && near {
-                self.refit(fitted, &candidate)
-            } else {
-                Alternative::of(&candidate)
-            };
+            let alternative =
+                if rank < LEADERS && near { self.refit(fitted, &candidate) } else { Alternative::of(&candidate) };
             let weight = alternative.log_gain + prior;
             weights.push((alternative, weight));
         }

@@ -153,21 +153,28 @@ pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdi
 
 /// In one sentence.
 pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Finding]) -> String {
-    let phrases = |separator: &str| {
-        findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator)
-    };
+    let phrases =
+        |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
     let text = match verdict {
         Verdict::Consistent => format!("nothing is missing at the noise level; {}", power(found)),
         Verdict::Identified => {
-            let gain: Vec<String> =
-                findings.iter().filter_map(|f| f.heldout).map(|(gain, error)| format!("{gain:.0} ± {error:.0}")).collect();
+            let gain: Vec<String> = findings
+                .iter()
+                .filter_map(|f| f.heldout)
+                .map(|(gain, error)| format!("{gain:.0} ± {error:.0}"))
+                .collect();
             format!("{}; held-out frames gain {} nat", phrases("; "), gain.join(" and "))
         }
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => format!("{}, which no effect of the library describes", phrases("; and ")),
     };
     let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
-        format!("; all {} scatter by {} {}, which is ordinary", family(scatter.kind), scatter.width, scatter.kind.unit())
+        format!(
+            "; all {} scatter by {} {}, which is ordinary",
+            family(scatter.kind),
+            scatter.width,
+            scatter.kind.unit()
+        )
     });
     let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
@@ -212,7 +219,8 @@ fn power(found: &Found) -> String {
         let amplitude = kind.prior_scale()? * (2.0 * SEEN / median.max(f64::MIN_POSITIVE)).sqrt();
         Some(format!("{} {amplitude:.1$} {2}", kind.word(), if amplitude < 0.1 { 3 } else { 2 }, kind.unit()))
     };
-    let list: Vec<String> = shown.into_iter().filter_map(of_kind).map(|one| one.trim_end_matches(" 1").to_owned()).collect();
+    let list: Vec<String> =
+        shown.into_iter().filter_map(of_kind).map(|one| one.trim_end_matches(" 1").to_owned()).collect();
     format!("what would have been seen at half of the places: {}", list.join(", "))
 }
 
