@@ -37,6 +37,8 @@ pub enum Command {
     Diagnose(Diagnose),
     /// Diagnose every recording below a folder and score it against the truth.json beside it
     Challenge(Challenge),
+    /// Diagnose simulated blind campaigns and count how often it is right
+    Prove(Prove),
     /// Publish the estimates of a device
     Serve(Serve),
     /// Surrogates and their measured errors
@@ -216,6 +218,37 @@ pub struct Challenge {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
+}
+
+/// `orbitcal prove`.
+#[derive(Debug, Args)]
+pub struct Prove {
+    /// Campaign whose settings, read-backs and gaps the simulated ones have
+    pub template: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    /// Campaigns with nothing missing
+    #[arg(long, value_name = "N", default_value_t = 300)]
+    pub empty: usize,
+    /// Campaigns with one effect of the library
+    #[arg(long, value_name = "N", default_value_t = 252)]
+    pub single: usize,
+    /// Campaigns with two
+    #[arg(long, value_name = "N", default_value_t = 48)]
+    pub pair: usize,
+    /// Campaigns with physics that the library does not hold
+    #[arg(long, value_name = "N", default_value_t = 90)]
+    pub unknown: usize,
+    /// One line a campaign; those that are there already are not run again
+    #[arg(long, value_name = "FILE.jsonl", default_value = "target/prove.jsonl")]
+    pub outcomes: PathBuf,
+    /// Write the tables between the marks of this page
+    #[arg(long, value_name = "FILE.md")]
+    pub page: Option<PathBuf>,
+    /// Fixes every random choice
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
 }
 
 /// How NUTS samples.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use host_bridge::cli::{Cli, Command};
-use host_bridge::command::{CommandError, challenge, diagnose, fit, replay, response, serve, study, surrogate, watch};
+use host_bridge::command::{CommandError, challenge, diagnose, fit, prove, replay, response, serve, study, surrogate, watch};
 
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -23,6 +23,7 @@ fn main() -> ExitCode {
         Command::Study(options) => study::run(options),
         Command::Diagnose(options) => diagnose::run(options),
         Command::Challenge(options) => challenge::run(options),
+        Command::Prove(options) => prove::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Surrogate(options) => surrogate::run(options),
     };

@@ -32,6 +32,9 @@ pub struct TrueEffect {
     /// Amplitude, if the kind has one.
     #[serde(default)]
     pub amplitude: Option<f64>,
+    /// What it is, where it is unknown to the library.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub what: Option<String>,
 }
 
 /// How right a verdict is.
@@ -40,6 +43,8 @@ pub struct TrueEffect {
 pub enum Grade {
     /// All effects named at their places, and no other; or nothing, where there is nothing.
     Right,
+    /// Some of several effects named, and no other.
+    Partial,
     /// Not decided, with the truth among the alternatives.
     Listed,
     /// Not decided, without the truth; or said to be beyond the library.
@@ -88,6 +93,9 @@ impl Truth {
             {
                 Grade::Right
             }
+            Verdict::Identified if effects.iter().all(|finding| self.effects.iter().any(|effect| effect.is(finding))) => {
+                Grade::Partial
+            }
             Verdict::Identified => Grade::Wrong,
             _ if library && !self.effects.is_empty() && self.effects.iter().all(listed) => Grade::Listed,
             _ => Grade::Open,
@@ -123,7 +131,7 @@ impl TrueEffect {
     pub fn label(&self) -> String {
         let at = if self.at.is_empty() { String::new() } else { format!("@{}", self.at) };
         let amplitude = self.amplitude.map_or(String::new(), |a| format!("={a:.4}"));
-        format!("{}{at}{amplitude}", self.kind)
+        format!("{}{at}{amplitude}", self.what.as_ref().unwrap_or(&self.kind))
     }
 }
 

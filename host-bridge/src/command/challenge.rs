@@ -18,6 +18,7 @@ struct Answer {
     recordings: Vec<Scored>,
     /// Number of recordings by grade.
     right: usize,
+    partial: usize,
     listed: usize,
     open: usize,
     missed: usize,
@@ -121,6 +122,7 @@ impl Answer {
             .collect();
         Self {
             right: count(Grade::Right),
+            partial: count(Grade::Partial),
             listed: count(Grade::Listed),
             open: count(Grade::Open),
             missed: count(Grade::Missed),
@@ -163,8 +165,8 @@ impl Answer {
         }
         println!("{table}");
         println!(
-            "{} right, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
-            self.right, self.listed, self.open, self.missed, self.wrong, self.amplitude_chi2, self.amplitudes
+            "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
+            self.right, self.partial, self.listed, self.open, self.missed, self.wrong, self.amplitude_chi2, self.amplitudes
         );
     }
 }

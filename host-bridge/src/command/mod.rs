@@ -3,6 +3,7 @@
 pub mod challenge;
 pub mod diagnose;
 pub mod fit;
+pub mod prove;
 pub mod replay;
 pub mod response;
 pub mod serve;

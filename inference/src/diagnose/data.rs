@@ -236,6 +236,20 @@ impl Data {
         Ok(())
     }
 
+    /// The same recording with a known signal taken out of its readings and tunes, rows frames.
+    pub fn less(&self, readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> Self {
+        let mut data = self.clone();
+        data.readings -= readings;
+        data.curved -= readings;
+        data.tunes -= tunes;
+        data.meter = data.meters();
+        data
+    }
+
+    fn meters(&self) -> [Option<Meter>; 2] {
+        [0, 1].map(|plane| Meter::of(self.tunes.column(plane).iter().zip(self.drives.time.iter())))
+    }
+
     /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
     pub fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
@@ -251,7 +265,7 @@ impl Data {
             data.screened.accepted[frame] = 0;
             data.tunes.row_mut(frame).fill(f64::NAN);
         }
-        data.meter = [0, 1].map(|plane| Meter::of(data.tunes.column(plane).iter().zip(data.drives.time.iter())));
+        data.meter = data.meters();
         data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
         data
     }

@@ -10,7 +10,8 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
-use nalgebra::{DMatrix, DVector};
+use estimator::MonitorState;
+use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{EffectError, Plane, Signatures};
 
 use super::data::Data;
@@ -24,6 +25,8 @@ pub enum Where {
     Monitor(usize),
     /// At a monitor, as time goes by.
     MonitorInTime(usize),
+    /// A monitor's gain, as time goes by.
+    GainInTime(usize),
     /// At a corrector.
     Corrector(usize),
     /// At a place in the ring (a quadrupole's entrance) that kicks the beam in a plane.
@@ -50,7 +53,7 @@ pub struct Discrepancy {
 }
 
 /// Sorts of places, which share the prior.
-pub const SORTS: usize = 7;
+pub const SORTS: usize = 8;
 /// Standard deviations tried [m].
 const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
 /// Stretches of time.
@@ -86,11 +89,20 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
     let stretches = stretches(data);
     let steps: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &stretches)).collect();
-    let speaking = data.speaking_monitors();
+    // monitors known to be faulty scatter as they like
+    let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
+    let speaking: Vec<usize> = data.speaking_monitors().into_iter().filter(healthy).collect();
+    if speaking.is_empty() {
+        return Ok(Vec::new());
+    }
+    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+    let predicted = machine.readings(&drives)?.0;
     let mut all = Vec::new();
     for &b in &speaking {
         all.push(bench.judge(Where::Monitor(b), &cells[b], speaking.len()));
         all.push(bench.judge(Where::MonitorInTime(b), &steps[b], speaking.len()));
+        let gains = data.cells(b, fitted, &scaled(&stretches, &predicted.column(b)));
+        all.push(bench.judge(Where::GainInTime(b), &gains, speaking.len()));
     }
     let driven = data.driven_correctors();
     for &c in &driven {
@@ -169,6 +181,14 @@ fn stretches(data: &Data) -> DMatrix<f64> {
     })
 }
 
+/// Steps of a gain: the steps times what is predicted, of rms 1.
+fn scaled(stretches: &DMatrix<f64>, predicted: &DVectorView<f64>) -> DMatrix<f64> {
+    let rms = (predicted.norm_squared() / predicted.len() as f64).sqrt().max(f64::MIN_POSITIVE);
+    let mut columns = stretches.clone();
+    columns.row_iter_mut().zip(predicted.iter()).for_each(|(mut row, p)| row *= p / rms);
+    columns
+}
+
 /// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
 fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, EffectError> {
     let ring = machine.ring();
@@ -239,9 +259,7 @@ impl Data {
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
         for b in self.speaking_monitors() {
             let mut columns = stretches.clone();
-            for (i, mut row) in columns.row_iter_mut().enumerate() {
-                row *= signature.readings[(i, b)] / rms;
-            }
+            columns.row_iter_mut().enumerate().for_each(|(i, mut row)| row *= signature.readings[(i, b)] / rms);
             let cells = self.cells(b, fitted, &columns);
             sum.gram += cells.gram;
             sum.cross += cells.cross;
@@ -256,7 +274,7 @@ impl Where {
     pub fn label(&self, data: &Data) -> String {
         let ring = &data.ring;
         match *self {
-            Self::Monitor(b) | Self::MonitorInTime(b) => ring.monitor_names()[b].clone(),
+            Self::Monitor(b) | Self::MonitorInTime(b) | Self::GainInTime(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) => ring.corrector_names()[c].clone(),
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
             Self::Time => "time".into(),
@@ -270,6 +288,7 @@ impl Where {
         match self {
             Self::Monitor(_) => format!("monitor {name} does not follow the orbit"),
             Self::MonitorInTime(_) => format!("monitor {name} changes with time"),
+            Self::GainInTime(_) => format!("the gain of monitor {name} changes with time"),
             Self::Corrector(_) => format!("corrector {name} does something else than one kick"),
             Self::Ring(_, Plane::X) => format!("something near {name} kicks the beam horizontally"),
             Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
@@ -285,7 +304,7 @@ impl Where {
     pub fn position(&self, data: &Data) -> Option<f64> {
         let ring = &data.ring;
         let at = match *self {
-            Self::Monitor(b) | Self::MonitorInTime(b) => ring.read_monitors[b],
+            Self::Monitor(b) | Self::MonitorInTime(b) | Self::GainInTime(b) => ring.read_monitors[b],
             Self::Corrector(c) => ring.correctors[c],
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q],
             Self::Time | Self::Everywhere => return None,

@@ -64,6 +64,11 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`] if there is no stable machine at the guess.
     pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
+        if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind == EffectKind::QuadDrift) {
+            let drifting = data.drifting(given.amplitude.abs());
+            let fitted = Self::minimise(&drifting, hypothesis, guess)?;
+            return Ok(Self { drifting: Some(Box::new(drifting)), ..fitted });
+        }
         let fitted = Self::minimise(data, hypothesis, guess)?;
         let Some(term) = hypothesis.terms.iter().position(|term| term.kind == EffectKind::QuadDrift) else {
             return Ok(fitted);
@@ -72,6 +77,18 @@ impl Fitted {
         let drifting = data.drifting(fitted.amplitude(data, term).0.abs());
         let fitted = Self::minimise(&drifting, hypothesis, &fitted.u)?;
         Ok(Self { drifting: Some(Box::new(drifting)), ..fitted })
+    }
+
+    /// The hypothesis at the prior's mean, linearised and not fitted.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, EffectError> {
+        let unknowns = hypothesis.unknowns(data);
+        let u = DVector::zeros(data.ring.quadrupoles.len() + unknowns.len());
+        let here = point(data, hypothesis, u)?;
+        let jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
+        Ok(Self::at(data, hypothesis, here, normal(&jacobian), jacobian))
     }
 
     /// The data as this fit whitens them.
@@ -98,12 +115,27 @@ impl Fitted {
             jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
             factor = normal(&jacobian);
         }
-        let params = params_of(&here.u, vars);
+        Ok(Self::at(data, hypothesis, here, factor, jacobian))
+    }
+
+    fn at(
+        data: &Data,
+        hypothesis: &Hypothesis,
+        here: Point,
+        factor: Cholesky<f64, Dyn>,
+        jacobian: DMatrix<f64>,
+    ) -> Self {
+        let params = params_of(&here.u, data.ring.quadrupoles.len());
         let log_det: f64 = 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det());
         let hypothesis = hypothesis.clone();
-        let (cost, residual, u) = (here.cost, here.residual, here.u);
-        Ok(Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, u, drifting: None })
+        let Point { u, residual, cost } = here;
+        Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, u, drifting: None }
+    }
+
+    /// `ln` posterior at the best point, up to a constant of the recording: evidence without the freedom of the unknowns.
+    pub fn log_posterior(&self, data: &Data) -> f64 {
+        -0.5 * (self.cost + self.data(data).log_det())
     }
 
     /// Amplitude and standard deviation of a term; (1, 0) without one.

@@ -36,6 +36,8 @@ pub struct Hypothesis {
     pub terms: Vec<Term>,
     /// Ordinary scatter.
     pub scatter: Vec<Scatter>,
+    /// Effects of known amplitude.
+    pub given: Vec<Effect>,
 }
 
 /// One number that is unknown beside the vars, with its prior standard deviation.
@@ -112,7 +114,7 @@ impl Hypothesis {
     /// The effects without an amplitude alone: what is large enough to matter for the curvature of the orbits.
     pub fn of_switches(&self) -> Self {
         let large = |term: &&Term| term.kind.prior_scale().is_none() && term.kind != EffectKind::BpmSwap;
-        Self { terms: self.terms.iter().filter(large).cloned().collect(), scatter: Vec::new() }
+        Self { terms: self.terms.iter().filter(large).cloned().collect(), ..Self::default() }
     }
 
     /// What is unknown beside the vars.
@@ -147,6 +149,7 @@ impl Hypothesis {
             params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
         let mut effects: Vec<Effect> =
             self.terms.iter().map(|t| Effect { kind: t.kind, place: t.place.clone(), amplitude: 1.0 }).collect();
+        effects.extend(self.given.iter().cloned());
         let mut drives = data.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {

@@ -30,6 +30,10 @@ const MOST: usize = 4;
 const LEADERS: usize = 10;
 const BEHIND: f64 = 7.0;
 const BEHIND_SHARE: f64 = 0.3;
+/// `ln` Bayes factor below which first order will do.
+const WORTH: f64 = 0.5;
+/// Chi-square per number beyond which a fit is far off.
+const GROSS: f64 = 1.3;
 
 /// What may fill a slot.
 #[derive(Debug, Clone)]
@@ -87,6 +91,13 @@ pub struct Found {
     pub next: Slot,
 }
 
+impl Found {
+    /// Probability that nothing is missing at all.
+    pub fn first_nothing(&self) -> f64 {
+        self.slots.iter().map(|slot| slot.nothing).fold(self.next.nothing, |product, nothing| product.min(nothing))
+    }
+}
+
 /// The candidates of a recording, and what they are worth beforehand.
 pub struct Search {
     data: Data,
@@ -117,17 +128,24 @@ impl Search {
             next = self.slot(&null, 0)?;
         }
         let mut best = null.clone();
+        let mut first = None;
         while best.hypothesis.terms.len() < MOST && next.library() > next.nothing.max(next.unknown()) {
             let Some(fitted) = next.leader() else { break };
+            let switches = best.hypothesis.of_switches();
             best = self.settle(fitted)?;
-            best = self.straighten(&best.hypothesis)?;
+            // the competition for the only effect is the one that it has just won, on the same data
+            first = Some(next);
+            if best.hypothesis.of_switches() != switches {
+                best = self.straighten(&best.hypothesis)?;
+                null = Fitted::of(&self.data, &null.hypothesis, &null.u)?;
+                first = None;
+            }
             next = self.slot(&best, best.hypothesis.terms.len())?;
         }
-        let slots: Vec<Slot> =
-            (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
-        if !slots.is_empty() {
-            null = Fitted::of(&self.data, &null.hypothesis, &null.u)?;
-        }
+        let slots = match (first, best.hypothesis.terms.len()) {
+            (Some(first), 1) => vec![first],
+            (_, terms) => (0..terms).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?,
+        };
         Ok(Found { data: self.data, null, best, slots, next })
     }
 
@@ -175,23 +193,16 @@ impl Search {
     fn slot(&self, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
         let odds = if effects == 0 { ODDS } else { ODDS_FURTHER };
         let scanned = scan(fitted.data(&self.data), fitted, &self.terms)?;
-        let mut ranked: Vec<(Candidate, f64)> = scanned
-            .iter()
-            .cloned()
-            .zip(&self.log_prior)
-            .map(|(candidate, prior)| (candidate, prior + ((1.0 - UNKNOWN) * odds).ln()))
-            .filter(|(candidate, _)| !fitted.hypothesis.terms.contains(&candidate.term))
-            .collect();
-        ranked.sort_by(|one, other| (other.0.log_bayes + other.1).total_cmp(&(one.0.log_bayes + one.1)));
-        let first = ranked.first().map_or(0.0, |(candidate, _)| candidate.log_bayes);
-        let prior_of_first = ranked.first().map_or(0.0, |(_, prior)| *prior);
-        let behind = BEHIND.max(BEHIND_SHARE * first);
+        let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNKNOWN) * odds).ln();
+        let leaders = self.leaders(fitted, &scanned)?;
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
-        for (rank, (candidate, prior)) in ranked.into_iter().enumerate() {
-            let near = candidate.log_bayes + prior > first + prior_of_first - behind && candidate.log_bayes > 0.5;
+        for (i, candidate) in scanned.iter().enumerate() {
+            if fitted.hypothesis.terms.contains(&candidate.term) {
+                continue;
+            }
             let alternative =
-                if rank < LEADERS && near { self.refit(fitted, &candidate) } else { Alternative::of(&candidate) };
-            let weight = alternative.log_gain + prior;
+                if leaders.contains(&i) { self.refit(fitted, candidate) } else { Alternative::of(candidate) };
+            let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
         for discrepancy in discrepancy::scan(&self.data, fitted)? {
@@ -200,6 +211,30 @@ impl Search {
             weights.push((Alternative::unknown(discrepancy), weight));
         }
         Ok(Slot::of(weights, fitted.clone(), scanned))
+    }
+
+    /// The candidates that are worth an exact fit. Where the fit is far off, its vars are bent out of shape and mislead: those
+    /// that lead at the prior's mean are then taken too.
+    fn leaders(&self, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, EffectError> {
+        let mut leaders = self.first(scanned, &fitted.hypothesis);
+        if fitted.residual.norm_squared() > GROSS * fitted.residual.len() as f64 {
+            let start = Fitted::unfitted(&self.data, &fitted.hypothesis)?;
+            leaders.extend(self.first(&scan(&self.data, &start, &self.terms)?, &fitted.hypothesis));
+        }
+        Ok(leaders)
+    }
+
+    /// Those near the first of a scan.
+    fn first(&self, scanned: &[Candidate], hypothesis: &Hypothesis) -> Vec<usize> {
+        let weight = |i: usize| scanned[i].log_bayes + self.log_prior[i];
+        let mut order: Vec<usize> =
+            (0..scanned.len()).filter(|&i| !hypothesis.terms.contains(&scanned[i].term)).collect();
+        order.sort_by(|&one, &other| weight(other).total_cmp(&weight(one)));
+        let Some(&best) = order.first() else { return order };
+        let behind = BEHIND.max(BEHIND_SHARE * scanned[best].log_bayes);
+        order.retain(|&i| weight(i) > weight(best) - behind && scanned[i].log_bayes > WORTH);
+        order.truncate(LEADERS);
+        order
     }
 
     fn refit(&self, fitted: &Fitted, candidate: &Candidate) -> Alternative {

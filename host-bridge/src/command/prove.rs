@@ -1,0 +1,143 @@
+//! `orbitcal prove`: simulated blind campaigns through the diagnosis, on all cores, to be taken up again where it stopped.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use inference::Recording;
+use inference::diagnose::data::{Data, DataError};
+use inference::diagnose::scan::candidates;
+use inference::prove::tables::Tables;
+use inference::prove::{Case, Class, Outcome, run as prove};
+use twin::Ring;
+
+use super::{CommandError, machine, progress, recording};
+use crate::cli::Prove;
+use crate::output;
+
+/// Run it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(options: &Prove) -> Result<(), CommandError> {
+    let ring = machine(options.common.machine.as_deref())?;
+    let template = recording(&options.template, &ring)?;
+    let known = known(&options.outcomes, options.seed)?;
+    let cases = cases(options, &ring, &template)?;
+    let to_do: Vec<&Case> = cases.iter().filter(|case| !known.contains_key(&case.index)).collect();
+    let bar = progress(cases.len(), "campaigns", options.common.quiet);
+    bar.set_position(known.len() as u64);
+    let fresh = all(&ring, &template, &to_do, &options.outcomes, options.seed, &|| bar.inc(1))?;
+    bar.finish_and_clear();
+    let wanted: Vec<usize> = cases.iter().map(|case| case.index).collect();
+    let mut outcomes: Vec<Outcome> = known.into_values().chain(fresh).collect();
+    outcomes.retain(|outcome| wanted.contains(&outcome.index));
+    outcomes.sort_by_key(|outcome| outcome.index);
+    let tables = Tables::of(&outcomes);
+    if let Some(path) = &options.common.json {
+        output::json(path, &tables)?;
+    }
+    if let Some(path) = &options.page {
+        write_between_marks(path, &tables.markdown())?;
+    }
+    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
+        println!("{}", tables.markdown());
+    }
+    Ok(())
+}
+
+/// Cases of all classes; the number of a case fixes it, so that a longer run begins with the shorter one's.
+fn cases(options: &Prove, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
+    let data = Data::of(ring, template)?;
+    let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
+    let classes = [
+        (Class::Empty, options.empty),
+        (Class::Single, options.single),
+        (Class::Pair, options.pair),
+        (Class::Unknown, options.unknown),
+    ];
+    let of_class = |(class, count): (Class, usize)| {
+        let (terms, offset) = (&terms, class as usize * 1_000_000);
+        (0..count).map(move |i| Case::draw(ring, template, terms, class, offset + i, options.seed))
+    };
+    Ok(classes.into_iter().flat_map(of_class).collect())
+}
+
+/// What has been run before with this seed.
+fn known(path: &Path, seed: u64) -> Result<BTreeMap<usize, Outcome>, CommandError> {
+    let Ok(text) = fs::read_to_string(path) else { return Ok(BTreeMap::new()) };
+    let mut known = BTreeMap::new();
+    for (number, line) in text.lines().enumerate() {
+        // a line that a stop cut short is run again
+        let Ok((of_seed, outcome)) = serde_json::from_str::<(u64, Outcome)>(line) else {
+            if number + 1 == text.lines().count() {
+                continue;
+            }
+            let what = "expected an outcome of this program's version; remove the file to begin anew";
+            return Err(CommandError::Input(format!("{}, line {}: {what}", path.display(), number + 1)));
+        };
+        if of_seed == seed {
+            known.insert(outcome.index, outcome);
+        }
+    }
+    Ok(known)
+}
+
+/// Run cases on all cores, writing each outcome down as it comes.
+fn all(
+    ring: &Ring,
+    template: &Recording,
+    cases: &[&Case],
+    path: &Path,
+    seed: u64,
+    done: &(dyn Fn() + Sync),
+) -> Result<Vec<Outcome>, CommandError> {
+    let wrong = |error: std::io::Error| CommandError::Other(format!("{}: {error}", path.display()));
+    if let Some(folder) = path.parent() {
+        fs::create_dir_all(folder).map_err(wrong)?;
+    }
+    let file = Mutex::new(OpenOptions::new().create(true).append(true).open(path).map_err(wrong)?);
+    let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    let work = || -> Result<(), CommandError> {
+        while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
+            let outcome = prove(ring, template, case).map_err(|error: DataError| {
+                CommandError::Other(format!("campaign {}: {error}", case.index))
+            })?;
+            if let Some(outcome) = outcome {
+                append(&file, seed, &outcome).map_err(wrong)?;
+                outcomes.lock().expect("no thread panics with it").push(outcome);
+            }
+            done();
+        }
+        Ok(())
+    };
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
+        threads.into_iter().try_for_each(|thread| thread.join().expect("a panic is a bug and stops the run"))
+    })?;
+    Ok(outcomes.into_inner().expect("no thread panics with it"))
+}
+
+fn append(file: &Mutex<File>, seed: u64, outcome: &Outcome) -> std::io::Result<()> {
+    let mut line = serde_json::to_string(&(seed, outcome))?;
+    line.push('\n');
+    file.lock().expect("no thread panics with it").write_all(line.as_bytes())
+}
+
+const MARKS: [&str; 2] = ["<!-- tables of make prove -->", "<!-- end of tables -->"];
+
+/// Replace what is between the marks of a page.
+fn write_between_marks(path: &Path, tables: &str) -> Result<(), CommandError> {
+    let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
+    let page = fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let [start, end] = MARKS.map(|mark| page.find(mark));
+    let (Some(start), Some(end)) = (start, end) else {
+        return Err(wrong(format!("expected the marks {MARKS:?}, found none")));
+    };
+    let text = format!("{}{}\n\n{tables}\n{}", &page[..start], MARKS[0], &page[end..]);
+    fs::write(path, text).map_err(|error| wrong(error.to_string()))
+}
