@@ -72,8 +72,6 @@ struct Cells {
 /// Everything that a scan needs of a fit.
 struct Bench<'f> {
     fitted: &'f Fitted,
-    /// `J^T r - u`, zero at the best point.
-    slope: DVector<f64>,
 }
 
 /// Give freedom to every place in turn.
@@ -82,8 +80,7 @@ struct Bench<'f> {
 /// [`EffectError`].
 pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectError> {
     let data = fitted.data(data);
-    let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
-    let bench = Bench { fitted, slope };
+    let bench = Bench { fitted };
     let settings = Settings::of(&data.drives);
     let monitors = data.readings.ncols();
     let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
@@ -130,8 +127,8 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
 impl Bench<'_> {
     /// Projected pull and Gram matrix of some numbers.
     fn project(&self, cells: &Cells) -> (DVector<f64>, DMatrix<f64>) {
-        let taken = self.fitted.factor.solve(&cells.cross.transpose());
-        let pull = &cells.pull - taken.tr_mul(&self.slope);
+        let taken = self.fitted.free.solve(&cells.cross.transpose());
+        let pull = &cells.pull - taken.tr_mul(&self.fitted.slope);
         (pull, &cells.gram - &cells.cross * taken)
     }
 

@@ -4,7 +4,8 @@
 //!
 //! `cost = |r(u)|^2 + |u|^2`, `ln evidence = -cost/2 - ln det(1 + J^T J)/2` (Laplace),
 //!
-//! minimised by damped Gauss-Newton. The normalisation of the data is the same for all hypotheses but those that change their
+//! minimised by damped Gauss-Newton within the range of the vars. Of a var at a bound the half of its normal that is within the
+//! range counts, of the others the part. The normalisation of the data is the same for all hypotheses but those that change their
 //! covariance, and is counted.
 
 use estimator::MonitorState;
@@ -35,14 +36,23 @@ pub struct Fitted {
     pub jacobian: DMatrix<f64>,
     /// Factor of `1 + J^T J`, the inverse of the covariance of u.
     pub factor: Cholesky<f64, Dyn>,
+    /// The same with the vars that are at a bound of their range held there.
+    pub free: Cholesky<f64, Dyn>,
+    /// `J^T r - u`, zero for the vars that are held.
+    pub slope: DVector<f64>,
     /// The data whitened for this hypothesis, where it says that the baselines drift.
     drifting: Option<Box<Data>>,
 }
 
 /// Expected decrease of the cost at which the steps have settled.
 const SETTLED: f64 = 0.01;
+/// Chi-square per number beyond which a fit is far off.
+const GROSS: f64 = 1.3;
 const STEPS: usize = 25;
 const HALVINGS: usize = 6;
+const SWEEPS: usize = 1000;
+/// Precision of a var that is held.
+const HELD: f64 = 1e12;
 /// Step of an amplitude for its derivative, in prior standard deviations.
 const DIFFERENCE: f64 = 0.02;
 
@@ -106,8 +116,8 @@ impl Fitted {
         let mut factor = normal(&jacobian);
         for _ in 0..STEPS {
             let slope = jacobian.tr_mul(&here.residual) - &here.u;
-            let full = factor.solve(&slope);
-            let Some((next, expected)) = descend(data, hypothesis, &here, &full, &slope, vars) else { break };
+            let step = within(&here.u, &factor.solve(&slope), &slope, &jacobian, vars);
+            let Some((next, expected)) = descend(data, hypothesis, &here, &step, &slope) else { break };
             here = next;
             if expected < SETTLED {
                 break;
@@ -125,12 +135,45 @@ impl Fitted {
         factor: Cholesky<f64, Dyn>,
         jacobian: DMatrix<f64>,
     ) -> Self {
-        let params = params_of(&here.u, data.ring.quadrupoles.len());
-        let log_det: f64 = 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-        let log_evidence = -0.5 * (here.cost + log_det + data.log_det());
+        let vars = data.ring.quadrupoles.len();
+        let params = params_of(&here.u, vars);
+        let mut slope = jacobian.tr_mul(&here.residual) - &here.u;
+        // held: at a bound, and pulled beyond it
+        let [lower, upper] = range();
+        let held = |i: usize, u: f64, pull: f64| {
+            i < vars && ((u <= lower + 1e-9 && pull < 0.0) || (u >= upper - 1e-9 && pull > 0.0))
+        };
+        let mut matrix = jacobian.transpose() * &jacobian;
+        let (mut log_inside, mut pinned) = (0.0, Vec::new());
+        for i in 0..matrix.ncols() {
+            matrix[(i, i)] += 1.0;
+            if held(i, here.u[i], slope[i]) {
+                log_inside += log_tail(slope[i].abs(), matrix[(i, i)]);
+                pinned.push(i);
+            }
+        }
+        for &i in &pinned {
+            slope[i] = 0.0;
+            matrix.row_mut(i).fill(0.0);
+            matrix.column_mut(i).fill(0.0);
+            matrix[(i, i)] = HELD;
+        }
+        let free = matrix.cholesky().expect("1 + J^T J is positive");
+        let covariance = free.inverse();
+        for i in (0..vars).filter(|i| !pinned.contains(i)) {
+            let sigma = covariance[(i, i)].sqrt();
+            log_inside += (normal_cdf((upper - here.u[i]) / sigma) - normal_cdf((lower - here.u[i]) / sigma)).ln();
+        }
+        let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>() - pinned.len() as f64 * HELD.ln();
+        let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
         let hypothesis = hypothesis.clone();
         let Point { u, residual, cost } = here;
-        Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, u, drifting: None }
+        Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, free, slope, u, drifting: None }
+    }
+
+    /// True where the fit is so far off that its vars are bent out of shape.
+    pub fn is_gross(&self) -> bool {
+        self.residual.norm_squared() > GROSS * self.residual.len() as f64
     }
 
     /// `ln` posterior at the best point, up to a constant of the recording: evidence without the freedom of the unknowns.
@@ -218,9 +261,57 @@ fn params_of(u: &DVector<f64>, vars: usize) -> Vec<f64> {
     u.rows(0, vars).iter().map(|u| mean + sigma * u).collect()
 }
 
-fn bounded(u: f64) -> f64 {
+/// Range of a var, in prior standard deviations of its logarithm.
+fn range() -> [f64; 2] {
     let (mean, sigma) = prior();
-    u.clamp((RANGE[0].ln() - mean) / sigma, (RANGE[1].ln() - mean) / sigma)
+    RANGE.map(|bound| (bound.ln() - mean) / sigma)
+}
+
+fn bounded(u: f64) -> f64 {
+    let [lower, upper] = range();
+    u.clamp(lower, upper)
+}
+
+/// The best step within the range: the full one if it stays there, else by projected Gauss-Seidel sweeps.
+fn within(
+    u: &DVector<f64>,
+    full: &DVector<f64>,
+    slope: &DVector<f64>,
+    jacobian: &DMatrix<f64>,
+    vars: usize,
+) -> DVector<f64> {
+    let clamp = |i: usize, step: f64| if i < vars { bounded(u[i] + step) - u[i] } else { step };
+    let mut step = DVector::from_fn(u.len(), |i, _| clamp(i, full[i]));
+    if step == *full {
+        return step;
+    }
+    let mut matrix = jacobian.transpose() * jacobian;
+    (0..matrix.ncols()).for_each(|i| matrix[(i, i)] += 1.0);
+    for _ in 0..SWEEPS {
+        let mut moved = 0.0_f64;
+        for i in 0..step.len() {
+            let pull = slope[i] - matrix.column(i).dot(&step);
+            let next = clamp(i, step[i] + pull / matrix[(i, i)]);
+            moved = moved.max((next - step[i]).abs());
+            step[i] = next;
+        }
+        if moved < 1e-6 {
+            break;
+        }
+    }
+    step
+}
+
+/// `ln` of the integral of `exp(-g x - h x^2/2)` over x > 0, over that of a standard normal.
+fn log_tail(g: f64, h: f64) -> f64 {
+    // exp(z^2/2) (1 - cdf(z))/sqrt(h), z = g/sqrt(h); its asymptote where the tail underflows
+    let z = g / h.sqrt();
+    let scaled = if z < 25.0 { (0.5 * z * z).exp() * normal_cdf(-z) } else { 1.0 / (z * core::f64::consts::TAU.sqrt()) };
+    scaled.ln() - 0.5 * h.ln()
+}
+
+fn normal_cdf(z: f64) -> f64 {
+    0.5 * statrs::function::erf::erfc(-z / core::f64::consts::SQRT_2)
 }
 
 fn normal(jacobian: &DMatrix<f64>) -> Cholesky<f64, Dyn> {
@@ -243,14 +334,12 @@ fn descend(
     data: &Data,
     hypothesis: &Hypothesis,
     here: &Point,
-    full: &DVector<f64>,
+    step: &DVector<f64>,
     slope: &DVector<f64>,
-    vars: usize,
 ) -> Option<(Point, f64)> {
     let mut share = 1.0;
     for _ in 0..HALVINGS {
-        let mut u = &here.u + full * share;
-        u.rows_mut(0, vars).iter_mut().for_each(|u| *u = bounded(*u));
+        let u = &here.u + step * share;
         let expected = (&u - &here.u).dot(slope);
         if let Ok(next) = point(data, hypothesis, u)
             && next.cost <= here.cost

@@ -46,7 +46,6 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     let vars = fitted.params.len();
     let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
     let signatures = Signatures::of(&machine, &drives)?;
-    let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
     let back = fitted.jacobian.transpose();
     let mut all = Vec::with_capacity(terms.len());
     for batch in terms.chunks(BATCH) {
@@ -59,10 +58,10 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
             .collect::<Result<_, EffectError>>()?;
         let columns = DMatrix::from_columns(&columns);
         let shared = &back * &columns;
-        let taken = fitted.factor.solve(&shared);
+        let taken = fitted.free.solve(&shared);
         for (i, term) in batch.iter().enumerate() {
             let column = columns.column(i);
-            let g = column.dot(&fitted.residual) - taken.column(i).dot(&slope);
+            let g = column.dot(&fitted.residual) - taken.column(i).dot(&fitted.slope);
             let h = (column.norm_squared() - taken.column(i).dot(&shared.column(i))).max(0.0);
             let (amplitude, log_bayes) = match term.kind.prior_scale() {
                 Some(_) => (g / (1.0 + h), 0.5 * g * g / (1.0 + h) - 0.5 * h.ln_1p()),
@@ -88,9 +87,8 @@ pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) ->
         .collect::<Result<_, EffectError>>()?;
     let columns = DMatrix::from_columns(&columns);
     let shared = fitted.jacobian.transpose() * &columns;
-    let taken = fitted.factor.solve(&shared);
-    let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
-    let pull = columns.tr_mul(&fitted.residual) - taken.tr_mul(&slope);
+    let taken = fitted.free.solve(&shared);
+    let pull = columns.tr_mul(&fitted.residual) - taken.tr_mul(&fitted.slope);
     let gram = columns.transpose() * &columns - shared.transpose() * taken;
     Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pull, &gram, width)).collect())
 }

@@ -32,8 +32,7 @@ const BEHIND: f64 = 7.0;
 const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order will do.
 const WORTH: f64 = 0.5;
-/// Chi-square per number beyond which a fit is far off.
-const GROSS: f64 = 1.3;
+
 
 /// What may fill a slot.
 #[derive(Debug, Clone)]
@@ -217,7 +216,7 @@ impl Search {
     /// that lead at the prior's mean are then taken too.
     fn leaders(&self, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, EffectError> {
         let mut leaders = self.first(scanned, &fitted.hypothesis);
-        if fitted.residual.norm_squared() > GROSS * fitted.residual.len() as f64 {
+        if fitted.is_gross() {
             let start = Fitted::unfitted(&self.data, &fitted.hypothesis)?;
             leaders.extend(self.first(&scan(&self.data, &start, &self.terms)?, &fitted.hypothesis));
         }
@@ -247,8 +246,13 @@ impl Search {
         if new > 0 {
             guess[at] = candidate.amplitude;
         }
+        let mut guesses = vec![guess];
+        if fitted.is_gross() {
+            guesses.push(DVector::zeros(vars));
+        }
+        let fits = guesses.iter().filter_map(|guess| Fitted::of(&self.data, &hypothesis, guess).ok());
         // a candidate that leads to no stable machine is none
-        let Ok(refitted) = Fitted::of(&self.data, &hypothesis, &guess) else {
+        let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
             return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
         };
         Alternative {
