@@ -119,8 +119,8 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
         let pattern = data.stepped(signature, fitted, &stretches);
         all.push(bench.judge(Where::QuadrupoleInTime(q), &pattern, of_vars.len()));
     }
-    all.push(bench.judge_apart(Where::Time, speaking.iter().map(|&b| &steps[b])));
-    all.push(bench.judge_apart(Where::Everywhere, speaking.iter().map(|&b| &cells[b])));
+    all.push(bench.judge_held(Where::Time, speaking.iter().map(|&b| &steps[b])));
+    all.push(bench.judge_held(Where::Everywhere, speaking.iter().map(|&b| &cells[b])));
     Ok(all)
 }
 
@@ -138,12 +138,11 @@ impl Bench<'_> {
         Discrepancy::of(at, logs, sites)
     }
 
-    /// Many monitors with one size, as if each had the fit's unknowns for itself.
-    fn judge_apart<'c>(&self, at: Where, each: impl Iterator<Item = &'c Cells>) -> Discrepancy {
+    /// Many monitors with one size, the fit's own unknowns held: less than the truth, as they would adapt.
+    fn judge_held<'c>(&self, at: Where, each: impl Iterator<Item = &'c Cells>) -> Discrepancy {
         let mut logs = [0.0; SIZES.len()];
         for cells in each {
-            let (pull, gram) = self.project(cells);
-            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&pull, &gram, size));
+            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&cells.pull, &cells.gram, size));
         }
         Discrepancy::of(at, logs, 1)
     }

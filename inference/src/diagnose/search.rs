@@ -91,9 +91,9 @@ pub struct Found {
 }
 
 impl Found {
-    /// Probability that nothing is missing at all.
-    pub fn first_nothing(&self) -> f64 {
-        self.slots.iter().map(|slot| slot.nothing).fold(self.next.nothing, |product, nothing| product.min(nothing))
+    /// Probability that nothing is missing.
+    pub fn nothing(&self) -> f64 {
+        self.slots.iter().fold(self.next.nothing, |least, slot| least.min(slot.nothing))
     }
 }
 

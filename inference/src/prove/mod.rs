@@ -80,7 +80,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         grade: key.grade(&diagnosis),
         found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
         stated: stated(&diagnosis, &key),
-        nothing: diagnosis.found.first_nothing(),
+        nothing: diagnosis.found.nothing(),
         heldout: diagnosis.gain(),
         pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
@@ -92,7 +92,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
 /// What the diagnosis thinks most likely where it is least certain, how likely, and whether it is so.
 fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
     let least = diagnosis.findings.iter().filter(|f| f.kind != "unknown").min_by(|a, b| a.probability.total_cmp(&b.probability));
-    let nothing = diagnosis.found.next.nothing;
+    let nothing = diagnosis.found.nothing();
     match least {
         Some(finding) if diagnosis.verdict != Verdict::Consistent => {
             let is_true = key.effects.iter().any(|effect| effect.is(finding));
