@@ -322,9 +322,13 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
 
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank<BX, BY, CX, CY> {
     fn clear(&mut self) {
-        (self.scale, self.rf_offset) = ([0.0; TERMS], [0.0; TERMS]);
-        (self.seen_x, self.seen_y) = ([[0; BX]; TERMS], [[0; BY]; TERMS]);
-        (self.driven_x, self.driven_y) = ([[0; CX]; TERMS], [[0; CY]; TERMS]);
+        // in place: blank ones of all of them would lie on the stack
+        self.scale.fill(0.0);
+        self.rf_offset.fill(0.0);
+        self.seen_x.as_flattened_mut().fill(0);
+        self.seen_y.as_flattened_mut().fill(0);
+        self.driven_x.as_flattened_mut().fill(0);
+        self.driven_y.as_flattened_mut().fill(0);
     }
 
     /// Nothing if there is no term.
