@@ -74,7 +74,8 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
 fn a_model_with_the_missing_physics_describes_the_machine() {
     let ring = Ring::booster();
     let vars = simulate::vars(&ring, 0.02, true, 3).unwrap();
-    for effect in ["quad_roll@F2=-0.018", "fixed_rf_frequency", "bpm_gain@x_E6=-0.076", "stray_gradient@SLOT_A3=-0.026"] {
+    for effect in ["quad_roll@F2=-0.018", "fixed_rf_frequency", "bpm_gain@x_E6=-0.076", "stray_gradient@SLOT_A3=-0.026"]
+    {
         let effects = [effect.parse().unwrap()];
         let recording = recorded(&ring, &vars, &effects);
         let [design, extended] = both(&ring, &recording, &vars, &effects);
