@@ -35,11 +35,13 @@ fn link(argument: &str) {
 /// to the same bits.
 fn tables() -> String {
     let green: Green = training::green::tables(&twin::Ring::booster()).expect("the built-in ring has tables");
+    assert!(green.low_rank.is_empty(), "a ring as designed needs none");
     let d = &green.dispersion;
     let mut text = String::new();
     write!(
         text,
-        "Green {{ x: {}, y: {}, first_family: {}, stated_error: {:?}, dispersion: Dispersion {{ monitor: {:?}, node: {:?}, \
+        "Green {{ x: {}, y: {}, first_family: {}, stated_error: {:?}, low_rank: LowRank::BLANK, \
+         dispersion: Dispersion {{ monitor: {:?}, node: {:?}, \
          second_order: {:?}, spurious: {:?}, compaction: {:?}, inverse_gamma_squared: {:?}, circumference: {:?} }} }}",
         plane(&green.x),
         plane(&green.y),

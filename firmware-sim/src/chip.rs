@@ -1,7 +1,7 @@
 //! The image: what lies where in memory, and the wiring.
 
 use estimator::booster::{Estimator, Green};
-use estimator::surrogate::{Block, Dispersion, GreenPlane, SymmetricBlock};
+use estimator::surrogate::{Block, Dispersion, GreenPlane, LowRank, SymmetricBlock};
 use firmware_sim::link::Vitals;
 use firmware_sim::{Device, Panel};
 use static_cell::ConstStaticCell;

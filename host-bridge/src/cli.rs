@@ -79,6 +79,9 @@ pub struct Replay {
     /// Which prediction
     #[arg(long, value_enum, default_value_t = CoreModel::Green)]
     pub model: CoreModel,
+    /// Tables of a machine with the physics that a diagnosis found, instead of the design's
+    #[arg(long, value_name = "FILE")]
+    pub model_file: Option<PathBuf>,
     /// Name of the shared-memory service
     #[arg(long, default_value = SERVICE)]
     pub service: String,
@@ -114,6 +117,9 @@ pub struct Serve {
     /// Which prediction
     #[arg(long, value_enum, default_value_t = CoreModel::Green)]
     pub model: CoreModel,
+    /// Tables of a machine with the physics that a diagnosis found, instead of the design's
+    #[arg(long, value_name = "FILE", requires = "feed")]
+    pub model_file: Option<PathBuf>,
     /// Name of the shared-memory service
     #[arg(long, default_value = SERVICE)]
     pub service: String,

@@ -4,6 +4,7 @@ pub mod answer;
 pub mod cli;
 pub mod command;
 pub mod link;
+pub mod model_file;
 pub mod output;
 pub mod publish;
 pub mod record;

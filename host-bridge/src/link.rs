@@ -116,7 +116,7 @@ pub enum LinkError {
         why: Refusal,
     },
     /// The device did not take new tables.
-    #[error("the device did not take the tables: {0:?}")]
+    #[error("the device did not take the tables: {0}")]
     Tables(ParcelError),
 }
 

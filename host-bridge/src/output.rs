@@ -28,6 +28,14 @@ pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
     whole(path, text.as_bytes()).map_err(wrong)
 }
 
+/// Write bytes to a file.
+///
+/// # Errors
+/// [`OutputError`]; a file of that name is then as it was.
+pub fn bytes(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
+    whole(path, bytes).map_err(|source| OutputError { path: path.display().to_string(), source })
+}
+
 fn whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let mut file = temporary(path)?;
     file.write_all(bytes)?;

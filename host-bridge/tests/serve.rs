@@ -118,7 +118,7 @@ fn tables_of_another_ring_are_not_answered_by() {
     let folder = tempfile::tempdir().unwrap();
     let mut other = tables();
     other.stated_error[0] *= 2.0;
-    let message = format!("goes by tables {:08x}, this machine has {:08x}; --load", other.digest(), tables().digest());
+    let message = format!("goes by tables {:08x}, this model has {:08x}; --load", other.digest(), tables().digest());
     device(&folder.path().join("uart"), other);
     let source = format!("unix:{}", folder.path().join("uart").display());
     let service = format!("orbitcal/test/{}/other", std::process::id());

@@ -76,6 +76,9 @@ pub enum StreamError {
     /// No tables for this ring.
     #[error(transparent)]
     Training(#[from] training::TrainingError),
+    /// Tables of a ring that keeps no beam at vars of 1.
+    #[error("the model's tables have no stable ring at vars of 1")]
+    Unstable,
 }
 
 /// The columns that a ring's recordings have.
@@ -118,10 +121,17 @@ impl Core {
     /// # Errors
     /// [`StreamError`] if the ring does not fit the core.
     pub fn try_new(ring: &Ring, setup: Setup) -> Result<Self, StreamError> {
-        let mut core =
-            Self { tables: Box::new(training::green::tables(ring)?), setup, state: Box::new(Booster::BLANK) };
+        Self::with_tables(Box::new(training::green::tables(ring)?), setup)
+    }
+
+    /// The core at its prior, going by other tables than a design's: those of [`training::extended`], or from a file.
+    ///
+    /// # Errors
+    /// [`StreamError::Unstable`].
+    pub fn with_tables(tables: Box<BoosterGreen>, setup: Setup) -> Result<Self, StreamError> {
+        let mut core = Self { tables, setup, state: Box::new(Booster::BLANK) };
         let (model, state) = core.parts();
-        state.restart(&model).expect("tables of a stable ring have a design");
+        state.restart(&model).map_err(|Unstable| StreamError::Unstable)?;
         Ok(core)
     }
 

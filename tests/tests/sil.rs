@@ -7,7 +7,6 @@ use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
-use estimator::booster::Green;
 use firmware_sim::link::{Refusal, Reply, Request, Status};
 use host_bridge::link::Link;
 use inference::Recording;
@@ -270,7 +269,9 @@ fn new_tables_reach_the_chip() {
     good[..30].iter().for_each(|wire| pair.agree(wire));
     let mut vars = vec![1.0; 48];
     vars[0] = 1.01;
-    let other: Green = training::green::tables(&ring.with_vars(&vars)).unwrap();
+    let rolled = ["quad_roll@F2=0.01".parse().unwrap()];
+    let other = *training::extended::tables(&ring.with_vars(&vars), &rolled, &[1.0; 48]).unwrap().tables;
+    assert!(!other.low_rank.is_empty());
     pair.link.load(&other, || ()).unwrap();
     // the host goes over to them after the same frame
     pair.core.prepare();

@@ -1,7 +1,7 @@
 //! Green's function tables of a ring, from its twin.
 
-use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, SymmetricBlock};
-use twin::{ClosedOrbit, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
+use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, LowRank, SymmetricBlock};
+use twin::{ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
 
 /// The Booster's Green's function surrogate.
 pub type BoosterGreen = estimator::booster::Green;
@@ -25,6 +25,50 @@ pub enum TrainingError {
     /// The design ring has no stable orbit.
     #[error(transparent)]
     Orbit(#[from] OrbitError),
+    /// An effect that the ring cannot have.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+    /// The ring would cross an integer resonance on its way from vars of 1 to those given.
+    #[error("{ring}: no stable ring connects vars of 1 with those given")]
+    Unstable {
+        /// The machine.
+        ring: String,
+    },
+}
+
+/// What monitors and correctors make of the orbit of a beam. As it is taken into the tables, it acts on every derivative.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Instruments {
+    /// Momentum deviation of the beam.
+    pub delta: f64,
+    /// Which monitor each one really is [B].
+    pub monitor: Vec<usize>,
+    /// What each one makes of a metre [B].
+    pub monitor_gain: Vec<f64>,
+    /// What each corrector makes of a radian [C].
+    pub corrector_gain: Vec<f64>,
+}
+
+impl Instruments {
+    /// All as they should be.
+    pub fn sound(ring: &Ring) -> Self {
+        let (monitors, correctors) = (ring.read_monitors.len(), ring.correctors.len());
+        Self {
+            delta: 0.0,
+            monitor: (0..monitors).collect(),
+            monitor_gain: vec![1.0; monitors],
+            corrector_gain: vec![1.0; correctors],
+        }
+    }
+
+    fn monitors(&self, optics: &Optics) -> Vec<Observer> {
+        let read = optics.read_monitors();
+        self.monitor.iter().zip(&self.monitor_gain).map(|(&b, &gain)| read[b].times(gain)).collect()
+    }
+
+    fn correctors(&self, optics: &Optics) -> Vec<Source> {
+        optics.correctors().into_iter().zip(&self.corrector_gain).map(|(source, &gain)| source.times(gain)).collect()
+    }
 }
 
 /// Nodes of two-point Gauss-Legendre quadrature on 0..1; each has weight 1/2.
@@ -43,9 +87,22 @@ const STATED_ERROR: [f32; 2] = [1.5e-6, 0.5e-6];
 pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
     ring: &Ring,
 ) -> Result<Green<BX, BY, CX, CY, Q, T>, TrainingError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let monitors = optics.read_monitors();
-    let correctors = optics.correctors();
+    tables_with(ring, &Instruments::sound(ring))
+}
+
+/// Tables of a ring as its instruments show it.
+pub(crate) fn tables_with<
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const Q: usize,
+    const T: usize,
+>(
+    ring: &Ring,
+    instruments: &Instruments,
+) -> Result<Green<BX, BY, CX, CY, Q, T>, TrainingError> {
+    let optics = Optics::of(ring, Hold::Momentum { delta: instruments.delta })?;
     let count = |what, expected, found| {
         if expected == found {
             Ok(())
@@ -53,15 +110,17 @@ pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize
             Err(TrainingError::Count { ring: ring.name.clone(), what, expected, found })
         }
     };
-    count("read monitors", BX + BY, monitors.len())?;
-    count("correctors", CX + CY, correctors.len())?;
+    count("read monitors", BX + BY, ring.read_monitors.len())?;
+    count("correctors", CX + CY, ring.correctors.len())?;
     count("quadrupoles", Q / 2, ring.quadrupoles.len())?;
+    let (monitors, correctors) = (instruments.monitors(&optics), instruments.correctors(&optics));
     let (monitors_x, monitors_y) = monitors.split_at(BX);
     let (correctors_x, correctors_y) = correctors.split_at(CX);
     Ok(Green {
         x: plane(ring, &optics, Plane::X, monitors_x, correctors_x),
         y: plane(ring, &optics, Plane::Y, monitors_y, correctors_y),
-        dispersion: dispersion(ring, &optics, monitors_x)?,
+        dispersion: dispersion(ring, &optics, instruments, monitors_x)?,
+        low_rank: LowRank::BLANK,
         first_family: ring.gradients().iter().filter(|k| **k > 0.0).count() as u16,
         stated_error: STATED_ERROR,
     })
@@ -106,22 +165,25 @@ fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
 fn dispersion<const B: usize, const Q: usize>(
     ring: &Ring,
     optics: &Optics,
+    instruments: &Instruments,
     monitors: &[Observer],
 ) -> Result<Dispersion<B, Q>, OrbitError> {
-    let up = ClosedOrbit::find(ring, Hold::Frequency { offset: RF_STEP })?;
-    let down = ClosedOrbit::find(ring, Hold::Frequency { offset: -RF_STEP })?;
+    let frequency = optics.frequency_offset();
+    let up = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency + RF_STEP })?;
+    let down = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency - RF_STEP })?;
     let second = |b: usize| {
-        let at = ring.read_monitors[b];
-        (up.at[at][0] + down.at[at][0]) / (2.0 * RF_STEP * RF_STEP)
+        let at = ring.read_monitors[instruments.monitor[b]];
+        let curved = up.at[at][0] + down.at[at][0] - 2.0 * optics.orbit(at)[0];
+        instruments.monitor_gain[b] * curved / (2.0 * RF_STEP * RF_STEP)
     };
     let nodes = nodes(ring);
     Ok(Dispersion {
         monitor: core::array::from_fn(|b| optics.dispersion(&monitors[b]) as f32),
         node: core::array::from_fn(|q| optics.dispersion(&optics.observe(nodes[q], Plane::X)) as f32),
         second_order: core::array::from_fn(|b| second(b) as f32),
-        spurious: spurious(ring, optics)?,
+        spurious: spurious(ring)?,
         compaction: optics.momentum_compaction() as f32,
-        inverse_gamma_squared: ring.particle.gamma(0.0).powi(-2) as f32,
+        inverse_gamma_squared: ring.particle.gamma(instruments.delta).powi(-2) as f32,
         circumference: ring.circumference as f32,
     })
 }
@@ -135,7 +197,8 @@ const SHIFT: f64 = 0.2e-3;
 ///
 /// The orbit that shifted quadrupoles make changes with the momentum, as every orbit does; which way, only the unknown
 /// shifts could tell.
-fn spurious(ring: &Ring, optics: &Optics) -> Result<[f32; 2], OrbitError> {
+fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
+    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
     for machine in 0..MISALIGNED {
         let shifted = misaligned(ring, machine);

@@ -54,6 +54,20 @@ pub struct Source {
     pub(crate) column: Vector6<f64>,
 }
 
+impl Observer {
+    /// The same, reading `gain` times as much.
+    pub fn times(self, gain: f64) -> Self {
+        Self { row: self.row * gain, ..self }
+    }
+}
+
+impl Source {
+    /// The same, kicking `gain` times as much.
+    pub fn times(self, gain: f64) -> Self {
+        Self { column: self.column * gain, ..self }
+    }
+}
+
 /// An element (or a thin place) whose gradient may change.
 #[derive(Debug, Clone, Copy)]
 pub struct Gradient {

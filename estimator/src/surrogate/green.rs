@@ -9,15 +9,15 @@
 //! `Z_qc = G_qc - Z_qq D G_qc`, `Z_qb = G_qb - Z_qq D G_qb`, `R = G_bc - Z_bq D G_qc`, and
 //! `dR_bc/d(ln strength) = - sum over the quadrupole's nodes of k L w strength Z_qb Z_qc`.
 //!
-//! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent: coupling
-//! is left to a surrogate that carries it.
+//! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent; what couples
+//! them, and whatever else a ring has beyond its design, is a short sum of products on top, see [`LowRank`].
 //!
 //! Source: the resolvent (Dyson) form of the perturbed Green's function, taken in by rank one after rank one (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
 use nalgebra::SMatrix;
 
-use super::{Block, Prediction, Surrogate, SymmetricBlock, Unstable};
+use super::{Block, LowRank, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
 use crate::linear::{add, add_four, add_four_twice, combine, dot, zeros};
 use crate::triangle::Triangle;
@@ -66,6 +66,8 @@ pub struct Green<const BX: usize, const BY: usize, const CX: usize, const CY: us
     pub y: GreenPlane<BY, CY, Q, T>,
     /// Momentum.
     pub dispersion: Dispersion<BX, Q>,
+    /// What is beyond both planes' Green's functions; none in a ring as designed.
+    pub low_rank: LowRank<BX, BY, CX, CY>,
     /// Number of quadrupoles on the first (QH) supply; they come first.
     pub first_family: u16,
     /// Stated rms error in x and y [m].
@@ -118,10 +120,11 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             inverse_gamma_squared: 0.0,
             circumference: 0.0,
         },
+        low_rank: LowRank::BLANK,
         first_family: 0,
         stated_error: [0.0; 2],
     };
-    /// Bytes of the tables.
+    /// Bytes of the tables, without room for terms of low rank.
     pub const BYTES: usize =
         GreenPlane::<BX, CX, Q, T>::BYTES + GreenPlane::<BY, CY, Q, T>::BYTES + 4 * (2 * BX + Q + 5);
     /// Entries of the tables.
@@ -269,6 +272,7 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
         let first = 2 * usize::from(self.first_family);
         at.x.read(kick_x, x);
         at.y.read(kick_y, y);
+        self.low_rank.read([kick_x, kick_y], drive.rf_offset, [&mut *x, &mut *y]);
         if drive.strength != [0.0; 2] {
             at.x.read_nodes(&scaled(&pushes[0], first, drive.strength), x);
             at.y.read_nodes(&scaled(&pushes[1], first, drive.strength), y);

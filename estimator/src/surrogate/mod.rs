@@ -1,10 +1,12 @@
 //! A fast stand-in for the twin: the orbit that a drive makes at given gradients, and its derivative.
 
 mod green;
+mod low_rank;
 mod parcel;
 mod quantised;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane};
+pub use low_rank::{LowRank, TERMS};
 pub use parcel::{Head, List, Parcel, ParcelError, Table};
 pub use quantised::{Block, SymmetricBlock};
 

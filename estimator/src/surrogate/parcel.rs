@@ -1,10 +1,12 @@
 //! Green's function tables in parcels, small enough for a packet each, so that they travel to a device and are written
 //! where they belong as they arrive. The CRC over the whole, in the last parcel, tells whether all of them did.
 
+use core::fmt;
+
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use super::{Block, Green, GreenPlane};
+use super::{Block, Green, GreenPlane, LowRank, TERMS};
 
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
@@ -60,27 +62,31 @@ pub struct Head {
 
 impl Head {
     /// The version written here.
-    pub const VERSION: u16 = 1;
+    pub const VERSION: u16 = 2;
 }
 
 /// A table of codes of one plane, 0 for x.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[allow(missing_docs)] // the fields of `GreenPlane`
+#[allow(missing_docs)] // the fields of `GreenPlane` and `LowRank`
 pub enum Table {
     Direct(u8),
     Seen(u8),
     Driven(u8),
     Mutual(u8),
+    TermSeen(u8),
+    TermDriven(u8),
 }
 
 /// A list of numbers; of one plane where a plane is given, 0 for x.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[allow(missing_docs)] // the fields of `GreenPlane` and `Dispersion`
+#[allow(missing_docs)] // the fields of `GreenPlane`, `Dispersion` and `LowRank`
 pub enum List {
     Weight(u8),
     MonitorDispersion,
     NodeDispersion,
     SecondOrder,
+    TermScale,
+    TermRfOffset,
 }
 
 /// Why tables were not taken. They are then not to be used.
@@ -124,6 +130,28 @@ pub enum ParcelError {
     /// The slot holds the tables in use.
     Busy,
 }
+
+impl fmt::Display for ParcelError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Version { supported, got } => write!(f, "tables of version {got}, this reads version {supported}"),
+            Self::Counts { need, got } => write!(
+                f,
+                "tables of another ring: monitors x, y, correctors x, y, nodes are {got:?}, this machine's {need:?}"
+            ),
+            Self::Line { line, length } => write!(f, "no table has a line {line} of {length} entries there"),
+            Self::Number => write!(f, "a number is not finite, or a step not positive"),
+            Self::Corrupted { stated, computed } => {
+                write!(f, "a part is missing or was changed: the tables' CRC is {computed:08x}, stated is {stated:08x}")
+            }
+            Self::Unstable => write!(f, "no ring like these tables is stable at the vars at hand"),
+            Self::Headless => write!(f, "a part of tables came without their head"),
+            Self::Busy => write!(f, "the tables in the slot are in use"),
+        }
+    }
+}
+
+impl core::error::Error for ParcelError {}
 
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
     Green<BX, BY, CX, CY, Q, T>
@@ -172,6 +200,7 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
         self.y.clear(&head.steps[1]);
         let d = &mut self.dispersion;
         (d.monitor, d.node, d.second_order) = ([0.0; BX], [0.0; Q], [0.0; BX]);
+        self.low_rank.clear();
         (d.spurious, [d.compaction, d.inverse_gamma_squared, d.circumference]) = (head.spurious, head.momentum);
         (self.first_family, self.stated_error) = (head.first_family, head.stated_error);
         Ok(())
@@ -187,6 +216,10 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             Table::Driven(1) => self.y.driven.codes.get_mut(line).map(|c| c.as_mut_slice()),
             Table::Mutual(0) => self.x.mutual.row_mut(line),
             Table::Mutual(1) => self.y.mutual.row_mut(line),
+            Table::TermSeen(0) => self.low_rank.seen_x.get_mut(line).map(|c| c.as_mut_slice()),
+            Table::TermSeen(1) => self.low_rank.seen_y.get_mut(line).map(|c| c.as_mut_slice()),
+            Table::TermDriven(0) => self.low_rank.driven_x.get_mut(line).map(|c| c.as_mut_slice()),
+            Table::TermDriven(1) => self.low_rank.driven_y.get_mut(line).map(|c| c.as_mut_slice()),
             _ => None,
         }
     }
@@ -199,6 +232,8 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             List::MonitorDispersion => Some(&mut self.dispersion.monitor),
             List::NodeDispersion => Some(&mut self.dispersion.node),
             List::SecondOrder => Some(&mut self.dispersion.second_order),
+            List::TermScale => Some(&mut self.low_rank.scale),
+            List::TermRfOffset => Some(&mut self.low_rank.rf_offset),
         }
     }
 
@@ -214,11 +249,11 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             (List::NodeDispersion, &d.node),
             (List::SecondOrder, &d.second_order),
         ];
-        let values = |(list, values): (List, &[f32])| Parcel::Values { list, values: gathered(values) };
         core::iter::once(Parcel::Head(self.head()))
             .chain(self.x.lines(0))
             .chain(self.y.lines(1))
             .chain(lists.map(values))
+            .chain(self.low_rank.parcels())
             .chain(seal)
     }
 
@@ -237,7 +272,8 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
 
     /// CRC-32 (ISO-HDLC) of all numbers, little endian: of each plane the steps, the codes of `direct`, `seen`, `driven` and
     /// `mutual` line by line, and the weights; then dispersion at monitors, at nodes, second order, spurious, the three of
-    /// the momentum, the stated errors, and the first family.
+    /// the momentum, the stated errors, and the first family. Then of each term of low rank, if there are any: the codes
+    /// `seen` in x and y and `driven` in x and y, its scale and its RF.
     pub fn digest(&self) -> u32 {
         let mut digest = CRC.digest();
         self.x.add_to(&mut digest);
@@ -248,6 +284,7 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             list.iter().for_each(|v| digest.update(&v.to_le_bytes()));
         }
         digest.update(&head.first_family.to_le_bytes());
+        self.low_rank.add_to(&mut digest);
         digest.finalize()
     }
 }
@@ -283,8 +320,52 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
     }
 }
 
+impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank<BX, BY, CX, CY> {
+    fn clear(&mut self) {
+        // in place: blank ones of all of them would lie on the stack
+        self.scale.fill(0.0);
+        self.rf_offset.fill(0.0);
+        self.seen_x.as_flattened_mut().fill(0);
+        self.seen_y.as_flattened_mut().fill(0);
+        self.driven_x.as_flattened_mut().fill(0);
+        self.driven_y.as_flattened_mut().fill(0);
+    }
+
+    /// Nothing if there is no term.
+    fn parcels(&self) -> impl Iterator<Item = Parcel> + '_ {
+        const { assert!(BX <= LINE && BY <= LINE && CX <= LINE && CY <= LINE && TERMS <= LINE) };
+        let terms = self.len();
+        let lists = [(List::TermScale, self.scale.as_slice()), (List::TermRfOffset, &self.rf_offset)];
+        lines(&self.seen_x, Table::TermSeen(0))
+            .take(terms)
+            .chain(lines(&self.seen_y, Table::TermSeen(1)).take(terms))
+            .chain(lines(&self.driven_x, Table::TermDriven(0)).take(terms))
+            .chain(lines(&self.driven_y, Table::TermDriven(1)).take(terms))
+            .chain(lists.into_iter().filter(move |_| terms > 0).map(values))
+    }
+
+    fn add_to(&self, digest: &mut crc::Digest<'_, u32>) {
+        let seen = self.seen_x.iter().zip(&self.seen_y);
+        let driven = self.driven_x.iter().zip(&self.driven_y);
+        let terms = seen.zip(driven).zip(self.scale.iter().zip(&self.rf_offset)).take(self.len());
+        for (((seen_x, seen_y), (driven_x, driven_y)), (scale, rf)) in terms {
+            let codes = seen_x.iter().chain(seen_y).chain(driven_x).chain(driven_y);
+            codes.for_each(|code| digest.update(&code.to_le_bytes()));
+            [scale, rf].into_iter().for_each(|v| digest.update(&v.to_le_bytes()));
+        }
+    }
+}
+
 fn columns<const R: usize, const C: usize>(block: &Block<R, C>, table: Table) -> impl Iterator<Item = Parcel> + '_ {
-    block.codes.iter().zip(0..).map(move |(column, line)| codes(table, line, column))
+    lines(&block.codes, table)
+}
+
+fn lines<const R: usize>(each: &[[i16; R]], table: Table) -> impl Iterator<Item = Parcel> + '_ {
+    each.iter().zip(0..).map(move |(entries, line)| codes(table, line, entries))
+}
+
+fn values((list, values): (List, &[f32])) -> Parcel {
+    Parcel::Values { list, values: gathered(values) }
 }
 
 fn codes(table: Table, line: u16, codes: &[i16]) -> Parcel {
@@ -325,6 +406,7 @@ mod tests {
         let mut tables = Small { x: plane(0.5), y: plane(1.5), first_family: 1, ..Small::BLANK };
         tables.dispersion.monitor = [1.0, 2.0];
         tables.dispersion.circumference = 200.0;
+        assert!(tables.low_rank.push([&[1.0, 2.0], &[3.0]], [&[0.5], &[0.25, 0.125]], 1.0));
         tables
     }
 
@@ -367,7 +449,7 @@ mod tests {
             match &mut parcels[changed] {
                 Parcel::Head(head) => head.spurious[1] += 1e-6,
                 Parcel::Codes { codes, .. } => *codes.last_mut().unwrap() ^= 1,
-                Parcel::Values { values, .. } => values[0] += 1e-6,
+                Parcel::Values { values, .. } => values[0] = f32::from_bits(values[0].to_bits() ^ 1),
                 Parcel::Seal { crc } => *crc ^= 1,
             }
             assert!(matches!(sealed(&parcels), Err(ParcelError::Corrupted { .. })), "parcel {changed}");
@@ -380,11 +462,15 @@ mod tests {
         let mut taken = Small::BLANK;
         let other = Head { counts: [9; 5], ..head };
         assert!(matches!(taken.take(&Parcel::Head(other)), Err(ParcelError::Counts { .. })));
-        let newer = Head { version: 2, ..head };
-        assert!(matches!(taken.take(&Parcel::Head(newer)), Err(ParcelError::Version { .. })));
+        for other in [1, 3] {
+            let head = Head { version: other, ..head };
+            assert_eq!(taken.take(&Parcel::Head(head)), Err(ParcelError::Version { supported: 2, got: other }));
+        }
         let infinite = Head { stated_error: [f32::INFINITY, 0.0], ..head };
         assert_eq!(taken.take(&Parcel::Head(infinite)), Err(ParcelError::Number));
-        for (table, line, length) in [(Table::Seen(0), 9, 4), (Table::Seen(0), 0, 3), (Table::Mutual(2), 0, 1)] {
+        let wrong =
+            [(Table::Seen(0), 9, 4), (Table::Seen(0), 0, 3), (Table::Mutual(2), 0, 1), (Table::TermSeen(0), 8, 2)];
+        for (table, line, length) in wrong {
             let codes = core::iter::repeat_n(1, length).collect();
             assert!(matches!(taken.take(&Parcel::Codes { table, line, codes }), Err(ParcelError::Line { .. })));
         }

@@ -17,8 +17,10 @@ use std::path::Path;
 use indicatif::{ProgressBar, ProgressStyle};
 use inference::readings::ReadingsError;
 use inference::{BatchError, Recording, RecordingError, stream};
+use training::BoosterGreen;
 use twin::{LatticeError, Ring};
 
+use crate::model_file::{self, ModelFileError};
 use crate::output::OutputError;
 
 /// Why a command ended: bad arguments or input (exit 2), or anything else (exit 1), in one line.
@@ -44,6 +46,12 @@ impl From<RecordingError> for CommandError {
 
 impl From<stream::StreamError> for CommandError {
     fn from(error: stream::StreamError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<ModelFileError> for CommandError {
+    fn from(error: ModelFileError) -> Self {
         Self::Input(error.to_string())
     }
 }
@@ -75,6 +83,14 @@ impl From<ReadingsError> for CommandError {
 /// The machine that was asked for, or the built-in one.
 fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
     path.map_or_else(|| Ok(Ring::booster()), Ring::read)
+}
+
+/// The core's tables: those of a model file, or of the ring as designed.
+fn tables(ring: &Ring, file: Option<&Path>) -> Result<Box<BoosterGreen>, CommandError> {
+    match file {
+        Some(path) => Ok(model_file::read(path)?),
+        None => Ok(Box::new(training::green::tables(ring).map_err(stream::StreamError::from)?)),
+    }
 }
 
 fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {

@@ -7,7 +7,7 @@ use inference::Recording;
 use inference::stream::{self, BoosterEstimate, Core};
 use twin::Ring;
 
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, machine, progress, recording, tables};
 use crate::answer::{Answer, Timing};
 use crate::cli::{Rate, Replay};
 use crate::output;
@@ -22,7 +22,8 @@ use crate::trace::Trace;
 pub fn run(options: &Replay) -> Result<(), CommandError> {
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
-    let mut core = stream::estimator(&ring, &recording, options.process_noise)?;
+    let tables = tables(&ring, options.model_file.as_deref())?;
+    let mut core = Core::with_tables(tables, stream::setup(&recording, options.process_noise)?)?;
     let (last, timing) = pump(options, &ring, &recording, &mut core)?;
     let quality = core.fit_quality();
     let answer = Answer::of_core(&ring, &recording, &core.setup, &last, |i, j| core.covariance(i, j), quality, timing);

@@ -8,7 +8,7 @@ use inference::{Recording, stream};
 use twin::Ring;
 
 use super::replay::{Clock, quantiles};
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, machine, progress, recording, tables};
 use crate::answer::{Answer, Timing};
 use crate::cli::{CoreModel, Serve};
 use crate::link::{Heard, Line, Link, LinkError};
@@ -108,7 +108,7 @@ fn feed(
 ) -> Result<Answer, CommandError> {
     let setup = stream::setup(recording, options.process_noise)?;
     let CoreModel::Green = options.model;
-    let tables = training::green::tables(ring).map_err(stream::StreamError::from)?;
+    let tables = tables(ring, options.model_file.as_deref())?;
     link.restart(&setup).map_err(other)?;
     if options.load {
         // restarted already: there are no frames of somebody before us that they would have to describe
@@ -132,7 +132,7 @@ fn feed(
 /// A device answers by the tables that it has, whatever ring they are of.
 fn expect_tables<L: Line>(link: &mut Link<L>, expected: u32) -> Result<(), CommandError> {
     let got = link.status().map_err(other)?.tables;
-    let wrong = || format!("the device goes by tables {got:08x}, this machine has {expected:08x}; --load sends them");
+    let wrong = || format!("the device goes by tables {got:08x}, this model has {expected:08x}; --load sends them");
     if got == expected { Ok(()) } else { Err(other(wrong())) }
 }
 

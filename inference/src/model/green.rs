@@ -57,7 +57,7 @@ struct PlaneOptics {
 }
 
 impl GreenModel {
-    /// From the core's tables.
+    /// From the core's tables; terms of low rank, which a design has none of, are left out.
     pub fn of<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
         tables: &Green<BX, BY, CX, CY, Q, T>,
     ) -> Self {

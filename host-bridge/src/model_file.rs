@@ -1,0 +1,181 @@
+//! A model on disk: the core's tables as the packets that a device takes.
+//!
+//! The bytes are those of `orbitcal serve --load`, requests `Model` with one parcel each, head first and seal last
+//! (`docs/device.md`), so that a file tells a device what it tells the core in process.
+
+use std::path::Path;
+
+use estimator::surrogate::{Parcel, ParcelError};
+use estimator::{FrameError, packet};
+use firmware_sim::link::{REQUEST, Request};
+use training::BoosterGreen;
+
+use crate::output::{self, OutputError};
+
+/// Why a file is no model.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ModelFileError {
+    /// The system cannot read it.
+    #[error("{path}: {source}")]
+    Read {
+        /// The file.
+        path: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// One of its packets is not what it should be.
+    #[error("{path}, packet {packet}: {fault}")]
+    Packet {
+        /// The file.
+        path: String,
+        /// Which one, from 1; one beyond the last if the file ends too early.
+        packet: usize,
+        /// What is wrong with it.
+        fault: Fault,
+    },
+}
+
+/// What is wrong with a packet.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Fault {
+    /// It is damaged, or no packet of a device.
+    #[error(transparent)]
+    Envelope(#[from] FrameError),
+    /// The tables do not take their part.
+    #[error(transparent)]
+    Tables(#[from] ParcelError),
+    /// Something else is due.
+    #[error("expected {expected}, found {found}")]
+    Order {
+        /// What is due.
+        expected: &'static str,
+        /// What is there.
+        found: &'static str,
+    },
+}
+
+/// Write the tables to a file.
+///
+/// # Errors
+/// [`OutputError`]; a file of that name is then as it was.
+pub fn write(path: &Path, tables: &BoosterGreen) -> Result<(), OutputError> {
+    output::bytes(path, &tables.parcels().flat_map(wire).collect::<Vec<u8>>())
+}
+
+fn wire(parcel: Parcel) -> Vec<u8> {
+    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+    let length = Request::Model(parcel).encode(&mut bytes).expect("a parcel fits a packet");
+    bytes.truncate(length);
+    bytes
+}
+
+/// The tables of a file.
+///
+/// # Errors
+/// [`ModelFileError`].
+pub fn read(path: &Path) -> Result<Box<BoosterGreen>, ModelFileError> {
+    let name = || path.display().to_string();
+    let mut bytes = std::fs::read(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
+    let mut tables = Box::new(BoosterGreen::BLANK);
+    let (mut due, mut packet) = (Due::Head, 0);
+    for wire in bytes.split_inclusive_mut(|byte| *byte == 0) {
+        packet += 1;
+        due = take(&mut tables, due, wire).map_err(|fault| ModelFileError::Packet { path: name(), packet, fault })?;
+    }
+    let early = Fault::Order { expected: due.words(), found: "the end of the file" };
+    if due == Due::End {
+        Ok(tables)
+    } else {
+        Err(ModelFileError::Packet { path: name(), packet: packet + 1, fault: early })
+    }
+}
+
+/// What comes next in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Due {
+    Head,
+    Rest,
+    End,
+}
+
+impl Due {
+    fn words(self) -> &'static str {
+        match self {
+            Self::Head => "the head of tables",
+            Self::Rest => "the rest of the tables and their seal",
+            Self::End => "the end of the file",
+        }
+    }
+}
+
+/// Take one packet in; returns what is due then.
+fn take(tables: &mut BoosterGreen, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
+    let found = |found| Fault::Order { expected: due.words(), found };
+    let Request::Model(parcel) = packet::unseal(REQUEST, wire)? else { return Err(found("another request")) };
+    let next = match (due, &parcel) {
+        (Due::Head, Parcel::Head(_)) => Due::Rest,
+        (Due::Rest, Parcel::Codes { .. } | Parcel::Values { .. }) => Due::Rest,
+        (Due::Rest, Parcel::Seal { .. }) => Due::End,
+        (_, Parcel::Head(_)) => return Err(found("a head")),
+        _ => return Err(found("a part of tables")),
+    };
+    tables.take(&parcel)?;
+    Ok(next)
+}
+
+#[cfg(test)]
+mod tests {
+    use estimator::surrogate::Head;
+    use twin::Ring;
+
+    use super::*;
+
+    fn extended() -> Box<BoosterGreen> {
+        let effects = ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|e| e.parse().unwrap());
+        training::extended::tables(&Ring::booster(), &effects, &[1.0; 48]).unwrap().tables
+    }
+
+    /// What is said of a file with these bytes, without its path.
+    fn refused(bytes: &[u8]) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model");
+        std::fs::write(&path, bytes).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        error.strip_prefix(&path.display().to_string()).unwrap().to_owned()
+    }
+
+    #[test]
+    fn tables_survive_their_file() {
+        let (folder, tables) = (tempfile::tempdir().unwrap(), extended());
+        let path = folder.path().join("model");
+        write(&path, &tables).unwrap();
+        assert_eq!(read(&path).unwrap(), tables);
+        // 328 parcels of every ring, four of each of two terms, and two lists of them
+        assert_eq!(std::fs::read(&path).unwrap().split_inclusive(|byte| *byte == 0).count(), 328 + 4 * 2 + 2);
+    }
+
+    #[test]
+    fn what_is_no_model_is_refused_by_the_packet_that_says_so() {
+        let packets: Vec<Vec<u8>> = extended().parcels().map(wire).collect();
+        let (head, seal) = (&packets[0], packets.last().unwrap());
+        assert_eq!(refused(&[]), ", packet 1: expected the head of tables, found the end of the file");
+        assert_eq!(refused(&packets[1]), ", packet 1: expected the head of tables, found a part of tables");
+        let short = packets[..9].concat();
+        assert_eq!(
+            refused(&short),
+            ", packet 10: expected the rest of the tables and their seal, found the end of the file"
+        );
+        let more = [packets.concat(), head.clone()].concat();
+        assert_eq!(refused(&more), ", packet 339: expected the end of the file, found a head");
+        let lost = [head.clone(), packets[2..].concat()].concat();
+        assert!(refused(&lost).starts_with(", packet 337: a part is missing or was changed: the tables' CRC is "));
+        assert!(refused(b"[model]").starts_with(", packet 1: "), "{}", refused(b"[model]"));
+        let Parcel::Head(first) = extended().parcels().next().unwrap() else { panic!("a head comes first") };
+        let old = [wire(Parcel::Head(Head { version: 1, ..first })), seal.clone()].concat();
+        assert_eq!(refused(&old), ", packet 1: tables of version 1, this reads version 2");
+        let other = [wire(Parcel::Head(Head { counts: [1; 5], ..first })), seal.clone()].concat();
+        assert!(refused(&other).starts_with(", packet 1: tables of another ring: "), "{}", refused(&other));
+    }
+}
