@@ -5,7 +5,7 @@
 //! The posterior weight of a candidate is its prior times its evidence: exact twin, everything refitted, for the leaders; first
 //! order for the rest.
 //!
-//! Forward: the best candidate is taken up as long as "one more" is more likely than "no more". Backward: each is taken out
+//! Forward: the best candidate is taken up as long as "one more" is three times as likely as "no more". Backward: each is taken out
 //! again and all candidates compete for its slot, given the others.
 
 use std::collections::BTreeMap;
@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 use nalgebra::DVector;
 use twin::{EffectError, EffectKind};
 
+use super::SUSPICIOUS;
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy, SORTS};
 use super::fit::Fitted;
@@ -128,7 +129,7 @@ impl Search {
         }
         let mut best = null.clone();
         let mut first = None;
-        while best.hypothesis.terms.len() < MOST && next.library() > next.nothing.max(next.unknown()) {
+        while best.hypothesis.terms.len() < MOST && next.nothing < 1.0 - SUSPICIOUS && next.library() > next.unknown() {
             let Some(fitted) = next.leader() else { break };
             let switches = best.hypothesis.of_switches();
             best = self.settle(fitted)?;

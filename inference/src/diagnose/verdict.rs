@@ -6,7 +6,7 @@ use super::data::Data;
 use super::heldout::{Fold, Score};
 use super::next::Menu;
 use super::search::{Alternative, Cause, Found, Slot};
-use super::{DECISIVE, PROVEN};
+use super::{DECISIVE, PROVEN, SUSPICIOUS};
 
 /// What the recording says about the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,9 +21,6 @@ pub enum Verdict {
     Unexplained,
 }
 
-/// Probability of something missing from which on a recording is not consistent: where it is less, naming it would be wrong
-/// in most cases, and one empty recording in thirty would be suspected.
-const SUSPICIOUS: f64 = 0.75;
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 
@@ -44,11 +41,12 @@ impl Verdict {
         if next.unknown() > SUSPICIOUS {
             return Self::Unexplained;
         }
-        if 1.0 - found.nothing() < SUSPICIOUS {
-            return Self::Consistent;
-        }
         if found.slots.is_empty() {
-            return if next.unknown() > next.library() { Self::Unexplained } else { Self::Ambiguous };
+            return match (1.0 - next.nothing > SUSPICIOUS, next.unknown() > next.library()) {
+                (false, _) => Self::Consistent,
+                (true, true) => Self::Unexplained,
+                (true, false) => Self::Ambiguous,
+            };
         }
         let decided = |slot: &Slot| slot.alternatives.first().is_some_and(|a| a.probability >= DECISIVE);
         let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
