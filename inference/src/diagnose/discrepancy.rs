@@ -264,6 +264,21 @@ impl Where {
         }
     }
 
+    /// In two or three words.
+    pub fn short(&self, data: &Data) -> String {
+        let name = self.label(data);
+        match self {
+            Self::Monitor(_) => format!("monitor {name}"),
+            Self::MonitorInTime(_) => format!("monitor {name}, in time"),
+            Self::Corrector(_) => format!("corrector {name}"),
+            Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
+            Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
+            Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
+            Self::Time => "all monitors, in time".into(),
+            Self::Everywhere => "all monitors".into(),
+        }
+    }
+
     /// What is said of it.
     pub fn phrase(&self, data: &Data) -> String {
         let name = self.label(data);
