@@ -15,8 +15,10 @@ use super::scan::{BATCH, Projection, Score};
 /// Longest cell [m], and longest where the gradient may be.
 const STEP: f64 = 0.5;
 const FINE: f64 = 0.05;
-/// How far behind the first a place may be to be looked at more finely [nat].
+/// How far behind the first a place may be to be looked at more finely [nat], and as a share of the first: where nothing is,
+/// nothing is far behind.
 const BEHIND: f64 = 12.0;
+const BEHIND_SHARE: f64 = 0.5;
 
 /// A piece of the ring with one trial gradient.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -90,7 +92,8 @@ impl Along {
 
     /// Cells that are not far behind the first.
     fn likely(&self) -> impl Iterator<Item = usize> + '_ {
-        let limit = self.log_bayes[self.peak()] - BEHIND;
+        let first = self.log_bayes[self.peak()];
+        let limit = first - BEHIND.min(BEHIND_SHARE * first.abs());
         (0..self.cells.len()).filter(move |&i| self.log_bayes[i] > limit)
     }
 

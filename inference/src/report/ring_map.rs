@@ -14,13 +14,13 @@ use super::pen::{Pen, Spot};
 const RADIUS: f64 = 218.0;
 const NAMES: f64 = 190.0;
 const SECTORS: f64 = 160.0;
-const MARKS: f64 = 240.0;
+const MARKS: f64 = 246.0;
 /// Radius and horizontal distance from the centre at which labels hang, and the space each takes [px].
 const LABELS: f64 = 262.0;
 const SIDE: f64 = 270.0;
 const LINE: f64 = 16.0;
 /// Centre [px].
-const CENTRE: (f64, f64) = (WIDTH / 2.0, TITLE + 282.0);
+const CENTRE: (f64, f64) = (WIDTH / 2.0, TITLE + 266.0);
 
 const INK: RGBColor = RGBColor(60, 60, 60);
 const PALE: RGBColor = RGBColor(150, 150, 150);
@@ -93,7 +93,7 @@ impl Figure {
 }
 
 fn chart(map: &RingMap) -> String {
-    draw(&map.title, CENTRE.1 + 292.0, |sheet| {
+    draw(&map.title, CENTRE.1 + 270.0, |sheet| {
         let ring = Round { sheet, circumference: map.circumference.max(f64::MIN_POSITIVE) };
         ring.path()?;
         map.sectors.iter().enumerate().try_for_each(|(i, (name, s))| {
@@ -148,7 +148,7 @@ impl Round<'_, '_> {
     }
 
     fn sector(&self, name: &str, from: f64, to: f64) -> Drawn {
-        self.line(vec![self.spot(from, SECTORS - 12.0), self.spot(from, RADIUS - 8.0)], PALE, 0.8)?;
+        self.line(vec![self.spot(from, SECTORS - 14.0), self.spot(from, NAMES - 10.0)], PALE, 0.8)?;
         self.text(name, 0.5 * (from + to), SECTORS, &bold(17.0, HPos::Center))
     }
 
@@ -162,9 +162,9 @@ impl Round<'_, '_> {
             Symbol::Defocusing => {
                 self.line(vec![self.spot(middle, RADIUS - 11.0), self.spot(middle, RADIUS + 4.0)], INK, 3.0)
             }
-            Symbol::Monitor => self.dot(self.spot(middle, RADIUS + 8.0), INK),
+            Symbol::Monitor => self.dot(self.spot(middle, RADIUS + 16.0), INK),
             Symbol::Corrector => {
-                let wide = 0.5 * self.circumference / 360.0;
+                let wide = 0.9 * self.circumference / 360.0;
                 let corners = vec![
                     self.spot(middle, RADIUS - 5.0),
                     self.spot(middle - wide, RADIUS - 12.0),
@@ -240,7 +240,7 @@ impl Round<'_, '_> {
 
 /// Heights in order, moved apart until each has its line.
 fn spread(wanted: &[f64]) -> Vec<f64> {
-    let (top, bottom) = (TITLE + 8.0, CENTRE.1 + 286.0);
+    let (top, bottom) = (TITLE + 8.0, CENTRE.1 + 262.0);
     let mut heights = wanted.to_vec();
     for _ in 0..200 {
         for i in 1..heights.len() {

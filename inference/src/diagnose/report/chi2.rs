@@ -38,20 +38,27 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
         let names: Vec<String> = of.iter().map(|&i| names[i].clone()).collect();
         Axes::new(title, label, "chi-square per reading [1]").named(&names).compared(Reference::Level(1.0))
     };
+    let kicked = residuals[0].all.iter().filter(|one| one.kick.is_some()).count() as f64;
+    // half of the readings are in-plane
+    let scatter = |members: usize| (2.0 * 2.0 * members as f64 / kicked.max(1.0)).sqrt();
     Section {
         heading: "Structure of the residuals".into(),
-        text: vec![
-            "Mean square of the residuals in units of their noise. Expected is 1, less the share of the readings that baselines and vars \
-             take up; in-plane are readings of x while an H corrector is powered and of y while a V corrector is, cross-plane the others."
-                .into(),
-        ],
+        text: vec![format!(
+            "Mean square of the residuals in units of their noise. Expected is 1, less the share of the readings that baselines and \
+                 vars take up; in-plane are readings of x while an H corrector is powered and of y while a V corrector is, cross-plane \
+                 the others. Noise alone scatters a marker by {:.2} (by monitor) and {:.2} (by corrector). Monitors that are noisy or \
+                 jump are given more noise than they mostly have, and lie low.",
+            scatter(monitors.len()),
+            scatter(correctors.len())
+        )],
         figures: vec![
             (
-                "By monitor. One marker that stands out from its neighbours is a fault of that monitor.".into(),
+                "By monitor. A monitor at fault stands out in its own column; a fault of the ring lifts many.".into(),
                 Figure::lines(&named("Chi-square by monitor", "monitor", &monitors, &monitor_names), &by_monitor),
             ),
             (
-                "By corrector. One marker that stands out from its neighbours is a fault of that corrector.".into(),
+                "By corrector. A corrector at fault stands out in its own column; a fault of the ring lifts many."
+                    .into(),
                 Figure::lines(
                     &named("Chi-square by corrector", "corrector", &correctors, &corrector_names),
                     &by_corrector,

@@ -33,14 +33,12 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
         Ranked { label, group: 1, value: one.log_bayes, price: Some(price_of(one)) }
     });
     let mut all: Vec<Ranked> = library.chain(unclassed).collect();
-    all.sort_by(|one, other| {
-        (other.value - other.price.unwrap_or(0.0)).total_cmp(&(one.value - one.price.unwrap_or(0.0)))
-    });
+    all.sort_by(|one, other| other.value.total_cmp(&one.value));
     all.truncate(LEADING);
     let axes = Axes::new(
         "The leading causes of the first search",
         "ln Bayes factor over the model without any effect [nat]",
-        "price of the search: a bar that does not reach it is noise as likely as not",
+        "price of the search: a bar that ends there is chance as likely as not",
     );
     Ok(Section {
         heading: "Evidence".into(),
@@ -51,7 +49,9 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
              rank close behind; that is settled by the exact fits of the table of findings, not here."
         )],
         figures: vec![(
-            format!("The {LEADING} causes with the largest posterior weight, evidence less price."),
+            format!(
+                "The {LEADING} causes with the largest evidence; each pays the price at its own tick, which is higher where a kind has more places."
+            ),
             Figure::ranking(&axes, &["effects of the library", "freedom without a class"], &all),
         )],
         ..Section::default()

@@ -52,7 +52,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
         ]
     };
     let same = before.log_density == after.log_density;
-    let mut rows = vec![row(if same { "the model" } else { "without any effect" }, before, "\u{2013}".into())];
+    let mut rows = vec![row(if same { "the model" } else { "without any effect" }, before, "0".into())];
     if !same {
         rows.push(row("with what was found", after, format!("{} ± {error:.1}", signed(gain, 1))));
     }

@@ -27,8 +27,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     let text = match rows.len() {
         0 => format!("Every monitor that is read is in order; expected noise of a reading {expected:.0} µm."),
         _ => format!(
-            "Noise, jumps and silence are faults of a monitor and not of the model. Its readings weigh less or nothing, and no effect is \
-             sought in them. Expected noise of a reading {expected:.0} µm."
+            "Noise, jumps and silence are faults of a monitor and not of the model. Its readings weigh less, or nothing. Expected noise of a reading {expected:.0} µm."
         ),
     };
     let header = ["monitor", "state", "noise [µm]", "weighted as [µm]", "readings refused"];

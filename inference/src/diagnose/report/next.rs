@@ -2,7 +2,7 @@
 
 use twin::EffectError;
 
-use super::super::{Diagnosis, verdict};
+use super::super::{Diagnosis, Verdict, verdict};
 use super::table;
 use crate::report::Section;
 
@@ -11,7 +11,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
     let mut section = Section { heading: "What to measure next".into(), ..Section::default() };
     section.text.push(match &diagnosis.next_measurement {
         Some(next) => format!("{}.", next.trim_end_matches('.')),
-        None => "No measurement is needed to tell the causes of the table of findings from each other.".into(),
+        None => settled(diagnosis.verdict).into(),
     });
     if let Some((menu, [one, other])) = verdict::menu(&diagnosis.found.data, &diagnosis.found, diagnosis.verdict)? {
         let row = |what: &str, separation: f64| [what.to_owned(), format!("{separation:.1}")];
@@ -38,4 +38,17 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
         section.tables.push(table(caption, ["cause", "probability", "ln evidence gain"], rows));
     }
     Ok(section)
+}
+
+/// What is said where there is nothing to propose.
+fn settled(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Consistent => "Nothing is missing, and nothing has to be told apart.",
+        Verdict::Identified => {
+            "What was found is decided; no further measurement is needed to tell it from anything else."
+        }
+        Verdict::Ambiguous | Verdict::Unexplained => {
+            "The library has no second cause to tell the first one from, so no campaign can be computed that would. What is found at one              instrument is best looked for there: exchange it, or its electronics, and repeat the campaign."
+        }
+    }
 }

@@ -1,13 +1,17 @@
 //! Where along the beam a gradient would sit.
 
-use twin::{EffectError, EffectKind};
+use twin::{EffectError, EffectKind, Element, Ring};
 
 use super::super::along::{Along, Interval, thin};
 use super::super::{Diagnosis, Verdict};
-use crate::report::{Axes, Figure, Section, Series};
+use super::signed;
+use crate::report::{Axes, Figure, Reference, Section, Series};
 
 /// Share of the posterior that an interval holds.
 const SHARE: f64 = 0.95;
+/// Density, over that of the peak, that is not worth showing, and what is shown beside it [m].
+const NEGLIGIBLE: f64 = 1e-3;
+const AROUND: f64 = 0.5;
 
 /// The scans for normal and skew gradients.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
@@ -33,7 +37,10 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
         if let (Some(own), Some(interval)) = (own, &interval) {
             section.text.push(stated(&along, interval, word, symbol, &terms[own].label()));
         }
-        section.figures.push(figure(diagnosis, &along, interval.as_deref(), word));
+        section.figures.push(figure(diagnosis, &along, word));
+        if let Some(interval) = &interval {
+            section.figures.push(density(&along, interval, found.data.ring.circumference, word));
+        }
     }
     Ok(section)
 }
@@ -42,15 +49,15 @@ fn stated(along: &Along, interval: &[Interval], word: &str, symbol: &str, label:
     let peak = along.peak();
     let list: Vec<String> = interval.iter().map(|one| format!("{:.2} to {:.2} m", one.from_m, one.to_m)).collect();
     format!(
-        "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {:.4} /m; 95 % credible interval of its \
+        "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {} /m; 95 % credible interval of its \
          place: {}.",
         along.cells[peak].s,
-        along.amplitude[peak],
+        signed(along.amplitude[peak], 4),
         list.join(" or ")
     )
 }
 
-fn figure(diagnosis: &Diagnosis, along: &Along, interval: Option<&[Interval]>, word: &str) -> (String, Figure) {
+fn figure(diagnosis: &Diagnosis, along: &Along, word: &str) -> (String, Figure) {
     let s: Vec<f64> = along.cells.iter().map(|cell| cell.s).collect();
     let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), along.log_bayes.clone())];
     let height = |at: f64| {
@@ -73,37 +80,57 @@ fn figure(diagnosis: &Diagnosis, along: &Along, interval: Option<&[Interval]>, w
             series.push(Series::points(label, x, y));
         }
     }
-    if let Some(interval) = interval {
-        series.push(bar(along, interval));
-    }
     let title = format!("A thin {word} gradient along the ring");
-    let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(crate::report::Reference::Level(0.0));
+    let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
+    let peak = along.peak();
     let caption = format!(
-        "ln Bayes factor of a thin {word} gradient against none, over its place; markers are the findings and alternatives that act as \
-         one, at the height of the curve{}.",
-        if interval.is_some() { "; the bar above the peak is the 95 % credible interval" } else { "" }
+        "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}.",
+        along.cells[peak].s,
+        nearest(&diagnosis.found.data.ring, along.cells[peak].s),
+        if series.len() > 1 {
+            "; markers are findings and alternatives that act like one, at the height of the curve"
+        } else {
+            ""
+        }
     );
     (caption, Figure::lines(&axes, &series))
 }
 
-/// The interval as a bar above the peak.
-fn bar(along: &Along, interval: &[Interval]) -> Series {
-    let end = along.cells.last().map_or(0.0, |cell| cell.s + 0.5 * cell.length);
-    let lowest = along.log_bayes.iter().copied().fold(f64::INFINITY, f64::min);
-    let peak = along.log_bayes[along.peak()];
-    let level = peak + 0.06 * (peak - lowest).max(1.0);
-    let (mut x, mut y) = (Vec::new(), Vec::new());
-    let mut piece = |from: f64, to: f64| {
-        x.extend([from, to, to]);
-        y.extend([level, level, f64::NAN]);
+/// The named element whose middle is nearest.
+fn nearest(ring: &Ring, s: f64) -> &str {
+    let away = |element: &&Element| (element.s + 0.5 * element.length - s).abs();
+    let named = ring.elements.iter().filter(|element| !element.name.is_empty());
+    named.min_by(|one, other| away(one).total_cmp(&away(other))).map_or("", |element| &element.name)
+}
+
+/// The posterior of the place, as far as it matters: all of it, and what the interval holds.
+fn density(along: &Along, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
+    let peak = along.peak();
+    let (middle, largest) = (along.cells[peak].s, along.log_bayes[peak]);
+    let weight = |i: usize| (along.log_bayes[i] - largest).exp();
+    let sum: f64 = (0..along.cells.len()).map(|i| weight(i) * along.cells[i].length).sum();
+    // unrolled about the peak: the ring begins anywhere
+    let s = |i: usize| along.cells[i].s - circumference * ((along.cells[i].s - middle) / circumference).round();
+    let mut order: Vec<usize> = (0..along.cells.len()).collect();
+    order.sort_by(|&i, &j| s(i).total_cmp(&s(j)));
+    let counts = |i: &&usize| weight(**i) > NEGLIGIBLE;
+    let (from, to) = (order.iter().find(counts), order.iter().rev().find(counts));
+    let range = from.map_or(middle, |&i| s(i) - AROUND)..=to.map_or(middle, |&i| s(i) + AROUND);
+    order.retain(|&i| range.contains(&s(i)));
+    let inside = |at: f64| {
+        interval.iter().any(|one| match one.from_m <= one.to_m {
+            true => (one.from_m..=one.to_m).contains(&at),
+            false => at >= one.from_m || at <= one.to_m,
+        })
     };
-    for one in interval {
-        if one.from_m < one.to_m {
-            piece(one.from_m, one.to_m);
-        } else {
-            piece(one.from_m, end);
-            piece(0.0, one.to_m);
-        }
-    }
-    Series::line("95 % credible interval", x, y)
+    let x: Vec<f64> = order.iter().map(|&i| s(i)).collect();
+    let all: Vec<f64> = order.iter().map(|&i| weight(i) / sum).collect();
+    let held = order.iter().zip(&all).map(|(&i, &y)| if inside(along.cells[i].s) { y } else { f64::NAN }).collect();
+    let series = [Series::line("posterior", x.clone(), all), Series::line("95 % of it", x, held)];
+    let axes =
+        Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
+    let caption = format!(
+        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring."
+    );
+    (caption, Figure::densities(&axes, &series))
 }

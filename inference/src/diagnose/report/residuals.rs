@@ -103,7 +103,7 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
         ],
         figures: vec![(
             format!(
-                "One cell for each monitor and corrector; lines divide the planes; grey cells have no readings. Colours end at \
+                "One cell for each monitor and corrector; lines divide the planes; grey cells have no readings; where names do not fit, every second is written. Colours end at \
                  ±{limit:.0}. {}.",
                 largest.join("; ")
             ),
