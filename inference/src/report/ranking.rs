@@ -15,6 +15,8 @@ use super::series::Mark;
 /// Height of a bar's row, and share of it that the bar fills [px].
 const ROW: f64 = 22.0;
 const BAR: f64 = 11.0;
+/// Space on the right for the values in figures [px].
+const FIGURES: f64 = 56.0;
 
 /// One value.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,7 +47,7 @@ fn chart(axes: &Axes, groups: &[&str], entries: &[Ranked]) -> String {
     let legend = Legend::new(samples);
     let left = entries.iter().map(|entry| text_width(&entry.label, TICK)).fold(0.0, f64::max) + 20.0;
     let top = legend.bottom() + if axes.y_label.is_empty() { 0.0 } else { 20.0 };
-    let place = Place { left, top, right: WIDTH - RIGHT, bottom: top + ROW * entries.len().max(1) as f64 };
+    let place = Place { left, top, right: WIDTH - RIGHT - FIGURES, bottom: top + ROW * entries.len().max(1) as f64 };
     let values = entries.iter().flat_map(|entry| [Some(entry.value), entry.price]).flatten();
     let range = span(values.chain([0.0]));
     let range = if range.start < 0.0 { aired(range) } else { range.start..aired(range).end };
@@ -72,6 +74,8 @@ fn bar(plot: &Plot, left: f64, row: f64, entry: &Ranked) -> Drawn {
     plot.sheet.draw_text(&entry.label, &plain(TICK, HPos::Right), (px(left - 8.0), from.1))?;
     pen.pale_bar(plot.sheet, [from, to], BAR)?;
     pen.mark(plot.sheet, to)?;
+    let figures = format!("{:.1}", entry.value).replace('-', "\u{2212}");
+    plot.sheet.draw_text(&figures, &plain(TICK, HPos::Right), (px(WIDTH - 8.0), from.1))?;
     entry.price.map_or(Ok(()), |price| tick(plot, plot.spot(price, row)))
 }
 

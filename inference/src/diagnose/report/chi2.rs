@@ -9,6 +9,11 @@ use crate::report::{Axes, Figure, Reference, Section, Series, Table};
 const STRETCHES: usize = 8;
 /// Distance of two markers of a name, in slots.
 const APART: f64 = 0.17;
+/// Chi-square from which on the axis is logarithmic.
+const LOGARITHMIC: f64 = 8.0;
+
+/// Some residuals by their name, and which they are.
+type Group = (String, Box<dyn Fn(&Residual) -> bool>);
 
 /// Mean square of some residuals.
 #[derive(Debug, Clone, Copy, Default)]
@@ -34,9 +39,15 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
     let (monitor_names, corrector_names) = (data.ring.monitor_names(), data.ring.corrector_names());
     let by_monitor = by(residuals, &monitors, |one| Some(one.monitor));
     let by_corrector = by(residuals, &correctors, |one| one.kick.map(|(corrector, _)| corrector));
-    let named = |title: &str, label: &str, of: &[usize], names: &[String]| {
+    let figure = |title: &str, label: &str, of: &[usize], names: &[String], series: Vec<Series>| {
         let names: Vec<String> = of.iter().map(|&i| names[i].clone()).collect();
-        Axes::new(title, label, "chi-square per reading [1]").named(&names).compared(Reference::Level(1.0))
+        let largest = series.iter().flat_map(|one| &one.y).copied().fold(0.0, f64::max);
+        let (scale, one, series) = match largest > LOGARITHMIC {
+            true => ("log10 of chi-square", 0.0, series.into_iter().map(log).collect()),
+            false => ("chi-square", 1.0, series),
+        };
+        let axes = Axes::new(title, label, &format!("{scale} per reading [1]"));
+        Figure::lines(&axes.named(&names).compared(Reference::Level(one)), &series)
     };
     let kicked = residuals[0].all.iter().filter(|one| one.kick.is_some()).count() as f64;
     // half of the readings are in-plane
@@ -54,15 +65,12 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
         figures: vec![
             (
                 "By monitor. A monitor at fault stands out in its own column; a fault of the ring lifts many.".into(),
-                Figure::lines(&named("Chi-square by monitor", "monitor", &monitors, &monitor_names), &by_monitor),
+                figure("Chi-square by monitor", "monitor", &monitors, &monitor_names, by_monitor),
             ),
             (
                 "By corrector. A corrector at fault stands out in its own column; a fault of the ring lifts many."
                     .into(),
-                Figure::lines(
-                    &named("Chi-square by corrector", "corrector", &correctors, &corrector_names),
-                    &by_corrector,
-                ),
+                figure("Chi-square by corrector", "corrector", &correctors, &corrector_names, by_corrector),
             ),
         ],
         tables: vec![groups(residuals)],
@@ -87,6 +95,11 @@ fn by(residuals: &[Residuals], members: &[usize], of: impl Fn(&Residual) -> Opti
     series
 }
 
+/// On a logarithmic axis.
+fn log(series: Series) -> Series {
+    Series { y: series.y.iter().map(|y| y.log10()).collect(), ..series }
+}
+
 /// By sign of the kick and by stretch of time.
 fn groups(residuals: &[Residuals]) -> Table {
     let sign = |wanted: f64| move |one: &Residual| one.kick.map_or(0.0, |(_, sign)| sign) == wanted;
@@ -94,7 +107,7 @@ fn groups(residuals: &[Residuals]) -> Table {
         let edge = |i: usize| -1.0 + 2.0 * i as f64 / STRETCHES as f64;
         move |one: &Residual| one.time >= edge(i) && (one.time < edge(i + 1) || i + 1 == STRETCHES)
     };
-    let mut groups: Vec<(String, Box<dyn Fn(&Residual) -> bool>)> = vec![
+    let mut groups: Vec<Group> = vec![
         ("all".into(), Box::new(|_| true)),
         ("kick +".into(), Box::new(sign(1.0))),
         ("kick \u{2212}".into(), Box::new(sign(-1.0))),
@@ -103,7 +116,7 @@ fn groups(residuals: &[Residuals]) -> Table {
     for i in 0..STRETCHES {
         groups.push((format!("time, {} of {STRETCHES}", i + 1), Box::new(stretch(i))));
     }
-    let row = |(name, holds): &(String, Box<dyn Fn(&Residual) -> bool>)| {
+    let row = |(name, holds): &Group| {
         let readings = residuals[0].all.iter().filter(|one| holds(one)).count();
         let cell = |one: &Residuals, plane: Option<bool>| {
             let mine = |r: &&Residual| holds(r) && plane.is_none_or(|plane| r.kick.is_some() && r.in_plane == plane);
@@ -130,4 +143,24 @@ fn groups(residuals: &[Residuals]) -> Table {
     let caption = "Chi-square per reading by sign of the kick and by stretch of time, without any effect (before) and with what was \
                    found (after). The last column is the standard deviation that noise alone gives a mean over all readings of the row.";
     table(caption, header, groups.iter().map(row).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn planes_are_told_apart_and_the_kick_counted() {
+        let one = |in_plane, sign: f64, value| Residual {
+            monitor: 3,
+            kick: (sign != 0.0).then_some((5, sign)),
+            in_plane,
+            time: 0.0,
+            value,
+        };
+        let all = vec![one(true, 1.0, 2.0), one(true, -1.0, 1.0), one(false, 1.0, 3.0), one(false, 0.0, 7.0)];
+        let series = by(&[Residuals { name: "before", all }], &[3, 4], |residual| Some(residual.monitor));
+        assert_eq!([series[0].y[0], series[1].y[0]], [2.5, 9.0]);
+        assert!(series[0].y[1].is_nan(), "a monitor without readings has no marker");
+    }
 }

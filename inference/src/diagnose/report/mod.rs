@@ -63,3 +63,29 @@ fn table<const N: usize>(caption: &str, header: [&str; N], rows: Vec<[String; N]
 fn signed(value: f64, decimals: usize) -> String {
     format!("{value:+.decimals$}").replace('-', "\u{2212}")
 }
+
+#[cfg(test)]
+mod tests {
+    use twin::{Effect, EffectKind};
+
+    use super::*;
+    use crate::simulate::campaign_tests::template;
+    use crate::simulate::{Hardware, Truth, campaign};
+
+    #[test]
+    fn the_page_leads_from_the_sentence_to_the_readings() {
+        let (ring, recording) = template();
+        let effects = [Effect { kind: EffectKind::BpmGain, place: "x_E4".into(), amplitude: -0.15 }];
+        let truth = Truth { vars: &[1.0; 48], effects: &effects, ..Truth::default() };
+        let made = campaign(&recording, &ring, &truth, &Hardware::shipped(&ring, &recording), 3).unwrap();
+        let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+        let page = page(&diagnosis, &made).unwrap();
+        assert!(page.lead.contains("x_E4"), "{}", page.lead);
+        assert_eq!(page.sections.len(), 10);
+        let figures: usize = page.sections.iter().map(|section| section.figures.len()).sum();
+        // ring, maps, two of chi-square, evidence, two scans, vars
+        assert_eq!(figures, 8);
+        let ranked = &page.sections[4].figures[0].1.csv;
+        assert!(ranked.lines().nth(1).is_some_and(|first| first.starts_with("bpm gain x_E4,")), "{ranked}");
+    }
+}

@@ -126,7 +126,7 @@ fn density(along: &Along, interval: &[Interval], circumference: f64, word: &str)
     let x: Vec<f64> = order.iter().map(|&i| s(i)).collect();
     let all: Vec<f64> = order.iter().map(|&i| weight(i) / sum).collect();
     let held = order.iter().zip(&all).map(|(&i, &y)| if inside(along.cells[i].s) { y } else { f64::NAN }).collect();
-    let series = [Series::line("posterior", x.clone(), all), Series::line("95 % of it", x, held)];
+    let series = [Series::line("posterior", x.clone(), all), Series::line("95 % credible interval", x, held)];
     let axes =
         Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
     let caption = format!(
