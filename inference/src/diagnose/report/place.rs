@@ -9,6 +9,8 @@ use crate::report::{Axes, Figure, Reference, Section, Series};
 
 /// Share of the posterior that an interval holds.
 const SHARE: f64 = 0.95;
+/// Stretches that are still listed.
+const STRETCHES: usize = 4;
 /// Density, over that of the peak, that is not worth showing, and what is shown beside it [m].
 const NEGLIGIBLE: f64 = 1e-3;
 const AROUND: f64 = 0.5;
@@ -47,13 +49,19 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
 
 fn stated(along: &Along, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
     let peak = along.peak();
-    let list: Vec<String> = interval.iter().map(|one| format!("{:.2} to {:.2} m", one.from_m, one.to_m)).collect();
+    let list = if interval.len() > STRETCHES {
+        let whole: f64 = interval.iter().map(|one| (one.to_m - one.from_m).max(0.0)).sum();
+        format!("{} stretches of the ring, {whole:.0} m in all", interval.len())
+    } else {
+        let of = |one: &Interval| format!("{:.2} to {:.2} m", one.from_m, one.to_m);
+        interval.iter().map(of).collect::<Vec<_>>().join(" or ")
+    };
     format!(
         "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {} /m; 95 % credible interval of its \
          place: {}.",
         along.cells[peak].s,
         signed(along.amplitude[peak], 4),
-        list.join(" or ")
+        list
     )
 }
 
