@@ -4,7 +4,7 @@ use comfy_table::{Table, presets};
 use inference::diagnose::average::Vars;
 use inference::diagnose::data::DataError;
 use inference::diagnose::heldout::Score;
-use inference::diagnose::{Diagnosis, Finding};
+use inference::diagnose::{Diagnosis, Finding, report};
 use serde::Serialize;
 use twin::Ring;
 
@@ -109,8 +109,15 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     if let Some(path) = &options.common.json {
         output::json(path, &answer)?;
     }
+    if let Some(path) = &options.report {
+        let page = report::page(&diagnosis, &recording);
+        let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
+        let written = page.write(path);
+        written.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
+    }
     if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
         answer.print();
+        options.report.iter().for_each(|path| println!("\n{}", path.display()));
     }
     Ok(())
 }

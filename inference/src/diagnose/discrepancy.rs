@@ -177,12 +177,13 @@ fn stretches(data: &Data) -> DMatrix<f64> {
     })
 }
 
-/// Steps of a gain: the steps times what is predicted, of rms 1.
+/// Steps of a gain, which leave its mean alone: the steps times what is predicted, of rms 1, less their share of it.
 fn scaled(stretches: &DMatrix<f64>, predicted: &DVectorView<f64>) -> DMatrix<f64> {
     let rms = (predicted.norm_squared() / predicted.len() as f64).sqrt().max(f64::MIN_POSITIVE);
     let mut columns = stretches.clone();
     columns.row_iter_mut().zip(predicted.iter()).for_each(|(mut row, p)| row *= p / rms);
-    columns
+    let share = predicted.tr_mul(&columns) / predicted.norm_squared().max(f64::MIN_POSITIVE);
+    columns - predicted * share
 }
 
 /// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
@@ -275,6 +276,22 @@ impl Where {
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
             Self::Time => "time".into(),
             Self::Everywhere => "everywhere".into(),
+        }
+    }
+
+    /// In two or three words.
+    pub fn short(&self, data: &Data) -> String {
+        let name = self.label(data);
+        match self {
+            Self::Monitor(_) => format!("monitor {name}"),
+            Self::MonitorInTime(_) => format!("monitor {name}, in time"),
+            Self::GainInTime(_) => format!("gain of {name} in time"),
+            Self::Corrector(_) => format!("corrector {name}"),
+            Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
+            Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
+            Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
+            Self::Time => "all monitors, in time".into(),
+            Self::Everywhere => "all monitors".into(),
         }
     }
 

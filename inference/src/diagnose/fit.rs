@@ -183,16 +183,19 @@ impl Fitted {
 
     /// Amplitude and standard deviation of a term; (1, 0) without one.
     pub fn amplitude(&self, data: &Data, term: usize) -> (f64, f64) {
-        let vars = self.params.len();
-        let unknowns = self.hypothesis.unknowns(data);
-        let found = unknowns.iter().enumerate().find_map(|(i, unknown)| match unknown {
-            Unknown::Amplitude(of, scale) if *of == term => Some((vars + i, *scale)),
-            _ => None,
-        });
-        found.map_or((1.0, 0.0), |(at, scale)| {
+        self.unknown(data, term).map_or((1.0, 0.0), |(at, scale)| {
             let mut unit = DVector::zeros(self.u.len());
             unit[at] = 1.0;
             (self.u[at] * scale, self.factor.solve(&unit)[at].sqrt() * scale)
+        })
+    }
+
+    /// Which of the unknowns is the amplitude of a term, and its prior standard deviation.
+    pub fn unknown(&self, data: &Data, term: usize) -> Option<(usize, f64)> {
+        let unknowns = self.hypothesis.unknowns(data);
+        unknowns.iter().enumerate().find_map(|(i, unknown)| match unknown {
+            Unknown::Amplitude(of, scale) if *of == term => Some((self.params.len() + i, *scale)),
+            _ => None,
         })
     }
 

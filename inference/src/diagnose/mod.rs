@@ -5,6 +5,7 @@
 //! ([`discrepancy`]); the leaders are refitted and compete ([`search`]); what is found has to predict frames that it was not
 //! fitted to ([`heldout`]); then the verdict is spoken ([`verdict`]).
 
+pub mod along;
 pub mod average;
 pub mod data;
 pub mod discrepancy;
@@ -12,6 +13,7 @@ pub mod fit;
 pub mod heldout;
 pub mod hypothesis;
 pub mod next;
+pub mod report;
 pub mod scan;
 pub mod search;
 pub mod settings;

@@ -7,7 +7,7 @@
 //!
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{EffectError, EffectKind, Signatures};
 
 use super::data::Data;
@@ -29,7 +29,82 @@ pub struct Candidate {
     pub adapting: DVector<f64>,
 }
 
-const BATCH: usize = 64;
+/// Signatures that are scored together.
+pub const BATCH: usize = 64;
+
+/// A fit, ready for the scores of further signatures.
+pub struct Projection {
+    residual: DVector<f64>,
+    /// `J^T`.
+    back: DMatrix<f64>,
+    factor: Cholesky<f64, Dyn>,
+    /// `J^T r - u`, zero at the best point.
+    slope: DVector<f64>,
+}
+
+/// What the data say of one signature.
+#[derive(Debug, Clone, Copy)]
+pub struct Score {
+    /// `d P r`.
+    pub pull: f64,
+    /// `d P d`.
+    pub power: f64,
+}
+
+/// Scores of some signatures, and how the fit's unknowns imitate each.
+pub struct Scored {
+    /// One for each.
+    pub scores: Vec<Score>,
+    /// Rows unknowns, columns signatures.
+    pub taken: DMatrix<f64>,
+}
+
+impl Projection {
+    /// About a fit at its best.
+    pub fn of(fitted: &Fitted) -> Self {
+        Self {
+            residual: fitted.residual.clone(),
+            back: fitted.jacobian.transpose(),
+            factor: fitted.free.clone(),
+            slope: fitted.slope.clone(),
+        }
+    }
+
+    /// About the same point without one of its unknowns: residuals are what they are with it at zero.
+    pub fn without(fitted: &Fitted, unknown: usize) -> Self {
+        let residual = &fitted.residual + fitted.jacobian.column(unknown) * fitted.u[unknown];
+        let back = fitted.jacobian.transpose().remove_row(unknown);
+        let normal = &back * back.transpose() + DMatrix::identity(back.nrows(), back.nrows());
+        let factor = normal.cholesky().expect("1 + J^T J is positive");
+        let slope = &back * &residual - fitted.u.clone().remove_row(unknown);
+        Self { residual, back, factor, slope }
+    }
+
+    /// Score whitened signatures, one a column, in units of their prior standard deviations.
+    pub fn score(&self, columns: DMatrix<f64>) -> Scored {
+        let shared = &self.back * &columns;
+        let taken = self.factor.solve(&shared);
+        let one = |i: usize| {
+            let (column, taken) = (columns.column(i), taken.column(i));
+            let pull = column.dot(&self.residual) - taken.dot(&self.slope);
+            Score { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
+        };
+        Scored { scores: (0..columns.ncols()).map(one).collect(), taken }
+    }
+}
+
+impl Score {
+    /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
+    pub fn of_amplitude(self) -> (f64, f64) {
+        let Self { pull, power } = self;
+        (pull / (1.0 + power), 0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p())
+    }
+
+    /// The same of an effect that is there or not.
+    pub fn of_switch(self) -> (f64, f64) {
+        (1.0, self.pull - 0.5 * self.power)
+    }
+}
 
 /// All candidates that the data can say anything about.
 pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
@@ -46,7 +121,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     let vars = fitted.params.len();
     let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
     let signatures = Signatures::of(&machine, &drives)?;
-    let back = fitted.jacobian.transpose();
+    let bench = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
     for batch in terms.chunks(BATCH) {
         let columns: Vec<DVector<f64>> = batch
@@ -56,18 +131,12 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
                 Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * scale)
             })
             .collect::<Result<_, EffectError>>()?;
-        let columns = DMatrix::from_columns(&columns);
-        let shared = &back * &columns;
-        let taken = fitted.free.solve(&shared);
-        for (i, term) in batch.iter().enumerate() {
-            let column = columns.column(i);
-            let g = column.dot(&fitted.residual) - taken.column(i).dot(&fitted.slope);
-            let h = (column.norm_squared() - taken.column(i).dot(&shared.column(i))).max(0.0);
-            let (amplitude, log_bayes) = match term.kind.prior_scale() {
-                Some(_) => (g / (1.0 + h), 0.5 * g * g / (1.0 + h) - 0.5 * h.ln_1p()),
-                None => (1.0, g - 0.5 * h),
-            };
-            all.push(Candidate { term: term.clone(), amplitude, log_bayes, power: h, adapting: -taken.column(i) });
+        let scored = bench.score(DMatrix::from_columns(&columns));
+        for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
+            let free = term.kind.prior_scale().is_some();
+            let (amplitude, log_bayes) = if free { score.of_amplitude() } else { score.of_switch() };
+            let adapting = -scored.taken.column(i);
+            all.push(Candidate { term: term.clone(), amplitude, log_bayes, power: score.power, adapting });
         }
     }
     Ok(all)

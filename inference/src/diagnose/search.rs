@@ -98,6 +98,24 @@ impl Found {
     }
 }
 
+/// `ln` prior of each candidate, given that the library holds the effect.
+fn log_prior(terms: &[Term]) -> Vec<f64> {
+    let mut count: BTreeMap<&str, usize> = BTreeMap::new();
+    terms.iter().for_each(|term| *count.entry(term.kind.word()).or_default() += 1);
+    let kinds = count.len() as f64;
+    terms.iter().map(|term| -(kinds * count[term.kind.word()] as f64).ln()).collect()
+}
+
+/// The price of a first search: what a `ln` Bayes factor has to exceed for even odds, of each candidate.
+pub fn prices(terms: &[Term]) -> Vec<f64> {
+    log_prior(terms).into_iter().map(|prior| -(prior + ((1.0 - UNKNOWN) * ODDS).ln())).collect()
+}
+
+/// The same of something without a class.
+pub fn price_of(discrepancy: &Discrepancy) -> f64 {
+    -(UNKNOWN * ODDS / (SORTS * discrepancy.sites) as f64).ln()
+}
+
 /// The candidates of a recording, and what they are worth beforehand.
 pub struct Search {
     data: Data,
@@ -109,10 +127,7 @@ pub struct Search {
 impl Search {
     /// A search among candidates.
     pub fn new(data: Data, terms: Vec<Term>) -> Self {
-        let mut count: BTreeMap<&str, usize> = BTreeMap::new();
-        terms.iter().for_each(|term| *count.entry(term.kind.word()).or_default() += 1);
-        let kinds = count.len() as f64;
-        let log_prior = terms.iter().map(|term| -(kinds * count[term.kind.word()] as f64).ln()).collect();
+        let log_prior = log_prior(&terms);
         Self { data, terms, log_prior }
     }
 

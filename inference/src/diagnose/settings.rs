@@ -31,6 +31,11 @@ impl Settings {
         Self { of_frame, powered }
     }
 
+    /// The corrector that is powered in a frame, and the sign of its kick.
+    pub fn kick(&self, frame: usize) -> Option<(usize, f64)> {
+        self.powered[self.of_frame[frame]].map(|(corrector, fifths)| (corrector, fifths.signum() as f64))
+    }
+
     /// Rows frames, columns settings.
     pub fn indicator(&self) -> DMatrix<f64> {
         let mut indicator = DMatrix::zeros(self.of_frame.len(), self.powered.len());

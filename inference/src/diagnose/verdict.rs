@@ -227,11 +227,11 @@ fn capitalised(text: &str) -> String {
     characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
 }
 
-/// The measurement that would take the two most likely causes furthest apart, for what is not settled.
+/// What could be measured, and the labels of the two causes that it would take apart, for what is not settled.
 ///
 /// # Errors
 /// [`EffectError`].
-pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, EffectError> {
+pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu, [String; 2])>, EffectError> {
     if verdict != Verdict::Ambiguous {
         return Ok(None);
     }
@@ -245,15 +245,20 @@ pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);
     let menu = Menu::of(data, &slot.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
-    let best = menu.proposals.first();
     let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label());
-    Ok(best.map(|best| {
+    Ok(Some((menu, [one.label(), against])))
+}
+
+/// The measurement that would take the two most likely causes furthest apart, for what is not settled.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, EffectError> {
+    let Some((menu, [one, against])) = menu(data, found, verdict)? else { return Ok(None) };
+    Ok(menu.proposals.first().map(|best| {
         format!(
-            "A second campaign {} would separate {} from {against}: expected ln Bayes factor {:.1} with both campaigns, {:.1} now",
-            best.what,
-            one.label(),
-            best.separation,
-            menu.present
+            "A second campaign {} would separate {one} from {against}: expected ln Bayes factor {:.1} with both campaigns, {:.1} now",
+            best.what, best.separation, menu.present
         )
     }))
 }

@@ -15,9 +15,9 @@ const SIDE: f64 = 720.0;
 /// See [`SIDE`].
 const CELL: f64 = 40.0;
 /// Width of the colour bar and its distance from the square [px].
-const BAR: f64 = 18.0;
+pub(super) const BAR: f64 = 18.0;
 /// See [`BAR`].
-const AWAY: f64 = 24.0;
+pub(super) const AWAY: f64 = 24.0;
 /// Steps of the colour bar.
 const STEPS: usize = 80;
 
@@ -47,27 +47,28 @@ fn map(title: &str, value: &str, names: &[String], matrix: &DMatrix<f64>) -> Str
     let place = Place { left, top: TITLE + 6.0, right: left + side, bottom: TITLE + 6.0 + side };
     draw(title, place.bottom + margin, |sheet| {
         let plot = Plot::new(sheet, place, slots(names.len()), slots(names.len()));
-        cells(&plot, matrix)?;
+        cells(&plot, matrix, 1.0)?;
         outline(sheet, place)?;
         plot.x_names(names)?;
-        rows(sheet, place, names)?;
-        colour_bar(sheet, Place { left: place.right + AWAY, right: place.right + AWAY + BAR, ..place }, value)
+        row_names(sheet, place, names)?;
+        colour_bar(sheet, Place { left: place.right + AWAY, right: place.right + AWAY + BAR, ..place }, value, 1.0)
     })
 }
 
-fn cells(plot: &Plot, matrix: &DMatrix<f64>) -> Drawn {
+/// Cells of a matrix, the first row at the top; the colours end at `limit` on both sides.
+pub(super) fn cells(plot: &Plot, matrix: &DMatrix<f64>, limit: f64) -> Drawn {
     let last = matrix.nrows() as f64 - 1.0;
     (0..matrix.nrows()).flat_map(|row| (0..matrix.ncols()).map(move |column| (row, column))).try_for_each(
         |(row, column)| {
             let (x, y) = (column as f64, last - row as f64);
             let corners = [plot.spot(x - 0.5, y + 0.5), plot.spot(x + 0.5, y - 0.5)];
-            plot.sheet.draw(&Rectangle::new(corners, colour(matrix[(row, column)]).filled()))
+            plot.sheet.draw(&Rectangle::new(corners, colour(matrix[(row, column)] / limit).filled()))
         },
     )
 }
 
 /// Names on the left, the first at the top.
-fn rows(sheet: &Sheet, place: Place, names: &[String]) -> Drawn {
+pub(super) fn row_names(sheet: &Sheet, place: Place, names: &[String]) -> Drawn {
     let cell = (place.bottom - place.top) / names.len().max(1) as f64;
     names.iter().enumerate().try_for_each(|(row, name)| {
         let at = (place.left - 6.0, place.top + (row as f64 + 0.5) * cell);
@@ -75,7 +76,8 @@ fn rows(sheet: &Sheet, place: Place, names: &[String]) -> Drawn {
     })
 }
 
-fn colour_bar(sheet: &Sheet, place: Place, value: &str) -> Drawn {
+/// The key to the colours, labelled with what the values are.
+pub(super) fn colour_bar(sheet: &Sheet, place: Place, value: &str, limit: f64) -> Drawn {
     let height = |value: f64| place.bottom + (place.top - place.bottom) * (value + 1.0) / 2.0;
     for step in (0..STEPS).rev() {
         let [low, high] = [step, step + 1].map(|edge| 2.0 * edge as f64 / STEPS as f64 - 1.0);
@@ -83,13 +85,15 @@ fn colour_bar(sheet: &Sheet, place: Place, value: &str) -> Drawn {
         sheet.draw(&Rectangle::new(corners, colour((low + high) / 2.0).filled()))?;
     }
     outline(sheet, place)?;
-    for (tick, text) in [(-1.0, "\u{2212}1"), (-0.5, "\u{2212}0.5"), (0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
-        write(sheet, text, (place.right + 6.0, height(tick)), &plain(TICK, HPos::Left))?;
+    for tick in [-1.0, -0.5, 0.0, 0.5, 1.0] {
+        let text = format!("{}", tick * limit).replace('-', "\u{2212}");
+        write(sheet, &text, (place.right + 6.0, height(tick)), &plain(TICK, HPos::Left))?;
     }
     write(sheet, value, (place.right + 46.0, height(0.0)), &upwards(LABEL, HPos::Center))
 }
 
-fn outline(sheet: &Sheet, place: Place) -> Drawn {
+/// A thin black frame.
+pub(super) fn outline(sheet: &Sheet, place: Place) -> Drawn {
     let corners = [(px(place.left), px(place.top)), (px(place.right), px(place.bottom))];
     sheet.draw(&Rectangle::new(corners, BLACK))
 }

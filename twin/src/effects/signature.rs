@@ -83,6 +83,11 @@ impl<'m> Signatures<'m> {
 
     /// Derivative with respect to a gradient (normal, or skew) [1/m] at any place of the ring.
     pub fn of_thin(&self, place: Place, kind: EffectKind) -> Signature {
+        self.as_read(self.unread_thin(place, kind))
+    }
+
+    /// The same, of the orbit itself.
+    fn unread_thin(&self, place: Place, kind: EffectKind) -> Signature {
         let gradient = match kind {
             EffectKind::StraySkewGradient => self.optics.thin_skew_gradient(place),
             _ => self.optics.thin_gradient(place),
@@ -166,7 +171,7 @@ impl<'m> Signatures<'m> {
                 // x'' = -k1 (x cos 2a + y sin 2a)
                 self.of_gradient(&self.optics.skew_gradient(at), -2.0 * k1)
             }
-            EffectKind::StrayGradient | EffectKind::StraySkewGradient => self.of_thin(element(place)?.into(), kind),
+            EffectKind::StrayGradient | EffectKind::StraySkewGradient => self.unread_thin(element(place)?.into(), kind),
             EffectKind::DipoleGradient => {
                 let at = element(place)?;
                 self.of_gradient(&self.optics.gradient(at), 1.0 / ring.elements[at].length)
