@@ -4,7 +4,9 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use host_bridge::cli::{Cli, Command};
-use host_bridge::command::{CommandError, challenge, diagnose, fit, prove, replay, response, serve, study, surrogate, watch};
+use host_bridge::command::{
+    CommandError, challenge, diagnose, fit, prove, replay, response, serve, study, surrogate, watch,
+};
 
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {

@@ -93,7 +93,9 @@ impl Truth {
             {
                 Grade::Right
             }
-            Verdict::Identified if effects.iter().all(|finding| self.effects.iter().any(|effect| effect.is(finding))) => {
+            Verdict::Identified
+                if effects.iter().all(|finding| self.effects.iter().any(|effect| effect.is(finding))) =>
+            {
                 Grade::Partial
             }
             Verdict::Identified => Grade::Wrong,

@@ -166,7 +166,14 @@ impl Answer {
         println!("{table}");
         println!(
             "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
-            self.right, self.partial, self.listed, self.open, self.missed, self.wrong, self.amplitude_chi2, self.amplitudes
+            self.right,
+            self.partial,
+            self.listed,
+            self.open,
+            self.missed,
+            self.wrong,
+            self.amplitude_chi2,
+            self.amplitudes
         );
     }
 }

@@ -103,9 +103,8 @@ fn all(
     let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let work = || -> Result<(), CommandError> {
         while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
-            let outcome = prove(ring, template, case).map_err(|error: DataError| {
-                CommandError::Other(format!("campaign {}: {error}", case.index))
-            })?;
+            let outcome = prove(ring, template, case)
+                .map_err(|error: DataError| CommandError::Other(format!("campaign {}: {error}", case.index)))?;
             if let Some(outcome) = outcome {
                 append(&file, seed, &outcome).map_err(wrong)?;
                 outcomes.lock().expect("no thread panics with it").push(outcome);

@@ -92,7 +92,8 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     if speaking.is_empty() {
         return Ok(Vec::new());
     }
-    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+    let (machine, drives) =
+        fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
     let predicted = machine.readings(&drives)?.0;
     let mut all = Vec::new();
     for &b in &speaking {

@@ -164,7 +164,8 @@ impl Fitted {
             let sigma = covariance[(i, i)].sqrt();
             log_inside += (normal_cdf((upper - here.u[i]) / sigma) - normal_cdf((lower - here.u[i]) / sigma)).ln();
         }
-        let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>() - pinned.len() as f64 * HELD.ln();
+        let log_det =
+            2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>() - pinned.len() as f64 * HELD.ln();
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
         let hypothesis = hypothesis.clone();
         let Point { u, residual, cost } = here;
@@ -309,7 +310,8 @@ fn within(
 fn log_tail(g: f64, h: f64) -> f64 {
     // exp(z^2/2) (1 - cdf(z))/sqrt(h), z = g/sqrt(h); its asymptote where the tail underflows
     let z = g / h.sqrt();
-    let scaled = if z < 25.0 { (0.5 * z * z).exp() * normal_cdf(-z) } else { 1.0 / (z * core::f64::consts::TAU.sqrt()) };
+    let scaled =
+        if z < 25.0 { (0.5 * z * z).exp() * normal_cdf(-z) } else { 1.0 / (z * core::f64::consts::TAU.sqrt()) };
     scaled.ln() - 0.5 * h.ln()
 }
 

@@ -111,10 +111,10 @@ impl Hypothesis {
         less
     }
 
-    /// The effects without an amplitude alone: what is large enough to matter for the curvature of the orbits.
-    pub fn of_switches(&self) -> Self {
-        let large = |term: &&Term| term.kind.prior_scale().is_none() && term.kind != EffectKind::BpmSwap;
-        Self { terms: self.terms.iter().filter(large).cloned().collect(), ..Self::default() }
+    /// The reversed correctors alone: what is large enough to matter for the curvature of the orbits.
+    pub fn reversed_correctors(&self) -> Self {
+        let reversed = |term: &&Term| term.kind == EffectKind::CorrectorPolarity;
+        Self { terms: self.terms.iter().filter(reversed).cloned().collect(), ..Self::default() }
     }
 
     /// What is unknown beside the vars.

@@ -25,15 +25,16 @@ const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Share of what the library does not hold.
 const UNKNOWN: f64 = 0.15;
+/// Rounds of competition for all slots.
+const ROUNDS: usize = 2;
 /// Effects at most.
 const MOST: usize = 4;
 /// Leaders that are refitted exactly, and how far behind the first a candidate may be, in nat and relative to the first.
-const LEADERS: usize = 10;
-const BEHIND: f64 = 7.0;
+const LEADERS: usize = 8;
+const BEHIND: f64 = 6.0;
 const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order will do.
-const WORTH: f64 = 0.5;
-
+const WORTH: f64 = 3.0;
 
 /// What may fill a slot.
 #[derive(Debug, Clone)]
@@ -142,25 +143,18 @@ impl Search {
             null = self.straighten(&Hypothesis { scatter, ..Hypothesis::default() })?;
             next = self.slot(&null, 0)?;
         }
-        let mut best = null.clone();
-        let mut first = None;
+        let (mut best, mut slots) = (null.clone(), Vec::new());
         while best.hypothesis.terms.len() < MOST && next.nothing < 1.0 - SUSPICIOUS && next.library() > next.unknown() {
             let Some(fitted) = next.leader() else { break };
-            let switches = best.hypothesis.of_switches();
-            best = self.settle(fitted)?;
-            // the competition for the only effect is the one that it has just won, on the same data
-            first = Some(next);
-            if best.hypothesis.of_switches() != switches {
+            let reversed = best.hypothesis.reversed_correctors();
+            (best, slots) = self.settle(fitted, next)?;
+            if best.hypothesis.reversed_correctors() != reversed {
                 best = self.straighten(&best.hypothesis)?;
                 null = Fitted::of(&self.data, &null.hypothesis, &null.u)?;
-                first = None;
+                slots = (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
             }
             next = self.slot(&best, best.hypothesis.terms.len())?;
         }
-        let slots = match (first, best.hypothesis.terms.len()) {
-            (Some(first), 1) => vec![first],
-            (_, terms) => (0..terms).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?,
-        };
         Ok(Found { data: self.data, null, best, slots, next })
     }
 
@@ -168,7 +162,7 @@ impl Search {
     fn straighten(&mut self, hypothesis: &Hypothesis) -> Result<Fitted, EffectError> {
         let zero = DVector::zeros(self.data.ring.quadrupoles.len());
         let fitted = Fitted::of(&self.data, hypothesis, &zero)?;
-        let machine = hypothesis.of_switches().machine(&self.data, &fitted.params, &[])?.0;
+        let machine = hypothesis.reversed_correctors().machine(&self.data, &fitted.params, &[])?.0;
         // a machine that keeps no beam in one of the settings is not the one that was recorded
         if self.data.bend(&machine).is_err() {
             return Ok(fitted);
@@ -176,26 +170,31 @@ impl Search {
         Fitted::of(&self.data, hypothesis, &fitted.u)
     }
 
-    /// Let all candidates compete for each slot, until the best one is in each.
-    fn settle(&self, fitted: Fitted) -> Result<Fitted, EffectError> {
+    /// Let all candidates compete for each slot, given the others, until the best one is in each. The only effect of a fit has
+    /// just won its competition.
+    fn settle(&self, fitted: Fitted, won: Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
         let mut best = fitted;
-        for _ in 0..2 {
+        if best.hypothesis.terms.len() == 1 {
+            return Ok((best, vec![won]));
+        }
+        for _ in 0..ROUNDS {
+            let mut slots = Vec::new();
             let mut changed = false;
             for i in 0..best.hypothesis.terms.len() {
-                if best.hypothesis.terms.len() == 1 {
-                    break; // the forward step was this competition
-                }
                 let slot = self.without(&best, i)?;
-                let Some(fitted) = slot.leader() else { continue };
-                if fitted.log_evidence > best.log_evidence + 1e-3 {
+                if let Some(fitted) = slot.leader()
+                    && fitted.log_evidence > best.log_evidence + 1e-3
+                {
                     (best, changed) = (fitted, true);
                 }
+                slots.push(slot);
             }
             if !changed {
-                break;
+                return Ok((best, slots));
             }
         }
-        Ok(best)
+        let slots = (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
+        Ok((best, slots))
     }
 
     /// The competition for one of the effects of a fit.

@@ -54,7 +54,8 @@ impl Case {
     pub fn draw(ring: &Ring, template: &Recording, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
         let mut streams = simulate::seeds(seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let mut stream = || streams.next().expect("seeds do not end");
-        let vars = simulate::vars(ring, f64::from(crate::stream::PRIOR_WIDTH), true, stream()).expect("a design has tunes");
+        let vars =
+            simulate::vars(ring, f64::from(crate::stream::PRIOR_WIDTH), true, stream()).expect("a design has tunes");
         let mut random = StdRng::seed_from_u64(stream());
         let mut effect = |index: usize| {
             let kind = EffectKind::ALL[index % EffectKind::ALL.len()];
@@ -71,7 +72,8 @@ impl Case {
             Class::Pair => vec![effect(index), effect(7 * index + 3)],
         };
         let kind = UnknownKind::ALL[index % UnknownKind::ALL.len()];
-        let beyond = if class == Class::Unknown { vec![Unknown::of(kind, ring, template, stream())] } else { Vec::new() };
+        let beyond =
+            if class == Class::Unknown { vec![Unknown::of(kind, ring, template, stream())] } else { Vec::new() };
         Self { index, class, vars, effects, beyond, seed: stream() }
     }
 

@@ -91,7 +91,11 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
 
 /// What the diagnosis thinks most likely where it is least certain, how likely, and whether it is so.
 fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
-    let least = diagnosis.findings.iter().filter(|f| f.kind != "unknown").min_by(|a, b| a.probability.total_cmp(&b.probability));
+    let least = diagnosis
+        .findings
+        .iter()
+        .filter(|f| f.kind != "unknown")
+        .min_by(|a, b| a.probability.total_cmp(&b.probability));
     let nothing = diagnosis.found.nothing();
     match least {
         Some(finding) if diagnosis.verdict != Verdict::Consistent => {
