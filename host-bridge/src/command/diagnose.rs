@@ -36,6 +36,9 @@ struct FindingAnswer {
     kind: &'static str,
     at: String,
     s_m: Option<f64>,
+    /// 95 % credible stretches of the place of a gradient.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    s_interval_m: Vec<[f64; 2]>,
     amplitude: f64,
     sigma: f64,
     unit: &'static str,
@@ -202,6 +205,7 @@ impl FindingAnswer {
             kind: finding.kind,
             at: finding.at.clone(),
             s_m: finding.s,
+            s_interval_m: finding.interval.iter().map(|one| [one.from_m, one.to_m]).collect(),
             amplitude: finding.amplitude.0,
             sigma: finding.amplitude.1,
             unit: finding.unit,

@@ -79,7 +79,7 @@ impl Diagnosis {
         let after = if found.slots.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
         let gains = verdict::gains(data, &found, &before, &after, &folds)?;
         let verdict = Verdict::of(&found, &gains);
-        let findings = verdict::findings(data, &found, &gains, verdict);
+        let findings = verdict::findings(data, &found, &gains, verdict)?;
         progress("held-out correctors");
         let whole = !found.slots.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {

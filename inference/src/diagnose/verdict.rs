@@ -2,6 +2,7 @@
 
 use twin::EffectError;
 
+use super::along::{Along, Interval, thin};
 use super::data::Data;
 use super::heldout::{Fold, Score};
 use super::next::Menu;
@@ -23,6 +24,8 @@ pub enum Verdict {
 
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
+/// Share of the posterior that an interval of the place holds.
+const CREDIBLE: f64 = 0.95;
 
 impl Verdict {
     /// The word for it.
@@ -63,6 +66,8 @@ pub struct Finding {
     pub at: String,
     /// Position along the beam [m].
     pub s: Option<f64>,
+    /// Shortest stretches of the ring that hold 95 % of the posterior of its place, for a gradient.
+    pub interval: Vec<Interval>,
     /// Amplitude and its standard deviation, in `unit`.
     pub amplitude: (f64, f64),
     /// Unit of the amplitude.
@@ -96,6 +101,7 @@ impl Finding {
             kind,
             at,
             s,
+            interval: Vec::new(),
             amplitude: alternative.amplitude,
             unit,
             phrase,
@@ -132,12 +138,24 @@ pub fn gains(
 }
 
 /// One finding for each effect, strongest first; of what is not in the model, the most likely.
-pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Vec<Finding> {
+///
+/// # Errors
+/// [`EffectError`].
+pub fn findings(
+    data: &Data,
+    found: &Found,
+    gains: &[(f64, f64)],
+    verdict: Verdict,
+) -> Result<Vec<Finding>, EffectError> {
     let mut all: Vec<Finding> = Vec::new();
-    for ((slot, term), &gain) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains) {
+    for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
         let is_it = |a: &Alternative| matches!(&a.cause, Cause::Effect(of) if of == term);
         let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
-        all.push(Finding { heldout: Some(gain), ..Finding::of_slot(data, slot, first) });
+        let interval = match thin(term.kind) {
+            Some(kind) => Along::of(data, &found.best, Some(index), kind)?.credible(CREDIBLE),
+            None => Vec::new(),
+        };
+        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first) });
     }
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match verdict {
@@ -146,7 +164,7 @@ pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdi
         _ => None,
     };
     all.extend(open.map(|first| Finding::of_slot(data, &found.next, first)));
-    all
+    Ok(all)
 }
 
 /// In one sentence.

@@ -18,7 +18,7 @@ use twin::{Effect, Ring};
 use crate::diagnose::data::{Data, DataError};
 use crate::diagnose::fit::Fitted;
 use crate::diagnose::hypothesis::Hypothesis;
-use crate::diagnose::{Diagnosis, Verdict};
+use crate::diagnose::{Diagnosis, Finding, Verdict};
 use crate::recording::Recording;
 use crate::score::{Grade, TrueEffect, Truth};
 use crate::simulate::{self, Beyond, Hardware};
@@ -50,6 +50,8 @@ pub struct Outcome {
     pub heldout: (f64, f64),
     /// Pulls of the named amplitudes.
     pub pulls: Vec<f64>,
+    /// Whether the 95 % stretches of the place of an identified gradient hold (or touch the magnet of) the true one.
+    pub covered: Vec<bool>,
     /// NEES per var before and after.
     pub nees: [f64; 2],
     /// Time of the diagnosis [s].
@@ -83,6 +85,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         nothing: diagnosis.found.nothing(),
         heldout: diagnosis.gain(),
         pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
+        covered: covered(ring, &diagnosis, &key),
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
         truth: key.effects,
         seconds,
@@ -108,6 +111,28 @@ fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
             ("unknown".into(), unknown, key.effects.iter().any(|effect| effect.kind == "unknown"))
         }
     }
+}
+
+/// Whether the stretches of identified gradients hold the true places.
+fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
+    let named = |finding: &&Finding| {
+        diagnosis.verdict == Verdict::Identified
+            && !finding.interval.is_empty()
+            && key.effects.iter().any(|effect| effect.is(finding))
+    };
+    let touches = |finding: &Finding| -> Option<bool> {
+        let term = diagnosis.found.best.hypothesis.terms.iter().find(|term| term.place == finding.at)?;
+        let element = &ring.elements[term.element(&diagnosis.found.data)?];
+        let (from, to) = (element.s, element.s + element.length);
+        Some(finding.interval.iter().any(|one| {
+            if one.from_m <= one.to_m {
+                one.from_m <= to && one.to_m >= from
+            } else {
+                one.from_m <= to || one.to_m >= from
+            }
+        }))
+    };
+    diagnosis.findings.iter().filter(named).filter_map(touches).collect()
 }
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given; of what the library does not hold, when
