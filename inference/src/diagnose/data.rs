@@ -11,7 +11,7 @@
 //! its change from start to end.
 
 use estimator::Health;
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
 use training::BoosterGreen;
 use twin::{
     Cycle, Drives, EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring, Signature, Signatures, Tracked,
@@ -39,8 +39,10 @@ pub struct Data {
     /// Readings at the mean supply currents, without what the orbit has beyond first order in kicks and RF offset, rows frames,
     /// columns monitors [m].
     pub readings: DMatrix<f64>,
-    /// The same with it [m].
-    curved: DMatrix<f64>,
+    /// As recorded [m]; one that is missing is not a number.
+    recorded: DMatrix<f64>,
+    /// `ln` of the supplies' factors off their mean, of each frame.
+    fluctuation: [DVector<f64>; 2],
     /// Noise of a reading by the recording's header [m].
     pub expected_noise: f64,
     /// Rms of the baselines in x and y [m].
@@ -50,6 +52,7 @@ pub struct Data {
     channels: Vec<Channel>,
     /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
     tunes: DMatrix<f64>,
+    recorded_tunes: DMatrix<f64>,
     meter: [Option<Meter>; 2],
     /// What each monitor's readings share, in standard deviations, but for the drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
@@ -127,121 +130,109 @@ impl Data {
         let mean = |family: usize| driven.iter().map(|d| d.strength[family]).sum::<f64>() / driven.len() as f64;
         let means = [mean(0), mean(1)];
         let first = first_family(ring);
-        let n = ring.quadrupoles.len();
-        let supplies: Vec<f64> = (0..n).map(|q| means[usize::from(q >= first)]).collect();
+        let supplies: Vec<f64> = (0..ring.quadrupoles.len()).map(|q| means[usize::from(q >= first)]).collect();
+        let fluctuation = [0, 1].map(|family| {
+            DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
+        });
         let mut drives = drives_of(recording, &driven, ring);
         let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &[])?;
-        let signatures = Signatures::of(&design, &drives)?.of_vars();
-        let mut readings = raw(recording, ring);
-        // what the supplies' fluctuations do to the kicked orbit, and the second order of the RF orbit
-        let off = |family: usize| {
-            DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
-        };
-        for (family, range) in [(0, 0..first), (1, first..n)] {
-            let slope = signatures[range]
-                .iter()
-                .fold(DMatrix::zeros(driven.len(), readings.ncols()), |sum, one| sum + &one.readings);
-            let off = off(family);
-            readings -= DMatrix::from_fn(slope.nrows(), slope.ncols(), |i, b| off[i] * slope[(i, b)]);
-        }
-        let (predicted, tunes, _) = design.readings(&drives)?;
-        // the orbit that the kicks are added to
+        let recorded = raw(recording, ring);
+        let baselines = baselines(&recorded, &design.readings(&drives)?.0, &screened);
         let split = ring.read_places().iter().filter(|(plane, _)| *plane == Plane::X).count();
-        let counts = |frame: usize, b: usize| screened.accepted[frame] >> b & 1 == 1 && !readings[(frame, b)].is_nan();
-        let baselines: Vec<Option<f64>> = (0..readings.ncols())
-            .map(|b| {
-                let frames: Vec<usize> = (0..readings.nrows()).filter(|&i| counts(i, b)).collect();
-                let sum: f64 = frames.iter().map(|&i| readings[(i, b)] - predicted[(i, b)]).sum();
-                (!frames.is_empty()).then(|| sum / frames.len() as f64)
-            })
-            .collect();
-        let rms = |from: usize, to: usize| {
-            let squares: Vec<f64> = baselines[from..to].iter().flatten().map(|b| b * b).collect();
-            (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
-        };
-        let baseline_rms = [rms(0, split), rms(split, readings.ncols())];
+        let baseline_rms = [rms(&baselines[..split]), rms(&baselines[split..])];
         let (orbit, orbit_sigma) = krige(design.ring(), &baselines, baseline_rms)?;
         drives.orbit = orbit;
+        let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
+            recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
+        });
         let tables: BoosterGreen = training::green::tables(ring)?;
         let spurious = [0, 1].map(|plane| f64::from(tables.dispersion.spurious[plane]) * baseline_rms[plane]);
-        let sensitivity = sensitivity(&tunes);
-        let shared = (0..readings.ncols()).map(|b| {
+        let design_tunes = Optics::of(design.ring(), Hold::Momentum { delta: 0.0 })?.tunes()?;
+        let sensitivity = sensitivity(&recorded_tunes, &design_tunes);
+        let shared = |b: usize| {
             let plane = usize::from(b >= split);
             let supply = sensitivity[plane] * baseline_rms[plane];
             DMatrix::from_columns(&[
                 DVector::from_element(driven.len(), BASELINE),
                 &drives.rf_offset * spurious[plane],
-                off(0) * supply,
-                off(1) * supply,
+                &fluctuation[0] * supply,
+                &fluctuation[1] * supply,
             ])
-        });
-        let shared: Vec<_> = shared.collect();
-        let slope = |plane: usize, range: core::ops::Range<usize>| {
-            signatures[range].iter().map(|s| s.tunes[plane]).sum::<f64>()
         };
-        let slopes = [0, 1].map(|plane| [slope(plane, 0..first), slope(plane, first..n)]);
-        let (off_x, off_y) = (off(0), off(1));
-        let tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| match recording.rows[i].tune[plane] {
-            Some(tune) if drives.rf_offset[i] == 0.0 => {
-                tune - slopes[plane][0] * off_x[i] - slopes[plane][1] * off_y[i]
-            }
-            _ => f64::NAN,
-        });
         let mut data = Self {
             ring: ring.clone(),
             orbit_sigma,
             screened,
             supplies,
-            curved: readings.clone(),
-            readings,
+            readings: recorded.clone(),
+            shared: (0..recorded.ncols()).map(shared).collect(),
+            recorded,
+            fluctuation,
             expected_noise: recording.header.bpm_sigma,
             baseline_rms,
             sensitivity,
             channels: Vec::new(),
-            meter: [0, 1].map(|plane| Meter::of(tunes.column(plane).iter().zip(drives.time.iter()))),
-            tunes,
-            shared,
+            meter: [None, None],
+            tunes: recorded_tunes.clone(),
+            recorded_tunes,
             drift: 0.0,
             drives,
         };
         data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, 0.0)).collect();
         data.check(recording)?;
-        data.bend(&design)?;
+        data.straighten(&design)?;
         Ok(data)
     }
 
-    /// Take away from the readings what the exact orbits of a machine have beyond first order: in the bends, by up to some
-    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Repeats of a setting share it.
+    /// Take away from the recorded readings and tunes what depends on the machine, and little on the details of its model: what the
+    /// supplies' fluctuations do to the kicked orbit, to first order, and what exact orbits have beyond first order: by the
+    /// bends' curvature up to some 10 um for kicks of 0.2 mrad, more near an integer tune.
     ///
     /// # Errors
-    /// [`OrbitError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn bend(&mut self, machine: &Machine) -> Result<(), OrbitError> {
+    /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
+    pub fn straighten(&mut self, machine: &Machine) -> Result<(), EffectError> {
+        let beyond = self.beyond(machine)?;
+        let slopes = Signatures::of(machine, &self.drives)?.of_vars();
+        let (mut readings, mut tunes) = (&self.recorded - beyond, self.recorded_tunes.clone());
+        let first = first_family(&self.ring);
+        for (off, range) in self.fluctuation.iter().zip([0..first, first..slopes.len()]) {
+            for slope in &slopes[range] {
+                for (b, mut column) in readings.column_iter_mut().enumerate() {
+                    column -= off.component_mul(&slope.readings.column(b));
+                }
+                tunes -= off * RowVector2::from(slope.tunes);
+            }
+        }
+        (self.readings, self.tunes) = (readings, tunes);
+        self.meter = self.meters();
+        Ok(())
+    }
+
+    /// What the exact orbits of a machine have beyond first order in kicks and RF offset, rows frames; repeats share it [m].
+    fn beyond(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
         let tracked = Tracked::of(machine.clone(), self.drives.nominal_kick)?;
         let settings = Settings::of(&self.drives);
         let drives = settings.means(&self.drives);
-        let (linear, ..) = machine.readings(&drives)?;
         let cycle = |kick: Vec<f64>, rf_offset: f64| {
             let strength = vec![0.0; self.ring.quadrupoles.len()];
             tracked.cycle(&Cycle { kick, strength, rf_offset, time: 0.0 })
         };
         let (plain, _) = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
-        let mut beyond = linear * -1.0;
+        let mut beyond = -machine.readings(&drives)?.0;
         for (i, mut row) in beyond.row_iter_mut().enumerate() {
             let (exact, _) = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
             row.iter_mut().zip(exact.iter().zip(&plain)).for_each(|(to, (exact, plain))| *to += exact - plain);
         }
-        self.readings = DMatrix::from_fn(self.curved.nrows(), self.curved.ncols(), |frame, b| {
-            self.curved[(frame, b)] - beyond[(settings.of_frame[frame], b)]
-        });
-        Ok(())
+        Ok(beyond.select_rows(&settings.of_frame))
     }
 
     /// The same recording with a known signal taken out of its readings and tunes, rows frames.
     pub fn less(&self, readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> Self {
         let mut data = self.clone();
         data.readings -= readings;
-        data.curved -= readings;
+        data.recorded -= readings;
         data.tunes -= tunes;
+        data.recorded_tunes -= tunes;
         data.meter = data.meters();
         data
     }
@@ -475,11 +466,33 @@ fn raw(recording: &Recording, ring: &Ring) -> DMatrix<f64> {
 }
 
 /// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with
-/// the tune: `pi |cot(pi Q) dQ/dln k|`, `dQ/dln k` the natural chromaticity, about the tune itself.
+/// the tune: `pi |cot(pi Q) dQ/dln k|`, `dQ/dln k` the natural chromaticity, about the tune itself. The recorded tune knows how
+/// near the integer is.
 ///
 /// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
-fn sensitivity(tunes: &Tunes) -> [f64; 2] {
-    [tunes.x, tunes.y].map(|q| 1.0 + core::f64::consts::PI * q * (core::f64::consts::PI * q).tan().recip().abs())
+fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
+    let pi = core::f64::consts::PI;
+    [(0, design.x), (1, design.y)].map(|(plane, design)| {
+        let known: Vec<f64> = recorded.column(plane).iter().copied().filter(|tune| !tune.is_nan()).collect();
+        let tune = if known.is_empty() { design } else { known.iter().sum::<f64>() / known.len() as f64 };
+        1.0 + pi * design * (pi * tune).tan().recip().abs()
+    })
+}
+
+/// Mean of each monitor's readings, the kicks' orbit taken off [m]; none for a silent one.
+fn baselines(recorded: &DMatrix<f64>, predicted: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
+    let of = |b: usize| {
+        let counts = |i: &usize| screened.accepted[*i] >> b & 1 == 1 && !recorded[(*i, b)].is_nan();
+        let frames: Vec<usize> = (0..recorded.nrows()).filter(counts).collect();
+        let sum: f64 = frames.iter().map(|&i| recorded[(i, b)] - predicted[(i, b)]).sum();
+        (!frames.is_empty()).then(|| sum / frames.len() as f64)
+    };
+    (0..recorded.ncols()).map(of).collect()
+}
+
+fn rms(values: &[Option<f64>]) -> f64 {
+    let squares: Vec<f64> = values.iter().flatten().map(|v| v * v).collect();
+    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
 }
 
 /// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard

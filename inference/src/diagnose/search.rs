@@ -158,13 +158,13 @@ impl Search {
         Ok(Found { data: self.data, null, best, slots, next })
     }
 
-    /// Fit, and take the curvature of the orbits from the machine that was found.
+    /// Fit, and straighten the readings by the machine that was found.
     fn straighten(&mut self, hypothesis: &Hypothesis) -> Result<Fitted, EffectError> {
         let zero = DVector::zeros(self.data.ring.quadrupoles.len());
         let fitted = Fitted::of(&self.data, hypothesis, &zero)?;
         let machine = hypothesis.reversed_correctors().machine(&self.data, &fitted.params, &[])?.0;
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        if self.data.bend(&machine).is_err() {
+        if self.data.straighten(&machine).is_err() {
             return Ok(fitted);
         }
         Fitted::of(&self.data, hypothesis, &fitted.u)
