@@ -21,6 +21,9 @@ pub struct Answer {
     pub vars: Vec<Var>,
     pub covariance: Vec<Vec<f64>>,
     pub chi2_per_dof: f64,
+    /// The core's alarm: its readings are further off than noise explains.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mismatch: Option<bool>,
     pub tunes: Option<Tunes>,
     pub monitors: Vec<Monitor>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -116,6 +119,7 @@ impl Answer {
             tunes: tunes(ring, &vars),
             vars,
             chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),
+            mismatch: Some(quality.is_mismatch()),
             monitors: monitors(ring, &last.health),
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
@@ -136,6 +140,7 @@ impl Answer {
             covariance: covariance(&vars, |i, j| fit.covariance[(i, j)]),
             vars,
             chi2_per_dof: fit.chi2_per_dof,
+            mismatch: None,
             tunes: Some(Tunes { x: fit.tunes.x, y: fit.tunes.y }),
             monitors: monitors(ring, &fit.screened.health),
             log_evidence: None,
@@ -160,6 +165,7 @@ impl Answer {
             tunes: tunes(ring, &vars),
             vars,
             chi2_per_dof: campaign.fit.chi2_per_dof,
+            mismatch: None,
             monitors: monitors(ring, &campaign.fit.screened.health),
             log_evidence: None,
             timing: None,
@@ -186,6 +192,9 @@ impl Answer {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
         if !clipped.is_empty() {
             println!("at a bound of 0.94..1.06: {}", clipped.join(", "));
+        }
+        if self.mismatch == Some(true) {
+            println!("model and machine disagree beyond the noise: orbitcal diagnose may say why");
         }
         print!("chi2/dof {:.4}", self.chi2_per_dof);
         if let Some(tunes) = &self.tunes {

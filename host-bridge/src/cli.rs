@@ -214,6 +214,9 @@ pub struct Diagnose {
     /// The report, one file with all figures and their numbers
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
+    /// The model with what was identified, for `orbitcal replay --model-file` and for a device
+    #[arg(long, value_name = "FILE")]
+    pub model_out: Option<PathBuf>,
 }
 
 /// `orbitcal challenge`.

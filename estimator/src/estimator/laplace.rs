@@ -18,6 +18,27 @@ pub struct FitQuality {
     pub degrees_of_freedom: f32,
 }
 
+/// Share of chi-square that the baseline orbit's dance with the supplies makes on a machine that is as its model (`docs/model.md`).
+const ORDINARY: f32 = 0.008;
+/// Standard deviations of chi-square beyond which model and machine disagree: one campaign in 700 by chance.
+const DISAGREES: f32 = 3.0;
+
+impl FitQuality {
+    /// How far chi-square is above what a true model leaves, in its standard deviations: `(chi2/dof - 1 - 0.008)/sqrt(2/dof)`.
+    pub fn excess(&self) -> f32 {
+        if self.degrees_of_freedom < 1.0 {
+            return 0.0;
+        }
+        (self.chi_square / self.degrees_of_freedom - 1.0 - ORDINARY) / libm::sqrtf(2.0 / self.degrees_of_freedom)
+    }
+
+    /// The mismatch alarm: the readings of healthy monitors are further off than noise explains. It sees all effects together and
+    /// no single one: of 11,000 readings a missing effect has to take some 250 nat to raise it.
+    pub fn is_mismatch(&self) -> bool {
+        self.excess() > DISAGREES
+    }
+}
+
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f32 = 0.5;
 /// Growth of chi-square that counts as uphill: more than rounding of a chi-square of 1e5.

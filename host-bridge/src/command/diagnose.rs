@@ -1,5 +1,7 @@
 //! `orbitcal diagnose`: what is missing in the model of a recording.
 
+use std::path::Path;
+
 use comfy_table::{Table, presets};
 use inference::diagnose::average::Vars;
 use inference::diagnose::data::DataError;
@@ -11,7 +13,7 @@ use twin::Ring;
 use super::{CommandError, machine, progress, recording};
 use crate::answer::{Monitor, Var, monitors, vars_of};
 use crate::cli::Diagnose;
-use crate::output;
+use crate::{model_file, output};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
@@ -118,11 +120,22 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
         let written = page.write(path);
         written.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
     }
+    let left_out = options.model_out.as_deref().map(|path| write_model(&ring, &diagnosis, path)).transpose()?;
     if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
         answer.print();
+        left_out.iter().flatten().for_each(|kind| println!("\n{kind} is beyond what the core's tables can hold"));
         options.report.iter().for_each(|path| println!("\n{}", path.display()));
     }
     Ok(())
+}
+
+/// Write the core's tables of the machine that was found; returns the kinds of effect that they cannot hold.
+fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<Vec<&'static str>, CommandError> {
+    let vars: Vec<f64> = diagnosis.found.best.params.iter().map(|theta| theta.exp()).collect();
+    let extended = training::extended::tables(ring, &diagnosis.effects(), &vars);
+    let extended = extended.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
+    model_file::write(path, &extended.tables)?;
+    Ok(extended.left_out.iter().map(|effect| effect.kind.word()).collect())
 }
 
 impl Answer {

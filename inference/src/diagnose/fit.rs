@@ -172,6 +172,17 @@ impl Fitted {
         Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, free, slope, u, drifting: None }
     }
 
+    /// The cost at another point; infinite where a var is out of its range.
+    ///
+    /// # Errors
+    /// [`EffectError`] if there is no stable machine.
+    pub fn cost_at(&self, data: &Data, u: &DVector<f64>) -> Result<f64, EffectError> {
+        if u.rows(0, self.params.len()).iter().any(|&u| bounded(u) != u) {
+            return Ok(f64::INFINITY);
+        }
+        Ok(point(self.data(data), &self.hypothesis, u.clone())?.cost)
+    }
+
     /// True where the fit is so far off that its vars are bent out of shape.
     pub fn is_gross(&self) -> bool {
         self.residual.norm_squared() > GROSS * self.residual.len() as f64

@@ -19,12 +19,13 @@ pub mod search;
 pub mod settings;
 pub mod verdict;
 
-use twin::Ring;
+use twin::{Effect, Ring};
 
 use crate::recording::Recording;
 use average::Vars;
 use data::{Data, DataError};
 use heldout::Score;
+use hypothesis::Term;
 use search::{Found, Search};
 pub use verdict::{Finding, Verdict};
 
@@ -104,6 +105,16 @@ impl Diagnosis {
             vars_after,
             next_measurement,
         })
+    }
+
+    /// The effects that were taken up, at their most likely amplitudes.
+    pub fn effects(&self) -> Vec<Effect> {
+        let best = &self.found.best;
+        let of = |(i, term): (usize, &Term)| {
+            let amplitude = best.amplitude(&self.found.data, i).0;
+            Effect { kind: term.kind, place: term.place.clone(), amplitude }
+        };
+        best.hypothesis.terms.iter().enumerate().map(of).collect()
     }
 
     /// Gain of held-out log predictive density by all effects, and its standard error.

@@ -1,23 +1,283 @@
-//! What all outcomes together say.
+//! What all outcomes together say, as numbers and as Markdown.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
 
 use serde::Serialize;
+use statrs::distribution::{Beta, ContinuousCDF};
+use twin::EffectKind;
 
-use super::Outcome;
+use super::{Class, Outcome};
+use crate::score::{Grade, TrueEffect};
 
-/// The tables.
+/// Share of successes among trials, with the 95 % limits of Clopper and Pearson.
+///
+/// Source: C. Clopper and E. Pearson, Biometrika 26 (1934) 404.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Share {
+    /// Successes.
+    pub of: usize,
+    /// Trials.
+    pub trials: usize,
+    /// Lower and upper limit.
+    pub limits: [f64; 2],
+}
+
+/// Verdicts of the campaigns of one row.
+#[derive(Debug, Clone, Default, Serialize)]
+#[allow(missing_docs)] // named after the grades
+pub struct Grades {
+    pub right: usize,
+    pub partial: usize,
+    pub listed: usize,
+    pub open: usize,
+    pub missed: usize,
+    pub wrong: usize,
+}
+
+/// How often a stated probability is right.
+#[derive(Debug, Clone, Serialize)]
+pub struct Reliability {
+    /// Stated probability, from and to.
+    pub bin: [f64; 2],
+    /// Mean of what was stated.
+    pub stated: f64,
+    /// How often it was so.
+    pub is_so: Share,
+}
+
+/// All tables.
 #[derive(Debug, Clone, Serialize)]
 pub struct Tables {
-    outcomes: Vec<Outcome>,
+    /// Empty campaigns that were called consistent, and that had something named.
+    pub empty_consistent: Share,
+    /// See above.
+    pub empty_identified: Share,
+    /// Grades of campaigns with effects of the library, by oracle gain.
+    pub by_gain: Vec<([f64; 2], Grades)>,
+    /// Campaigns beyond the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
+    pub unknown: Vec<([f64; 2], Share, usize)>,
+    /// Single effects named right, by kind and size (weak, medium, strong thirds of the logarithm).
+    pub power: BTreeMap<String, [Share; 3]>,
+    /// Wrong names: what it was, what was said.
+    pub confused: Vec<(String, String)>,
+    /// Stated probabilities.
+    pub reliability: Vec<Reliability>,
+    /// Brier score of the stated probabilities.
+    pub brier: f64,
+    /// Pulls of the amplitudes of named effects: number, mean square, and share within 1 and 2 standard deviations.
+    pub amplitudes: (usize, f64, [Share; 2]),
+    /// 95 % stretches of a gradient's place that hold it.
+    pub places: Share,
+    /// NEES per var before and after, medians of single effects named right.
+    pub nees: [f64; 2],
+    /// Held-out gain in its standard errors, median of effects named right.
+    pub heldout: f64,
+    /// Median and longest time of a diagnosis [s].
+    pub seconds: [f64; 2],
+}
+
+/// Oracle gains that make a row.
+const GAINS: [[f64; 2]; 5] = [[f64::NEG_INFINITY, 4.0], [4.0, 9.0], [9.0, 25.0], [25.0, 100.0], [100.0, f64::INFINITY]];
+/// Thirds of the logarithm of the sizes that are drawn.
+const THIRDS: [f64; 2] = [0.464, 1.077];
+const BINS: [[f64; 2]; 6] = [[0.0, 0.5], [0.5, 0.7], [0.7, 0.85], [0.85, 0.95], [0.95, 0.99], [0.99, 1.01]];
+
+impl Share {
+    /// Count.
+    pub fn of<'o>(outcomes: impl IntoIterator<Item = &'o Outcome>, is: impl Fn(&Outcome) -> bool) -> Self {
+        let (of, trials) = outcomes.into_iter().fold((0, 0), |(of, n), one| (of + usize::from(is(one)), n + 1));
+        Self::new(of, trials)
+    }
+
+    /// Of some trials.
+    pub fn new(of: usize, trials: usize) -> Self {
+        let beta = |a: usize, b: usize, p: f64| Beta::new(a as f64, b as f64).map_or(0.0, |beta| beta.inverse_cdf(p));
+        let lower = if of == 0 { 0.0 } else { beta(of, trials - of + 1, 0.025) };
+        let upper = if of == trials { 1.0 } else { beta(of + 1, trials - of, 0.975) };
+        Self { of, trials, limits: [lower, upper] }
+    }
+
+    fn text(&self) -> String {
+        if self.trials == 0 {
+            return "none".into();
+        }
+        let [lower, upper] = self.limits.map(|limit| 100.0 * limit);
+        format!("{} of {} ({lower:.1} to {upper:.1} %)", self.of, self.trials)
+    }
+}
+
+impl Grades {
+    fn of<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> Self {
+        let mut grades = Self::default();
+        for outcome in outcomes {
+            *match outcome.grade {
+                Grade::Right => &mut grades.right,
+                Grade::Partial => &mut grades.partial,
+                Grade::Listed => &mut grades.listed,
+                Grade::Open => &mut grades.open,
+                Grade::Missed => &mut grades.missed,
+                Grade::Wrong => &mut grades.wrong,
+            } += 1;
+        }
+        grades
+    }
+
+    fn total(&self) -> usize {
+        self.right + self.partial + self.listed + self.open + self.missed + self.wrong
+    }
 }
 
 impl Tables {
     /// Count.
     pub fn of(outcomes: &[Outcome]) -> Self {
-        Self { outcomes: outcomes.to_vec() }
+        let class = |class: Class| outcomes.iter().filter(move |outcome| outcome.class == class);
+        let library = || outcomes.iter().filter(|o| matches!(o.class, Class::Single | Class::Pair));
+        let within = |[from, to]: [f64; 2]| move |o: &&Outcome| (from..to).contains(&o.oracle_gain);
+        let named = |outcome: &Outcome| outcome.verdict == "identified";
+        let undecided = |outcome: &Outcome| matches!(outcome.verdict.as_str(), "unexplained" | "ambiguous");
+        let right = || outcomes.iter().filter(|o| o.grade == Grade::Right && o.class != Class::Empty);
+        let pulls: Vec<f64> = outcomes.iter().flat_map(|o| o.pulls.iter().copied()).collect();
+        let inside = |limit: f64| Share::new(pulls.iter().filter(|p| p.abs() < limit).count(), pulls.len());
+        let covered: Vec<bool> = outcomes.iter().flat_map(|o| o.covered.iter().copied()).collect();
+        let seconds: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
+        Self {
+            empty_consistent: Share::of(class(Class::Empty), |o| o.verdict == "consistent"),
+            empty_identified: Share::of(class(Class::Empty), named),
+            by_gain: GAINS.map(|bin| (bin, Grades::of(library().filter(within(bin))))).into(),
+            unknown: GAINS
+                .map(|bin| {
+                    let of = || class(Class::Unknown).filter(within(bin));
+                    (bin, Share::of(of(), undecided), of().filter(|o| named(o)).count())
+                })
+                .into(),
+            power: power(class(Class::Single)),
+            confused: outcomes.iter().filter(|o| o.grade == Grade::Wrong).map(confusion).collect(),
+            reliability: BINS.iter().filter_map(|&bin| Reliability::of(outcomes, bin)).collect(),
+            brier: mean(outcomes.iter().map(|o| (o.stated.1 - f64::from(u8::from(o.stated.2))).powi(2))),
+            amplitudes: (pulls.len(), mean(pulls.iter().map(|p| p * p)), [inside(1.0), inside(2.0)]),
+            places: Share::new(covered.iter().filter(|covered| **covered).count(), covered.len()),
+            nees: [0, 1].map(|i| median(right().map(|o| o.nees[i]).collect())),
+            heldout: median(right().map(|o| o.heldout.0 / o.heldout.1).collect()),
+            seconds: [median(seconds.clone()), seconds.iter().copied().fold(0.0, f64::max)],
+        }
     }
 
     /// As Markdown.
     pub fn markdown(&self) -> String {
-        String::new()
+        let mut text = String::new();
+        self.write(&mut text).expect("a string takes everything");
+        text
+    }
+
+    fn write(&self, text: &mut String) -> core::fmt::Result {
+        writeln!(text, "All campaigns below are simulated by the exact twin.\n")?;
+        writeln!(text, "| empty campaigns | of all, 95 % limits |\n|---|---|")?;
+        writeln!(text, "| called consistent | {} |", self.empty_consistent.text())?;
+        writeln!(text, "| something named | {} |\n", self.empty_identified.text())?;
+        writeln!(text, "Effects of the library, one or two a campaign, by the oracle's gain in ln posterior:\n")?;
+        writeln!(text, "| oracle gain | campaigns | named right | one of two named | undecided, truth listed | undecided, truth not listed | missed | wrong |")?;
+        writeln!(text, "|---|---|---|---|---|---|---|---|")?;
+        for (bin, grades) in &self.by_gain {
+            let Grades { right, partial, listed, open, missed, wrong } = grades;
+            let total = grades.total();
+            writeln!(text, "| {} | {total} | {right} | {partial} | {listed} | {open} | {missed} | {wrong} |", range(bin))?;
+        }
+        writeln!(text, "\nPhysics beyond the library:\n")?;
+        writeln!(text, "| oracle gain | called unexplained or ambiguous | named as something else |\n|---|---|---|")?;
+        for (bin, share, wrong) in &self.unknown {
+            writeln!(text, "| {} | {} | {wrong} |", range(bin), share.text())?;
+        }
+        writeln!(text, "\nPower: single effects named right, by size (in prior standard deviations; kinds without one: all):\n")?;
+        writeln!(text, "| kind | 0.2 to 0.46 | 0.46 to 1.08 | 1.08 to 2.5 |\n|---|---|---|---|")?;
+        for (kind, shares) in &self.power {
+            let [weak, medium, strong] = shares.map(|s| format!("{} of {}", s.of, s.trials));
+            writeln!(text, "| `{kind}` | {weak} | {medium} | {strong} |")?;
+        }
+        writeln!(text, "\nWrong names: {}\n", if self.confused.is_empty() { "none." } else { "" })?;
+        for (truth, said) in &self.confused {
+            writeln!(text, "- {truth}, called {said}")?;
+        }
+        writeln!(text, "\nStated probability of what is thought most likely (where least certain), and how often it is so:\n")?;
+        writeln!(text, "| stated | mean | is so |\n|---|---|---|")?;
+        for Reliability { bin, stated, is_so } in &self.reliability {
+            writeln!(text, "| {:.2} to {:.2} | {stated:.3} | {} |", bin[0], bin[1].min(1.0), is_so.text())?;
+        }
+        let (number, square, [one, two]) = &self.amplitudes;
+        writeln!(text, "\nBrier score {:.3}.\n", self.brier)?;
+        writeln!(text, "| what | measured |\n|---|---|")?;
+        writeln!(text, "| amplitudes of named effects: mean square pull | {square:.2} of {number} |")?;
+        writeln!(text, "| within one standard deviation | {} |", one.text())?;
+        writeln!(text, "| within two | {} |", two.text())?;
+        writeln!(text, "| 95 % stretch of a gradient's place holds it | {} |", self.places.text())?;
+        writeln!(text, "| NEES per var where named right, median, before and after | {:.2}, {:.2} |", self.nees[0], self.nees[1])?;
+        writeln!(text, "| held-out gain where named right, median, in standard errors | {:.1} |", self.heldout)?;
+        writeln!(text, "| time of one diagnosis beside another, median and longest | {:.1} s, {:.1} s |", self.seconds[0], self.seconds[1])
+    }
+}
+
+impl Reliability {
+    fn of(outcomes: &[Outcome], bin: [f64; 2]) -> Option<Self> {
+        let within: Vec<&Outcome> = outcomes.iter().filter(|o| (bin[0]..bin[1]).contains(&o.stated.1)).collect();
+        let stated = mean(within.iter().map(|o| o.stated.1));
+        let is_so = Share::of(within.iter().copied(), |o| o.stated.2);
+        (!within.is_empty()).then_some(Self { bin, stated, is_so })
+    }
+}
+
+/// Named right, by kind and third of the logarithm of the size.
+fn power<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> BTreeMap<String, [Share; 3]> {
+    let mut counts: BTreeMap<String, [(usize, usize); 3]> = BTreeMap::new();
+    for outcome in outcomes {
+        let Some(effect) = outcome.truth.first() else { continue };
+        let third = size(effect).map_or(2, |size| usize::from(size > THIRDS[0]) + usize::from(size > THIRDS[1]));
+        let (of, trials) = &mut counts.entry(effect.kind.clone()).or_default()[third];
+        *of += usize::from(outcome.grade == Grade::Right);
+        *trials += 1;
+    }
+    counts.into_iter().map(|(kind, thirds)| (kind, thirds.map(|(of, trials)| Share::new(of, trials)))).collect()
+}
+
+/// Amplitude in prior standard deviations, if the kind has one.
+fn size(effect: &TrueEffect) -> Option<f64> {
+    let kind = EffectKind::ALL.iter().find(|kind| kind.word() == effect.kind)?;
+    Some((effect.amplitude? / kind.prior_scale()?).abs())
+}
+
+fn confusion(outcome: &Outcome) -> (String, String) {
+    let truth: Vec<String> = outcome.truth.iter().map(TrueEffect::label).collect();
+    let truth = if truth.is_empty() { "nothing".into() } else { truth.join(" + ") };
+    (format!("{truth} (oracle gain {:.1})", outcome.oracle_gain), outcome.found.join(" + "))
+}
+
+fn range([from, to]: &[f64; 2]) -> String {
+    match (from.is_finite(), to.is_finite()) {
+        (false, _) => format!("below {to:.0}"),
+        (_, false) => format!("above {from:.0}"),
+        _ => format!("{from:.0} to {to:.0}"),
+    }
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
+    if count > 0.0 { sum / count } else { 0.0 }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Clopper and Pearson's limits from their tables: 0 of 300 is below 1.2 %, 8 of 10 between 44.4 and 97.5 %.
+    #[test]
+    fn limits_are_those_of_clopper_and_pearson() {
+        let none = Share::new(0, 300);
+        assert!(none.limits[0] == 0.0 && (none.limits[1] - 0.01222).abs() < 1e-4, "{none:?}");
+        let most = Share::new(8, 10);
+        assert!((most.limits[0] - 0.4439).abs() < 1e-3 && (most.limits[1] - 0.9748).abs() < 1e-3, "{most:?}");
     }
 }

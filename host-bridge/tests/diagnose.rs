@@ -1,0 +1,142 @@
+//! `orbitcal diagnose`, `challenge` and `prove` as users run them, on good and on bad recordings.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn orbitcal(arguments: &[&str]) -> Output {
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    Command::new(env!("CARGO_BIN_EXE_orbitcal")).args(arguments).current_dir(repository).output().unwrap()
+}
+
+fn diagnose(recording: &str) -> Value {
+    let run = orbitcal(&["diagnose", recording, "--json", "-", "--quiet"]);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    serde_json::from_slice(&run.stdout).unwrap()
+}
+
+/// The answer has what the contract says, and the model that comes out fits better in the core.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn an_identified_effect_reaches_the_core() {
+    let folder = tempfile::tempdir().unwrap();
+    let [model, report, before, after] =
+        ["model.bin", "report.html", "before.json", "after.json"].map(|name| folder.path().join(name));
+    let recording = "recordings/concealed/open-04";
+    let run = orbitcal(&[
+        "diagnose",
+        recording,
+        "--json",
+        "-",
+        "--model-out",
+        model.to_str().unwrap(),
+        "--report",
+        report.to_str().unwrap(),
+    ]);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let answer: Value = serde_json::from_slice(&run.stdout).unwrap();
+    assert_eq!(answer["verdict"], "identified");
+    let finding = &answer["findings"][0];
+    assert_eq!((finding["kind"].as_str(), finding["at"].as_str(), finding["unit"].as_str()), (Some("quad_roll"), Some("F2"), Some("rad")));
+    assert!(finding["probability"].as_f64().unwrap() >= 0.95);
+    let gain = |key: &str| answer["fit"][key].as_f64().unwrap();
+    assert!(gain("elpd_gain") > 2.0 * gain("elpd_gain_se"));
+    assert_eq!(answer["vars_before"].as_array().map(Vec::len), Some(48));
+    assert_eq!(answer["vars_after"].as_array().map(Vec::len), Some(48));
+    assert_eq!(answer["monitors"].as_array().map(Vec::len), Some(33));
+    assert!(fs::read_to_string(&report).unwrap().contains("quad_roll"));
+    let core = |path: &Path, more: &[&str]| {
+        let arguments = ["replay", recording, "--quiet", "--service", "orbitcal.DiagnoseTest.v1", "--json", path.to_str().unwrap()];
+        let run = orbitcal(&[arguments.as_slice(), more].concat());
+        assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+        let answer: Value = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+        (answer["chi2_per_dof"].as_f64().unwrap(), answer["mismatch"].as_bool().unwrap())
+    };
+    let (plain, extended) = (core(&before, &[]), core(&after, &["--model-file", model.to_str().unwrap()]));
+    assert!(extended.0 < plain.0 - 0.04, "{plain:?} {extended:?}");
+    assert!(plain.1 && !extended.1, "the core's alarm before, and silence after: {plain:?} {extended:?}");
+}
+
+/// Rewrites the rows of a recording into a folder.
+fn altered(folder: &Path, change: impl Fn(usize, Vec<String>, &[String]) -> Option<Vec<String>>) -> String {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed/open-02");
+    fs::copy(source.join("header.toml"), folder.join("header.toml")).unwrap();
+    let text = fs::read_to_string(source.join("frames.csv")).unwrap();
+    let mut lines = text.lines();
+    let names: Vec<String> = lines.next().unwrap().split(',').map(str::to_owned).collect();
+    let rows = lines.enumerate().filter_map(|(i, line)| change(i, line.split(',').map(str::to_owned).collect(), &names));
+    let body: Vec<String> = core::iter::once(names.join(",")).chain(rows.map(|row| row.join(","))).collect();
+    fs::write(folder.join("frames.csv"), body.join("\n") + "\n").unwrap();
+    folder.to_str().unwrap().to_owned()
+}
+
+/// Too little to tell anything from: one line that says what is too few, or nothing found and what would have been seen.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn bad_recordings_invent_no_effect() {
+    let folder = || tempfile::tempdir().unwrap();
+    let one_corrector = |_: usize, row: Vec<String>, _: &[String]| (row[3] == "A2").then_some(row);
+    let few_frames = |i: usize, row: Vec<String>, _: &[String]| (i < 6).then_some(row);
+    let no_baseline = |_: usize, row: Vec<String>, _: &[String]| (row[4] != "0" || row[5] != "0").then_some(row);
+    let all_dead = |_: usize, mut row: Vec<String>, names: &[String]| {
+        for (cell, name) in row.iter_mut().zip(names) {
+            if name.starts_with("x_") || name.starts_with("y_") {
+                cell.clear();
+            }
+        }
+        Some(row)
+    };
+    for (what, expected) in [("one corrector", "correctors"), ("few frames", "monitors"), ("all dead", "monitors")] {
+        let folder = folder();
+        let recording = match what {
+            "one corrector" => altered(folder.path(), one_corrector),
+            "few frames" => altered(folder.path(), few_frames),
+            _ => altered(folder.path(), all_dead),
+        };
+        let run = orbitcal(&["diagnose", &recording]);
+        let error = String::from_utf8_lossy(&run.stderr).into_owned();
+        assert_eq!(run.status.code(), Some(2), "{what}: {error}");
+        assert!(error.lines().count() == 1 && error.contains(expected) && error.contains("expected at least"), "{what}: {error}");
+    }
+    let folder = folder();
+    let answer = diagnose(&altered(folder.path(), no_baseline));
+    let at = answer["findings"][0]["at"].as_str();
+    assert!(answer["verdict"] == "consistent" || at == Some("x_E6"), "{answer:#}");
+}
+
+#[test]
+fn what_is_no_recording_is_refused() {
+    for arguments in [
+        ["diagnose", "recordings/no-such"].as_slice(),
+        &["challenge", "docs"],
+        &["prove", "recordings/no-such"],
+        &["replay", "recordings/paper-vars", "--model-file", "Cargo.toml"],
+    ] {
+        let run = orbitcal(arguments);
+        assert_eq!(run.status.code(), Some(2), "{arguments:?}");
+        assert_eq!(String::from_utf8_lossy(&run.stderr).lines().count(), 1, "{arguments:?}");
+    }
+}
+
+/// A run that is taken up again does not run a campaign twice, and the tables are the same.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_proof_is_taken_up_where_it_stopped() {
+    let folder = tempfile::tempdir().unwrap();
+    let outcomes = folder.path().join("outcomes.jsonl");
+    let run = |single: &str| {
+        let few = ["--empty", "1", "--single", single, "--pair", "0", "--unknown", "1"];
+        let arguments =
+            ["prove", "recordings/paper-vars", "--json", "-", "--quiet", "--outcomes", outcomes.to_str().unwrap()];
+        let run = orbitcal(&[arguments.as_slice(), few.as_slice()].concat());
+        assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+        let tables: Value = serde_json::from_slice(&run.stdout).unwrap();
+        (tables, fs::read_to_string(&outcomes).unwrap().lines().count())
+    };
+    let (_, first) = run("1");
+    let (tables, second) = run("2");
+    assert_eq!((first, second), (3, 4));
+    assert_eq!(run("2"), (tables, 4));
+}
