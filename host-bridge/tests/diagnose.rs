@@ -39,7 +39,10 @@ fn an_identified_effect_reaches_the_core() {
     let answer: Value = serde_json::from_slice(&run.stdout).unwrap();
     assert_eq!(answer["verdict"], "identified");
     let finding = &answer["findings"][0];
-    assert_eq!((finding["kind"].as_str(), finding["at"].as_str(), finding["unit"].as_str()), (Some("quad_roll"), Some("F2"), Some("rad")));
+    assert_eq!(
+        (finding["kind"].as_str(), finding["at"].as_str(), finding["unit"].as_str()),
+        (Some("quad_roll"), Some("F2"), Some("rad"))
+    );
     assert!(finding["probability"].as_f64().unwrap() >= 0.95);
     let gain = |key: &str| answer["fit"][key].as_f64().unwrap();
     assert!(gain("elpd_gain") > 2.0 * gain("elpd_gain_se"));
@@ -48,7 +51,8 @@ fn an_identified_effect_reaches_the_core() {
     assert_eq!(answer["monitors"].as_array().map(Vec::len), Some(33));
     assert!(fs::read_to_string(&report).unwrap().contains("quad_roll"));
     let core = |path: &Path, more: &[&str]| {
-        let arguments = ["replay", recording, "--quiet", "--service", "orbitcal.DiagnoseTest.v1", "--json", path.to_str().unwrap()];
+        let arguments =
+            ["replay", recording, "--quiet", "--service", "orbitcal.DiagnoseTest.v1", "--json", path.to_str().unwrap()];
         let run = orbitcal(&[arguments.as_slice(), more].concat());
         assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
         let answer: Value = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
@@ -66,7 +70,8 @@ fn altered(folder: &Path, change: impl Fn(usize, Vec<String>, &[String]) -> Opti
     let text = fs::read_to_string(source.join("frames.csv")).unwrap();
     let mut lines = text.lines();
     let names: Vec<String> = lines.next().unwrap().split(',').map(str::to_owned).collect();
-    let rows = lines.enumerate().filter_map(|(i, line)| change(i, line.split(',').map(str::to_owned).collect(), &names));
+    let rows =
+        lines.enumerate().filter_map(|(i, line)| change(i, line.split(',').map(str::to_owned).collect(), &names));
     let body: Vec<String> = core::iter::once(names.join(",")).chain(rows.map(|row| row.join(","))).collect();
     fs::write(folder.join("frames.csv"), body.join("\n") + "\n").unwrap();
     folder.to_str().unwrap().to_owned()
@@ -98,7 +103,10 @@ fn bad_recordings_invent_no_effect() {
         let run = orbitcal(&["diagnose", &recording]);
         let error = String::from_utf8_lossy(&run.stderr).into_owned();
         assert_eq!(run.status.code(), Some(2), "{what}: {error}");
-        assert!(error.lines().count() == 1 && error.contains(expected) && error.contains("expected at least"), "{what}: {error}");
+        assert!(
+            error.lines().count() == 1 && error.contains(expected) && error.contains("expected at least"),
+            "{what}: {error}"
+        );
     }
     let folder = folder();
     let answer = diagnose(&altered(folder.path(), no_baseline));

@@ -110,7 +110,12 @@ fn scatter_of_a_family_is_ordinary() {
             names.into_iter().enumerate().map(|(i, place)| Effect { kind, place, amplitude: wave(i) }).collect();
         let diagnosis = Diagnosis::of(&ring, &simulated(&effects, 8), |_| ()).unwrap();
         assert!(diagnosis.verdict != Verdict::Identified, "{}", diagnosis.sentence);
-        assert_eq!(diagnosis.found.null.hypothesis.scatter.first().map(|s| s.kind), Some(kind), "{}", diagnosis.sentence);
+        assert_eq!(
+            diagnosis.found.null.hypothesis.scatter.first().map(|s| s.kind),
+            Some(kind),
+            "{}",
+            diagnosis.sentence
+        );
     }
 }
 
@@ -150,9 +155,11 @@ fn cases_are_fixed_by_their_number() {
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn the_amplitude_is_that_of_the_exact_posterior() {
     let ring = Ring::booster();
-    for (name, kind, place) in
-        [("open-02", EffectKind::BpmGain, "x_E6"), ("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")]
-    {
+    for (name, kind, place) in [
+        ("open-02", EffectKind::BpmGain, "x_E6"),
+        ("open-04", EffectKind::QuadRoll, "F2"),
+        ("open-08", EffectKind::BpmRoll, "y_C5"),
+    ] {
         let data = Data::of(&ring, &read(&format!("concealed/{name}"))).unwrap();
         let hypothesis = Hypothesis::default().with(Term::new(kind, place));
         let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();

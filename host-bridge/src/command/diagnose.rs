@@ -49,7 +49,6 @@ struct FindingAnswer {
     sentence: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     heldout_gain: Option<[f64; 2]>,
-    #[serde(skip_serializing_if = "Vec::is_empty")]
     alternatives: Vec<FindingAnswer>,
 }
 

@@ -73,7 +73,7 @@ fn known(path: &Path, seed: u64) -> Result<BTreeMap<usize, Outcome>, CommandErro
     for (number, line) in text.lines().enumerate() {
         // a line that a stop cut short is run again
         let Ok((of_seed, outcome)) = serde_json::from_str::<(u64, Outcome)>(line) else {
-            if number + 1 == text.lines().count() {
+            if !line.ends_with('}') && !line.ends_with(']') || number + 1 == text.lines().count() {
                 continue;
             }
             let what = "expected an outcome of this program's version; remove the file to begin anew";
@@ -99,7 +99,12 @@ fn all(
     if let Some(folder) = path.parent() {
         fs::create_dir_all(folder).map_err(wrong)?;
     }
+    // a line that a stop cut short is ended, so that it spoils no other
+    let cut = fs::read(path).is_ok_and(|bytes| bytes.last().is_some_and(|last| *last != b'\n'));
     let file = Mutex::new(OpenOptions::new().create(true).append(true).open(path).map_err(wrong)?);
+    if cut {
+        file.lock().expect("no thread panics with it").write_all(b"\n").map_err(wrong)?;
+    }
     let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let work = || -> Result<(), CommandError> {
         while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {

@@ -10,17 +10,17 @@
 //! Whitened once, everything that follows is plain least squares. The tune meter adds four numbers: the mean of each tune and
 //! its change from start to end.
 
-use estimator::Health;
+use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
 use training::BoosterGreen;
 use twin::{
-    Cycle, Drives, EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring, Signature, Signatures, Tracked,
-    Tunes,
+    Cycle, Drives, Effect, EffectError, EffectKind, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring, Signature,
+    Signatures, Tracked, Tunes,
 };
 
 use super::settings::Settings;
 use crate::map::{Drive, Screened, first_family, screen};
-use crate::recording::{Recording, Row};
+use crate::recording::{BelievedRf, Recording, Row};
 use crate::stream::StreamError;
 
 /// A recording, whitened.
@@ -54,6 +54,8 @@ pub struct Data {
     tunes: DMatrix<f64>,
     recorded_tunes: DMatrix<f64>,
     meter: [Option<Meter>; 2],
+    /// What the operators believe the machine holds instead of the momentum.
+    pub believed: Vec<Effect>,
     /// What each monitor's readings share, in standard deviations, but for the drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
@@ -116,6 +118,10 @@ const BASELINE: f64 = 20e-3;
 const OFFSET: f64 = 0.7e-3;
 /// Calibration error of a tune meter [1], of the order of its resolution.
 const TUNE_CALIBRATION: f64 = 3e-4;
+/// Cotangent of the phase advance of a machine that still keeps its beam.
+const STEEPEST: f64 = 20.0;
+/// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
+const FAULTY: f64 = 4.0;
 /// Monitors and correctors below which nothing can be told apart.
 const LEAST: usize = 4;
 
@@ -135,7 +141,7 @@ impl Data {
             DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
         });
         let mut drives = drives_of(recording, &driven, ring);
-        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &[])?;
+        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed(recording))?;
         let recorded = raw(recording, ring);
         let baselines = baselines(&recorded, &design.readings(&drives)?.0, &screened);
         let split = ring.read_places().iter().filter(|(plane, _)| *plane == Plane::X).count();
@@ -146,9 +152,14 @@ impl Data {
             recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
         });
         let tables: BoosterGreen = training::green::tables(ring)?;
-        let spurious = [0, 1].map(|plane| f64::from(tables.dispersion.spurious[plane]) * baseline_rms[plane]);
         let design_tunes = Optics::of(design.ring(), Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(&recorded_tunes, &design_tunes);
+        // an orbit's change with the momentum grows towards the integer as that with the gradients does
+        let of_design = self::sensitivity(&DMatrix::zeros(0, 2), &design_tunes);
+        let spurious = [0, 1].map(|plane| {
+            let growth = (sensitivity[plane] / of_design[plane]).max(1.0);
+            f64::from(tables.dispersion.spurious[plane]) * baseline_rms[plane] * growth
+        });
         let shared = |b: usize| {
             let plane = usize::from(b >= split);
             let supply = sensitivity[plane] * baseline_rms[plane];
@@ -175,6 +186,7 @@ impl Data {
             meter: [None, None],
             tunes: recorded_tunes.clone(),
             recorded_tunes,
+            believed: believed(recording),
             drift: 0.0,
             drives,
         };
@@ -206,6 +218,19 @@ impl Data {
         (self.readings, self.tunes) = (readings, tunes);
         self.meter = self.meters();
         Ok(())
+    }
+
+    /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the core took for a first reading.
+    pub fn trim(&mut self, residual: &DVector<f64>) {
+        for (r, place) in residual.iter().zip(self.places()) {
+            if let Some((frame, b)) = place
+                && r.abs() > FAULTY
+                && self.health()[b].state != MonitorState::Ok
+            {
+                self.screened.accepted[frame] &= !(1 << b);
+            }
+        }
+        self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
     }
 
     /// What the exact orbits of a machine have beyond first order in kicks and RF offset, rows frames; repeats share it [m].
@@ -270,15 +295,20 @@ impl Data {
     /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
-        let drift = drift * self.sensitivity[plane] * self.baseline_rms[plane];
+        let drift = drift * self.sensitivity[plane];
         let shared = self.shared[b].select_rows(frames);
         if drift == 0.0 {
             return shared;
         }
+        // to second order: near an integer tune an orbit grows faster than the quadrupoles drift
+        let time = |power: i32| {
+            let relative = drift.powi(power) * self.baseline_rms[plane];
+            DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i].powi(power) * relative))
+        };
         let at = shared.ncols();
-        let time = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i] * drift));
-        let mut shared = shared.insert_column(at, 0.0);
-        shared.set_column(at, &time);
+        let mut shared = shared.insert_columns(at, 2, 0.0);
+        shared.set_column(at, &time(1));
+        shared.set_column(at + 1, &time(2));
         shared
     }
 
@@ -440,6 +470,17 @@ impl Meter {
     }
 }
 
+/// What the recording's header says was held, as an effect.
+fn believed(recording: &Recording) -> Vec<Effect> {
+    let pair = recording.header.radial_loop_monitors.as_ref();
+    let one = |kind, place: String| vec![Effect { kind, place, amplitude: 1.0 }];
+    match recording.header.believed_rf {
+        BelievedRf::FixedMomentum => Vec::new(),
+        BelievedRf::FixedFrequency => one(EffectKind::FixedRfFrequency, String::new()),
+        BelievedRf::RadialLoop => pair.map_or_else(Vec::new, |pair| one(EffectKind::RadialLoop, pair.join(","))),
+    }
+}
+
 fn exp(ln: &[f64]) -> Vec<f64> {
     ln.iter().map(|l| l.exp()).collect()
 }
@@ -473,9 +514,9 @@ fn raw(recording: &Recording, ring: &Ring) -> DMatrix<f64> {
 fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
     let pi = core::f64::consts::PI;
     [(0, design.x), (1, design.y)].map(|(plane, design)| {
-        let known: Vec<f64> = recorded.column(plane).iter().copied().filter(|tune| !tune.is_nan()).collect();
+        let known: Vec<f64> = recorded.column(plane).iter().copied().filter(|tune| *tune > 0.0).collect();
         let tune = if known.is_empty() { design } else { known.iter().sum::<f64>() / known.len() as f64 };
-        1.0 + pi * design * (pi * tune).tan().recip().abs()
+        1.0 + pi * design * (pi * tune).tan().recip().abs().min(STEEPEST)
     })
 }
 

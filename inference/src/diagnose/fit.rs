@@ -8,6 +8,8 @@
 //! range counts, of the others the part. The normalisation of the data is the same for all hypotheses but those that change their
 //! covariance, and is counted.
 
+use std::collections::BTreeMap;
+
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{EffectError, EffectKind, Signatures};
@@ -148,10 +150,11 @@ impl Fitted {
         for i in 0..matrix.ncols() {
             matrix[(i, i)] += 1.0;
             if held(i, here.u[i], slope[i]) {
-                log_inside += log_tail(slope[i].abs(), matrix[(i, i)]);
                 pinned.push(i);
             }
         }
+        let whole = matrix.clone();
+        let slope_of_held: BTreeMap<usize, f64> = pinned.iter().map(|&i| (i, slope[i])).collect();
         for &i in &pinned {
             slope[i] = 0.0;
             matrix.row_mut(i).fill(0.0);
@@ -159,6 +162,12 @@ impl Fitted {
             matrix[(i, i)] = HELD;
         }
         let free = matrix.cholesky().expect("1 + J^T J is positive");
+        for &i in &pinned {
+            // the curvature along a held var, the free unknowns adapting
+            let along = whole.column(i).map_with_location(|row, _, h| if pinned.contains(&row) { 0.0 } else { h });
+            let curvature = whole[(i, i)] - along.dot(&free.solve(&along));
+            log_inside += log_tail((slope_of_held[&i]).abs(), curvature);
+        }
         let covariance = free.inverse();
         for i in (0..vars).filter(|i| !pinned.contains(i)) {
             let sigma = covariance[(i, i)].sqrt();

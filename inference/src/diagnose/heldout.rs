@@ -7,7 +7,8 @@
 //! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less what the factors take.
 //!
 //! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
-//! standard error of its mean over frames.
+//! standard error of its mean over readings: given the model they are independent, also within a frame, and an effect of one corrector
+//! has few frames and many readings.
 //!
 //! Source: A. Vehtari, A. Gelman and J. Gabry, Stat. Comput. 27 (2017) 1413, eq. 4 and 23.
 
@@ -29,17 +30,15 @@ const FOLDS: usize = 5;
 
 /// One repeat of every setting in each fold.
 pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
-    let mut seen: BTreeMap<(Option<&str>, u64, u64), usize> = BTreeMap::new();
+    let mut seen: BTreeMap<(Option<&str>, u64, u64), (usize, usize)> = BTreeMap::new();
     let mut folds = vec![Fold::new(); FOLDS];
     for (i, row) in recording.rows.iter().enumerate() {
         let key = (row.corrector.as_deref(), row.setting.to_bits(), row.rf_offset.to_bits());
-        let repeat = seen.entry(key).or_insert(0);
-        folds[*repeat % FOLDS].push(i);
+        let settings = seen.len();
+        let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
+        // settings begin in different folds, so that one that is never repeated does not fall in with all others
+        folds[(*setting + *repeat) % FOLDS].push(i);
         *repeat += 1;
-    }
-    // settings that are never repeated: every fifth frame
-    if seen.values().all(|&repeats| repeats == 1) {
-        folds = (0..FOLDS).map(|fold| (fold..recording.rows.len()).step_by(FOLDS).collect()).collect();
     }
     folds.retain(|fold| !fold.is_empty());
     folds
@@ -62,10 +61,10 @@ pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
 }
 
 /// What the left-out readings say of a hypothesis.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Score {
-    /// Log density of each frame, 0 for one without readings that count.
-    pub log_density: Vec<f64>,
+    /// Log density of each reading, rows frames, columns monitors; 0 for one that does not count.
+    pub log_density: DMatrix<f64>,
     /// Readings.
     pub readings: usize,
     /// Rms of measured minus predicted, monitors in state ok [m].
@@ -80,14 +79,16 @@ impl Score {
     /// # Errors
     /// [`EffectError`].
     pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, EffectError> {
-        let mut score = Self { log_density: vec![0.0; data.readings.nrows()], ..Self::default() };
+        let log_density = DMatrix::zeros(data.readings.nrows(), data.readings.ncols());
+        let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
         let (mut squares, mut plain) = (0.0, 0usize);
         for fold in folds {
             let kept = data.without(fold);
             let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
             for left in predict(data, fit.data(&kept), &fit, fold)? {
                 let z = left.innovation / left.variance.sqrt();
-                score.log_density[left.frame] -= 0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
+                score.log_density[(left.frame, left.monitor)] -=
+                    0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
                 score.readings += 1;
                 score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
                 score.inside[1] += f64::from(u8::from(z.abs() < 2.0));

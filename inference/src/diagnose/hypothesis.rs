@@ -149,7 +149,7 @@ impl Hypothesis {
             params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
         let mut effects: Vec<Effect> =
             self.terms.iter().map(|t| Effect { kind: t.kind, place: t.place.clone(), amplitude: 1.0 }).collect();
-        effects.extend(self.given.iter().cloned());
+        effects.extend(self.given.iter().chain(&data.believed).cloned());
         let mut drives = data.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {

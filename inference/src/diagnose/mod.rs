@@ -33,7 +33,7 @@ pub use verdict::{Finding, Verdict};
 pub const DECISIVE: f64 = 0.95;
 /// Probability of something missing from which on a recording is not consistent: where it is less, naming it would often be
 /// wrong, and too many empty recordings would be suspected.
-pub const SUSPICIOUS: f64 = 0.75;
+pub const SUSPICIOUS: f64 = 0.6;
 /// Standard errors by which held-out frames have to be predicted better.
 pub const PROVEN: f64 = 2.0;
 

@@ -1,7 +1,7 @@
 //! What to measure next: how far one more campaign of the same length would take two causes apart.
 //!
 //! The expected `ln` Bayes factor of the true cause A over B, both amplitudes and all vars free, is half of what B and the vars
-//! cannot imitate of A: with the whitened signatures of the old and the new campaign below each other,
+//! cannot imitate of A (of a rival without an amplitude, of the difference): with the whitened signatures, in prior standard deviations, of the old and the new campaign below each other,
 //!
 //! `gain = (d_A P d_A - (d_A P d_B)^2/(1 + d_B P d_B)) a^2/2`.
 
@@ -53,15 +53,16 @@ impl Menu {
         let vars = fitted.params.len();
         let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
         let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
-        let amplitude = one.1;
+        let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
+        let fixed = other.is_some_and(|other| other.kind.prior_scale().is_none());
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is no proposal
             let Ok(new) = Campaign::of(data, &machine, &drives, one.0, other, weight) else { continue };
-            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude) });
+            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, fixed) });
         }
         proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
-        Ok(Self { present: separation(&[&present], amplitude), proposals })
+        Ok(Self { present: separation(&[&present], amplitude, fixed), proposals })
     }
 }
 
@@ -80,7 +81,8 @@ impl Campaign {
         let columns: Vec<_> = signatures.of_vars().iter().map(|s| data.signature(s) * sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
             let weight = if is_stray(term.kind) { weight } else { 1.0 };
-            Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * weight)
+            let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
+            Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * scale)
         };
         Ok(Self { jacobian: DMatrix::from_columns(&columns), one: of(one)?, other: other.map(of).transpose()? })
     }
@@ -145,7 +147,7 @@ fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
 }
 
 /// Expected `ln` Bayes factor of the first cause over the other.
-fn separation(campaigns: &[&Campaign], amplitude: f64) -> f64 {
+fn separation(campaigns: &[&Campaign], amplitude: f64, fixed: bool) -> f64 {
     let p = campaigns[0].jacobian.ncols();
     let mut normal = DMatrix::identity(p, p);
     let (mut with_one, mut with_other) = (DVector::zeros(p), DVector::zeros(p));
@@ -165,6 +167,10 @@ fn separation(campaigns: &[&Campaign], amplitude: f64) -> f64 {
     let taken = factor.solve(&with_one);
     let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
     let rival = other - with_other.dot(&factor.solve(&with_other));
-    let left = if rival > 0.0 { h - c * c / rival } else { h };
-    0.5 * amplitude * amplitude * left.max(0.0)
+    let left = if fixed {
+        amplitude * amplitude * h - 2.0 * amplitude * c + rival
+    } else {
+        amplitude * amplitude * (h - c * c / (1.0 + rival))
+    };
+    0.5 * left.max(0.0)
 }

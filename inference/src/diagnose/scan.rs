@@ -109,8 +109,11 @@ impl Score {
 /// All candidates that the data can say anything about.
 pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
     let of_kind = |&kind: &EffectKind| members(kind, data);
-    let radial = radial_loop.map(|pair| Term::new(EffectKind::RadialLoop, &pair.join(",")));
-    EffectKind::ALL.iter().flat_map(of_kind).chain(radial).collect()
+    let read = data.ring.monitor_names();
+    let is_read = |pair: &&[String; 2]| pair.iter().all(|name| name.starts_with("x_") && read.contains(name));
+    let radial = radial_loop.filter(is_read).map(|pair| Term::new(EffectKind::RadialLoop, &pair.join(",")));
+    let is_believed = |term: &Term| data.believed.iter().any(|effect| effect.kind == term.kind);
+    EffectKind::ALL.iter().flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
 }
 
 /// Scan them.
@@ -128,9 +131,11 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
             .iter()
             .map(|term| {
                 let scale = term.kind.prior_scale().unwrap_or(1.0);
-                Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * scale)
+                // what leads to no stable machine has nothing to say
+                let signature = signatures.of_effect(term.kind, &term.place);
+                signature.map_or_else(|_| DVector::zeros(data.len()), |one| data.signature(&one) * scale)
             })
-            .collect::<Result<_, EffectError>>()?;
+            .collect();
         let scored = bench.score(DMatrix::from_columns(&columns));
         for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
             let free = term.kind.prior_scale().is_some();

@@ -5,7 +5,7 @@
 //! The posterior weight of a candidate is its prior times its evidence: exact twin, everything refitted, for the leaders; first
 //! order for the rest.
 //!
-//! Forward: the best candidate is taken up as long as "one more" is three times as likely as "no more". Backward: each is taken out
+//! Forward: the best candidate is taken up as long as "one more" is clearly more likely than "no more". Backward: each is taken out
 //! again and all candidates compete for its slot, given the others.
 
 use std::collections::BTreeMap;
@@ -161,7 +161,11 @@ impl Search {
     /// Fit, and straighten the readings by the machine that was found.
     fn straighten(&mut self, hypothesis: &Hypothesis) -> Result<Fitted, EffectError> {
         let zero = DVector::zeros(self.data.ring.quadrupoles.len());
-        let fitted = Fitted::of(&self.data, hypothesis, &zero)?;
+        let mut fitted = Fitted::of(&self.data, hypothesis, &zero)?;
+        if !fitted.is_gross() {
+            self.data.trim(&fitted.residual);
+            fitted = Fitted::of(&self.data, hypothesis, &fitted.u)?;
+        }
         let machine = hypothesis.reversed_correctors().machine(&self.data, &fitted.params, &[])?.0;
         // a machine that keeps no beam in one of the settings is not the one that was recorded
         if self.data.straighten(&machine).is_err() {
@@ -183,7 +187,7 @@ impl Search {
             for i in 0..best.hypothesis.terms.len() {
                 let slot = self.without(&best, i)?;
                 if let Some(fitted) = slot.leader()
-                    && fitted.log_evidence > best.log_evidence + 1e-3
+                    && fitted.hypothesis.terms.last() != best.hypothesis.terms.get(i)
                 {
                     (best, changed) = (fitted, true);
                 }
@@ -346,6 +350,7 @@ const LISTED: f64 = 1e-4;
 impl Slot {
     /// Normalise posterior weights (`ln`, "nothing" having 0).
     fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
+        weights.retain(|(_, weight)| weight.is_finite());
         let largest = weights.iter().map(|(_, weight)| *weight).fold(0.0, f64::max);
         let nothing = (-largest).exp();
         let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();

@@ -5,6 +5,7 @@ use twin::EffectError;
 use super::along::{Along, Interval, thin};
 use super::data::Data;
 use super::heldout::{Fold, Score};
+use super::hypothesis::Term;
 use super::next::Menu;
 use super::search::{Alternative, Cause, Found, Slot};
 use super::{DECISIVE, PROVEN, SUSPICIOUS};
@@ -51,9 +52,17 @@ impl Verdict {
                 (true, false) => Self::Ambiguous,
             };
         }
-        let decided = |slot: &Slot| slot.alternatives.first().is_some_and(|a| a.probability >= DECISIVE);
+        let decided = |(slot, term): (&Slot, &Term)| {
+            let is_it = |a: &&Alternative| matches!(&a.cause, Cause::Effect(of) if of == term);
+            slot.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
+        };
         let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
-        if found.slots.iter().all(decided) && proven { Self::Identified } else { Self::Ambiguous }
+        let whole = 1.0 - next.nothing <= SUSPICIOUS;
+        if found.slots.iter().zip(&found.best.hypothesis.terms).all(decided) && proven && whole {
+            Self::Identified
+        } else {
+            Self::Ambiguous
+        }
     }
 }
 
@@ -182,7 +191,13 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
             format!("{}; held-out frames gain {} nat", phrases("; "), gain.join(" and "))
         }
         Verdict::Ambiguous => ambiguous(findings),
-        Verdict::Unexplained => format!("{}, which no effect of the library describes", phrases("; and ")),
+        Verdict::Unexplained => {
+            let last = findings.last().map_or("", |finding| finding.phrase.as_str());
+            let named = findings.iter().take(findings.len().saturating_sub(1)).map(|finding| finding.phrase.as_str());
+            let named: Vec<&str> = named.collect();
+            let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
+            format!("{named}{last}, which no effect of the library describes")
+        }
     };
     let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
         format!(
@@ -259,7 +274,7 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
         Cause::Effect(term) => Some((a, term)),
         Cause::Unknown(_) => None,
     });
-    let leaders: Vec<(&Alternative, &super::hypothesis::Term)> = effects.take(2).collect();
+    let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);
     let menu = Menu::of(data, &slot.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;

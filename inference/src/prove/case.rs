@@ -57,8 +57,10 @@ impl Case {
         let vars =
             simulate::vars(ring, f64::from(crate::stream::PRIOR_WIDTH), true, stream()).expect("a design has tunes");
         let mut random = StdRng::seed_from_u64(stream());
+        let kinds: Vec<EffectKind> =
+            EffectKind::ALL.iter().copied().filter(|kind| terms.iter().any(|term| term.kind == *kind)).collect();
         let mut effect = |index: usize| {
-            let kind = EffectKind::ALL[index % EffectKind::ALL.len()];
+            let kind = kinds[index % kinds.len()];
             let of_kind: Vec<&Term> = terms.iter().filter(|term| term.kind == kind).collect();
             let term = of_kind.choose(&mut random).expect("every kind has a place");
             let sign = if random.random_bool(0.5) { -1.0 } else { 1.0 };

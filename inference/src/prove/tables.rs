@@ -176,19 +176,29 @@ impl Tables {
         writeln!(text, "| called consistent | {} |", self.empty_consistent.text())?;
         writeln!(text, "| something named | {} |\n", self.empty_identified.text())?;
         writeln!(text, "Effects of the library, one or two a campaign, by the oracle's gain in ln posterior:\n")?;
-        writeln!(text, "| oracle gain | campaigns | named right | one of two named | undecided, truth listed | undecided, truth not listed | missed | wrong |")?;
+        writeln!(
+            text,
+            "| oracle gain | campaigns | named right | one of two named | undecided, truth listed | undecided, truth not listed | missed | wrong |"
+        )?;
         writeln!(text, "|---|---|---|---|---|---|---|---|")?;
         for (bin, grades) in &self.by_gain {
             let Grades { right, partial, listed, open, missed, wrong } = grades;
             let total = grades.total();
-            writeln!(text, "| {} | {total} | {right} | {partial} | {listed} | {open} | {missed} | {wrong} |", range(bin))?;
+            writeln!(
+                text,
+                "| {} | {total} | {right} | {partial} | {listed} | {open} | {missed} | {wrong} |",
+                range(bin)
+            )?;
         }
         writeln!(text, "\nPhysics beyond the library:\n")?;
         writeln!(text, "| oracle gain | called unexplained or ambiguous | named as something else |\n|---|---|---|")?;
         for (bin, share, wrong) in &self.unknown {
             writeln!(text, "| {} | {} | {wrong} |", range(bin), share.text())?;
         }
-        writeln!(text, "\nPower: single effects named right, by size (in prior standard deviations; kinds without one: all):\n")?;
+        writeln!(
+            text,
+            "\nPower: single effects named right, by size (in prior standard deviations; kinds without one: all):\n"
+        )?;
         writeln!(text, "| kind | 0.2 to 0.46 | 0.46 to 1.08 | 1.08 to 2.5 |\n|---|---|---|---|")?;
         for (kind, shares) in &self.power {
             let [weak, medium, strong] = shares.map(|s| format!("{} of {}", s.of, s.trials));
@@ -198,7 +208,10 @@ impl Tables {
         for (truth, said) in &self.confused {
             writeln!(text, "- {truth}, called {said}")?;
         }
-        writeln!(text, "\nStated probability of what is thought most likely (where least certain), and how often it is so:\n")?;
+        writeln!(
+            text,
+            "\nStated probability of what is thought most likely (where least certain), and how often it is so:\n"
+        )?;
         writeln!(text, "| stated | mean | is so |\n|---|---|---|")?;
         for Reliability { bin, stated, is_so } in &self.reliability {
             writeln!(text, "| {:.2} to {:.2} | {stated:.3} | {} |", bin[0], bin[1].min(1.0), is_so.text())?;
@@ -210,9 +223,17 @@ impl Tables {
         writeln!(text, "| within one standard deviation | {} |", one.text())?;
         writeln!(text, "| within two | {} |", two.text())?;
         writeln!(text, "| 95 % stretch of a gradient's place holds it | {} |", self.places.text())?;
-        writeln!(text, "| NEES per var where named right, median, before and after | {:.2}, {:.2} |", self.nees[0], self.nees[1])?;
+        writeln!(
+            text,
+            "| NEES per var where named right, median, before and after | {:.2}, {:.2} |",
+            self.nees[0], self.nees[1]
+        )?;
         writeln!(text, "| held-out gain where named right, median, in standard errors | {:.1} |", self.heldout)?;
-        writeln!(text, "| time of one diagnosis beside another, median and longest | {:.1} s, {:.1} s |", self.seconds[0], self.seconds[1])
+        writeln!(
+            text,
+            "| time of one diagnosis beside another, median and longest | {:.1} s, {:.1} s |",
+            self.seconds[0], self.seconds[1]
+        )
     }
 }
 
