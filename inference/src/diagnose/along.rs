@@ -203,7 +203,7 @@ mod tests {
             let hypothesis = Hypothesis { terms: vec![Term::new(kind, place)], ..Hypothesis::default() };
             let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;
-            data.bend(&machine).unwrap();
+            data.straighten(&machine).unwrap();
             let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
             let along = Along::of(&data, &fitted, Some(0), kind).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;

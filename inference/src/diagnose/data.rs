@@ -336,7 +336,7 @@ impl Data {
     }
 
     /// Number of whitened numbers.
-    pub fn len(&self) -> usize {
+    pub fn size(&self) -> usize {
         self.channels.iter().map(|c| c.frames.len()).sum::<usize>() + 4
     }
 
@@ -364,7 +364,7 @@ impl Data {
     }
 
     fn whiten(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
-        let mut all = DVector::zeros(self.len());
+        let mut all = DVector::zeros(self.size());
         let mut at = 0;
         for (b, channel) in self.channels.iter().enumerate() {
             let n = channel.frames.len();
@@ -536,11 +536,14 @@ fn rms(values: &[Option<f64>]) -> f64 {
     (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
 }
 
+/// Orbit (x, y) at every element, and its standard deviation [m].
+type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
+
 /// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard
 /// deviation: kicks of random size at all quadrupoles, as many as explain the baselines' rms.
 ///
 /// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
-fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<(Vec<[f64; 2]>, Vec<[f64; 2]>), OrbitError> {
+fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let (mut orbit, mut sigma) = (vec![[0.0; 2]; ring.elements.len()], vec![[0.0; 2]; ring.elements.len()]);
     let places = ring.read_places();

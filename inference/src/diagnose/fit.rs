@@ -387,7 +387,7 @@ fn differentiate(
     let (_, sigma) = prior();
     let (machine, drives) = hypothesis.machine(data, &params_of(&here.u, vars), &here.u.as_slice()[vars..])?;
     let signatures = Signatures::of(&machine, &drives)?;
-    let mut jacobian = DMatrix::zeros(data.len(), vars + unknowns.len());
+    let mut jacobian = DMatrix::zeros(data.size(), vars + unknowns.len());
     for (q, signature) in signatures.of_vars().iter().enumerate() {
         jacobian.set_column(q, &(data.signature(signature) * sigma));
     }

@@ -133,7 +133,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
                 let scale = term.kind.prior_scale().unwrap_or(1.0);
                 // what leads to no stable machine has nothing to say
                 let signature = signatures.of_effect(term.kind, &term.place);
-                signature.map_or_else(|_| DVector::zeros(data.len()), |one| data.signature(&one) * scale)
+                signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
             })
             .collect();
         let scored = bench.score(DMatrix::from_columns(&columns));

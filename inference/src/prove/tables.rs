@@ -1,7 +1,7 @@
 //! What all outcomes together say, as numbers and as Markdown.
 
+use core::fmt::Write;
 use std::collections::BTreeMap;
-use std::fmt::Write;
 
 use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF};
