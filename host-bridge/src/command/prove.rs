@@ -1,11 +1,11 @@
 //! `orbitcal prove`: simulated blind campaigns through the diagnosis, on all cores, to be taken up again where it stopped.
 
+use core::sync::atomic::{AtomicUsize, Ordering};
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
 use std::path::Path;
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use inference::Recording;
 use inference::diagnose::data::{Data, DataError};
