@@ -93,7 +93,7 @@ fn bad_recordings_invent_no_effect() {
         }
         Some(row)
     };
-    for (what, expected) in [("one corrector", "correctors"), ("few frames", "monitors"), ("all dead", "monitors")] {
+    for (what, expected) in [("one corrector", "correctors"), ("few frames", "correctors"), ("all dead", "monitors")] {
         let folder = folder();
         let recording = match what {
             "one corrector" => altered(folder.path(), one_corrector),

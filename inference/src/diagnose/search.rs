@@ -297,11 +297,16 @@ impl Search {
                 }
             }
         }
-        let price = ((FAMILIES.len() * 4) as f64).ln();
+        let price = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
         Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
     }
 }
 
+/// Widths that are tried of each family.
+const WIDTHS: usize = 3;
+/// By how much scatter of a whole family has to describe the readings better than any single effect [nat]: where rolls imitate each
+/// other a family can stand in for any of them.
+const CLEARLY: f64 = 6.0;
 /// Families whose members all scatter a little, and the widths tried, in the unit of the kind.
 ///
 /// Source: alignment and calibration tolerances, from good to poor (1 to 5 % of gain, 5 to 30 mrad; 1 to 5 mrad of a quadrupole).
