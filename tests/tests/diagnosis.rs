@@ -72,7 +72,7 @@ fn every_kind_is_found_when_it_is_strong() {
         let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == kind);
         let seen = of_kind.max_by(|a, b| a.power.total_cmp(&b.power)).unwrap();
         // a gain of 40 nat, if the prior allows it
-        let size = (80.0 / seen.power).sqrt().min(2.5);
+        let size = (80.0 / seen.power).sqrt().min(if kind == EffectKind::MomentumOffset { 1.0 } else { 2.0 });
         let amplitude = kind.prior_scale().map_or(1.0, |scale| size * scale);
         let effect = Effect { kind, place: seen.term.place.clone(), amplitude };
         let diagnosis = Diagnosis::of(&ring, &simulated(core::slice::from_ref(&effect), 5), |_| ()).unwrap();
