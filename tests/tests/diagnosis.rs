@@ -20,11 +20,16 @@ fn read(name: &str) -> Recording {
     Recording::read(&repository("recordings").join(name), &stream::layout(&Ring::booster())).unwrap()
 }
 
-fn simulated(effects: &[Effect], seed: u64) -> Recording {
+/// A blind campaign; none if its machine keeps no beam.
+fn tracked(effects: &[Effect], seed: u64) -> Option<Recording> {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let vars = simulate::vars(&ring, 0.03, true, seed).unwrap();
     let truth = simulate::Truth { vars: &vars, effects, beyond: &[] };
-    simulate::campaign(&template, &ring, &truth, &Hardware::shipped(&ring, &template), seed).unwrap()
+    simulate::campaign(&template, &ring, &truth, &Hardware::shipped(&ring, &template), seed).ok()
+}
+
+fn simulated(effects: &[Effect], seed: u64) -> Recording {
+    tracked(effects, seed).unwrap()
 }
 
 /// The recordings of an independent code. Where the oracle's gain is 2.7 (open-06) nothing can be known: an empty campaign
@@ -61,7 +66,7 @@ fn concealed_effects_are_found_and_only_those() {
 
 /// Each kind alone at the strong end of what is drawn, at a place that the campaign sees well.
 #[test]
-#[ignore = "fails for some kinds: which of them, and why, is open"]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn every_kind_is_found_when_it_is_strong() {
     let ring = Ring::booster();
     let data = Data::of(&ring, &simulated(&[], 5)).unwrap();
@@ -71,11 +76,16 @@ fn every_kind_is_found_when_it_is_strong() {
     for &kind in EffectKind::ALL {
         let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == kind);
         let seen = of_kind.max_by(|a, b| a.power.total_cmp(&b.power)).unwrap();
-        // a gain of 40 nat, if the prior allows it
-        let size = (80.0 / seen.power).sqrt().min(if kind == EffectKind::MomentumOffset { 1.0 } else { 2.0 });
-        let amplitude = kind.prior_scale().map_or(1.0, |scale| size * scale);
-        let effect = Effect { kind, place: seen.term.place.clone(), amplitude };
-        let diagnosis = Diagnosis::of(&ring, &simulated(core::slice::from_ref(&effect), 5), |_| ()).unwrap();
+        // a gain of 40 nat, if the prior allows it and the beam is kept
+        let largest = (80.0 / seen.power).sqrt().min(2.0);
+        let sized = |size: f64| {
+            let amplitude = kind.prior_scale().map_or(1.0, |scale| size * scale);
+            let effect = Effect { kind, place: seen.term.place.clone(), amplitude };
+            Some((size, tracked(core::slice::from_ref(&effect), 5)?, effect))
+        };
+        let kept = (0..6).find_map(|halvings| sized(largest * 0.5_f64.powi(halvings)));
+        let (size, recording, effect) = kept.unwrap_or_else(|| panic!("no {} keeps the beam", kind.word()));
+        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
         let expected = 0.5 * seen.power * if kind.prior_scale().is_some() { size * size } else { 1.0 };
         let first = diagnosis.findings.first();
         let found = first.is_some_and(|f| {

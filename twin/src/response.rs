@@ -18,7 +18,7 @@
 //!
 //! Source: S. Y. Lee, Accelerator Physics, ch. 2; J. Safranek, NIM A 388 (1997) 27 for the use.
 
-use nalgebra::{DMatrix, Matrix4, Matrix5, Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix4, Matrix5, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y};
@@ -162,6 +162,13 @@ impl<'r> Optics<'r> {
         Observer { place, row: self.transfer(place).row(index).into_owned() }
     }
 
+    /// An observer of the slope in a plane, `dp/p0`, at a place.
+    pub fn observe_slope(&self, place: impl Into<Place>, plane: Plane) -> Observer {
+        let place = place.into();
+        let index = if plane == Plane::X { PX } else { PY };
+        Observer { place, row: self.transfer(place).row(index).into_owned() }
+    }
+
     /// A thin kick `(dx', dy')` of the given direction at a place.
     pub fn kick(&self, place: impl Into<Place>, direction: [f64; 2]) -> Source {
         let place = place.into();
@@ -268,6 +275,11 @@ impl<'r> Optics<'r> {
     /// Dispersion seen by an observer [m], momentum deviations closed at any hold.
     pub fn dispersion(&self, observer: &Observer) -> f64 {
         (observer.row * self.dispersive)[0]
+    }
+
+    /// The same of some observers.
+    pub fn dispersion_of(&self, observers: &[Observer]) -> DVector<f64> {
+        DVector::from_iterator(observers.len(), observers.iter().map(|observer| self.dispersion(observer)))
     }
 
     /// Derivative of [`Optics::dispersion`], rows observers, columns gradients.

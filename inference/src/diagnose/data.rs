@@ -78,6 +78,8 @@ struct Channel {
 #[derive(Debug, Clone)]
 struct Meter {
     value: Vector2<f64>,
+    /// Noise of one frame's tune.
+    noise: f64,
     /// Whitens (value, change).
     whiten: Matrix2<f64>,
 }
@@ -117,7 +119,7 @@ const BASELINE: f64 = 20e-3;
 /// Offset of a monitor from the orbit [m]: what surveys of such monitors find.
 const OFFSET: f64 = 0.7e-3;
 /// Calibration error of a tune meter [1], of the order of its resolution.
-const TUNE_CALIBRATION: f64 = 3e-4;
+pub const TUNE_CALIBRATION: f64 = 3e-4;
 /// Cotangent of the phase advance of a machine that still keeps its beam.
 const STEEPEST: f64 = 20.0;
 /// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
@@ -198,11 +200,12 @@ impl Data {
 
     /// Take away from the recorded readings and tunes what depends on the machine, and little on the details of its model: what the
     /// supplies' fluctuations do to the kicked orbit, to first order, and what exact orbits have beyond first order: by the
-    /// bends' curvature up to some 10 um for kicks of 0.2 mrad, more near an integer tune.
+    /// bends' curvature up to some 10 um for kicks of 0.2 mrad, more near an integer tune. Returns the chi-square of what the
+    /// readings change by.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn straighten(&mut self, machine: &Machine) -> Result<(), EffectError> {
+    pub fn straighten(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let beyond = self.beyond(machine)?;
         let slopes = Signatures::of(machine, &self.drives)?.of_vars();
         let (mut readings, mut tunes) = (&self.recorded - beyond, self.recorded_tunes.clone());
@@ -215,9 +218,10 @@ impl Data {
                 tunes -= off * RowVector2::from(slope.tunes);
             }
         }
+        let moved = self.whiten(|b, frame| readings[(frame, b)] - self.readings[(frame, b)], [Vector2::zeros(); 2]);
         (self.readings, self.tunes) = (readings, tunes);
         self.meter = self.meters();
-        Ok(())
+        Ok(moved.norm_squared())
     }
 
     /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the core took for a first reading.
@@ -354,6 +358,18 @@ impl Data {
         self.whiten(|b, frame| self.readings[(frame, b)] - predicted[(frame, b)], miss)
     }
 
+    /// Readings [m] and tunes [1] as columns, less those predicted; a tune is known up to an integer.
+    pub fn miss(&self, predicted: &DMatrix<f64>) -> DMatrix<f64> {
+        let monitors = self.readings.ncols();
+        let mut miss = -predicted;
+        let mut part = miss.columns_mut(0, monitors);
+        part += &self.readings;
+        let mut part = miss.columns_mut(monitors, 2);
+        part += &self.tunes;
+        part.apply(|tune| *tune -= tune.round());
+        miss
+    }
+
     /// A signature, whitened.
     pub fn signature(&self, signature: &Signature) -> DVector<f64> {
         let tunes = [0, 1].map(|plane| {
@@ -394,6 +410,16 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
+    /// What of a monitor's residuals is its own and not shared by its readings, at the most likely factors of what is shared:
+    /// `(1 - Q D^2/(1 + D^2) Q^T) r`, and how many numbers that takes. `residual` has a row for every frame.
+    pub fn own(&self, b: usize, residual: &DVector<f64>) -> (DVector<f64>, f64) {
+        let channel = &self.channels[b];
+        let counting = residual.select_rows(&channel.frames);
+        let share = channel.shrink.map(|shrink| 1.0 - (1.0 - shrink).powi(2));
+        let along = channel.basis.tr_mul(&counting).component_mul(&share);
+        (counting - &channel.basis * along, share.sum())
+    }
+
     /// Whiten columns over all frames as readings of one monitor.
     pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let channel = &self.channels[b];
@@ -422,6 +448,17 @@ impl Data {
     /// Noise of one reading of a monitor [m].
     pub fn noise(&self, b: usize) -> f64 {
         self.channels[b].sigma
+    }
+
+    /// Frames in which a tune counts.
+    pub fn tune_frames(&self, plane: usize) -> Vec<usize> {
+        let counts = |&frame: &usize| self.meter[plane].is_some() && !self.tunes[(frame, plane)].is_nan();
+        (0..self.tunes.nrows()).filter(counts).collect()
+    }
+
+    /// Noise of one reading of the tune meter [1], if it has been read often enough.
+    pub fn tune_noise(&self, plane: usize) -> Option<f64> {
+        self.meter[plane].as_ref().map(|meter| meter.noise)
     }
 
     /// State of the monitors.
@@ -456,11 +493,12 @@ impl Meter {
         let normal = points.iter().fold(Matrix2::zeros(), |sum, &(t, _)| sum + Matrix2::new(1.0, t, t, t * t));
         let moment = points.iter().fold(Vector2::zeros(), |sum, &(t, tune)| sum + Vector2::new(tune, t * tune));
         let value = normal.try_inverse()? * moment;
-        let squares: f64 = points.iter().map(|&(t, tune)| (tune - value[0] - value[1] * t).powi(2)).sum();
-        let noise = squares / (points.len() - 2) as f64;
-        let covariance = normal.try_inverse()? * noise + Matrix2::new(TUNE_CALIBRATION.powi(2), 0.0, 0.0, 0.0);
+        // from one frame to the next, as the tune itself may move
+        let squares: f64 = points.windows(2).map(|pair| (pair[1].1 - pair[0].1).powi(2)).sum();
+        let variance = 0.5 * squares / (points.len() - 1) as f64;
+        let covariance = normal.try_inverse()? * variance + Matrix2::new(TUNE_CALIBRATION.powi(2), 0.0, 0.0, 0.0);
         let whiten = covariance.cholesky()?.l().try_inverse()?;
-        Some(Self { value, whiten })
+        Some(Self { value, noise: variance.sqrt(), whiten })
     }
 
     fn miss(&self, predicted: Vector2<f64>) -> Vector2<f64> {

@@ -27,6 +27,10 @@ pub enum Where {
     MonitorInTime(usize),
     /// A monitor's gain, as time goes by.
     GainInTime(usize),
+    /// A monitor that reads another sum of position and slope in both planes than its own position.
+    MonitorElsewhere(usize),
+    /// A monitor that reads another function of its position.
+    MonitorCurve(usize),
     /// At a corrector.
     Corrector(usize),
     /// At a place in the ring (a quadrupole's entrance) that kicks the beam in a plane.
@@ -35,6 +39,8 @@ pub enum Where {
     QuadrupoleInTime(usize),
     /// All monitors, as time goes by.
     Time,
+    /// The tunes, as time goes by.
+    Tunes,
     /// Everywhere.
     Everywhere,
 }
@@ -53,11 +59,13 @@ pub struct Discrepancy {
 }
 
 /// Sorts of places, which share the prior.
-pub const SORTS: usize = 8;
+pub const SORTS: usize = 11;
 /// Standard deviations tried [m].
 const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
 /// Stretches of time.
 const STRETCHES: usize = 8;
+/// Highest power of the position in what a monitor may read.
+const POWERS: usize = 5;
 
 /// Sums of one monitor's whitened numbers over cells (settings or stretches of time).
 struct Cells {
@@ -94,32 +102,38 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     }
     let (machine, drives) =
         fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
-    let predicted = machine.readings(&drives)?.0;
+    let predicted = fitted.predicted(data)?;
+    let miss = data.miss(&predicted);
+    let signatures = Signatures::of(&machine, &drives)?;
     let mut all = Vec::new();
     for &b in &speaking {
         all.push(bench.judge(Where::Monitor(b), &cells[b], speaking.len()));
         all.push(bench.judge(Where::MonitorInTime(b), &steps[b], speaking.len()));
         let gains = data.cells(b, fitted, &scaled(&stretches, &predicted.column(b)));
         all.push(bench.judge(Where::GainInTime(b), &gains, speaking.len()));
+        let orbit = signatures.around(b);
+        let elsewhere = data.cells(b, fitted, &independent(orbit.clone()));
+        all.push(bench.judge(Where::MonitorElsewhere(b), &elsewhere, speaking.len()));
+        let curve = data.cells(b, fitted, &independent(powers(&orbit.column(0))));
+        all.push(bench.judge(Where::MonitorCurve(b), &curve, speaking.len()));
     }
     let driven = data.driven_correctors();
     for &c in &driven {
         let of_corrector = settings.of_corrector(c);
         all.push(bench.judge(Where::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
     }
-    let (machine, drives) =
-        fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
     for (quadrupole, plane, pattern) in patterns {
         all.push(bench.judge(Where::Ring(quadrupole, plane), &weighted(&cells, &speaking, &pattern), sites));
     }
-    let signatures = Signatures::of(&machine, &drives)?;
     let of_vars = signatures.of_vars();
     for (q, signature) in of_vars.iter().enumerate() {
         let pattern = data.stepped(signature, fitted, &stretches);
         all.push(bench.judge(Where::QuadrupoleInTime(q), &pattern, of_vars.len()));
     }
+    let tunes: Vec<Cells> = [0, 1].into_iter().filter_map(|plane| data.tune_cells(plane, &miss, &stretches)).collect();
+    all.push(bench.judge_held(Where::Tunes, tunes.iter()));
     all.push(bench.judge_held(Where::Time, speaking.iter().map(|&b| &steps[b])));
     all.push(bench.judge_held(Where::Everywhere, speaking.iter().map(|&b| &cells[b])));
     Ok(all)
@@ -187,6 +201,21 @@ fn scaled(stretches: &DMatrix<f64>, predicted: &DVectorView<f64>) -> DMatrix<f64
     columns - predicted * share
 }
 
+/// The powers of a position, from the first on.
+fn powers(position: &DVectorView<f64>) -> DMatrix<f64> {
+    let scale = position.amax().max(f64::MIN_POSITIVE);
+    DMatrix::from_fn(position.len(), POWERS, |i, power| (position[i] / scale).powi(power as i32 + 1))
+}
+
+/// The same space spanned by columns at right angles, each of rms 1.
+fn independent(columns: DMatrix<f64>) -> DMatrix<f64> {
+    let rows = columns.nrows() as f64;
+    let largest = columns.column_iter().map(|column| column.norm()).collect::<Vec<_>>();
+    let mut scaled = columns;
+    scaled.column_iter_mut().zip(largest).for_each(|(mut column, norm)| column /= norm.max(f64::MIN_POSITIVE));
+    scaled.qr().q() * rows.sqrt()
+}
+
 /// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
 fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, EffectError> {
     let ring = machine.ring();
@@ -249,6 +278,25 @@ impl Data {
         }
     }
 
+    /// Sums of one tune's numbers over the columns of `indicator`, its mean left alone, in units that make its noise as large as
+    /// that of a monitor; none if the tune meter says too little.
+    fn tune_cells(&self, plane: usize, miss: &DMatrix<f64>, indicator: &DMatrix<f64>) -> Option<Cells> {
+        let noise = self.tune_noise(plane)?;
+        let miss = miss.column(self.readings.ncols() + plane);
+        let frames = self.tune_frames(plane);
+        let centred = |mut columns: DMatrix<f64>| {
+            columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
+            columns
+        };
+        let columns = centred(indicator.select_rows(&frames)) / self.expected_noise;
+        let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
+        Some(Cells {
+            gram: columns.tr_mul(&columns),
+            cross: DMatrix::zeros(columns.ncols(), 0),
+            pull: columns.tr_mul(&miss).column(0).into_owned(),
+        })
+    }
+
     /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
     fn stepped(&self, signature: &twin::Signature, fitted: &Fitted, stretches: &DMatrix<f64>) -> Cells {
         let (edges, p) = (stretches.ncols(), fitted.jacobian.ncols());
@@ -272,10 +320,15 @@ impl Where {
     pub fn label(&self, data: &Data) -> String {
         let ring = &data.ring;
         match *self {
-            Self::Monitor(b) | Self::MonitorInTime(b) | Self::GainInTime(b) => ring.monitor_names()[b].clone(),
+            Self::Monitor(b)
+            | Self::MonitorInTime(b)
+            | Self::GainInTime(b)
+            | Self::MonitorElsewhere(b)
+            | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) => ring.corrector_names()[c].clone(),
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
             Self::Time => "time".into(),
+            Self::Tunes => "tunes".into(),
             Self::Everywhere => "everywhere".into(),
         }
     }
@@ -287,11 +340,14 @@ impl Where {
             Self::Monitor(_) => format!("monitor {name}"),
             Self::MonitorInTime(_) => format!("monitor {name}, in time"),
             Self::GainInTime(_) => format!("gain of {name} in time"),
+            Self::MonitorElsewhere(_) => format!("monitor {name}, elsewhere"),
+            Self::MonitorCurve(_) => format!("curve of {name}"),
             Self::Corrector(_) => format!("corrector {name}"),
             Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
             Self::Time => "all monitors, in time".into(),
+            Self::Tunes => "tunes, in time".into(),
             Self::Everywhere => "all monitors".into(),
         }
     }
@@ -303,11 +359,14 @@ impl Where {
             Self::Monitor(_) => format!("monitor {name} does not follow the orbit"),
             Self::MonitorInTime(_) => format!("monitor {name} changes with time"),
             Self::GainInTime(_) => format!("the gain of monitor {name} changes with time"),
+            Self::MonitorElsewhere(_) => format!("monitor {name} reads something of the orbit elsewhere"),
+            Self::MonitorCurve(_) => format!("monitor {name} reads another function of the position"),
             Self::Corrector(_) => format!("corrector {name} does something else than one kick"),
             Self::Ring(_, Plane::X) => format!("something near {name} kicks the beam horizontally"),
             Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
             Self::Time => "the orbit changes with time at many monitors".into(),
+            Self::Tunes => "the tunes change during the campaign".into(),
             Self::Everywhere => {
                 "the readings scatter more from setting to setting than from repeat to repeat, everywhere".into()
             }
@@ -318,10 +377,14 @@ impl Where {
     pub fn position(&self, data: &Data) -> Option<f64> {
         let ring = &data.ring;
         let at = match *self {
-            Self::Monitor(b) | Self::MonitorInTime(b) | Self::GainInTime(b) => ring.read_monitors[b],
+            Self::Monitor(b)
+            | Self::MonitorInTime(b)
+            | Self::GainInTime(b)
+            | Self::MonitorElsewhere(b)
+            | Self::MonitorCurve(b) => ring.read_monitors[b],
             Self::Corrector(c) => ring.correctors[c],
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q],
-            Self::Time | Self::Everywhere => return None,
+            Self::Time | Self::Tunes | Self::Everywhere => return None,
         };
         Some(ring.elements[at].s)
     }

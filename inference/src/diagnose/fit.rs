@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{EffectError, EffectKind, Signatures};
+use twin::{EffectError, EffectKind, Signature, Signatures};
 
 use super::data::Data;
 use super::hypothesis::{Hypothesis, Unknown};
@@ -51,6 +51,9 @@ const SETTLED: f64 = 0.01;
 /// Chi-square per number beyond which a fit is far off.
 const GROSS: f64 = 1.3;
 const STEPS: usize = 25;
+/// Steps after which a fit is given up whose cost is larger than a rival's by this factor.
+const TRIAL: usize = 4;
+const HOPELESS: f64 = 1.5;
 const HALVINGS: usize = 6;
 const SWEEPS: usize = 1000;
 /// Precision of a var that is held.
@@ -76,18 +79,31 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`] if there is no stable machine at the guess.
     pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
+        Self::against(data, hypothesis, guess, f64::INFINITY)
+    }
+
+    /// The same, given up after a few steps if the cost stays far above that of a rival.
+    ///
+    /// # Errors
+    /// [`EffectError`] if there is no stable machine at the guess.
+    pub fn against(
+        data: &Data,
+        hypothesis: &Hypothesis,
+        guess: &DVector<f64>,
+        rival: f64,
+    ) -> Result<Self, EffectError> {
         if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind == EffectKind::QuadDrift) {
             let drifting = data.drifting(given.amplitude.abs());
-            let fitted = Self::minimise(&drifting, hypothesis, guess)?;
+            let fitted = Self::minimise(&drifting, hypothesis, guess, rival)?;
             return Ok(Self { drifting: Some(Box::new(drifting)), ..fitted });
         }
-        let fitted = Self::minimise(data, hypothesis, guess)?;
+        let fitted = Self::minimise(data, hypothesis, guess, rival)?;
         let Some(term) = hypothesis.terms.iter().position(|term| term.kind == EffectKind::QuadDrift) else {
             return Ok(fitted);
         };
         // the drift of the baselines is as large as that of the quadrupoles
         let drifting = data.drifting(fitted.amplitude(data, term).0.abs());
-        let fitted = Self::minimise(&drifting, hypothesis, &fitted.u)?;
+        let fitted = Self::minimise(&drifting, hypothesis, &fitted.u, rival)?;
         Ok(Self { drifting: Some(Box::new(drifting)), ..fitted })
     }
 
@@ -108,7 +124,7 @@ impl Fitted {
         self.drifting.as_deref().unwrap_or(data)
     }
 
-    fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
+    fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, EffectError> {
         let vars = data.ring.quadrupoles.len();
         let unknowns = hypothesis.unknowns(data);
         let mut u = guess.clone().resize_vertically(vars + unknowns.len(), 0.0);
@@ -116,7 +132,10 @@ impl Fitted {
         let mut here = point(data, hypothesis, u)?;
         let mut jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
         let mut factor = normal(&jacobian);
-        for _ in 0..STEPS {
+        for taken in 0..STEPS {
+            if taken >= TRIAL && here.cost > HOPELESS * rival {
+                break;
+            }
             let slope = jacobian.tr_mul(&here.residual) - &here.u;
             let step = within(&here.u, &factor.solve(&slope), &slope, &jacobian, vars);
             let Some((next, expected)) = descend(data, hypothesis, &here, &step, &slope) else { break };
@@ -220,54 +239,61 @@ impl Fitted {
         })
     }
 
-    /// Residuals at the best point, measured minus predicted, and the derivative of each prediction with respect to every u,
-    /// rows frames, columns monitors [m].
+    /// Predictions at the best point, rows frames, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn linearise(&self, data: &Data) -> Result<(DMatrix<f64>, Vec<DMatrix<f64>>), EffectError> {
+    pub fn predicted(&self, data: &Data) -> Result<DMatrix<f64>, EffectError> {
+        self.predicted_at(data, &self.u)
+    }
+
+    fn predicted_at(&self, data: &Data, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let vars = self.params.len();
-        let readings = |u: &DVector<f64>| -> Result<DMatrix<f64>, EffectError> {
-            let (machine, drives) = self.hypothesis.machine(data, &params_of(u, vars), &u.as_slice()[vars..])?;
-            Ok(machine.readings(&drives)?.0)
-        };
+        let (machine, drives) = self.hypothesis.machine(data, &params_of(u, vars), &u.as_slice()[vars..])?;
+        let (readings, tunes, tune_drift) = machine.readings(&drives)?;
+        Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift }.by_frame(&drives.time))
+    }
+
+    /// Derivative of the predictions with respect to every u.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn slopes(&self, data: &Data) -> Result<Vec<DMatrix<f64>>, EffectError> {
+        let vars = self.params.len();
         let (machine, drives) = self.hypothesis.machine(data, &self.params, &self.u.as_slice()[vars..])?;
         let signatures = Signatures::of(&machine, &drives)?;
-        let mut slopes: Vec<DMatrix<f64>> =
-            signatures.of_vars().into_iter().map(|signature| signature.readings * prior().1).collect();
+        let by_frame = |signature: Signature, scale: f64| signature.by_frame(&drives.time) * scale;
+        let of_vars = signatures.of_vars().into_iter().map(|signature| by_frame(signature, prior().1));
+        let mut slopes: Vec<DMatrix<f64>> = of_vars.collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Member(term, width) => signatures.of_effect(term.kind, &term.place)?.readings * *width,
+                Unknown::Member(term, width) => by_frame(signatures.of_effect(term.kind, &term.place)?, *width),
                 _ => {
                     let at = |step: f64| {
                         let mut u = self.u.clone();
                         u[vars + i] += step;
-                        readings(&u)
+                        self.predicted_at(data, &u)
                     };
                     (at(DIFFERENCE)? - at(-DIFFERENCE)?) / (2.0 * DIFFERENCE)
                 }
             });
         }
-        Ok((&data.readings - readings(&self.u)?, slopes))
+        Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines taken out, per degree of freedom
-    /// (readings less baselines less vars).
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, less what the readings of a monitor share
+    /// (its baseline, and how that moves), per degree of freedom (readings less what is shared less vars).
     ///
     /// # Errors
     /// [`EffectError`].
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
-        let (machine, drives) = self.hypothesis.machine(data, &self.params, &self.u.as_slice()[self.params.len()..])?;
-        let residual = &data.readings - machine.readings(&drives)?.0;
+        let data = self.data(data);
+        let miss = data.miss(&self.predicted(data)?);
         let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
-        for b in data.speaking_monitors() {
-            if data.health()[b].state != MonitorState::Ok {
-                continue;
-            }
-            let of: Vec<f64> = data.frames(b).iter().map(|&i| residual[(i, b)]).collect();
-            let mean = of.iter().sum::<f64>() / of.len() as f64;
-            sum += of.iter().map(|r| (r - mean).powi(2)).sum::<f64>();
-            freedom += of.len() as f64 - 1.0;
+        for b in data.speaking_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
+            let (own, shared) = data.own(b, &miss.column(b).into_owned());
+            sum += own.norm_squared();
+            freedom += own.len() as f64 - shared;
         }
         Ok(sum / data.expected_noise.powi(2) / freedom)
     }

@@ -1,8 +1,9 @@
 //! How well a hypothesis predicts frames that it was not fitted to.
 //!
 //! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
-//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z` has a normal density: the mean is the
-//! prediction `h` with what the monitor's kept readings say of its shared factors (baseline and the like, `U`, known to `C`),
+//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z`, of a monitor or of the tune meter, has a
+//! normal density: the mean is the prediction `h` with what the kept readings of that instrument say of its shared factors
+//! (baseline, calibration and the like, `U`, known to `C`),
 //!
 //! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less what the factors take.
 //!
@@ -14,10 +15,11 @@
 
 use std::collections::BTreeMap;
 
+use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::EffectError;
 
-use super::data::Data;
+use super::data::{Data, TUNE_CALIBRATION};
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use crate::recording::Recording;
@@ -63,9 +65,9 @@ pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
 /// What the left-out readings say of a hypothesis.
 #[derive(Debug, Clone)]
 pub struct Score {
-    /// Log density of each reading, rows frames, columns monitors; 0 for one that does not count.
+    /// Log density of each reading, rows frames, columns monitors and the two tunes; 0 for one that does not count.
     pub log_density: DMatrix<f64>,
-    /// Readings.
+    /// Readings of monitors and of the tune meter.
     pub readings: usize,
     /// Rms of measured minus predicted, monitors in state ok [m].
     pub rms: f64,
@@ -79,7 +81,8 @@ impl Score {
     /// # Errors
     /// [`EffectError`].
     pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, EffectError> {
-        let log_density = DMatrix::zeros(data.readings.nrows(), data.readings.ncols());
+        let monitors = data.readings.ncols();
+        let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
         let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
         let (mut squares, mut plain) = (0.0, 0usize);
         for fold in folds {
@@ -87,12 +90,12 @@ impl Score {
             let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
             for left in predict(data, fit.data(&kept), &fit, fold)? {
                 let z = left.innovation / left.variance.sqrt();
-                score.log_density[(left.frame, left.monitor)] -=
+                score.log_density[(left.frame, left.column)] -=
                     0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
                 score.readings += 1;
                 score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
                 score.inside[1] += f64::from(u8::from(z.abs() < 2.0));
-                if data.health()[left.monitor].state == estimator::MonitorState::Ok {
+                if left.column < monitors && data.health()[left.column].state == MonitorState::Ok {
                     squares += left.innovation.powi(2);
                     plain += 1;
                 }
@@ -122,38 +125,61 @@ impl Score {
 /// One reading that was left out.
 struct Left {
     frame: usize,
-    monitor: usize,
+    column: usize,
     innovation: f64,
     variance: f64,
 }
 
+/// One column of what a frame holds, a monitor or a tune: kept frames, left-out ones, noise, and what their readings share, in
+/// standard deviations.
+struct Column {
+    index: usize,
+    kept: Vec<usize>,
+    out: Vec<usize>,
+    variance: f64,
+    shared: [DMatrix<f64>; 2],
+}
+
+/// All of them of which readings are left out.
+fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
+    let monitor = |b: usize| {
+        let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
+        let shared = [kept.shared(b, kept.frames(b)), kept.shared(b, &out)];
+        Column { index: b, kept: kept.frames(b).to_vec(), out, variance: kept.noise(b).powi(2), shared }
+    };
+    let tune = |plane: usize| {
+        let noise = kept.tune_noise(plane)?;
+        let out: Vec<usize> = all.tune_frames(plane).into_iter().filter(|i| fold.contains(i)).collect();
+        let kept = kept.tune_frames(plane);
+        let shared = [kept.len(), out.len()].map(|n| DMatrix::from_element(n, 1, TUNE_CALIBRATION));
+        Some(Column { index: all.readings.ncols() + plane, kept, out, variance: noise * noise, shared })
+    };
+    let monitors = all.speaking_monitors().into_iter().map(monitor);
+    monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
+}
+
 /// Predict the left-out readings by a fit to the kept ones.
 fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, EffectError> {
-    let (residual, slopes) = fit.linearise(kept)?;
+    let (residual, slopes) = (all.miss(&fit.predicted(kept)?), fit.slopes(kept)?);
     let mut left = Vec::new();
-    for b in all.speaking_monitors() {
-        let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
-        if out.is_empty() {
-            continue;
-        }
-        let within = kept.frames(b);
-        let noise = kept.noise(b).powi(2);
-        let (u_in, u_out) = (kept.shared(b, within), kept.shared(b, &out));
-        let mut normal = u_in.tr_mul(&u_in) / noise;
+    for column in columns(all, kept, fold) {
+        let at = column.index;
+        let [u_in, u_out] = &column.shared;
+        let mut normal = u_in.tr_mul(u_in) / column.variance;
         (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
         let Some(normal) = normal.cholesky() else { continue };
-        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], b)]);
-        let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, b)]));
+        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], at)]);
+        let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, at)]));
         // what the kept readings say of the factors, of the residual and of each derivative
-        let back = u_in.transpose() / noise;
-        let factors = normal.solve(&(&back * of(within)));
-        let innovation = of(&out) - &u_out * factors;
-        let d = rows(&out) - &u_out * normal.solve(&(back * rows(within)));
+        let back = u_in.transpose() / column.variance;
+        let factors = normal.solve(&(&back * of(&column.kept)));
+        let innovation = of(&column.out) - u_out * factors;
+        let d = rows(&column.out) - u_out * normal.solve(&(back * rows(&column.kept)));
         let unknown = normal.l().solve_lower_triangular(&u_out.transpose()).unwrap_or_else(|| u_out.transpose() * 0.0);
         let params = fit.factor.l().solve_lower_triangular(&d.transpose()).unwrap_or_else(|| d.transpose() * 0.0);
-        for (i, &frame) in out.iter().enumerate() {
-            let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
-            left.push(Left { frame, monitor: b, innovation: innovation[i], variance });
+        for (i, &frame) in column.out.iter().enumerate() {
+            let variance = column.variance + unknown.column(i).norm_squared() + params.column(i).norm_squared();
+            left.push(Left { frame, column: at, innovation: innovation[i], variance });
         }
     }
     Ok(left)

@@ -111,12 +111,6 @@ impl Hypothesis {
         less
     }
 
-    /// The reversed correctors alone: what is large enough to matter for the curvature of the orbits.
-    pub fn reversed_correctors(&self) -> Self {
-        let reversed = |term: &&Term| term.kind == EffectKind::CorrectorPolarity;
-        Self { terms: self.terms.iter().filter(reversed).cloned().collect(), ..Self::default() }
-    }
-
     /// What is unknown beside the vars.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {

@@ -72,7 +72,7 @@ impl Diagnosis {
         let data = Data::of(ring, recording)?;
         let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
         progress("searching");
-        let found = Search::new(data, candidates).run()?;
+        let found = Search::new(candidates).run(data)?;
         let data = &found.data;
         progress("held-out frames");
         let folds = heldout::by_repeat(recording);

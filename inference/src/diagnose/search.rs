@@ -11,7 +11,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::{EffectError, EffectKind};
+use twin::{EffectError, EffectKind, Machine};
 
 use super::SUSPICIOUS;
 use super::data::Data;
@@ -23,6 +23,11 @@ use super::scan::{Candidate, scan};
 /// Prior odds of one (more) effect.
 const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
+
+/// Prior odds of one more beside some effects.
+fn odds(effects: usize) -> f64 {
+    if effects == 0 { ODDS } else { ODDS_FURTHER }
+}
 /// Share of what the library does not hold.
 const UNKNOWN: f64 = 0.15;
 /// Rounds of competition for all slots.
@@ -35,6 +40,10 @@ const BEHIND: f64 = 6.0;
 const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order will do.
 const WORTH: f64 = 3.0;
+
+/// Passes of straightening at most, and the chi-square of what one changes from which on the next is worth it.
+const PASSES: usize = 4;
+const CURVED: f64 = 4.0;
 
 /// What may fill a slot.
 #[derive(Debug, Clone)]
@@ -119,7 +128,6 @@ pub fn price_of(discrepancy: &Discrepancy) -> f64 {
 
 /// The candidates of a recording, and what they are worth beforehand.
 pub struct Search {
-    data: Data,
     terms: Vec<Term>,
     /// `ln` prior of each candidate, given that the library holds the effect.
     log_prior: Vec<f64>,
@@ -127,65 +135,91 @@ pub struct Search {
 
 impl Search {
     /// A search among candidates.
-    pub fn new(data: Data, terms: Vec<Term>) -> Self {
+    pub fn new(terms: Vec<Term>) -> Self {
         let log_prior = log_prior(&terms);
-        Self { data, terms, log_prior }
+        Self { terms, log_prior }
     }
 
     /// Search.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn run(mut self) -> Result<Found, EffectError> {
-        let mut null = self.straighten(&Hypothesis::default())?;
-        let mut next = self.slot(&null, 0)?;
-        if let Some(scatter) = self.scatter(&null, &next)? {
-            null = self.straighten(&Hypothesis { scatter, ..Hypothesis::default() })?;
-            next = self.slot(&null, 0)?;
-        }
-        let (mut best, mut slots) = (null.clone(), Vec::new());
-        while best.hypothesis.terms.len() < MOST && next.nothing < 1.0 - SUSPICIOUS && next.library() > next.unknown() {
-            let Some(fitted) = next.leader() else { break };
-            let reversed = best.hypothesis.reversed_correctors();
-            (best, slots) = self.settle(fitted, next)?;
-            if best.hypothesis.reversed_correctors() != reversed {
-                best = self.straighten(&best.hypothesis)?;
-                null = Fitted::of(&self.data, &null.hypothesis, &null.u)?;
-                slots = (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
+    pub fn run(&self, data: Data) -> Result<Found, EffectError> {
+        let mut found = self.without_effects(data)?;
+        while found.slots.len() < MOST && found.next.nothing < 1.0 - SUSPICIOUS {
+            let Some(leader) = found.next.leader() else { break };
+            let further = self.further(&found, leader)?;
+            // something without a class may say it better than one more effect, but not than two that need each other
+            if found.next.library() <= found.next.unknown() && self.log_weight(&further) < self.log_weight(&found) {
+                break;
             }
-            next = self.slot(&best, best.hypothesis.terms.len())?;
+            found = further;
         }
-        Ok(Found { data: self.data, null, best, slots, next })
+        Ok(found)
     }
 
-    /// Fit, and straighten the readings by the machine that was found.
-    fn straighten(&mut self, hypothesis: &Hypothesis) -> Result<Fitted, EffectError> {
-        let zero = DVector::zeros(self.data.ring.quadrupoles.len());
-        let mut fitted = Fitted::of(&self.data, hypothesis, &zero)?;
-        if !fitted.is_gross() {
-            self.data.trim(&fitted.residual);
-            fitted = Fitted::of(&self.data, hypothesis, &fitted.u)?;
+    /// TEMP
+    pub fn stages(&self, data: Data) -> Result<Vec<Found>, EffectError> {
+        // TEMP
+        let mut found = vec![self.without_effects(data)?];
+        while found.len() <= MOST && found.last().unwrap().next.nothing < 1.0 - SUSPICIOUS {
+            let Some(leader) = found.last().unwrap().next.leader() else { break };
+            found.push(self.further(found.last().unwrap(), leader)?);
         }
-        let machine = hypothesis.reversed_correctors().machine(&self.data, &fitted.params, &[])?.0;
-        // a machine that keeps no beam in one of the settings is not the one that was recorded
-        if self.data.straighten(&machine).is_err() {
-            return Ok(fitted);
+        Ok(found)
+    }
+
+    /// Nothing but vars, and the ordinary scatter of a family if there is any.
+    fn without_effects(&self, mut data: Data) -> Result<Found, EffectError> {
+        let zero = DVector::zeros(data.ring.quadrupoles.len());
+        let mut null = straighten(&mut data, &Hypothesis::default(), &zero)?;
+        let mut next = self.slot(&data, &null, 0)?;
+        if let Some(scatter) = scatter(&data, &null, &next)? {
+            null = straighten(&mut data, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)?;
+            next = self.slot(&data, &null, 0)?;
         }
-        Fitted::of(&self.data, hypothesis, &fitted.u)
+        Ok(Found { data, best: null.clone(), null, slots: Vec::new(), next })
+    }
+
+    /// One more effect.
+    fn further(&self, found: &Found, leader: Fitted) -> Result<Found, EffectError> {
+        let mut data = found.data.clone();
+        let mut null = found.null.clone();
+        let (mut best, mut slots) = self.settle(&data, leader, &found.next)?;
+        // orbits that the effects have changed are curved in another way
+        if data.straighten(&machine(&data, &best)?).is_ok_and(|moved| moved > CURVED) {
+            best = straighten(&mut data, &best.hypothesis, &best.u)?;
+            null = Fitted::of(&data, &null.hypothesis, &null.u)?;
+            slots = (0..slots.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
+        } else {
+            data = found.data.clone();
+        }
+        let next = self.slot(&data, &best, slots.len())?;
+        Ok(Found { data, null, best, slots, next })
+    }
+
+    /// `ln` posterior of the effects of a fit, with or without something beside them.
+    pub fn log_weight(&self, found: &Found) -> f64 {
+        let prior_of = |(i, term): (usize, &Term)| {
+            let known = self.terms.iter().position(|one| one == term).map_or(0.0, |at| self.log_prior[at]);
+            known + ((1.0 - UNKNOWN) * odds(i)).ln()
+        };
+        let prior: f64 = found.best.hypothesis.terms.iter().enumerate().map(prior_of).sum();
+        found.best.log_evidence - found.null.log_evidence + prior + softplus(found.next.log_odds)
     }
 
     /// Let all candidates compete for each slot, given the others, until the best one is in each. The only effect of a fit has
     /// just won its competition.
-    fn settle(&self, fitted: Fitted, won: Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
+    fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
         let mut best = fitted;
         if best.hypothesis.terms.len() == 1 {
-            return Ok((best, vec![won]));
+            return Ok((best, vec![won.clone()]));
         }
         for _ in 0..ROUNDS {
             let mut slots = Vec::new();
             let mut changed = false;
             for i in 0..best.hypothesis.terms.len() {
-                let slot = self.without(&best, i)?;
+                let slot = self.without(data, &best, i)?;
                 if let Some(fitted) = slot.leader()
                     && fitted.hypothesis.terms.last() != best.hypothesis.terms.get(i)
                 {
@@ -197,33 +231,37 @@ impl Search {
                 return Ok((best, slots));
             }
         }
-        let slots = (0..best.hypothesis.terms.len()).map(|i| self.without(&best, i)).collect::<Result<_, _>>()?;
+        let slots = (0..best.hypothesis.terms.len()).map(|i| self.without(data, &best, i)).collect::<Result<_, _>>()?;
         Ok((best, slots))
     }
 
     /// The competition for one of the effects of a fit.
-    fn without(&self, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
-        let rest = super::heldout::reduced(&self.data, fitted, term)?;
-        self.slot(&rest, fitted.hypothesis.terms.len() - 1)
+    fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
+        let rest = super::heldout::reduced(data, fitted, term)?;
+        self.slot(data, &rest, fitted.hypothesis.terms.len() - 1)
     }
 
     /// The competition for one more effect beside those of a fit.
-    fn slot(&self, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
-        let odds = if effects == 0 { ODDS } else { ODDS_FURTHER };
-        let scanned = scan(fitted.data(&self.data), fitted, &self.terms)?;
+    fn slot(&self, data: &Data, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
+        let odds = odds(effects);
+        let scanned = scan(fitted.data(data), fitted, &self.terms)?;
         let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNKNOWN) * odds).ln();
-        let leaders = self.leaders(fitted, &scanned)?;
+        let leaders = self.leaders(data, fitted, &scanned)?;
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
+        let mut least = f64::INFINITY;
         for (i, candidate) in scanned.iter().enumerate() {
             if fitted.hypothesis.terms.contains(&candidate.term) {
                 continue;
             }
-            let alternative =
-                if leaders.contains(&i) { self.refit(fitted, candidate) } else { Alternative::of(candidate) };
+            let alternative = match leaders.contains(&i) {
+                true => refit(data, fitted, candidate, least),
+                false => Alternative::of(candidate),
+            };
+            least = alternative.fitted.as_ref().map_or(least, |fitted| least.min(fitted.cost));
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
-        for discrepancy in discrepancy::scan(&self.data, fitted)? {
+        for discrepancy in discrepancy::scan(data, fitted)? {
             let prior = (UNKNOWN * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unknown(discrepancy), weight));
@@ -233,11 +271,11 @@ impl Search {
 
     /// The candidates that are worth an exact fit. Where the fit is far off, its vars are bent out of shape and mislead: those
     /// that lead at the prior's mean are then taken too.
-    fn leaders(&self, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, EffectError> {
+    fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, EffectError> {
         let mut leaders = self.first(scanned, &fitted.hypothesis);
         if fitted.is_gross() {
-            let start = Fitted::unfitted(&self.data, &fitted.hypothesis)?;
-            leaders.extend(self.first(&scan(&self.data, &start, &self.terms)?, &fitted.hypothesis));
+            let start = Fitted::unfitted(data, &fitted.hypothesis)?;
+            leaders.extend(self.first(&scan(data, &start, &self.terms)?, &fitted.hypothesis));
         }
         Ok(leaders)
     }
@@ -254,52 +292,82 @@ impl Search {
         order.truncate(LEADERS);
         order
     }
+}
 
-    fn refit(&self, fitted: &Fitted, candidate: &Candidate) -> Alternative {
-        let hypothesis = fitted.hypothesis.with(candidate.term.clone());
-        let vars = fitted.params.len();
-        // the new unknowns of a term stand before those of scatter
-        let at = vars + fitted.hypothesis.unknowns(&self.data).len() - fitted.hypothesis.members(&self.data);
-        let new = hypothesis.unknowns(&self.data).len() - fitted.hypothesis.unknowns(&self.data).len();
-        let mut guess = fitted.u.clone().insert_rows(at, new, 0.0);
-        if new > 0 {
-            guess[at] = candidate.amplitude;
-        }
-        let mut guesses = vec![guess];
-        if fitted.is_gross() {
-            guesses.push(DVector::zeros(vars));
-        }
-        let fits = guesses.iter().filter_map(|guess| Fitted::of(&self.data, &hypothesis, guess).ok());
-        // a candidate that leads to no stable machine is none
-        let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
-            return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
-        };
-        Alternative {
-            cause: Cause::Effect(candidate.term.clone()),
-            log_gain: refitted.log_evidence - fitted.log_evidence,
-            probability: 0.0,
-            amplitude: refitted.amplitude(&self.data, fitted.hypothesis.terms.len()),
-            adapting: DVector::zeros(0),
-            fitted: Some(refitted),
+/// Fit, and straighten the readings by the machine that was found, until that changes them no more.
+fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, EffectError> {
+    let mut fitted = Fitted::of(data, hypothesis, guess)?;
+    if !fitted.is_gross() {
+        data.trim(&fitted.residual);
+        fitted = Fitted::of(data, hypothesis, &fitted.u)?;
+    }
+    for _ in 0..PASSES {
+        // a machine that keeps no beam in one of the settings is not the one that was recorded
+        let Ok(moved) = data.straighten(&machine(data, &fitted)?) else { break };
+        fitted = Fitted::of(data, hypothesis, &fitted.u)?;
+        if moved < CURVED {
+            break;
         }
     }
+    Ok(fitted)
+}
 
-    /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
-    fn scatter(&self, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
-        let single = next.log_odds;
-        let mut best: Option<(Scatter, f64)> = None;
-        for &(kind, widths) in &FAMILIES {
-            let terms = members(kind, &self.data);
-            let logs = super::scan::family(&self.data, fitted, &terms, widths)?;
-            for (&width, log_bayes) in widths.iter().zip(logs) {
-                if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
-                    best = Some((Scatter { kind, width }, log_bayes));
-                }
+/// The machine of a fit.
+fn machine(data: &Data, fitted: &Fitted) -> Result<Machine, EffectError> {
+    let unknown = &fitted.u.as_slice()[fitted.params.len()..];
+    Ok(fitted.hypothesis.machine(data, &fitted.params, unknown)?.0)
+}
+
+/// The exact fit with a candidate, given up where it stays far behind the least cost of its rivals.
+fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alternative {
+    let hypothesis = fitted.hypothesis.with(candidate.term.clone());
+    let vars = fitted.params.len();
+    // the new unknowns of a term stand before those of scatter
+    let at = vars + fitted.hypothesis.unknowns(data).len() - fitted.hypothesis.members(data);
+    let new = hypothesis.unknowns(data).len() - fitted.hypothesis.unknowns(data).len();
+    let mut guess = fitted.u.clone().insert_rows(at, new, 0.0);
+    if new > 0 {
+        guess[at] = candidate.amplitude;
+    }
+    let mut guesses = vec![guess];
+    if fitted.is_gross() {
+        guesses.push(DVector::zeros(vars));
+    }
+    let fits = guesses.iter().filter_map(|guess| Fitted::against(data, &hypothesis, guess, least).ok());
+    // a candidate that leads to no stable machine is none
+    let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
+        return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
+    };
+    Alternative {
+        cause: Cause::Effect(candidate.term.clone()),
+        log_gain: refitted.log_evidence - fitted.log_evidence,
+        probability: 0.0,
+        amplitude: refitted.amplitude(data, fitted.hypothesis.terms.len()),
+        adapting: DVector::zeros(0),
+        fitted: Some(refitted),
+    }
+}
+
+/// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
+fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
+    let single = next.log_odds;
+    let mut best: Option<(Scatter, f64)> = None;
+    for &(kind, widths) in &FAMILIES {
+        let terms = members(kind, data);
+        let logs = super::scan::family(data, fitted, &terms, widths)?;
+        for (&width, log_bayes) in widths.iter().zip(logs) {
+            if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
+                best = Some((Scatter { kind, width }, log_bayes));
             }
         }
-        let price = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
-        Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
     }
+    let price = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
+    Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
+}
+
+/// `ln(1 + exp(x))`.
+fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 
 /// Widths that are tried of each family.
@@ -349,21 +417,24 @@ impl Alternative {
     }
 }
 
-/// Probability below which an alternative is not listed.
+/// Probability below which an alternative that was not refitted is not listed.
 const LISTED: f64 = 1e-4;
 
 impl Slot {
     /// Normalise posterior weights (`ln`, "nothing" having 0).
     fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
-        let largest = weights.iter().map(|(_, weight)| *weight).fold(0.0, f64::max);
+        weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
+        let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
         let nothing = (-largest).exp();
         let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
         let sum = nothing + something;
-        weights.iter_mut().for_each(|(alternative, weight)| alternative.probability = (*weight - largest).exp() / sum);
-        let mut alternatives: Vec<Alternative> = weights.into_iter().map(|(alternative, _)| alternative).collect();
-        alternatives.sort_by(|one, other| other.probability.total_cmp(&one.probability));
-        alternatives.retain(|alternative| alternative.probability > LISTED);
+        let normalised = |(alternative, weight): (Alternative, f64)| {
+            let probability = (weight - largest).exp() / sum;
+            Alternative { probability, ..alternative }
+        };
+        let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
+        let alternatives = weights.into_iter().map(normalised).filter(listed).collect();
         let log_odds = largest + something.ln();
         Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
     }

@@ -123,6 +123,10 @@ fn signatures_hold_about_a_machine_with_effects() {
     let held =
         |kind| matches!(kind, EffectKind::MomentumOffset | EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
     assert_derivatives(&about("momentum_offset=0.002"), held, 5e-5);
+    // where not the momentum is held, but for the curvature of a sextupole, which is taken at constant momentum
+    let linear = |kind: EffectKind| kind.prior_scale().is_some() && kind != EffectKind::SextupoleError;
+    assert_derivatives(&about("radial_loop@x_D8,x_E6"), linear, 2e-4);
+    assert_derivatives(&about("fixed_rf_frequency"), linear, 2e-4);
 }
 
 /// Largest error of the linear change against the exact one, in frames with kicks and in those with an RF offset, the

@@ -1,7 +1,8 @@
 //! A ring with effects applied, and the response that would then be measured.
 
-use nalgebra::{DMatrix, DVector, Rotation2, Vector2};
+use nalgebra::{DMatrix, Rotation2, Vector2};
 
+use super::held::Held;
 use super::{Effect, EffectError, EffectKind};
 use crate::lattice::{Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
@@ -162,26 +163,9 @@ impl Machine {
 
     /// Response (x, y) at the monitor places with what this machine holds constant.
     pub(super) fn held(&self, ring: &Ring, optics: &Optics) -> Result<(DMatrix<f64>, DMatrix<f64>), OrbitError> {
-        let (mut x, mut y) = planes(optics, &optics.correctors());
-        if self.frequency_share != 0.0 {
-            let offset = optics.frequency_offset();
-            let held = Optics::of(ring, Hold::Frequency { offset })?;
-            let (fixed_x, fixed_y) = planes(&held, &held.correctors());
-            x += (fixed_x - &x) * self.frequency_share;
-            y += (fixed_y - &y) * self.frequency_share;
-        }
-        if let Some(([i, j], share)) = self.radial_loop {
-            let seen = |plane| {
-                let dispersion = optics.monitor_places(plane).iter().map(|o| optics.dispersion(o)).collect();
-                DVector::<f64>::from_vec(dispersion)
-            };
-            let (dispersion, dispersion_y) = (seen(Plane::X), seen(Plane::Y));
-            // the momentum that brings the pair's mean back
-            let momentum = (x.row(i) + x.row(j)) * (share / (dispersion[i] + dispersion[j]));
-            x -= dispersion * &momentum;
-            y -= dispersion_y * &momentum;
-        }
-        Ok((x, y))
+        let held = Held::of(self, ring, optics)?;
+        let of = |plane| held.response(optics, &optics.monitor_places(plane), &optics.correctors());
+        Ok((of(Plane::X), of(Plane::Y)))
     }
 
     fn read(&self, optics: &Optics, instrument: &Instrument, x: &mut DMatrix<f64>, y: &mut DMatrix<f64>) {

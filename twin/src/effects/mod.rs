@@ -6,6 +6,7 @@
 #[cfg(test)]
 mod agreement;
 mod drives;
+mod held;
 mod library;
 mod machine;
 mod signature;

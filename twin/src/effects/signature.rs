@@ -8,6 +8,7 @@
 use nalgebra::{DMatrix, DVector, RowDVector};
 
 use super::drives::{Drives, Seen, curved};
+use super::held::Held;
 use super::machine::{Instrument, Machine};
 use super::{Effect, EffectError, EffectKind};
 use crate::lattice::{Kind, Plane};
@@ -20,6 +21,7 @@ pub struct Signatures<'m> {
     machine: &'m Machine,
     drives: &'m Drives,
     optics: Optics<'m>,
+    held: Held<'m>,
     /// Read monitors, each in its plane.
     observers: Vec<Observer>,
     sources: Vec<Source>,
@@ -45,6 +47,19 @@ pub struct Signature {
     pub tune_drift: [f64; 2],
 }
 
+impl Signature {
+    /// Readings and, as two more columns, the tunes of every frame.
+    pub fn by_frame(self, time: &DVector<f64>) -> DMatrix<f64> {
+        let monitors = self.readings.ncols();
+        let mut all = self.readings.insert_columns(monitors, 2, 0.0);
+        for plane in 0..2 {
+            let tune = time.map(|t| self.tunes[plane] + self.tune_drift[plane] * t);
+            all.set_column(monitors + plane, &tune);
+        }
+        all
+    }
+}
+
 /// Edge angle for a numerical derivative [rad], and momentum [1].
 const STEP: f64 = 1e-4;
 
@@ -55,6 +70,7 @@ impl<'m> Signatures<'m> {
     /// [`OrbitError`] if the machine is unstable.
     pub fn of(machine: &'m Machine, drives: &'m Drives) -> Result<Self, OrbitError> {
         let optics = Optics::of(&machine.ring, Hold::Momentum { delta: machine.delta })?;
+        let held = Held::of(machine, &machine.ring, &optics)?;
         let seen = machine.seen(&machine.ring)?;
         let kick = machine.kicks(drives);
         let (x, y) = drives.positions(&seen, &kick);
@@ -66,7 +82,7 @@ impl<'m> Signatures<'m> {
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
         let correctors = machine.ring.corrector_names();
         let response = DMatrix::from_rows(&rows);
-        Ok(Self { machine, drives, optics, observers, sources, kick, x, y, response, monitors, correctors })
+        Ok(Self { machine, drives, optics, held, observers, sources, kick, x, y, response, monitors, correctors })
     }
 
     /// Derivative of readings and tunes with respect to `ln` of each var.
@@ -93,6 +109,30 @@ impl<'m> Signatures<'m> {
             _ => self.optics.thin_gradient(place),
         };
         self.of_gradient(&gradient, 1.0)
+    }
+
+    /// What kicks and RF offset do to the orbit at the place of a read monitor: its position and slope in the monitor's plane,
+    /// then in the other, rows frames [m, rad]. Where no kick is in between, the orbit anywhere near is a sum of these.
+    pub fn around(&self, b: usize) -> DMatrix<f64> {
+        let (plane, place) = self.monitors[b];
+        let at = self.machine.ring.monitors[place];
+        let (own, other) = match plane {
+            Plane::X => (&self.x, &self.y),
+            Plane::Y => (&self.y, &self.x),
+        };
+        let crossed = if plane == Plane::X { Plane::Y } else { Plane::X };
+        let slope = |plane| {
+            let observer = self.optics.observe_slope(at, plane);
+            let response = self.optics.response(&[observer], &self.sources);
+            let rf = -self.optics.dispersion(&observer) / self.optics.slip_factor();
+            (&self.kick * response.transpose() + &self.drives.rf_offset * rf).column(0).into_owned()
+        };
+        DMatrix::from_columns(&[
+            own.column(place).into_owned(),
+            slope(plane),
+            other.column(place).into_owned(),
+            slope(crossed),
+        ])
     }
 
     /// What gains and exchanged names, already in the machine, make of a change of the orbit.
@@ -163,7 +203,11 @@ impl<'m> Signatures<'m> {
                 let c = machine.corrector(&effect)?;
                 let turned = if self.correctors[c].starts_with("H_") { [0.0, 1.0] } else { [-1.0, 0.0] };
                 let source = self.optics.kick(ring.correctors[c], turned);
-                self.of_kick(c, self.optics.response(&self.observers, &[source]).column(0).into_owned(), |k| k)
+                self.of_kick(
+                    c,
+                    self.held.response(&self.optics, &self.observers, &[source]).column(0).into_owned(),
+                    |k| k,
+                )
             }
             EffectKind::QuadRoll => {
                 let at = ring.quadrupole(place)?;
@@ -213,7 +257,7 @@ impl<'m> Signatures<'m> {
     /// A change of gradient by `scale`.
     fn of_gradient(&self, gradient: &Gradient, scale: f64) -> Signature {
         let gradients = core::slice::from_ref(gradient);
-        let response = &self.optics.response_jacobian(&self.observers, &self.sources, gradients)[0];
+        let response = self.held.jacobian(&self.optics, &self.observers, &self.sources, gradient);
         let mut readings = &self.kick * response.transpose() * scale;
         let rf = self.optics.rf_jacobian(&self.observers, gradients) * scale;
         readings.ger(1.0, &self.drives.rf_offset, &rf.column(0), 1.0);
