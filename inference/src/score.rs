@@ -7,7 +7,7 @@ use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 
 use crate::diagnose::average::Vars;
-use crate::diagnose::{Diagnosis, Finding, Verdict};
+use crate::diagnose::{DECISIVE, Diagnosis, Finding, Verdict};
 
 /// What a recording was made with.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -53,6 +53,20 @@ pub enum Grade {
     Missed,
     /// Something was named that is not there.
     Wrong,
+}
+
+/// What became of one effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Fate {
+    /// Named at its place, in a verdict that stands.
+    Named,
+    /// Not decided between causes that the recording cannot tell apart, this one among them.
+    Together,
+    /// Not decided, and listed.
+    Listed,
+    /// Not mentioned, where something else or nothing is said.
+    Absent,
 }
 
 /// Why an answer key cannot be read.
@@ -104,6 +118,26 @@ impl Truth {
         }
     }
 
+    /// What became of each effect.
+    pub fn fates(&self, diagnosis: &Diagnosis) -> Vec<Fate> {
+        let among = |truth: &TrueEffect, finding: &Finding, inseparable: bool| {
+            let others = finding.alternatives.iter().filter(|other| other.inseparable || !inseparable);
+            truth.is(finding) || others.into_iter().any(|other| truth.is(other))
+        };
+        let fate = |truth: &TrueEffect| {
+            let findings = &diagnosis.findings;
+            let together = |f: &&Finding| among(truth, f, true) && f.together() >= DECISIVE && f.is_proven();
+            match diagnosis.verdict {
+                Verdict::Identified if findings.iter().any(|finding| truth.is(finding)) => Fate::Named,
+                Verdict::Consistent | Verdict::Identified => Fate::Absent,
+                _ if findings.iter().any(|finding| together(&finding)) => Fate::Together,
+                _ if findings.iter().any(|finding| among(truth, finding, false)) => Fate::Listed,
+                _ => Fate::Absent,
+            }
+        };
+        self.effects.iter().map(fate).collect()
+    }
+
     /// Pull of each named effect's amplitude, (found - true)/sigma.
     pub fn pulls(&self, diagnosis: &Diagnosis) -> Vec<f64> {
         let pull = |truth: &TrueEffect| {
@@ -114,9 +148,10 @@ impl Truth {
         self.effects.iter().filter_map(pull).collect()
     }
 
-    /// Normalised estimation error squared of the vars, per var.
+    /// Normalised estimation error squared of the vars, per var; not a number if the key lacks one.
     pub fn nees(&self, names: &[String], vars: &Vars) -> f64 {
-        let off = names.iter().zip(vars.mean.iter()).map(|(name, mean)| mean - self.vars[name].ln());
+        let truth = |name: &String| self.vars.get(name).map_or(f64::NAN, |var| var.ln());
+        let off = names.iter().zip(vars.mean.iter()).map(|(name, mean)| mean - truth(name));
         let off = DVector::from_iterator(names.len(), off);
         let solved = vars.covariance.clone().cholesky().map(|factor| factor.solve(&off));
         solved.map_or(f64::INFINITY, |solved| off.dot(&solved) / names.len() as f64)

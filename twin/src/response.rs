@@ -171,10 +171,15 @@ impl<'r> Optics<'r> {
 
     /// A thin kick `(dx', dy')` of the given direction at a place.
     pub fn kick(&self, place: impl Into<Place>, direction: [f64; 2]) -> Source {
+        self.step(place, [0.0, direction[0], 0.0, direction[1]])
+    }
+
+    /// A thin step of the beam in x, x', y and y' at a place.
+    pub fn step(&self, place: impl Into<Place>, step: [f64; 4]) -> Source {
         let place = place.into();
-        let mut kick = Vector6::zeros();
-        (kick[PX], kick[PY]) = (direction[0], direction[1]);
-        Source { place, column: inverse(&self.transfer(place)) * kick }
+        let mut all = Vector6::zeros();
+        (all[X], all[PX], all[Y], all[PY]) = (step[0], step[1], step[2], step[3]);
+        Source { place, column: inverse(&self.transfer(place)) * all }
     }
 
     /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one.

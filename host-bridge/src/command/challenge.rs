@@ -75,22 +75,29 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
 
 /// Folders below (or the folder itself) that hold a recording and its key, sorted.
 fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
-    let wrong = |error: std::io::Error| CommandError::Input(format!("{}: {error}", root.display()));
-    let is_one = |folder: &Path| folder.join("frames.csv").is_file() && folder.join("truth.json").is_file();
-    if is_one(root) {
-        return Ok(vec![root.to_owned()]);
-    }
-    let entries: Vec<PathBuf> = std::fs::read_dir(root)
-        .map_err(wrong)?
-        .map(|entry| Ok(entry.map_err(wrong)?.path()))
-        .collect::<Result<_, CommandError>>()?;
-    let mut found: Vec<PathBuf> = entries.into_iter().filter(|folder| is_one(folder)).collect();
+    let mut found = Vec::new();
+    descend(root, &mut found)?;
     found.sort();
     if found.is_empty() {
         let what = "expected folders with frames.csv and truth.json, found none";
         return Err(CommandError::Input(format!("{}: {what}", root.display())));
     }
     Ok(found)
+}
+
+fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> {
+    let wrong = |error: std::io::Error| CommandError::Input(format!("{}: {error}", folder.display()));
+    if folder.join("frames.csv").is_file() && folder.join("truth.json").is_file() {
+        found.push(folder.to_owned());
+    }
+    for entry in std::fs::read_dir(folder).map_err(wrong)? {
+        let entry = entry.map_err(wrong)?;
+        // not by a link, which may lead back here
+        if entry.file_type().map_err(wrong)?.is_dir() {
+            descend(&entry.path(), found)?;
+        }
+    }
+    Ok(())
 }
 
 impl Scored {

@@ -49,6 +49,9 @@ struct FindingAnswer {
     sentence: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     heldout_gain: Option<[f64; 2]>,
+    /// Of an alternative: such a recording is not expected to tell it from the finding.
+    #[serde(skip_serializing_if = "core::ops::Not::not")]
+    inseparable: bool,
     alternatives: Vec<FindingAnswer>,
 }
 
@@ -225,6 +228,7 @@ impl FindingAnswer {
             probability: finding.probability,
             sentence: finding.phrase.clone(),
             heldout_gain: finding.heldout.map(Into::into),
+            inseparable: finding.inseparable,
             alternatives: finding.alternatives.iter().map(Self::of).collect(),
         }
     }

@@ -70,8 +70,7 @@ impl Along {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
         let bench = unknown.map_or_else(|| Projection::of(fitted), |at| Projection::without(fitted, at));
         let data = fitted.data(data);
-        let (machine, drives) =
-            fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+        let (machine, drives) = fitted.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;
         let scale = kind.prior_scale().unwrap_or(1.0);
         let judge = |cells: Vec<Cell>| -> Self {

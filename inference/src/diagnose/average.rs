@@ -6,8 +6,9 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::discrepancy::Discrepancy;
 use super::fit::{Fitted, prior};
-use super::search::{Found, Slot};
+use super::search::{Cause, Found, Slot};
 
 /// `ln` of the vars.
 #[derive(Debug, Clone)]
@@ -36,10 +37,14 @@ impl Vars {
         let (vars, (_, sigma)) = (plain.mean.len(), prior());
         let mut parts = vec![(slot.nothing, plain.clone())];
         for alternative in &slot.alternatives {
-            let part = match &alternative.fitted {
-                Some(fitted) => Self::of(fitted),
-                None if alternative.adapting.is_empty() => plain.clone(),
-                None => {
+            let part = match (&alternative.fitted, &alternative.cause) {
+                (Some(fitted), _) => Self::of(fitted),
+                (None, Cause::Unknown(Discrepancy { adapted: Some(adapted), .. })) => Self {
+                    mean: &plain.mean + adapted.step.rows(0, vars) * sigma,
+                    covariance: adapted.covariance.view((0, 0), (vars, vars)) * (sigma * sigma),
+                },
+                (None, Cause::Unknown(_)) => plain.clone(),
+                (None, Cause::Effect(_)) => {
                     // to first order: the fit moves along with the amplitude, and shares its uncertainty
                     let shift = alternative.adapting.rows(0, vars) * sigma;
                     let (amplitude, error) = alternative.amplitude;

@@ -33,6 +33,8 @@ pub enum Where {
     MonitorCurve(usize),
     /// At a corrector.
     Corrector(usize),
+    /// A corrector whose kick is not where it should be, or not all.
+    CorrectorElsewhere(usize),
     /// At a place in the ring (a quadrupole's entrance) that kicks the beam in a plane.
     Ring(usize, Plane),
     /// A quadrupole that changes in time.
@@ -56,12 +58,25 @@ pub struct Discrepancy {
     pub size: f64,
     /// Places of the same sort.
     pub sites: usize,
+    /// What the fit's unknowns become, where the data ask for the freedom.
+    pub adapted: Option<Adapted>,
+}
+
+/// The unknowns of a fit beside the freedom, which is marginalised: how they move, and their covariance, to first order.
+#[derive(Debug, Clone)]
+pub struct Adapted {
+    /// Step from the fit, in prior standard deviations.
+    pub step: DVector<f64>,
+    /// Covariance.
+    pub covariance: DMatrix<f64>,
 }
 
 /// Sorts of places, which share the prior.
-pub const SORTS: usize = 11;
+pub const SORTS: usize = 12;
 /// Standard deviations tried [m].
 const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
+/// `ln` Bayes factor from which on the data ask for the freedom.
+const ASKED: f64 = 3.0;
 /// Stretches of time.
 const STRETCHES: usize = 8;
 /// Highest power of the position in what a monitor may read.
@@ -100,8 +115,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     if speaking.is_empty() {
         return Ok(Vec::new());
     }
-    let (machine, drives) =
-        fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[fitted.params.len()..])?;
+    let (machine, drives) = fitted.machine(data)?;
     let predicted = fitted.predicted(data)?;
     let miss = data.miss(&predicted);
     let signatures = Signatures::of(&machine, &drives)?;
@@ -121,6 +135,9 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     for &c in &driven {
         let of_corrector = settings.of_corrector(c);
         all.push(bench.judge(Where::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
+        let patterns = independent(signatures.beside(c));
+        let beside = patterned(&cells, &speaking, &settings.strength(c), &patterns);
+        all.push(bench.judge(Where::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
@@ -132,11 +149,16 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
         let pattern = data.stepped(signature, fitted, &stretches);
         all.push(bench.judge(Where::QuadrupoleInTime(q), &pattern, of_vars.len()));
     }
-    let tunes: Vec<Cells> = [0, 1].into_iter().filter_map(|plane| data.tune_cells(plane, &miss, &stretches)).collect();
-    all.push(bench.judge_held(Where::Tunes, tunes.iter()));
-    all.push(bench.judge_held(Where::Time, speaking.iter().map(|&b| &steps[b])));
-    all.push(bench.judge_held(Where::Everywhere, speaking.iter().map(|&b| &cells[b])));
+    let tunes: Vec<Cells> =
+        [0, 1].into_iter().filter_map(|plane| data.tune_cells(plane, &miss, fitted, &stretches)).collect();
+    all.push(bench.judge_held(Where::Tunes, &tunes.iter().collect::<Vec<_>>()));
+    all.push(bench.judge_held(Where::Time, &some(&steps, &speaking)));
+    all.push(bench.judge_held(Where::Everywhere, &some(&cells, &speaking)));
     Ok(all)
+}
+
+fn some<'c>(cells: &'c [Cells], monitors: &[usize]) -> Vec<&'c Cells> {
+    monitors.iter().map(|&b| &cells[b]).collect()
 }
 
 impl Bench<'_> {
@@ -150,16 +172,38 @@ impl Bench<'_> {
     fn judge(&self, at: Where, cells: &Cells, sites: usize) -> Discrepancy {
         let (pull, gram) = self.project(cells);
         let logs = SIZES.map(|size| marginal(&pull, &gram, size));
-        Discrepancy::of(at, logs, sites)
+        self.conclude(Discrepancy::of(at, logs, sites), &[cells])
     }
 
     /// Many monitors with one size, the fit's own unknowns held: less than the truth, as they would adapt.
-    fn judge_held<'c>(&self, at: Where, each: impl Iterator<Item = &'c Cells>) -> Discrepancy {
+    fn judge_held(&self, at: Where, each: &[&Cells]) -> Discrepancy {
         let mut logs = [0.0; SIZES.len()];
         for cells in each {
             logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&cells.pull, &cells.gram, size));
         }
-        Discrepancy::of(at, logs, 1)
+        self.conclude(Discrepancy::of(at, logs, 1), each)
+    }
+
+    /// With what the fit's unknowns become.
+    fn conclude(&self, found: Discrepancy, each: &[&Cells]) -> Discrepancy {
+        let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
+        Discrepancy { adapted, ..found }
+    }
+
+    /// With `C = Z^T J` and `K = (Z^T Z + 1/omega^2)^-1`: covariance `(1 + J^T J - sum of C^T K C)^-1`, step `-cov sum of C^T K Z^T r`.
+    fn adapted(&self, each: &[&Cells], size: f64) -> Option<Adapted> {
+        let lower = self.fitted.factor.l();
+        let mut information = &lower * lower.transpose();
+        let mut slope = self.fitted.slope.clone();
+        for cells in each {
+            let mut gram = cells.gram.clone();
+            (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0 / (size * size));
+            let factor = gram.cholesky()?;
+            information -= cells.cross.transpose() * factor.solve(&cells.cross);
+            slope -= cells.cross.tr_mul(&factor.solve(&cells.pull));
+        }
+        let factor = information.cholesky()?;
+        Some(Adapted { step: factor.solve(&slope), covariance: factor.inverse() })
     }
 }
 
@@ -170,7 +214,7 @@ impl Discrepancy {
             .enumerate()
             .fold((0, f64::NEG_INFINITY), |best, (i, &log)| if log > best.1 { (i, log) } else { best });
         let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
-        Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites }
+        Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
     }
 }
 
@@ -238,12 +282,23 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
 /// One number for each setting that all monitors see by a pattern.
 fn weighted(cells: &[Cells], monitors: &[usize], pattern: &DVector<f64>) -> Cells {
     let first = &cells[monitors[0]];
-    let (n, p) = first.cross.shape();
-    let mut sum = Cells { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
+    let mut sum = Cells::none(first.cross.nrows(), first.cross.ncols());
     for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
         sum.gram += &cells[b].gram * (pattern[b] * pattern[b]);
         sum.cross += &cells[b].cross * pattern[b];
         sum.pull += &cells[b].pull * pattern[b];
+    }
+    sum
+}
+
+/// One number for each pattern over the monitors (one a column), in proportion to `setting`.
+fn patterned(cells: &[Cells], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Cells {
+    let mut sum = Cells::none(patterns.ncols(), cells[monitors[0]].cross.ncols());
+    for &b in monitors {
+        let seen = patterns.row(b).transpose();
+        sum.gram += &seen * seen.transpose() * setting.dot(&(&cells[b].gram * setting));
+        sum.cross += &seen * setting.tr_mul(&cells[b].cross);
+        sum.pull += &seen * setting.dot(&cells[b].pull);
     }
     sum
 }
@@ -280,7 +335,13 @@ impl Data {
 
     /// Sums of one tune's numbers over the columns of `indicator`, its mean left alone, in units that make its noise as large as
     /// that of a monitor; none if the tune meter says too little.
-    fn tune_cells(&self, plane: usize, miss: &DMatrix<f64>, indicator: &DMatrix<f64>) -> Option<Cells> {
+    fn tune_cells(
+        &self,
+        plane: usize,
+        miss: &DMatrix<f64>,
+        fitted: &Fitted,
+        indicator: &DMatrix<f64>,
+    ) -> Option<Cells> {
         let noise = self.tune_noise(plane)?;
         let miss = miss.column(self.readings.ncols() + plane);
         let frames = self.tune_frames(plane);
@@ -292,16 +353,14 @@ impl Data {
         let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
         Some(Cells {
             gram: columns.tr_mul(&columns),
-            cross: DMatrix::zeros(columns.ncols(), 0),
+            cross: DMatrix::zeros(columns.ncols(), fitted.jacobian.ncols()),
             pull: columns.tr_mul(&miss).column(0).into_owned(),
         })
     }
 
     /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
     fn stepped(&self, signature: &twin::Signature, fitted: &Fitted, stretches: &DMatrix<f64>) -> Cells {
-        let (edges, p) = (stretches.ncols(), fitted.jacobian.ncols());
-        let mut sum =
-            Cells { gram: DMatrix::zeros(edges, edges), cross: DMatrix::zeros(edges, p), pull: DVector::zeros(edges) };
+        let mut sum = Cells::none(stretches.ncols(), fitted.jacobian.ncols());
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
         for b in self.speaking_monitors() {
             let mut columns = stretches.clone();
@@ -315,6 +374,13 @@ impl Data {
     }
 }
 
+impl Cells {
+    fn none(numbers: usize, unknowns: usize) -> Self {
+        let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
+        Self { gram, cross, pull: DVector::zeros(numbers) }
+    }
+}
+
 impl Where {
     /// The name of the place: a monitor, a corrector, a half-cell, or a stretch.
     pub fn label(&self, data: &Data) -> String {
@@ -325,7 +391,7 @@ impl Where {
             | Self::GainInTime(b)
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
-            Self::Corrector(c) => ring.corrector_names()[c].clone(),
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
             Self::Time => "time".into(),
             Self::Tunes => "tunes".into(),
@@ -343,6 +409,7 @@ impl Where {
             Self::MonitorElsewhere(_) => format!("monitor {name}, elsewhere"),
             Self::MonitorCurve(_) => format!("curve of {name}"),
             Self::Corrector(_) => format!("corrector {name}"),
+            Self::CorrectorElsewhere(_) => format!("corrector {name}, elsewhere"),
             Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
@@ -362,6 +429,7 @@ impl Where {
             Self::MonitorElsewhere(_) => format!("monitor {name} reads something of the orbit elsewhere"),
             Self::MonitorCurve(_) => format!("monitor {name} reads another function of the position"),
             Self::Corrector(_) => format!("corrector {name} does something else than one kick"),
+            Self::CorrectorElsewhere(_) => format!("corrector {name} kicks the beam elsewhere too"),
             Self::Ring(_, Plane::X) => format!("something near {name} kicks the beam horizontally"),
             Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
@@ -382,7 +450,7 @@ impl Where {
             | Self::GainInTime(b)
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.read_monitors[b],
-            Self::Corrector(c) => ring.correctors[c],
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c],
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q],
             Self::Time | Self::Tunes | Self::Everywhere => return None,
         };

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{EffectError, EffectKind, Signature, Signatures};
+use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
 
 use super::data::Data;
 use super::hypothesis::{Hypothesis, Unknown};
@@ -239,6 +239,14 @@ impl Fitted {
         })
     }
 
+    /// The machine at the best point, and what drives it.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn machine(&self, data: &Data) -> Result<(Machine, Drives), EffectError> {
+        self.hypothesis.machine(data, &self.params, &self.u.as_slice()[self.params.len()..])
+    }
+
     /// Predictions at the best point, rows frames, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
@@ -260,7 +268,7 @@ impl Fitted {
     /// [`EffectError`].
     pub fn slopes(&self, data: &Data) -> Result<Vec<DMatrix<f64>>, EffectError> {
         let vars = self.params.len();
-        let (machine, drives) = self.hypothesis.machine(data, &self.params, &self.u.as_slice()[vars..])?;
+        let (machine, drives) = self.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;
         let by_frame = |signature: Signature, scale: f64| signature.by_frame(&drives.time) * scale;
         let of_vars = signatures.of_vars().into_iter().map(|signature| by_frame(signature, prior().1));

@@ -11,6 +11,7 @@ use twin::{Drives, EffectError, EffectKind, Machine, Rf, Signatures};
 use super::data::Data;
 use super::fit::{Fitted, prior};
 use super::hypothesis::Term;
+use super::scan::expected;
 
 /// One thing that could be done.
 #[derive(Debug, Clone)]
@@ -50,8 +51,7 @@ impl Menu {
     /// # Errors
     /// [`EffectError`].
     pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, EffectError> {
-        let vars = fitted.params.len();
-        let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
+        let (machine, drives) = fitted.machine(data)?;
         let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let fixed = other.is_some_and(|other| other.kind.prior_scale().is_none());
@@ -167,10 +167,5 @@ fn separation(campaigns: &[&Campaign], amplitude: f64, fixed: bool) -> f64 {
     let taken = factor.solve(&with_one);
     let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
     let rival = other - with_other.dot(&factor.solve(&with_other));
-    let left = if fixed {
-        amplitude * amplitude * h - 2.0 * amplitude * c + rival
-    } else {
-        amplitude * amplitude * (h - c * c / (1.0 + rival))
-    };
-    0.5 * left.max(0.0)
+    expected(amplitude, h, c, rival, !fixed)
 }

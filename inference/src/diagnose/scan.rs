@@ -80,6 +80,17 @@ impl Projection {
         Self { residual, back, factor, slope }
     }
 
+    /// `d P r` of whitened signatures, one a column.
+    fn pulls(&self, columns: &DMatrix<f64>) -> DVector<f64> {
+        columns.tr_mul(&self.residual) - self.factor.solve(&(&self.back * columns)).tr_mul(&self.slope)
+    }
+
+    /// `d_i P d_j` of whitened signatures, one a column.
+    pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        let shared = &self.back * columns;
+        columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
+    }
+
     /// Score whitened signatures, one a column, in units of their prior standard deviations.
     pub fn score(&self, columns: DMatrix<f64>) -> Scored {
         let shared = &self.back * &columns;
@@ -121,8 +132,7 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 /// # Errors
 /// [`EffectError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, EffectError> {
-    let vars = fitted.params.len();
-    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
+    let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let bench = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
@@ -147,22 +157,61 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     Ok(all)
 }
 
+/// Expected `ln` Bayes factor of a cause, `amplitude` prior standard deviations large, over a rival, from what a fit cannot
+/// imitate of both: `h = d P d` of the cause, `rival` the same of the other, `both` between them. The rival's amplitude is free,
+/// or it has none.
+///
+/// `(h - both^2/(1 + rival)) a^2/2`, or half of `|a d - d_rival|^2` by P.
+pub fn expected(amplitude: f64, h: f64, both: f64, rival: f64, free: bool) -> f64 {
+    let left = if free {
+        amplitude * amplitude * (h - both * both / (1.0 + rival))
+    } else {
+        amplitude * amplitude * h - 2.0 * amplitude * both + rival
+    };
+    0.5 * left.max(0.0)
+}
+
+/// [`expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn separations(
+    data: &Data,
+    fitted: &Fitted,
+    (term, amplitude): (&Term, f64),
+    others: &[&Term],
+) -> Result<Vec<f64>, EffectError> {
+    let (machine, drives) = fitted.machine(data)?;
+    let signatures = Signatures::of(&machine, &drives)?;
+    let data = fitted.data(data);
+    let column = |term: &&Term| -> Result<DVector<f64>, EffectError> {
+        Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * term.kind.prior_scale().unwrap_or(1.0))
+    };
+    let columns: Vec<DVector<f64>> =
+        core::iter::once(&term).chain(others).map(column).collect::<Result<_, EffectError>>()?;
+    let gram = Projection::of(fitted).gram(&DMatrix::from_columns(&columns));
+    let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
+    let of = |(i, other): (usize, &&Term)| {
+        let free = other.kind.prior_scale().is_some();
+        expected(amplitude, gram[(0, 0)], gram[(0, i + 1)], gram[(i + 1, i + 1)], free)
+    };
+    Ok(others.iter().enumerate().map(of).collect())
+}
+
 /// `ln` Bayes factor of all members of a family having amplitudes of one of some standard deviations, to first order.
 ///
 /// # Errors
 /// [`EffectError`].
 pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, EffectError> {
-    let vars = fitted.params.len();
-    let (machine, drives) = fitted.hypothesis.machine(data, &fitted.params, &fitted.u.as_slice()[vars..])?;
+    let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let columns: Vec<DVector<f64>> = members
         .iter()
         .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?)))
         .collect::<Result<_, EffectError>>()?;
     let columns = DMatrix::from_columns(&columns);
-    let shared = fitted.jacobian.transpose() * &columns;
-    let taken = fitted.free.solve(&shared);
-    let pull = columns.tr_mul(&fitted.residual) - taken.tr_mul(&fitted.slope);
-    let gram = columns.transpose() * &columns - shared.transpose() * taken;
-    Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pull, &gram, width)).collect())
+    let bench = Projection::of(fitted);
+    let pulls = bench.pulls(&columns);
+    let gram = bench.gram(&columns);
+    Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pulls, &gram, width)).collect())
 }

@@ -11,7 +11,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::{EffectError, EffectKind, Machine};
+use twin::{EffectError, EffectKind};
 
 use super::SUSPICIOUS;
 use super::data::Data;
@@ -187,7 +187,7 @@ impl Search {
         let mut null = found.null.clone();
         let (mut best, mut slots) = self.settle(&data, leader, &found.next)?;
         // orbits that the effects have changed are curved in another way
-        if data.straighten(&machine(&data, &best)?).is_ok_and(|moved| moved > CURVED) {
+        if data.straighten(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
             best = straighten(&mut data, &best.hypothesis, &best.u)?;
             null = Fitted::of(&data, &null.hypothesis, &null.u)?;
             slots = (0..slots.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
@@ -208,30 +208,30 @@ impl Search {
         found.best.log_evidence - found.null.log_evidence + prior + softplus(found.next.log_odds)
     }
 
-    /// Let all candidates compete for each slot, given the others, until the best one is in each. The only effect of a fit has
-    /// just won its competition.
+    /// Let all candidates compete for each slot, given the others, until the best one is in each. The last effect of the fit has
+    /// just won the competition for its slot.
     fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
         let mut best = fitted;
-        if best.hypothesis.terms.len() == 1 {
-            return Ok((best, vec![won.clone()]));
-        }
-        for _ in 0..ROUNDS {
-            let mut slots = Vec::new();
+        let last = best.hypothesis.terms.len() - 1;
+        let mut slots = Vec::new();
+        for round in 0.. {
             let mut changed = false;
-            for i in 0..best.hypothesis.terms.len() {
-                let slot = self.without(data, &best, i)?;
-                if let Some(fitted) = slot.leader()
-                    && fitted.hypothesis.terms.last() != best.hypothesis.terms.get(i)
+            slots.clear();
+            for i in 0..=last {
+                let slot =
+                    if round == 0 && i == last && !changed { won.clone() } else { self.without(data, &best, i)? };
+                let is_other = |fitted: &Fitted| fitted.hypothesis.terms.last() != best.hypothesis.terms.get(i);
+                if let Some(other) = slot.leader().filter(is_other)
+                    && round < ROUNDS
                 {
-                    (best, changed) = (fitted, true);
+                    (best, changed) = (other, true);
                 }
                 slots.push(slot);
             }
             if !changed {
-                return Ok((best, slots));
+                break;
             }
         }
-        let slots = (0..best.hypothesis.terms.len()).map(|i| self.without(data, &best, i)).collect::<Result<_, _>>()?;
         Ok((best, slots))
     }
 
@@ -303,19 +303,13 @@ fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) ->
     }
     for _ in 0..PASSES {
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = data.straighten(&machine(data, &fitted)?) else { break };
+        let Ok(moved) = data.straighten(&fitted.machine(data)?.0) else { break };
         fitted = Fitted::of(data, hypothesis, &fitted.u)?;
         if moved < CURVED {
             break;
         }
     }
     Ok(fitted)
-}
-
-/// The machine of a fit.
-fn machine(data: &Data, fitted: &Fitted) -> Result<Machine, EffectError> {
-    let unknown = &fitted.u.as_slice()[fitted.params.len()..];
-    Ok(fitted.hypothesis.machine(data, &fitted.params, unknown)?.0)
 }
 
 /// The exact fit with a candidate, given up where it stays far behind the least cost of its rivals.
@@ -411,9 +405,17 @@ impl Alternative {
         }
     }
 
+    /// The effect of the library that it is, if any.
+    pub fn term(&self) -> Option<&Term> {
+        match &self.cause {
+            Cause::Effect(term) => Some(term),
+            Cause::Unknown(_) => None,
+        }
+    }
+
     /// True for an effect of the library.
     pub fn is_of_library(&self) -> bool {
-        matches!(self.cause, Cause::Effect(_))
+        self.term().is_some()
     }
 }
 

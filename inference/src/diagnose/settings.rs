@@ -49,6 +49,14 @@ impl Settings {
         (0..self.powered.len()).filter(powered).collect()
     }
 
+    /// What a corrector is set to in each setting, in units of the nominal.
+    pub fn strength(&self, c: usize) -> DVector<f64> {
+        let set = |powered: &Option<(usize, i64)>| {
+            powered.filter(|(of, _)| *of == c).map_or(0.0, |(_, fifths)| 0.2 * fifths as f64)
+        };
+        DVector::from_iterator(self.powered.len(), self.powered.iter().map(set))
+    }
+
     /// Mean drive of each setting, on the reference orbit, in mid-campaign.
     pub fn means(&self, drives: &Drives) -> Drives {
         let indicator = self.indicator();

@@ -7,6 +7,7 @@ use super::data::Data;
 use super::heldout::{Fold, Score};
 use super::hypothesis::Term;
 use super::next::Menu;
+use super::scan::separations;
 use super::search::{Alternative, Cause, Found, Slot};
 use super::{DECISIVE, PROVEN, SUSPICIOUS};
 
@@ -25,6 +26,8 @@ pub enum Verdict {
 
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
+/// Alternatives that the sentence names.
+const SAID: usize = 3;
 /// Share of the posterior that an interval of the place holds.
 const CREDIBLE: f64 = 0.95;
 
@@ -53,7 +56,7 @@ impl Verdict {
             };
         }
         let decided = |(slot, term): (&Slot, &Term)| {
-            let is_it = |a: &&Alternative| matches!(&a.cause, Cause::Effect(of) if of == term);
+            let is_it = |a: &&Alternative| a.term() == Some(term);
             slot.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
         };
         let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
@@ -89,6 +92,8 @@ pub struct Finding {
     pub probability: f64,
     /// Gain of held-out log predictive density, and its standard error; none if it is not in the model.
     pub heldout: Option<(f64, f64)>,
+    /// True for an alternative that such a recording is not expected to tell from the finding.
+    pub inseparable: bool,
     /// The rest of the competition.
     pub alternatives: Vec<Finding>,
 }
@@ -117,15 +122,37 @@ impl Finding {
             log_evidence_gain: alternative.log_gain,
             probability: alternative.probability,
             heldout: None,
+            inseparable: false,
             alternatives: Vec::new(),
         }
     }
 
     /// The first of a competition, with the others below it.
-    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Self {
+    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Result<Self, EffectError> {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
-        let others = slot.alternatives.iter().enumerate().filter(listed).map(|(_, a)| Self::of(data, a));
-        Self { alternatives: others.collect(), ..Self::of(data, &slot.alternatives[first]) }
+        let others: Vec<&Alternative> = slot.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
+        let finding = Self::of(data, &slot.alternatives[first]);
+        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
+        if let Cause::Effect(term) = &slot.alternatives[first].cause {
+            let effects: Vec<(usize, &Term)> =
+                others.iter().enumerate().filter_map(|(i, a)| Some((i, a.term()?))).collect();
+            let terms: Vec<&Term> = effects.iter().map(|(_, term)| *term).collect();
+            let separations = separations(data, &slot.without, (term, finding.amplitude.0), &terms)?;
+            for ((i, _), separation) in effects.iter().zip(separations) {
+                alternatives[*i].inseparable = separation < (DECISIVE / (1.0 - DECISIVE)).ln();
+            }
+        }
+        Ok(Self { alternatives, ..finding })
+    }
+
+    /// True if held-out frames are predicted better by more than the standard errors asked for.
+    pub fn is_proven(&self) -> bool {
+        self.heldout.is_some_and(|(gain, error)| gain > PROVEN * error)
+    }
+
+    /// Probability of this cause and of all that cannot be told from it.
+    pub fn together(&self) -> f64 {
+        self.probability + self.alternatives.iter().filter(|a| a.inseparable).map(|a| a.probability).sum::<f64>()
     }
 }
 
@@ -158,13 +185,13 @@ pub fn findings(
 ) -> Result<Vec<Finding>, EffectError> {
     let mut all: Vec<Finding> = Vec::new();
     for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
-        let is_it = |a: &Alternative| matches!(&a.cause, Cause::Effect(of) if of == term);
+        let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
         let interval = match thin(term.kind) {
             Some(kind) => Along::of(data, &found.best, Some(index), kind)?.credible(CREDIBLE),
             None => Vec::new(),
         };
-        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first) });
+        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first)? });
     }
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match verdict {
@@ -172,7 +199,9 @@ pub fn findings(
         Verdict::Ambiguous if all.is_empty() => (!found.next.alternatives.is_empty()).then_some(0),
         _ => None,
     };
-    all.extend(open.map(|first| Finding::of_slot(data, &found.next, first)));
+    if let Some(first) = open {
+        all.push(Finding::of_slot(data, &found.next, first)?);
+    }
     Ok(all)
 }
 
@@ -228,8 +257,10 @@ fn ambiguous(findings: &[Finding]) -> String {
             continue;
         }
         let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
-        let others = finding.alternatives.iter().take(3).map(of);
-        parts.push(core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or "));
+        let others = finding.alternatives.iter().take(SAID).map(of);
+        let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
+        let apart = if finding.together() >= DECISIVE { ", which this recording cannot tell apart" } else { "" };
+        parts.push(format!("{said}{apart}"));
     }
     format!("something may be missing: {}", parts.join("; and "))
 }
@@ -270,10 +301,7 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     }
     let undecided = |slot: &&Slot| slot.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
     let slot = found.slots.iter().find(undecided).or(found.slots.first()).unwrap_or(&found.next);
-    let effects = slot.alternatives.iter().filter_map(|a| match &a.cause {
-        Cause::Effect(term) => Some((a, term)),
-        Cause::Unknown(_) => None,
-    });
+    let effects = slot.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);

@@ -20,7 +20,7 @@ use crate::diagnose::fit::Fitted;
 use crate::diagnose::hypothesis::Hypothesis;
 use crate::diagnose::{Diagnosis, Finding, Verdict};
 use crate::recording::Recording;
-use crate::score::{Grade, TrueEffect, Truth};
+use crate::score::{Fate, Grade, TrueEffect, Truth};
 use crate::simulate::{self, Beyond, Hardware};
 pub use case::{Case, Class};
 pub use unknown::{Unknown, UnknownKind};
@@ -36,6 +36,8 @@ pub struct Outcome {
     pub truth: Vec<TrueEffect>,
     /// Gain in `ln` posterior when kind, place and size are given.
     pub oracle_gain: f64,
+    /// Of each effect, the same beside the others, and what became of it.
+    pub fates: Vec<(f64, Fate)>,
     /// The verdict's word.
     pub verdict: String,
     /// How right it is.
@@ -74,10 +76,12 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     let seconds = started.elapsed().as_secs_f64();
     let key = case.key(ring);
     let names = ring.var_names();
+    let (oracle_gain, own) = oracle(ring, case, &recording, &without)?;
     Ok(Some(Outcome {
         index: case.index,
         class: case.class,
-        oracle_gain: oracle(ring, case, &recording, &without)?,
+        oracle_gain,
+        fates: own.into_iter().zip(key.fates(&diagnosis)).collect(),
         verdict: diagnosis.verdict.word().into(),
         grade: key.grade(&diagnosis),
         found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
@@ -135,21 +139,28 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
     diagnosis.findings.iter().filter(named).filter_map(touches).collect()
 }
 
-/// Gain in `ln` posterior of vars and baselines when kind, place and size are given; of what the library does not hold, when
-/// its signal is taken out.
-fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<f64, DataError> {
+/// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
+/// others; of what the library does not hold, when its signal is taken out.
+fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<(f64, Vec<f64>), DataError> {
     let data = Data::of(ring, recording)?;
     let zero = DVector::zeros(ring.quadrupoles.len());
     let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
         let hypothesis = Hypothesis { given: given.to_vec(), ..Hypothesis::default() };
         Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
     };
-    let known = if case.beyond.is_empty() {
-        best(&data, &case.effects)?
-    } else {
-        best(&data.less(&signal(recording, without), &tunes(recording, without)), &[])?
+    let nothing = best(&data, &[])?;
+    if !case.beyond.is_empty() {
+        let cleaned = data.less(&signal(recording, without), &tunes(recording, without));
+        let gain = best(&cleaned, &[])? - nothing;
+        return Ok((gain, vec![gain]));
+    }
+    let all = best(&data, &case.effects)?;
+    let own = |i: usize| -> Result<f64, DataError> {
+        let mut others = case.effects.clone();
+        others.remove(i);
+        Ok(all - if others.is_empty() { nothing } else { best(&data, &others)? })
     };
-    Ok(known - best(&data, &[])?)
+    Ok((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?))
 }
 
 /// What the effect adds to each reading [m].

@@ -8,7 +8,7 @@ use statrs::distribution::{Beta, ContinuousCDF};
 use twin::EffectKind;
 
 use super::{Class, Outcome};
-use crate::score::{Grade, TrueEffect};
+use crate::score::{Fate, Grade, TrueEffect};
 
 /// Share of successes among trials, with the 95 % limits of Clopper and Pearson.
 ///
@@ -23,16 +23,14 @@ pub struct Share {
     pub limits: [f64; 2],
 }
 
-/// Verdicts of the campaigns of one row.
+/// What became of the effects of one row.
 #[derive(Debug, Clone, Default, Serialize)]
-#[allow(missing_docs)] // named after the grades
-pub struct Grades {
-    pub right: usize,
-    pub partial: usize,
+#[allow(missing_docs)] // named after the fates
+pub struct Fates {
+    pub named: usize,
+    pub together: usize,
     pub listed: usize,
-    pub open: usize,
-    pub missed: usize,
-    pub wrong: usize,
+    pub absent: usize,
 }
 
 /// How often a stated probability is right.
@@ -53,8 +51,10 @@ pub struct Tables {
     pub empty_consistent: Share,
     /// See above.
     pub empty_identified: Share,
-    /// Grades of campaigns with effects of the library, by oracle gain.
-    pub by_gain: Vec<([f64; 2], Grades)>,
+    /// What became of the effects of the library, by their own oracle gain.
+    pub by_gain: Vec<([f64; 2], Fates)>,
+    /// Campaigns with something named, and among them those with something named that is not there, by oracle gain.
+    pub wrong: Share,
     /// Campaigns beyond the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
     pub unknown: Vec<([f64; 2], Share, usize)>,
     /// Single effects named right, by kind and size (weak, medium, strong thirds of the logarithm).
@@ -107,24 +107,22 @@ impl Share {
     }
 }
 
-impl Grades {
-    fn of<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> Self {
-        let mut grades = Self::default();
-        for outcome in outcomes {
-            *match outcome.grade {
-                Grade::Right => &mut grades.right,
-                Grade::Partial => &mut grades.partial,
-                Grade::Listed => &mut grades.listed,
-                Grade::Open => &mut grades.open,
-                Grade::Missed => &mut grades.missed,
-                Grade::Wrong => &mut grades.wrong,
+impl Fates {
+    fn of<'o>(fates: impl Iterator<Item = &'o Fate>) -> Self {
+        let mut all = Self::default();
+        for fate in fates {
+            *match fate {
+                Fate::Named => &mut all.named,
+                Fate::Together => &mut all.together,
+                Fate::Listed => &mut all.listed,
+                Fate::Absent => &mut all.absent,
             } += 1;
         }
-        grades
+        all
     }
 
     fn total(&self) -> usize {
-        self.right + self.partial + self.listed + self.open + self.missed + self.wrong
+        self.named + self.together + self.listed + self.absent
     }
 }
 
@@ -133,6 +131,10 @@ impl Tables {
     pub fn of(outcomes: &[Outcome]) -> Self {
         let class = |class: Class| outcomes.iter().filter(move |outcome| outcome.class == class);
         let library = || outcomes.iter().filter(|o| matches!(o.class, Class::Single | Class::Pair));
+        let with_gain = |[from, to]: [f64; 2]| {
+            let effects = library().flat_map(|outcome| &outcome.fates);
+            effects.filter(move |(gain, _)| (from..to).contains(gain)).map(|(_, fate)| fate)
+        };
         let within = |[from, to]: [f64; 2]| move |o: &&Outcome| (from..to).contains(&o.oracle_gain);
         let named = |outcome: &Outcome| outcome.verdict == "identified";
         let undecided = |outcome: &Outcome| matches!(outcome.verdict.as_str(), "unexplained" | "ambiguous");
@@ -144,7 +146,8 @@ impl Tables {
         Self {
             empty_consistent: Share::of(class(Class::Empty), |o| o.verdict == "consistent"),
             empty_identified: Share::of(class(Class::Empty), named),
-            by_gain: GAINS.map(|bin| (bin, Grades::of(library().filter(within(bin))))).into(),
+            by_gain: GAINS.map(|bin| (bin, Fates::of(with_gain(bin)))).into(),
+            wrong: Share::of(outcomes.iter().filter(|o| o.class != Class::Unknown), |o| o.grade == Grade::Wrong),
             unknown: GAINS
                 .map(|bin| {
                     let of = || class(Class::Unknown).filter(within(bin));
@@ -175,21 +178,23 @@ impl Tables {
         writeln!(text, "| empty campaigns | of all, 95 % limits |\n|---|---|")?;
         writeln!(text, "| called consistent | {} |", self.empty_consistent.text())?;
         writeln!(text, "| something named | {} |\n", self.empty_identified.text())?;
-        writeln!(text, "Effects of the library, one or two a campaign, by the oracle's gain in ln posterior:\n")?;
         writeln!(
             text,
-            "| oracle gain | campaigns | named right | one of two named | undecided, truth listed | undecided, truth not listed | missed | wrong |"
+            "Effects of the library, one or two a campaign, by the gain in ln posterior when kind, place and size are given (of one of \
+             two: beside the other):\n"
         )?;
-        writeln!(text, "|---|---|---|---|---|---|---|---|")?;
-        for (bin, grades) in &self.by_gain {
-            let Grades { right, partial, listed, open, missed, wrong } = grades;
-            let total = grades.total();
-            writeln!(
-                text,
-                "| {} | {total} | {right} | {partial} | {listed} | {open} | {missed} | {wrong} |",
-                range(bin)
-            )?;
+        writeln!(
+            text,
+            "| oracle gain | effects | named | undecided among causes that cannot be told apart | undecided, listed | not mentioned | named or such a set |"
+        )?;
+        writeln!(text, "|---|---|---|---|---|---|---|")?;
+        for (bin, fates) in &self.by_gain {
+            let Fates { named, together, listed, absent } = fates;
+            let found = Share::new(named + together, fates.total());
+            let counts = format!("{} | {named} | {together} | {listed} | {absent}", fates.total());
+            writeln!(text, "| {} | {counts} | {} |", range(bin), found.text())?;
         }
+        writeln!(text, "\nCampaigns in which something was named that is not there: {}.", self.wrong.text())?;
         writeln!(text, "\nPhysics beyond the library:\n")?;
         writeln!(text, "| oracle gain | called unexplained or ambiguous | named as something else |\n|---|---|---|")?;
         for (bin, share, wrong) in &self.unknown {

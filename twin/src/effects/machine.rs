@@ -116,8 +116,8 @@ impl Machine {
             }
             EffectKind::StrayGradient => self.stray(effect, a, 0.0)?,
             EffectKind::StraySkewGradient => self.stray(effect, 0.0, a)?,
-            EffectKind::DipoleGradient => self.bends(effect, |bend, length| bend.k1 += a / length)?,
-            EffectKind::DipoleEdge => self.bends(effect, |bend, _| {
+            EffectKind::DipoleGradient => self.bend(effect, |bend, length| bend.k1 += a / length)?,
+            EffectKind::DipoleEdge => self.bend(effect, |bend, _| {
                 bend.e1 += a;
                 bend.e2 += a;
             })?,
@@ -259,18 +259,23 @@ impl Machine {
         Ok(())
     }
 
-    fn bends(&mut self, effect: &Effect, change: impl Fn(&mut crate::lattice::Bend, f64)) -> Result<(), EffectError> {
+    /// The dipole of an effect, or all where edges are meant and no place is given.
+    pub(super) fn bends(&self, effect: &Effect) -> Result<Vec<usize>, EffectError> {
         let everywhere = effect.place.is_empty() && effect.kind == EffectKind::DipoleEdge;
-        let mut found = false;
-        for element in &mut self.ring.elements {
-            if let Kind::Bend(bend) = &mut element.kind
-                && (everywhere || element.name == effect.place || element.name.ends_with(&format!("_{}", effect.place)))
-            {
+        let named = |name: &str| everywhere || name == effect.place || name.ends_with(&format!("_{}", effect.place));
+        let is = |(_, e): &(usize, &crate::Element)| matches!(e.kind, Kind::Bend(_)) && named(&e.name);
+        let found: Vec<usize> = self.ring.elements.iter().enumerate().filter(is).map(|(at, _)| at).collect();
+        if found.is_empty() { Err(effect.wrong("a dipole such as B_C4")) } else { Ok(found) }
+    }
+
+    fn bend(&mut self, effect: &Effect, change: impl Fn(&mut crate::lattice::Bend, f64)) -> Result<(), EffectError> {
+        for at in self.bends(effect)? {
+            let element = &mut self.ring.elements[at];
+            if let Kind::Bend(bend) = &mut element.kind {
                 change(bend, element.length);
-                found = true;
             }
         }
-        if found { Ok(()) } else { Err(effect.wrong("a dipole such as B_C4")) }
+        Ok(())
     }
 
     fn sextupole(&mut self, effect: &Effect) -> Result<(), EffectError> {

@@ -48,6 +48,14 @@ pub struct Signature {
 }
 
 impl Signature {
+    fn add(&mut self, other: Self) {
+        self.readings += other.readings;
+        (0..2).for_each(|plane| {
+            self.tunes[plane] += other.tunes[plane];
+            self.tune_drift[plane] += other.tune_drift[plane];
+        });
+    }
+
     /// Readings and, as two more columns, the tunes of every frame.
     pub fn by_frame(self, time: &DVector<f64>) -> DMatrix<f64> {
         let monitors = self.readings.ncols();
@@ -60,7 +68,7 @@ impl Signature {
     }
 }
 
-/// Edge angle for a numerical derivative [rad], and momentum [1].
+/// Momentum step for a numerical derivative [1].
 const STEP: f64 = 1e-4;
 
 impl<'m> Signatures<'m> {
@@ -133,6 +141,14 @@ impl<'m> Signatures<'m> {
             other.column(place).into_owned(),
             slope(crossed),
         ])
+    }
+
+    /// What the read monitors see of a step of the beam in x, x', y and y' at a corrector, columns the four [m, m/rad]. A kick
+    /// anywhere near is a sum of these, but for monitors in between.
+    pub fn beside(&self, corrector: usize) -> DMatrix<f64> {
+        let at = self.machine.ring.correctors[corrector];
+        let step = |i: usize| self.optics.step(at, core::array::from_fn(|j| f64::from(u8::from(i == j))));
+        self.held.response(&self.optics, &self.observers, &[0, 1, 2, 3].map(step))
     }
 
     /// What gains and exchanged names, already in the machine, make of a change of the orbit.
@@ -220,7 +236,8 @@ impl<'m> Signatures<'m> {
                 let at = element(place)?;
                 self.of_gradient(&self.optics.gradient(at), 1.0 / ring.elements[at].length)
             }
-            EffectKind::DipoleEdge | EffectKind::MomentumOffset => self.of_slope(&effect)?,
+            EffectKind::DipoleEdge => self.of_edges(&effect)?,
+            EffectKind::MomentumOffset => self.of_slope(&effect)?,
             EffectKind::FixedRfFrequency | EffectKind::RadialLoop => self.of_change(&effect)?,
             EffectKind::SextupoleError => self.of_sextupole(&effect)?,
             EffectKind::QuadDrift => self.of_drift(),
@@ -240,9 +257,9 @@ impl<'m> Signatures<'m> {
     }
 
     fn of_monitor(&self, b: usize, change: DVector<f64>) -> Signature {
-        let mut readings = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
-        readings.set_column(b, &change);
-        Signature { readings, tunes: [0.0; 2], tune_drift: [0.0; 2] }
+        let mut signature = self.nothing();
+        signature.readings.set_column(b, &change);
+        signature
     }
 
     fn of_corrector(&self, corrector: usize, change: impl Fn(f64) -> f64) -> Signature {
@@ -262,6 +279,26 @@ impl<'m> Signatures<'m> {
         let rf = self.optics.rf_jacobian(&self.observers, gradients) * scale;
         readings.ger(1.0, &self.drives.rf_offset, &rf.column(0), 1.0);
         Signature { readings, tunes: self.optics.tune_slope(gradient).map(|t| t * scale), tune_drift: [0.0; 2] }
+    }
+
+    /// Pole faces of one dipole, or of all: to first order an edge of angle e is a thin gradient of `-h tan e`, h the bend's
+    /// curvature. That a soft fringe focuses y a little less is left out.
+    fn of_edges(&self, effect: &Effect) -> Result<Signature, EffectError> {
+        let mut sum = self.nothing();
+        for at in self.machine.bends(effect)? {
+            let element = &self.machine.ring.elements[at];
+            let Kind::Bend(bend) = &element.kind else { continue };
+            for (depth, angle) in [(0.0, bend.e1), (element.length, bend.e2)] {
+                let gradient = self.optics.thin_gradient(Place { element: at, depth });
+                sum.add(self.of_gradient(&gradient, -bend.curvature / angle.cos().powi(2)));
+            }
+        }
+        Ok(sum)
+    }
+
+    fn nothing(&self) -> Signature {
+        let readings = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
+        Signature { readings, tunes: [0.0; 2], tune_drift: [0.0; 2] }
     }
 
     /// Central difference of two exact responses.
@@ -310,8 +347,7 @@ impl<'m> Signatures<'m> {
 
     /// All gradients in proportion to the time.
     fn of_drift(&self) -> Signature {
-        let zero = DMatrix::zeros(self.kick.nrows(), self.monitors.len());
-        let mut sum = Signature { readings: zero, tunes: [0.0; 2], tune_drift: [0.0; 2] };
+        let mut sum = self.nothing();
         for one in self.unread_vars() {
             sum.readings += one.readings;
             sum.tune_drift = [sum.tune_drift[0] + one.tunes[0], sum.tune_drift[1] + one.tunes[1]];
