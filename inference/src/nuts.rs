@@ -17,7 +17,6 @@ use nuts_rs::{
 };
 
 use rand::Rng;
-use twin::OrbitError;
 
 use crate::draws::{Chain, DrawStats, Draws};
 use crate::posterior::{Laplace, Posterior, RANGE, params_of};
@@ -68,6 +67,33 @@ pub enum NutsError {
     Missing(&'static str),
 }
 
+/// What the sampler explores, in coordinates in which it is nearly a standard normal.
+pub trait Density: Send + Sync + 'static {
+    /// Number of coordinates.
+    fn dimension(&self) -> usize;
+
+    /// Log-density at a position, and its gradient.
+    ///
+    /// # Errors
+    /// Where there is no stable ring: the trajectory ends there.
+    fn evaluate(&self, position: &[f64]) -> Result<(f64, Vec<f64>), Unstable>;
+
+    /// What is kept of a draw, by the names given: the vars, then anything else.
+    fn expand(&self, position: &[f64]) -> Vec<f64>;
+}
+
+/// A ring without a closed orbit.
+#[derive(Debug, thiserror::Error)]
+#[error("no stable ring: {0}")]
+pub struct Unstable(Box<dyn core::error::Error + Send + Sync>);
+
+impl Unstable {
+    /// With its reason.
+    pub fn new(reason: impl core::error::Error + Send + Sync + 'static) -> Self {
+        Self(Box::new(reason))
+    }
+}
+
 /// Sample a posterior about its Laplace approximation; `progress` hears of finished draws, warm-up included.
 ///
 /// # Errors
@@ -75,6 +101,19 @@ pub enum NutsError {
 pub fn sample(
     posterior: Arc<Posterior>,
     laplace: Arc<Laplace>,
+    names: &[String],
+    settings: NutsSettings,
+    progress: impl FnMut(usize),
+) -> Result<NutsRun, NutsError> {
+    explore(Arc::new(Whitened { posterior, laplace }), names, settings, progress)
+}
+
+/// Sample a density from the origin of its coordinates.
+///
+/// # Errors
+/// [`NutsError`].
+pub fn explore<D: Density>(
+    density: Arc<D>,
     names: &[String],
     settings: NutsSettings,
     mut progress: impl FnMut(usize),
@@ -89,7 +128,7 @@ pub fn sample(
     };
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(settings.chains);
     let start = Instant::now();
-    let model = Arc::new(Whitened { posterior, laplace: Arc::clone(&laplace) });
+    let model = Arc::new(Explored(Arc::clone(&density)));
     let failed = |error: anyhow::Error| NutsError::Sampler(format!("{error:#}"));
     let mut sampler = Sampler::new(model, options, HashMapConfig::new(), threads, None).map_err(failed)?;
     let chains = loop {
@@ -102,7 +141,7 @@ pub fn sample(
         }
     };
     let seconds = start.elapsed().as_secs_f64();
-    let explain = |(c, chain)| explained(c, chain, &laplace, names, settings.warm_up);
+    let explain = |(c, chain)| explained(c, chain, density.as_ref(), names, settings.warm_up);
     let divergences = chains.iter().enumerate().flat_map(explain).collect();
     let evaluations = chains.iter().map(leapfrogs).sum();
     let unpack = |chain| unpack(chain, names.len(), settings.warm_up);
@@ -110,60 +149,78 @@ pub fn sample(
     Ok(NutsRun { draws: Draws { names: names.to_vec(), chains }, evaluations, seconds, threads, divergences })
 }
 
-/// The density that the sampler sees.
-#[derive(Debug, Clone)]
+/// The posterior of the vars, in the coordinates of its Laplace approximation.
+#[derive(Debug)]
 struct Whitened {
     posterior: Arc<Posterior>,
     laplace: Arc<Laplace>,
 }
 
-/// A ring without a closed orbit: the trajectory ends there.
-#[derive(Debug, thiserror::Error)]
-#[error("no stable ring: {0}")]
-struct NoRing(#[from] OrbitError);
+impl Density for Whitened {
+    fn dimension(&self) -> usize {
+        self.posterior.dimension()
+    }
 
-impl LogpError for NoRing {
+    fn evaluate(&self, position: &[f64]) -> Result<(f64, Vec<f64>), Unstable> {
+        let u = self.laplace.unbounded(position);
+        let (value, slope) = self.posterior.of_unbounded(u.as_slice()).map_err(Unstable::new)?;
+        Ok((value, self.laplace.whiten(&slope).as_slice().to_vec()))
+    }
+
+    fn expand(&self, position: &[f64]) -> Vec<f64> {
+        params_of(self.laplace.unbounded(position).as_slice()).iter().map(|theta| theta.exp()).collect()
+    }
+}
+
+/// A density as the sampler wants it.
+struct Explored<D>(Arc<D>);
+
+impl<D> Clone for Explored<D> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+impl LogpError for Unstable {
     fn is_recoverable(&self) -> bool {
         true
     }
 }
 
-impl HasDims for Whitened {
+impl<D: Density> HasDims for Explored<D> {
     fn dim_sizes(&self) -> HashMap<String, u64> {
-        HashMap::from([("dim".to_owned(), self.posterior.dimension() as u64)])
+        HashMap::from([("dim".to_owned(), self.0.dimension() as u64)])
     }
 }
 
-impl CpuLogpFunc for Whitened {
-    type LogpError = NoRing;
+impl<D: Density> CpuLogpFunc for Explored<D> {
+    type LogpError = Unstable;
     type FlowParameters = ();
     type ExpandedVector = Vec<f64>;
 
     fn dim(&self) -> usize {
-        self.posterior.dimension()
+        self.0.dimension()
     }
 
-    fn logp(&mut self, position: &[f64], gradient: &mut [f64]) -> Result<f64, NoRing> {
-        let u = self.laplace.unbounded(position);
-        let (value, slope) = self.posterior.of_unbounded(u.as_slice())?;
-        gradient.copy_from_slice(self.laplace.whiten(&slope).as_slice());
+    fn logp(&mut self, position: &[f64], gradient: &mut [f64]) -> Result<f64, Unstable> {
+        let (value, slope) = self.0.evaluate(position)?;
+        gradient.copy_from_slice(&slope);
         Ok(value)
     }
 
-    /// The vars.
     fn expand_vector<R: Rng + ?Sized>(&mut self, _: &mut R, position: &[f64]) -> Result<Vec<f64>, CpuMathError> {
-        Ok(params_of(self.laplace.unbounded(position).as_slice()).iter().map(|theta| theta.exp()).collect())
+        Ok(self.0.expand(position))
     }
 }
 
-impl Model for Whitened {
-    type Math = CpuMath<Whitened>;
+impl<D: Density> Model for Explored<D> {
+    type Math = CpuMath<Explored<D>>;
 
     fn math<R: Rng + ?Sized>(self: Arc<Self>, _: &mut R) -> anyhow::Result<Self::Math> {
         Ok(CpuMath::new((*self).clone()))
     }
 
-    /// The MAP.
+    /// The origin.
     fn init_position<R: Rng + ?Sized>(&self, _: &mut R, _: u64, position: &mut [f64]) -> Result<(), InitPositionError> {
         position.fill(0.0);
         Ok(())
@@ -171,7 +228,13 @@ impl Model for Whitened {
 }
 
 /// One sentence a divergence after the warm-up: where its trajectory began, and which var was nearest its bound there.
-fn explained(chain: usize, result: &HashMapResult, laplace: &Laplace, names: &[String], warm_up: usize) -> Vec<String> {
+fn explained(
+    chain: usize,
+    result: &HashMapResult,
+    density: &impl Density,
+    names: &[String],
+    warm_up: usize,
+) -> Vec<String> {
     let (Some(HashMapValue::U64(draws)), Some(HashMapValue::String(messages)), Some(HashMapValue::F64(starts))) = (
         result.stats.get("divergence_draw"),
         result.stats.get("divergence_message"),
@@ -179,12 +242,15 @@ fn explained(chain: usize, result: &HashMapResult, laplace: &Laplace, names: &[S
     ) else {
         return Vec::new();
     };
-    let each = draws.iter().zip(messages).zip(starts.chunks_exact(names.len()));
+    let each = draws.iter().zip(messages).zip(starts.chunks_exact(density.dimension()));
     let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
     let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
-        let params = DVector::from_vec(params_of(laplace.unbounded(start).as_slice()));
-        let nearest = params.map(|theta| (theta - RANGE[0].ln()).min(RANGE[1].ln() - theta)).imin();
-        let (name, var) = (&names[nearest], params[nearest].exp());
+        let kept = DVector::from_vec(density.expand(start));
+        // anything that is no var is out of their range, or far from its ends
+        let room = kept
+            .map(|var| if (RANGE[0]..RANGE[1]).contains(&var) { (var - RANGE[0]).min(RANGE[1] - var) } else { 1.0 });
+        let nearest = room.imin();
+        let (name, var) = (&names[nearest], kept[nearest]);
         format!("chain {}, draw {}: {message}; {name} = {var:.4} was nearest its bound", chain + 1, draw + 1)
     };
     kept.map(sentence).collect()

@@ -180,15 +180,15 @@ impl Posterior {
 }
 
 /// One param as a function of its coordinate without bounds.
-struct Bounded {
+pub(crate) struct Bounded {
     /// `d theta/du`.
-    slope: f64,
+    pub(crate) slope: f64,
     /// `d2 theta/du2`.
-    bend: f64,
+    pub(crate) bend: f64,
     /// `d ln(slope)/du`.
-    log_slope_slope: f64,
+    pub(crate) log_slope_slope: f64,
     /// `-d2 ln(slope)/du2`.
-    log_curvature: f64,
+    pub(crate) log_curvature: f64,
 }
 
 /// Distance from a bound within which the map bends [ln var].
@@ -196,7 +196,7 @@ pub const BEND: f64 = 0.003;
 
 impl Bounded {
     /// `slope = s_l (1 - s_u) (1 - e^(-(upper - lower)/t))`, `s` the logistic functions of the distances from both bounds.
-    fn at(u: f64) -> Self {
+    pub(crate) fn at(u: f64) -> Self {
         let [lower, upper] = bounds();
         let [above_lower, above_upper] = [logistic((u - lower) / BEND), logistic((u - upper) / BEND)];
         let [below_lower, below_upper] = [logistic((lower - u) / BEND), logistic((upper - u) / BEND)];
@@ -220,7 +220,7 @@ fn logistic(x: f64) -> f64 {
 }
 
 /// `ln(1 + e^x)`.
-fn softplus(x: f64) -> f64 {
+pub(crate) fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 

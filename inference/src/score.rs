@@ -120,20 +120,18 @@ impl Truth {
 
     /// What became of each effect.
     pub fn fates(&self, diagnosis: &Diagnosis) -> Vec<Fate> {
-        let among = |truth: &TrueEffect, finding: &Finding, inseparable: bool| {
-            let others = finding.alternatives.iter().filter(|other| other.inseparable || !inseparable);
-            truth.is(finding) || others.into_iter().any(|other| truth.is(other))
+        let findings = &diagnosis.findings;
+        let listed = |truth: &TrueEffect, f: &Finding| truth.is(f) || f.alternatives.iter().any(|a| truth.is(a));
+        let together = |truth: &TrueEffect, f: &Finding| {
+            let is_one = truth.is(f) || f.alternatives.iter().any(|a| a.inseparable && truth.is(a));
+            is_one && f.probability < DECISIVE && f.together() >= DECISIVE && f.is_proven()
         };
-        let fate = |truth: &TrueEffect| {
-            let findings = &diagnosis.findings;
-            let together = |f: &&Finding| among(truth, f, true) && f.together() >= DECISIVE && f.is_proven();
-            match diagnosis.verdict {
-                Verdict::Identified if findings.iter().any(|finding| truth.is(finding)) => Fate::Named,
-                Verdict::Consistent | Verdict::Identified => Fate::Absent,
-                _ if findings.iter().any(|finding| together(&finding)) => Fate::Together,
-                _ if findings.iter().any(|finding| among(truth, finding, false)) => Fate::Listed,
-                _ => Fate::Absent,
-            }
+        let fate = |truth: &TrueEffect| match diagnosis.verdict {
+            Verdict::Identified if findings.iter().any(|f| truth.is(f)) => Fate::Named,
+            Verdict::Consistent | Verdict::Identified => Fate::Absent,
+            _ if findings.iter().any(|f| together(truth, f)) => Fate::Together,
+            _ if findings.iter().any(|f| listed(truth, f)) => Fate::Listed,
+            _ => Fate::Absent,
         };
         self.effects.iter().map(fate).collect()
     }

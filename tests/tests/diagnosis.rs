@@ -4,15 +4,13 @@
 use inference::diagnose::fit::Fitted;
 use inference::diagnose::hypothesis::{Hypothesis, Term};
 use inference::diagnose::scan::{candidates, scan};
-use inference::diagnose::{Diagnosis, Verdict, data::Data};
+use inference::diagnose::{Diagnosis, Verdict, data::Data, sample};
+use inference::nuts::NutsSettings;
 use inference::prove::{Case, Class, Unknown, UnknownKind};
 use inference::score::{Grade, Truth};
 use inference::simulate::{self, Hardware};
 use inference::{Recording, stream};
 use nalgebra::DVector;
-use rand::SeedableRng;
-use rand::rngs::StdRng;
-use rand_distr::{Distribution, StandardNormal};
 use system_tests::repository;
 use twin::{Effect, EffectKind, Machine, Rf, Ring};
 
@@ -162,47 +160,36 @@ fn cases_are_fixed_by_their_number() {
     assert_ne!(draw(7).seed, draw(8).seed);
 }
 
-/// A Gaussian about the best point is what the evidence and the error bars go by. Importance sampling from it on the exact
-/// extended machine, vars and amplitude together, finds the same amplitude and error bar.
+/// A Gaussian about the best point is what the evidence and the error bars go by. NUTS on the exact extended machine, vars and
+/// amplitude together, finds the same amplitude and error bar.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-fn the_amplitude_is_that_of_the_exact_posterior() {
+fn the_amplitude_is_that_of_nuts() {
     let ring = Ring::booster();
-    for (name, kind, place) in [
-        ("open-02", EffectKind::BpmGain, "x_E6"),
-        ("open-04", EffectKind::QuadRoll, "F2"),
-        ("open-08", EffectKind::BpmRoll, "y_C5"),
-    ] {
+    for (name, kind, place) in [("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")] {
         let data = Data::of(&ring, &read(&format!("concealed/{name}"))).unwrap();
         let hypothesis = Hypothesis::default().with(Term::new(kind, place));
         let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
-        let draws = weighted(&data, &fitted, 3000);
-        let total: f64 = draws.iter().map(|(w, _)| w).sum();
-        let effective = total * total / draws.iter().map(|(w, _)| w * w).sum::<f64>();
+        let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
+        let run = sample::sample(&data, &fitted, settings).unwrap();
+        // a step that has been adapted in so few draws is too long at one of the bounds now and then
+        assert!(run.divergences.len() <= 4, "{name}: {:?}", run.divergences);
         let scale = kind.prior_scale().unwrap();
-        let average = draws.iter().map(|(w, u)| w * u).sum::<f64>() / total * scale;
-        let spread = (draws.iter().map(|(w, u)| w * (u * scale - average).powi(2)).sum::<f64>() / total).sqrt();
-        assert!(effective > 200.0, "{name}: the Gaussian is far from the posterior, {effective} effective draws");
-        // three Monte Carlo errors of the mean (1/sqrt(n)) and of the width (1/sqrt(2 n)), and 5 % for the truncated vars
-        let error = effective.sqrt().recip();
+        let drawn: Vec<f64> = run.draws.chains.iter().flat_map(|c| &c.draws).map(|draw| draw[48] * scale).collect();
+        let n = drawn.len() as f64;
+        let average = drawn.iter().sum::<f64>() / n;
+        let spread = (drawn.iter().map(|a| (a - average).powi(2)).sum::<f64>() / n).sqrt();
+        println!(
+            "{name}: {mean} +- {sigma}, NUTS {average} +- {spread}, {} evaluations, {:.0} s",
+            run.evaluations, run.seconds
+        );
+        // three Monte Carlo errors of the mean (1/sqrt(n)) and of the width (1/sqrt(2 n)) for draws that are a quarter as many as
+        // they seem, and 5 % for the vars' range
+        let error = 2.0 / n.sqrt();
         assert!((average - mean).abs() < (3.0 * error + 0.05) * sigma, "{name}: {average} {mean} +- {sigma}");
         assert!((spread / sigma - 1.0).abs() < 3.0 * error / 2f64.sqrt() + 0.05, "{name}: {spread} {sigma}");
     }
-}
-
-/// Draws of the amplitude (in prior standard deviations) from the Gaussian, weighted to the exact posterior; vars beyond their
-/// range have no weight.
-fn weighted(data: &Data, fitted: &Fitted, draws: usize) -> Vec<(f64, f64)> {
-    let mut random = StdRng::seed_from_u64(1);
-    let back = fitted.factor.l().transpose();
-    let mut one = || {
-        let z = DVector::from_fn(fitted.u.len(), |_, _| StandardNormal.sample(&mut random));
-        let u = &fitted.u + back.solve_upper_triangular(&z).unwrap();
-        let cost = fitted.cost_at(data, &u).unwrap_or(f64::INFINITY);
-        ((0.5 * (fitted.cost + z.norm_squared() - cost)).exp(), u[48])
-    };
-    (0..draws).map(|_| one()).collect()
 }
 
 /// What `diagnose` hands to the core is the machine that it found.

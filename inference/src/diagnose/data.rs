@@ -56,8 +56,10 @@ pub struct Data {
     meter: [Option<Meter>; 2],
     /// What the operators believe the machine holds instead of the momentum.
     pub believed: Vec<Effect>,
-    /// What each monitor's readings share, in standard deviations, but for the drift [frames][factors] [m].
+    /// What each monitor's readings share, in standard deviations, but for RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
+    /// Standard deviation of what an RF offset does beside the dispersion, in x and y [m].
+    spurious: [f64; 2],
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
 }
@@ -167,7 +169,6 @@ impl Data {
             let supply = sensitivity[plane] * baseline_rms[plane];
             DMatrix::from_columns(&[
                 DVector::from_element(driven.len(), BASELINE),
-                &drives.rf_offset * spurious[plane],
                 &fluctuation[0] * supply,
                 &fluctuation[1] * supply,
             ])
@@ -179,6 +180,7 @@ impl Data {
             supplies,
             readings: recorded.clone(),
             shared: (0..recorded.ncols()).map(shared).collect(),
+            spurious,
             recorded,
             fluctuation,
             expected_noise: recording.header.bpm_sigma,
@@ -278,6 +280,13 @@ impl Data {
         data
     }
 
+    /// A campaign like this one with other drives, for what it would say: its readings are of no use.
+    pub fn driven_by(&self, drives: &Drives) -> Self {
+        let mut data = Self { drives: drives.clone(), ..self.clone() };
+        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data
+    }
+
     /// The same recording without some frames.
     pub fn without(&self, frames: &[usize]) -> Self {
         let mut data = self.clone();
@@ -300,7 +309,11 @@ impl Data {
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
         let drift = drift * self.sensitivity[plane];
+        let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
+        let at = shared.ncols();
+        let mut shared = shared.insert_column(at, 0.0);
+        shared.set_column(at, &(rf * self.spurious[plane]));
         if drift == 0.0 {
             return shared;
         }

@@ -200,15 +200,15 @@ impl Fitted {
         Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, free, slope, u, drifting: None }
     }
 
-    /// The cost at another point; infinite where a var is out of its range.
+    /// `ln` posterior at another point, and its gradient.
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
-    pub fn cost_at(&self, data: &Data, u: &DVector<f64>) -> Result<f64, EffectError> {
-        if u.rows(0, self.params.len()).iter().any(|&u| bounded(u) != u) {
-            return Ok(f64::INFINITY);
-        }
-        Ok(point(self.data(data), &self.hypothesis, u.clone())?.cost)
+    pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+        let data = self.data(data);
+        let here = point(data, &self.hypothesis, u.clone())?;
+        let jacobian = differentiate(data, &self.hypothesis, &self.hypothesis.unknowns(data), &here)?;
+        Ok((-0.5 * here.cost, jacobian.tr_mul(&here.residual) - u))
     }
 
     /// True where the fit is so far off that its vars are bent out of shape.

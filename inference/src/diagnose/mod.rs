@@ -14,6 +14,7 @@ pub mod heldout;
 pub mod hypothesis;
 pub mod next;
 pub mod report;
+pub mod sample;
 pub mod scan;
 pub mod search;
 pub mod settings;

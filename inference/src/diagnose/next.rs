@@ -1,17 +1,15 @@
 //! What to measure next: how far one more campaign of the same length would take two causes apart.
 //!
-//! The expected `ln` Bayes factor of the true cause A over B, both amplitudes and all vars free, is half of what B and the vars
-//! cannot imitate of A (of a rival without an amplitude, of the difference): with the whitened signatures, in prior standard deviations, of the old and the new campaign below each other,
-//!
-//! `gain = (d_A P d_A - (d_A P d_B)^2/(1 + d_B P d_B)) a^2/2`.
+//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), with the whitened signatures of the old and the
+//! new campaign below each other, and everything that the fit leaves free adapting.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine, Rf, Signatures};
+use twin::{Drives, EffectError, EffectKind, Machine, Signatures};
 
 use super::data::Data;
 use super::fit::{Fitted, prior};
 use super::hypothesis::Term;
-use super::scan::expected;
+use super::scan::Rivals;
 
 /// One thing that could be done.
 #[derive(Debug, Clone)]
@@ -54,15 +52,15 @@ impl Menu {
         let (machine, drives) = fitted.machine(data)?;
         let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
-        let fixed = other.is_some_and(|other| other.kind.prior_scale().is_none());
+        let free = [Some(one.0), other].map(|term| term.is_some_and(|term| term.kind.prior_scale().is_some()));
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is no proposal
             let Ok(new) = Campaign::of(data, &machine, &drives, one.0, other, weight) else { continue };
-            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, fixed) });
+            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, free) });
         }
         proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
-        Ok(Self { present: separation(&[&present], amplitude, fixed), proposals })
+        Ok(Self { present: separation(&[&present], amplitude, free), proposals })
     }
 }
 
@@ -77,6 +75,7 @@ impl Campaign {
         weight: f64,
     ) -> Result<Self, EffectError> {
         let signatures = Signatures::of(machine, drives)?;
+        let data = &data.driven_by(drives);
         let (_, sigma) = prior();
         let columns: Vec<_> = signatures.of_vars().iter().map(|s| data.signature(s) * sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
@@ -100,16 +99,15 @@ fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec
         let families = crate::map::first_family(ring);
         let vars: Vec<f64> =
             (0..ring.quadrupoles.len()).map(|q| if (q < families) == first { factor } else { 1.0 }).collect();
-        Machine::new(ring.with_vars(&vars), Rf::FixedMomentum, &[]).ok()
+        machine.with_vars(&vars)
     };
     let mut all = vec![("with the same settings".to_owned(), machine.clone(), drives.clone(), 1.0)];
     let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };
     all.push(("with twice the corrector settings".into(), machine.clone(), doubled, 1.0));
     for (family, first) in [("QH", true), ("QV", false)] {
         for (word, factor) in [("raised", 1.0 + RETUNE), ("lowered", 1.0 - RETUNE)] {
-            if let Some(retuned) = retuned(first, factor) {
-                all.push((format!("with {family} {word} by {:.0} %", RETUNE * 100.0), retuned, drives.clone(), 1.0));
-            }
+            let what = format!("with {family} {word} by {:.0} %", RETUNE * 100.0);
+            all.push((what, retuned(first, factor), drives.clone(), 1.0));
         }
     }
     let alternating = DVector::from_fn(drives.rf_offset.len(), |i, _| if i % 2 == 0 { RF_STEP } else { -RF_STEP });
@@ -147,7 +145,7 @@ fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
 }
 
 /// Expected `ln` Bayes factor of the first cause over the other.
-fn separation(campaigns: &[&Campaign], amplitude: f64, fixed: bool) -> f64 {
+fn separation(campaigns: &[&Campaign], amplitude: f64, free: [bool; 2]) -> f64 {
     let p = campaigns[0].jacobian.ncols();
     let mut normal = DMatrix::identity(p, p);
     let (mut with_one, mut with_other) = (DVector::zeros(p), DVector::zeros(p));
@@ -167,5 +165,5 @@ fn separation(campaigns: &[&Campaign], amplitude: f64, fixed: bool) -> f64 {
     let taken = factor.solve(&with_one);
     let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
     let rival = other - with_other.dot(&factor.solve(&with_other));
-    expected(amplitude, h, c, rival, !fixed)
+    Rivals { power: h, rival, both: c, free }.expected(amplitude)
 }

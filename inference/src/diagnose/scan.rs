@@ -157,21 +157,36 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     Ok(all)
 }
 
-/// Expected `ln` Bayes factor of a cause, `amplitude` prior standard deviations large, over a rival, from what a fit cannot
-/// imitate of both: `h = d P d` of the cause, `rival` the same of the other, `both` between them. The rival's amplitude is free,
-/// or it has none.
-///
-/// `(h - both^2/(1 + rival)) a^2/2`, or half of `|a d - d_rival|^2` by P.
-pub fn expected(amplitude: f64, h: f64, both: f64, rival: f64, free: bool) -> f64 {
-    let left = if free {
-        amplitude * amplitude * (h - both * both / (1.0 + rival))
-    } else {
-        amplitude * amplitude * h - 2.0 * amplitude * both + rival
-    };
-    0.5 * left.max(0.0)
+/// A cause and a rival to a fit: what it cannot imitate of both, per prior standard deviation.
+#[derive(Debug, Clone, Copy)]
+pub struct Rivals {
+    /// `d P d` of the cause.
+    pub power: f64,
+    /// The same of the rival, 0 of nothing.
+    pub rival: f64,
+    /// `d P d_rival`.
+    pub both: f64,
+    /// Whether each has an amplitude.
+    pub free: [bool; 2],
 }
 
-/// [`expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
+impl Rivals {
+    /// Expected `ln` Bayes factor of the cause, if it is true and `amplitude` prior standard deviations large: with the rival's
+    /// amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less what the freedom of
+    /// the one costs more than that of the other, `ln((1 + h)/(1 + h_rival))/2`.
+    pub fn expected(self, amplitude: f64) -> f64 {
+        let Self { power, rival, both, free: [cause_is_free, rival_is_free] } = self;
+        let left = if rival_is_free {
+            amplitude * amplitude * (power - both * both / (1.0 + rival))
+        } else {
+            amplitude * amplitude * power - 2.0 * amplitude * both + rival
+        };
+        let freedom = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
+        0.5 * (left.max(0.0) - freedom(cause_is_free, power) + freedom(rival_is_free, rival))
+    }
+}
+
+/// [`Rivals::expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
 ///
 /// # Errors
 /// [`EffectError`].
@@ -192,8 +207,9 @@ pub fn separations(
     let gram = Projection::of(fitted).gram(&DMatrix::from_columns(&columns));
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let of = |(i, other): (usize, &&Term)| {
-        let free = other.kind.prior_scale().is_some();
-        expected(amplitude, gram[(0, 0)], gram[(0, i + 1)], gram[(i + 1, i + 1)], free)
+        let free = [term, other].map(|term| term.kind.prior_scale().is_some());
+        let (power, rival, both) = (gram[(0, 0)], gram[(i + 1, i + 1)], gram[(0, i + 1)]);
+        Rivals { power, rival, both, free }.expected(amplitude)
     };
     Ok(others.iter().enumerate().map(of).collect())
 }

@@ -19,6 +19,7 @@ use super::discrepancy::{self, Discrepancy, SORTS};
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::scan::{Candidate, scan};
+use crate::posterior::softplus;
 
 /// Prior odds of one (more) effect.
 const ODDS: f64 = 1.0;
@@ -30,8 +31,9 @@ fn odds(effects: usize) -> f64 {
 }
 /// Share of what the library does not hold.
 const UNKNOWN: f64 = 0.15;
-/// Rounds of competition for all slots.
-const ROUNDS: usize = 2;
+/// Rounds of competition for all slots, and the gain of `ln` evidence that is worth another one.
+const ROUNDS: usize = 3;
+const BETTER: f64 = 0.1;
 /// Effects at most.
 const MOST: usize = 4;
 /// Leaders that are refitted exactly, and how far behind the first a candidate may be, in nat and relative to the first.
@@ -173,10 +175,10 @@ impl Search {
     fn without_effects(&self, mut data: Data) -> Result<Found, EffectError> {
         let zero = DVector::zeros(data.ring.quadrupoles.len());
         let mut null = straighten(&mut data, &Hypothesis::default(), &zero)?;
-        let mut next = self.slot(&data, &null, 0)?;
+        let mut next = self.slot(&data, &null)?;
         if let Some(scatter) = scatter(&data, &null, &next)? {
             null = straighten(&mut data, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)?;
-            next = self.slot(&data, &null, 0)?;
+            next = self.slot(&data, &null)?;
         }
         Ok(Found { data, best: null.clone(), null, slots: Vec::new(), next })
     }
@@ -194,7 +196,7 @@ impl Search {
         } else {
             data = found.data.clone();
         }
-        let next = self.slot(&data, &best, slots.len())?;
+        let next = self.slot(&data, &best)?;
         Ok(Found { data, null, best, slots, next })
     }
 
@@ -208,9 +210,20 @@ impl Search {
         found.best.log_evidence - found.null.log_evidence + prior + softplus(found.next.log_odds)
     }
 
-    /// Let all candidates compete for each slot, given the others, until the best one is in each. The last effect of the fit has
-    /// just won the competition for its slot.
+    /// Let all candidates compete for each slot, given the others, until the best one is in each; what then need not be there is
+    /// taken out. The last effect of the fit has just won the competition for its slot.
     fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
+        let (mut best, mut slots) = self.compete(data, fitted, Some(won))?;
+        while let Some(idle) = slots.iter().position(|slot| slot.nothing > 1.0 - SUSPICIOUS)
+            && slots.len() > 1
+        {
+            (best, slots) = self.compete(data, slots.swap_remove(idle).without, None)?;
+        }
+        Ok((best, slots))
+    }
+
+    /// The competition for every slot, again where a better one has got into one of them.
+    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Slot>) -> Result<(Fitted, Vec<Slot>), EffectError> {
         let mut best = fitted;
         let last = best.hypothesis.terms.len() - 1;
         let mut slots = Vec::new();
@@ -218,10 +231,11 @@ impl Search {
             let mut changed = false;
             slots.clear();
             for i in 0..=last {
-                let slot =
-                    if round == 0 && i == last && !changed { won.clone() } else { self.without(data, &best, i)? };
-                let is_other = |fitted: &Fitted| fitted.hypothesis.terms.last() != best.hypothesis.terms.get(i);
-                if let Some(other) = slot.leader().filter(is_other)
+                let known = won.filter(|_| round == 0 && i == last && !changed);
+                let slot = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
+                // the same effects may have been fitted better from elsewhere
+                if let Some(other) = slot.leader()
+                    && other.log_evidence > best.log_evidence + BETTER
                     && round < ROUNDS
                 {
                     (best, changed) = (other, true);
@@ -238,12 +252,18 @@ impl Search {
     /// The competition for one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
         let rest = super::heldout::reduced(data, fitted, term)?;
-        self.slot(data, &rest, fitted.hypothesis.terms.len() - 1)
+        let present = Alternative::exact(data, &rest, fitted.clone(), term);
+        self.competition(data, &rest, Some(present))
     }
 
     /// The competition for one more effect beside those of a fit.
-    fn slot(&self, data: &Data, fitted: &Fitted, effects: usize) -> Result<Slot, EffectError> {
-        let odds = odds(effects);
+    fn slot(&self, data: &Data, fitted: &Fitted) -> Result<Slot, EffectError> {
+        self.competition(data, fitted, None)
+    }
+
+    /// The same, where one of the candidates has been fitted already.
+    fn competition(&self, data: &Data, fitted: &Fitted, present: Option<Alternative>) -> Result<Slot, EffectError> {
+        let odds = odds(fitted.hypothesis.terms.len());
         let scanned = scan(fitted.data(data), fitted, &self.terms)?;
         let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNKNOWN) * odds).ln();
         let leaders = self.leaders(data, fitted, &scanned)?;
@@ -253,10 +273,12 @@ impl Search {
             if fitted.hypothesis.terms.contains(&candidate.term) {
                 continue;
             }
+            let known = present.clone().filter(|present| present.term() == Some(&candidate.term));
             let alternative = match leaders.contains(&i) {
                 true => refit(data, fitted, candidate, least),
                 false => Alternative::of(candidate),
             };
+            let alternative = known.filter(|known| known.log_gain > alternative.log_gain).unwrap_or(alternative);
             least = alternative.fitted.as_ref().map_or(least, |fitted| least.min(fitted.cost));
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
@@ -332,14 +354,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
     };
-    Alternative {
-        cause: Cause::Effect(candidate.term.clone()),
-        log_gain: refitted.log_evidence - fitted.log_evidence,
-        probability: 0.0,
-        amplitude: refitted.amplitude(data, fitted.hypothesis.terms.len()),
-        adapting: DVector::zeros(0),
-        fitted: Some(refitted),
-    }
+    Alternative::exact(data, fitted, refitted, fitted.hypothesis.terms.len())
 }
 
 /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
@@ -357,11 +372,6 @@ fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatt
     }
     let price = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
     Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
-}
-
-/// `ln(1 + exp(x))`.
-fn softplus(x: f64) -> f64 {
-    x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 
 /// Widths that are tried of each family.
@@ -391,6 +401,18 @@ impl Alternative {
             probability: 0.0,
             adapting: &candidate.adapting * candidate.amplitude,
             fitted: None,
+        }
+    }
+
+    /// One of the terms of a fit, beside the fit without it.
+    fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
+        Self {
+            cause: Cause::Effect(fitted.hypothesis.terms[term].clone()),
+            log_gain: fitted.log_evidence - without.log_evidence,
+            probability: 0.0,
+            amplitude: fitted.amplitude(data, term),
+            adapting: DVector::zeros(0),
+            fitted: Some(fitted),
         }
     }
 

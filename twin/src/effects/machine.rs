@@ -149,6 +149,11 @@ impl Machine {
         Ok(())
     }
 
+    /// The same machine with factors on the quadrupoles' gradients.
+    pub fn with_vars(&self, vars: &[f64]) -> Self {
+        Self { ring: self.ring.with_vars(vars), ..self.clone() }
+    }
+
     /// Orbit response as it would be measured, places `[48]` (H monitors then V) by correctors `[48]` (H then V).
     ///
     /// # Errors
