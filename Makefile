@@ -9,7 +9,7 @@ export CARGO_TERM_COLOR ?= auto
 .PHONY: help demo test build setup toolchain firmware sil train bench peers prove prove-short docs fuzz clean
 
 help: ## this list
-	@grep -E '^[a-z]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
+	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
 
 demo: build ## the main job on a recording that ships with the repository, and its studies with few draws
 	$(ORBITCAL) replay $(RECORDING)
@@ -62,11 +62,12 @@ peers: build .venv-peers ## NUTS of numpyro and blackjax beside ours, on the den
 	python3 -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet numpyro==0.22.0 blackjax==1.7.1 'jax[cpu]==0.10.2' 'arviz==0.23.*'
 
-prove: build ## how often the diagnosis is right: 690 blind campaigns, half an hour on two cores; a stopped run is taken up again
+prove: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run is taken up again (anew after `rm target/prove.jsonl`)
 	$(ORBITCAL) prove recordings/paper-vars --outcomes target/prove.jsonl --page docs/diagnosis.md --json target/prove.json
 
-prove-short: build ## the same with 80 campaigns, five minutes
-	$(ORBITCAL) prove recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 9 --outcomes target/prove-short.jsonl
+prove-short: build ## the same with 80 campaigns, four minutes, and an error if anything is named that is not there
+	rm -f target/prove-short.jsonl
+	$(ORBITCAL) prove recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 18 --outcomes target/prove-short.jsonl --strict
 
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps

@@ -10,7 +10,7 @@
 use estimator::{Health, Marginal, MonitorState, Prior};
 use nalgebra::{DMatrix, DVector};
 use training::BoosterGreen;
-use twin::{ClosedOrbit, Gradient, Hold, Observer, Optics, OrbitError, Plane, Ring, Tunes};
+use twin::{ClosedOrbit, Hold, Optics, OrbitError, Plane, Ring, Tunes};
 
 use crate::recording::{Recording, Row};
 use crate::stream::{self, PRIOR_WIDTH, StreamError};
@@ -297,7 +297,8 @@ impl<'r> Problem<'r> {
         let mut offsets: Vec<f64> = self.drives.iter().map(|d| d.rf_offset).filter(|&offset| offset != 0.0).collect();
         offsets.sort_by(f64::total_cmp);
         offsets.dedup();
-        let slope = dispersion_slope(&ring, &optics, &observers, &gradients);
+        let mut slope = optics.rf_jacobian(&observers, &gradients);
+        slope.column_iter_mut().zip(ring.gradients()).for_each(|(mut column, k1)| column *= k1);
         let rf = offsets.into_iter().map(|offset| Ok((offset, rf_orbit(&ring, offset)?, &slope * offset)));
         Ok(Linearised {
             response: optics.response(&observers, &sources),
@@ -378,19 +379,6 @@ pub fn rf_orbit(ring: &Ring, offset: f64) -> Result<DVector<f64>, OrbitError> {
     let vertical = |at: usize| matches!(ring.elements[at].kind, twin::Kind::Monitor { plane: Plane::Y });
     let seen = ring.read_monitors.iter().map(|&at| orbit.at[at][if vertical(at) { 2 } else { 0 }]);
     Ok(DVector::from_iterator(ring.read_monitors.len(), seen))
-}
-
-/// Derivative with respect to theta of the orbit per unit of RF offset, `-D/eta`: rows monitors, columns quadrupoles.
-fn dispersion_slope(ring: &Ring, optics: &Optics, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
-    let eta = optics.slip_factor();
-    let compaction = optics.compaction_jacobian(gradients);
-    let mut slope = optics.dispersion_jacobian(observers, gradients) * (-1.0 / eta);
-    for (b, observer) in observers.iter().enumerate() {
-        let per_compaction = optics.dispersion(observer) / (eta * eta);
-        slope.row_mut(b).iter_mut().zip(&compaction).for_each(|(s, c)| *s += per_compaction * c);
-    }
-    slope.column_iter_mut().zip(ring.gradients()).for_each(|(mut column, k1)| column *= k1);
-    slope
 }
 
 impl Normal {

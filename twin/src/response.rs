@@ -326,6 +326,18 @@ impl<'r> Optics<'r> {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
     }
 
+    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients.
+    pub fn rf_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
+        let eta = self.slip_factor();
+        let compaction = self.compaction_jacobian(gradients);
+        let mut slope = self.dispersion_jacobian(observers, gradients) * (-1.0 / eta);
+        for (b, observer) in observers.iter().enumerate() {
+            let per_compaction = self.dispersion(observer) / (eta * eta);
+            slope.row_mut(b).iter_mut().zip(&compaction).for_each(|(s, c)| *s += per_compaction * c);
+        }
+        slope
+    }
+
     /// Tunes of the two normal modes.
     ///
     /// `cos(mu)` of the modes are the roots of the quadratic formed by the trace of the 4x4 one-turn matrix and the

@@ -239,13 +239,19 @@ impl FindingAnswer {
             format!("{before}{}", self.kind),
             self.at.clone(),
             self.s_m.map_or_else(String::new, |s| format!("{s:.2}")),
-            format!("{:.3e} ± {:.1e}", self.amplitude, self.sigma),
+            if self.sigma > 0.0 { measured(self.amplitude, self.sigma) } else { String::new() },
             self.unit.into(),
             format!("{:.1}", self.log_evidence_gain),
             format!("{:.3}", self.probability),
             gain,
         ]
     }
+}
+
+/// Digits down to the second of the error bar.
+fn measured(value: f64, sigma: f64) -> String {
+    let digits = (1.0 - sigma.log10().floor()).clamp(0.0, 9.0) as usize;
+    format!("{value:.digits$} ± {sigma:.digits$}")
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

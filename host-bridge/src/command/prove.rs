@@ -25,12 +25,13 @@ use crate::output;
 pub fn run(options: &Prove) -> Result<(), CommandError> {
     let ring = machine(options.common.machine.as_deref())?;
     let template = recording(&options.template, &ring)?;
-    let known = known(&options.outcomes, options.seed)?;
+    let key = format!("{} {}", template.name, options.seed);
+    let known = known(&options.outcomes, &key)?;
     let cases = cases(options, &ring, &template)?;
     let to_do: Vec<&Case> = cases.iter().filter(|case| !known.contains_key(&case.index)).collect();
     let bar = progress(cases.len(), "campaigns", options.common.quiet);
     bar.set_position(known.len() as u64);
-    let fresh = all(&ring, &template, &to_do, &options.outcomes, options.seed, &|| bar.inc(1))?;
+    let fresh = all(&ring, &template, &to_do, &options.outcomes, &key, &|| bar.inc(1))?;
     bar.finish_and_clear();
     let wanted: Vec<usize> = cases.iter().map(|case| case.index).collect();
     let mut outcomes: Vec<Outcome> = known.into_values().chain(fresh).collect();
@@ -45,6 +46,10 @@ pub fn run(options: &Prove) -> Result<(), CommandError> {
     }
     if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
         println!("{}", tables.markdown());
+    }
+    if options.strict && tables.wrong.of > 0 {
+        let what = format!("something was named that is not there in {} of {} campaigns", tables.wrong.of, tables.wrong.trials);
+        return Err(CommandError::Other(what));
     }
     Ok(())
 }
@@ -66,20 +71,20 @@ fn cases(options: &Prove, ring: &Ring, template: &Recording) -> Result<Vec<Case>
     Ok(classes.into_iter().flat_map(of_class).collect())
 }
 
-/// What has been run before with this seed.
-fn known(path: &Path, seed: u64) -> Result<BTreeMap<usize, Outcome>, CommandError> {
+/// What has been run before with this template and seed.
+fn known(path: &Path, key: &str) -> Result<BTreeMap<usize, Outcome>, CommandError> {
     let Ok(text) = fs::read_to_string(path) else { return Ok(BTreeMap::new()) };
     let mut known = BTreeMap::new();
     for (number, line) in text.lines().enumerate() {
         // a line that a stop cut short is run again
-        let Ok((of_seed, outcome)) = serde_json::from_str::<(u64, Outcome)>(line) else {
+        let Ok((of_key, outcome)) = serde_json::from_str::<(String, Outcome)>(line) else {
             if !line.ends_with('}') && !line.ends_with(']') || number + 1 == text.lines().count() {
                 continue;
             }
             let what = "expected an outcome of this program's version; remove the file to begin anew";
             return Err(CommandError::Input(format!("{}, line {}: {what}", path.display(), number + 1)));
         };
-        if of_seed == seed {
+        if of_key == key {
             known.insert(outcome.index, outcome);
         }
     }
@@ -92,7 +97,7 @@ fn all(
     template: &Recording,
     cases: &[&Case],
     path: &Path,
-    seed: u64,
+    key: &str,
     done: &(dyn Fn() + Sync),
 ) -> Result<Vec<Outcome>, CommandError> {
     let wrong = |error: std::io::Error| CommandError::Other(format!("{}: {error}", path.display()));
@@ -111,7 +116,7 @@ fn all(
             let outcome = prove(ring, template, case)
                 .map_err(|error: DataError| CommandError::Other(format!("campaign {}: {error}", case.index)))?;
             if let Some(outcome) = outcome {
-                append(&file, seed, &outcome).map_err(wrong)?;
+                append(&file, key, &outcome).map_err(wrong)?;
                 outcomes.lock().expect("no thread panics with it").push(outcome);
             }
             done();
@@ -126,8 +131,8 @@ fn all(
     Ok(outcomes.into_inner().expect("no thread panics with it"))
 }
 
-fn append(file: &Mutex<File>, seed: u64, outcome: &Outcome) -> std::io::Result<()> {
-    let mut line = serde_json::to_string(&(seed, outcome))?;
+fn append(file: &Mutex<File>, key: &str, outcome: &Outcome) -> std::io::Result<()> {
+    let mut line = serde_json::to_string(&(key, outcome))?;
     line.push('\n');
     file.lock().expect("no thread panics with it").write_all(line.as_bytes())
 }

@@ -8,7 +8,8 @@ use nalgebra::{DMatrix, DVector};
 
 use super::discrepancy::Discrepancy;
 use super::fit::{Fitted, prior};
-use super::search::{Cause, Found, Slot};
+use super::search::Found;
+use super::slot::{Cause, Slot};
 
 /// `ln` of the vars.
 #[derive(Debug, Clone)]

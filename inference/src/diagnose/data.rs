@@ -14,13 +14,14 @@ use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
 use training::BoosterGreen;
 use twin::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring, Signature,
-    Signatures, Tracked, Tunes,
+    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Plane, Rf, Ring, Signature, Signatures,
+    Tracked, Tunes,
 };
 
+use super::baseline::Baseline;
 use super::settings::Settings;
 use crate::map::{Drive, Screened, first_family, screen};
-use crate::recording::{BelievedRf, Recording, Row};
+use crate::recording::{BelievedRf, Recording};
 use crate::stream::StreamError;
 
 /// A recording, whitened.
@@ -30,8 +31,8 @@ pub struct Data {
     pub ring: Ring,
     /// What drove the beam, and the orbit it started from.
     pub drives: Drives,
-    /// Standard deviation of that orbit at each element [m].
-    pub orbit_sigma: Vec<[f64; 2]>,
+    /// What is known of that orbit.
+    pub baseline: Baseline,
     /// Which readings count, and the state of the monitors.
     pub screened: Screened,
     /// `ln` of each quadrupole's mean supply factor.
@@ -45,10 +46,6 @@ pub struct Data {
     fluctuation: [DVector<f64>; 2],
     /// Noise of a reading by the recording's header [m].
     pub expected_noise: f64,
-    /// Rms of the baselines in x and y [m].
-    pub baseline_rms: [f64; 2],
-    /// Relative change of the baseline orbit per `ln` of all gradients, in x and y [1].
-    pub sensitivity: [f64; 2],
     channels: Vec<Channel>,
     /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
     tunes: DMatrix<f64>,
@@ -58,8 +55,6 @@ pub struct Data {
     pub believed: Vec<Effect>,
     /// What each monitor's readings share, in standard deviations, but for RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
-    /// Standard deviation of what an RF offset does beside the dispersion, in x and y [m].
-    spurious: [f64; 2],
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
 }
@@ -118,12 +113,8 @@ pub enum DataError {
 
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
-/// Offset of a monitor from the orbit [m]: what surveys of such monitors find.
-const OFFSET: f64 = 0.7e-3;
 /// Calibration error of a tune meter [1], of the order of its resolution.
 pub const TUNE_CALIBRATION: f64 = 3e-4;
-/// Cotangent of the phase advance of a machine that still keeps its beam.
-const STEEPEST: f64 = 20.0;
 /// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
 const FAULTY: f64 = 4.0;
 /// Monitors and correctors below which nothing can be told apart.
@@ -147,26 +138,16 @@ impl Data {
         let mut drives = drives_of(recording, &driven, ring);
         let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed(recording))?;
         let recorded = raw(recording, ring);
-        let baselines = baselines(&recorded, &design.readings(&drives)?.0, &screened);
-        let split = ring.read_places().iter().filter(|(plane, _)| *plane == Plane::X).count();
-        let baseline_rms = [rms(&baselines[..split]), rms(&baselines[split..])];
-        let (orbit, orbit_sigma) = krige(design.ring(), &baselines, baseline_rms)?;
-        drives.orbit = orbit;
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
             recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
         });
+        let kicked_off = &recorded - design.readings(&drives)?.0;
         let tables: BoosterGreen = training::green::tables(ring)?;
-        let design_tunes = Optics::of(design.ring(), Hold::Momentum { delta: 0.0 })?.tunes()?;
-        let sensitivity = sensitivity(&recorded_tunes, &design_tunes);
-        // an orbit's change with the momentum grows towards the integer as that with the gradients does
-        let of_design = self::sensitivity(&DMatrix::zeros(0, 2), &design_tunes);
-        let spurious = [0, 1].map(|plane| {
-            let growth = (sensitivity[plane] / of_design[plane]).max(1.0);
-            f64::from(tables.dispersion.spurious[plane]) * baseline_rms[plane] * growth
-        });
+        let per_rms = tables.dispersion.spurious.map(f64::from);
+        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, &screened, &recorded_tunes, per_rms)?;
+        drives.orbit = orbit;
         let shared = |b: usize| {
-            let plane = usize::from(b >= split);
-            let supply = sensitivity[plane] * baseline_rms[plane];
+            let supply = baseline.per_gradient(usize::from(ring.read_places()[b].0 == Plane::Y));
             DMatrix::from_columns(&[
                 DVector::from_element(driven.len(), BASELINE),
                 &fluctuation[0] * supply,
@@ -175,17 +156,14 @@ impl Data {
         };
         let mut data = Self {
             ring: ring.clone(),
-            orbit_sigma,
             screened,
             supplies,
             readings: recorded.clone(),
             shared: (0..recorded.ncols()).map(shared).collect(),
-            spurious,
+            baseline,
             recorded,
             fluctuation,
             expected_noise: recording.header.bpm_sigma,
-            baseline_rms,
-            sensitivity,
             channels: Vec::new(),
             meter: [None, None],
             tunes: recorded_tunes.clone(),
@@ -308,18 +286,17 @@ impl Data {
     /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
-        let drift = drift * self.sensitivity[plane];
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);
-        shared.set_column(at, &(rf * self.spurious[plane]));
+        shared.set_column(at, &(rf * self.baseline.spurious[plane]));
         if drift == 0.0 {
             return shared;
         }
         // to second order: near an integer tune an orbit grows faster than the quadrupoles drift
         let time = |power: i32| {
-            let relative = drift.powi(power) * self.baseline_rms[plane];
+            let relative = (drift * self.baseline.sensitivity[plane]).powi(power) * self.baseline.rms[plane];
             DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i].powi(power) * relative))
         };
         let at = shared.ncols();
@@ -423,14 +400,21 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// What of a monitor's residuals is its own and not shared by its readings, at the most likely factors of what is shared:
-    /// `(1 - Q D^2/(1 + D^2) Q^T) r`, and how many numbers that takes. `residual` has a row for every frame.
-    pub fn own(&self, b: usize, residual: &DVector<f64>) -> (DVector<f64>, f64) {
-        let channel = &self.channels[b];
-        let counting = residual.select_rows(&channel.frames);
-        let share = channel.shrink.map(|shrink| 1.0 - (1.0 - shrink).powi(2));
-        let along = channel.basis.tr_mul(&counting).component_mul(&share);
-        (counting - &channel.basis * along, share.sum())
+    /// A monitor's residuals about its baseline, and about that baseline's drift where the hypothesis says that it drifts: the
+    /// drift's factors are at their most likely values, `(1 + U^T U/sigma^2)^-1 U^T r/sigma^2`. `residual` has a row for every frame.
+    pub fn about_baseline(&self, b: usize, residual: &DVector<f64>) -> DVector<f64> {
+        let frames = self.frames(b);
+        let mut own = residual.select_rows(frames);
+        let shared = self.shared(b, frames);
+        let steady = self.shared[b].ncols() + 1;
+        let variance = self.noise(b).powi(2);
+        let information = shared.tr_mul(&shared) / variance + DMatrix::identity(shared.ncols(), shared.ncols());
+        if let Some(factor) = information.cholesky().filter(|_| shared.ncols() > steady) {
+            let factors = factor.solve(&(shared.tr_mul(&own) / variance));
+            own -= shared.columns_range(steady..) * factors.rows_range(steady..);
+        }
+        own.add_scalar_mut(-own.mean());
+        own
     }
 
     /// Whiten columns over all frames as readings of one monitor.
@@ -538,14 +522,11 @@ fn exp(ln: &[f64]) -> Vec<f64> {
 
 fn drives_of(recording: &Recording, driven: &[Drive], ring: &Ring) -> Drives {
     let rows: Vec<_> = driven.iter().map(|d| d.kick.transpose()).collect();
-    let (start, end) = (recording.rows[0].time, recording.rows[recording.rows.len() - 1].time);
-    let time = |row: &Row| if end > start { 2.0 * (row.time - start) / (end - start) - 1.0 } else { 0.0 };
-    let largest = recording.rows.iter().map(|row| row.setting.abs()).fold(0.0, f64::max);
     Drives {
         kick: DMatrix::from_rows(&rows),
         rf_offset: DVector::from_iterator(driven.len(), driven.iter().map(|d| d.rf_offset)),
-        time: DVector::from_iterator(driven.len(), recording.rows.iter().map(time)),
-        nominal_kick: if largest > 0.0 { largest * recording.header.kick_per_ampere } else { 1.0 },
+        time: DVector::from_vec(recording.times()),
+        nominal_kick: recording.nominal_kick(),
         orbit: vec![[0.0; 2]; ring.elements.len()],
     }
 }
@@ -555,69 +536,4 @@ fn raw(recording: &Recording, ring: &Ring) -> DMatrix<f64> {
     DMatrix::from_fn(recording.rows.len(), ring.read_monitors.len(), |i, b| {
         recording.rows[i].reading[b].unwrap_or(f64::NAN)
     })
-}
-
-/// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with
-/// the tune: `pi |cot(pi Q) dQ/dln k|`, `dQ/dln k` the natural chromaticity, about the tune itself. The recorded tune knows how
-/// near the integer is.
-///
-/// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
-fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
-    let pi = core::f64::consts::PI;
-    [(0, design.x), (1, design.y)].map(|(plane, design)| {
-        let known: Vec<f64> = recorded.column(plane).iter().copied().filter(|tune| *tune > 0.0).collect();
-        let tune = if known.is_empty() { design } else { known.iter().sum::<f64>() / known.len() as f64 };
-        1.0 + pi * design * (pi * tune).tan().recip().abs().min(STEEPEST)
-    })
-}
-
-/// Mean of each monitor's readings, the kicks' orbit taken off [m]; none for a silent one.
-fn baselines(recorded: &DMatrix<f64>, predicted: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
-    let of = |b: usize| {
-        let counts = |i: &usize| screened.accepted[*i] >> b & 1 == 1 && !recorded[(*i, b)].is_nan();
-        let frames: Vec<usize> = (0..recorded.nrows()).filter(counts).collect();
-        let sum: f64 = frames.iter().map(|&i| recorded[(i, b)] - predicted[(i, b)]).sum();
-        (!frames.is_empty()).then(|| sum / frames.len() as f64)
-    };
-    (0..recorded.ncols()).map(of).collect()
-}
-
-fn rms(values: &[Option<f64>]) -> f64 {
-    let squares: Vec<f64> = values.iter().flatten().map(|v| v * v).collect();
-    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
-}
-
-/// Orbit (x, y) at every element, and its standard deviation [m].
-type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
-
-/// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard
-/// deviation: kicks of random size at all quadrupoles, as many as explain the baselines' rms.
-///
-/// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
-fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut orbit, mut sigma) = (vec![[0.0; 2]; ring.elements.len()], vec![[0.0; 2]; ring.elements.len()]);
-    let places = ring.read_places();
-    for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
-        let direction = [[1.0, 0.0], [0.0, 1.0]][index];
-        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
-        let read: Vec<usize> = (0..places.len()).filter(|&b| places[b].0 == plane && baselines[b].is_some()).collect();
-        let seen: Vec<_> = read.iter().map(|&b| optics.observe(ring.monitors[places[b].1], plane)).collect();
-        let everywhere: Vec<_> = (0..ring.elements.len()).map(|i| optics.observe(i, plane)).collect();
-        let (at, all) = (optics.response(&seen, &sources), optics.response(&everywhere, &sources));
-        let mean_square = at.norm_squared() / (read.len().max(1)) as f64;
-        let variance = if mean_square > 0.0 { rms[index].powi(2) / mean_square } else { 0.0 };
-        let noise = DMatrix::from_diagonal_element(read.len(), read.len(), OFFSET.powi(2));
-        let Some(factor) = (&at * at.transpose() * variance + noise).cholesky() else { continue };
-        let values = DVector::from_iterator(read.len(), read.iter().filter_map(|&b| baselines[b]));
-        let cross = &all * at.transpose() * variance;
-        let mean = &cross * factor.solve(&values);
-        for i in 0..ring.elements.len() {
-            let row = cross.row(i).transpose();
-            let left = all.row(i).norm_squared() * variance - row.dot(&factor.solve(&row));
-            orbit[i][index] = mean[i];
-            sigma[i][index] = left.max(0.0).sqrt();
-        }
-    }
-    Ok((orbit, sigma))
 }

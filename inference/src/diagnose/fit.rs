@@ -4,19 +4,16 @@
 //!
 //! `cost = |r(u)|^2 + |u|^2`, `ln evidence = -cost/2 - ln det(1 + J^T J)/2` (Laplace),
 //!
-//! minimised by damped Gauss-Newton within the range of the vars. Of a var at a bound the half of its normal that is within the
-//! range counts, of the others the part. The normalisation of the data is the same for all hypotheses but those that change their
-//! covariance, and is counted.
-
-use std::collections::BTreeMap;
+//! minimised by damped Gauss-Newton within the range of the vars (what that takes from the integral: [`super::evidence`]). The
+//! normalisation of the data is the same for all hypotheses but those that change their covariance, and is counted.
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
 
 use super::data::Data;
+use super::evidence::{Within, bounded};
 use super::hypothesis::{Hypothesis, Unknown};
-use crate::posterior::RANGE;
 use crate::stream::PRIOR_WIDTH;
 
 /// A hypothesis at its best.
@@ -56,8 +53,6 @@ const TRIAL: usize = 4;
 const HOPELESS: f64 = 1.5;
 const HALVINGS: usize = 6;
 const SWEEPS: usize = 1000;
-/// Precision of a var that is held.
-const HELD: f64 = 1e12;
 /// Step of an amplitude for its derivative, in prior standard deviations.
 const DIFFERENCE: f64 = 0.02;
 
@@ -158,42 +153,9 @@ impl Fitted {
     ) -> Self {
         let vars = data.ring.quadrupoles.len();
         let params = params_of(&here.u, vars);
-        let mut slope = jacobian.tr_mul(&here.residual) - &here.u;
-        // held: at a bound, and pulled beyond it
-        let [lower, upper] = range();
-        let held = |i: usize, u: f64, pull: f64| {
-            i < vars && ((u <= lower + 1e-9 && pull < 0.0) || (u >= upper - 1e-9 && pull > 0.0))
-        };
-        let mut matrix = jacobian.transpose() * &jacobian;
-        let (mut log_inside, mut pinned) = (0.0, Vec::new());
-        for i in 0..matrix.ncols() {
-            matrix[(i, i)] += 1.0;
-            if held(i, here.u[i], slope[i]) {
-                pinned.push(i);
-            }
-        }
-        let whole = matrix.clone();
-        let slope_of_held: BTreeMap<usize, f64> = pinned.iter().map(|&i| (i, slope[i])).collect();
-        for &i in &pinned {
-            slope[i] = 0.0;
-            matrix.row_mut(i).fill(0.0);
-            matrix.column_mut(i).fill(0.0);
-            matrix[(i, i)] = HELD;
-        }
-        let free = matrix.cholesky().expect("1 + J^T J is positive");
-        for &i in &pinned {
-            // the curvature along a held var, the free unknowns adapting
-            let along = whole.column(i).map_with_location(|row, _, h| if pinned.contains(&row) { 0.0 } else { h });
-            let curvature = whole[(i, i)] - along.dot(&free.solve(&along));
-            log_inside += log_tail((slope_of_held[&i]).abs(), curvature);
-        }
-        let covariance = free.inverse();
-        for i in (0..vars).filter(|i| !pinned.contains(i)) {
-            let sigma = covariance[(i, i)].sqrt();
-            log_inside += (normal_cdf((upper - here.u[i]) / sigma) - normal_cdf((lower - here.u[i]) / sigma)).ln();
-        }
-        let log_det =
-            2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>() - pinned.len() as f64 * HELD.ln();
+        let slope = jacobian.tr_mul(&here.residual) - &here.u;
+        let lower = factor.l();
+        let Within { free, slope, log_det, log_inside } = Within::of(&lower * lower.transpose(), &here.u, slope, vars);
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
         let hypothesis = hypothesis.clone();
         let Point { u, residual, cost } = here;
@@ -289,8 +251,8 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, less what the readings of a monitor share
-    /// (its baseline, and how that moves), per degree of freedom (readings less what is shared less vars).
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines (and their drift) taken out, per degree
+    /// of freedom (readings less baselines less vars).
     ///
     /// # Errors
     /// [`EffectError`].
@@ -299,9 +261,9 @@ impl Fitted {
         let miss = data.miss(&self.predicted(data)?);
         let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
         for b in data.speaking_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
-            let (own, shared) = data.own(b, &miss.column(b).into_owned());
+            let own = data.about_baseline(b, &miss.column(b).into_owned());
             sum += own.norm_squared();
-            freedom += own.len() as f64 - shared;
+            freedom += own.len() as f64 - 1.0;
         }
         Ok(sum / data.expected_noise.powi(2) / freedom)
     }
@@ -317,17 +279,6 @@ impl Fitted {
 fn params_of(u: &DVector<f64>, vars: usize) -> Vec<f64> {
     let (mean, sigma) = prior();
     u.rows(0, vars).iter().map(|u| mean + sigma * u).collect()
-}
-
-/// Range of a var, in prior standard deviations of its logarithm.
-fn range() -> [f64; 2] {
-    let (mean, sigma) = prior();
-    RANGE.map(|bound| (bound.ln() - mean) / sigma)
-}
-
-fn bounded(u: f64) -> f64 {
-    let [lower, upper] = range();
-    u.clamp(lower, upper)
 }
 
 /// The best step within the range: the full one if it stays there, else by projected Gauss-Seidel sweeps.
@@ -358,19 +309,6 @@ fn within(
         }
     }
     step
-}
-
-/// `ln` of the integral of `exp(-g x - h x^2/2)` over x > 0, over that of a standard normal.
-fn log_tail(g: f64, h: f64) -> f64 {
-    // exp(z^2/2) (1 - cdf(z))/sqrt(h), z = g/sqrt(h); its asymptote where the tail underflows
-    let z = g / h.sqrt();
-    let scaled =
-        if z < 25.0 { (0.5 * z * z).exp() * normal_cdf(-z) } else { 1.0 / (z * core::f64::consts::TAU.sqrt()) };
-    scaled.ln() - 0.5 * h.ln()
-}
-
-fn normal_cdf(z: f64) -> f64 {
-    0.5 * statrs::function::erf::erfc(-z / core::f64::consts::SQRT_2)
 }
 
 fn normal(jacobian: &DMatrix<f64>) -> Cholesky<f64, Dyn> {

@@ -116,7 +116,7 @@ impl Hypothesis {
         let of_term = |(i, term): (usize, &Term)| {
             let amplitude = term.kind.prior_scale().map(|scale| Unknown::Amplitude(i, scale));
             let orbit = term.orbits().iter().filter_map(move |&plane| {
-                let sigma = data.orbit_sigma[term.element(data)?][usize::from(plane == Plane::Y)];
+                let sigma = data.baseline.sigma[term.element(data)?][usize::from(plane == Plane::Y)];
                 Some(Unknown::Orbit(i, plane, sigma))
             });
             amplitude.into_iter().chain(orbit.collect::<Vec<_>>()).collect::<Vec<_>>()

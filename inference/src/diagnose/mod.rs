@@ -7,8 +7,10 @@
 
 pub mod along;
 pub mod average;
+pub mod baseline;
 pub mod data;
 pub mod discrepancy;
+pub mod evidence;
 pub mod fit;
 pub mod heldout;
 pub mod hypothesis;
@@ -18,7 +20,9 @@ pub mod sample;
 pub mod scan;
 pub mod search;
 pub mod settings;
+pub mod slot;
 pub mod verdict;
+pub mod whereabouts;
 
 use twin::{Effect, Ring};
 

@@ -6,7 +6,8 @@
 //! order for the rest.
 //!
 //! Forward: the best candidate is taken up as long as "one more" is clearly more likely than "no more". Backward: each is taken out
-//! again and all candidates compete for its slot, given the others.
+//! again and all candidates compete for its slot, given the others; one that need not be there is dropped. Where something
+//! without a class is the most likely, one more effect is still tried: two strong ones may need each other.
 
 use std::collections::BTreeMap;
 
@@ -15,20 +16,17 @@ use twin::{EffectError, EffectKind};
 
 use super::SUSPICIOUS;
 use super::data::Data;
-use super::discrepancy::{self, Discrepancy, SORTS};
+use super::discrepancy::{self, Discrepancy};
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::scan::{Candidate, scan};
+use super::slot::{Alternative, Slot};
+use super::whereabouts::SORTS;
 use crate::posterior::softplus;
 
 /// Prior odds of one (more) effect.
 const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
-
-/// Prior odds of one more beside some effects.
-fn odds(effects: usize) -> f64 {
-    if effects == 0 { ODDS } else { ODDS_FURTHER }
-}
 /// Share of what the library does not hold.
 const UNKNOWN: f64 = 0.15;
 /// Rounds of competition for all slots, and the gain of `ln` evidence that is worth another one.
@@ -46,47 +44,6 @@ const WORTH: f64 = 3.0;
 /// Passes of straightening at most, and the chi-square of what one changes from which on the next is worth it.
 const PASSES: usize = 4;
 const CURVED: f64 = 4.0;
-
-/// What may fill a slot.
-#[derive(Debug, Clone)]
-pub enum Cause {
-    /// An effect of the library.
-    Effect(Term),
-    /// Something else.
-    Unknown(Discrepancy),
-}
-
-/// One cause that competes for a slot.
-#[derive(Debug, Clone)]
-pub struct Alternative {
-    /// The cause.
-    pub cause: Cause,
-    /// `ln` evidence over the fit without it.
-    pub log_gain: f64,
-    /// Posterior probability within the slot.
-    pub probability: f64,
-    /// Amplitude and its standard deviation, in the unit of the kind.
-    pub amplitude: (f64, f64),
-    /// How the vars and other unknowns adapt to it, to first order, in units of their prior standard deviations.
-    pub adapting: DVector<f64>,
-    /// The exact fit with it, for the leaders.
-    pub fitted: Option<Fitted>,
-}
-
-/// One effect, given the others: who competes for it.
-#[derive(Debug, Clone)]
-pub struct Slot {
-    /// Most likely first; those of any weight.
-    pub alternatives: Vec<Alternative>,
-    /// Probability that nothing fills it.
-    pub nothing: f64,
-    /// `ln` posterior odds of something over nothing.
-    pub log_odds: f64,
-    /// All candidates, to first order.
-    pub scanned: Vec<Candidate>,
-    /// The fit without it.
-    pub without: Fitted,
-}
 
 /// What the search found.
 #[derive(Debug, Clone)]
@@ -108,6 +65,11 @@ impl Found {
     pub fn nothing(&self) -> f64 {
         self.slots.iter().fold(self.next.nothing, |least, slot| least.min(slot.nothing))
     }
+}
+
+/// Prior odds of one more beside some effects.
+fn odds(effects: usize) -> f64 {
+    if effects == 0 { ODDS } else { ODDS_FURTHER }
 }
 
 /// `ln` prior of each candidate, given that the library holds the effect.
@@ -389,92 +351,3 @@ const FAMILIES: [(EffectKind, &[f64]); 5] = [
     (EffectKind::CorrectorRoll, &[0.01, 0.02, 0.04]),
     (EffectKind::QuadRoll, &[0.001, 0.002, 0.004]),
 ];
-
-impl Alternative {
-    fn of(candidate: &Candidate) -> Self {
-        let scale = candidate.term.kind.prior_scale();
-        let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
-        Self {
-            amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
-            cause: Cause::Effect(candidate.term.clone()),
-            log_gain: candidate.log_bayes,
-            probability: 0.0,
-            adapting: &candidate.adapting * candidate.amplitude,
-            fitted: None,
-        }
-    }
-
-    /// One of the terms of a fit, beside the fit without it.
-    fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
-        Self {
-            cause: Cause::Effect(fitted.hypothesis.terms[term].clone()),
-            log_gain: fitted.log_evidence - without.log_evidence,
-            probability: 0.0,
-            amplitude: fitted.amplitude(data, term),
-            adapting: DVector::zeros(0),
-            fitted: Some(fitted),
-        }
-    }
-
-    fn unknown(discrepancy: Discrepancy) -> Self {
-        Self {
-            amplitude: (discrepancy.size, 0.0),
-            log_gain: discrepancy.log_bayes,
-            cause: Cause::Unknown(discrepancy),
-            probability: 0.0,
-            adapting: DVector::zeros(0),
-            fitted: None,
-        }
-    }
-
-    /// The effect of the library that it is, if any.
-    pub fn term(&self) -> Option<&Term> {
-        match &self.cause {
-            Cause::Effect(term) => Some(term),
-            Cause::Unknown(_) => None,
-        }
-    }
-
-    /// True for an effect of the library.
-    pub fn is_of_library(&self) -> bool {
-        self.term().is_some()
-    }
-}
-
-/// Probability below which an alternative that was not refitted is not listed.
-const LISTED: f64 = 1e-4;
-
-impl Slot {
-    /// Normalise posterior weights (`ln`, "nothing" having 0).
-    fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
-        weights.retain(|(_, weight)| weight.is_finite());
-        weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
-        let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
-        let nothing = (-largest).exp();
-        let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
-        let sum = nothing + something;
-        let normalised = |(alternative, weight): (Alternative, f64)| {
-            let probability = (weight - largest).exp() / sum;
-            Alternative { probability, ..alternative }
-        };
-        let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
-        let alternatives = weights.into_iter().map(normalised).filter(listed).collect();
-        let log_odds = largest + something.ln();
-        Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
-    }
-
-    /// Probability of an effect of the library.
-    pub fn library(&self) -> f64 {
-        self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
-    }
-
-    /// Probability of something else.
-    pub fn unknown(&self) -> f64 {
-        self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
-    }
-
-    /// The exact fit with the most likely effect of the library.
-    fn leader(&self) -> Option<Fitted> {
-        self.alternatives.iter().filter(|a| a.is_of_library()).find_map(|a| a.fitted.clone())
-    }
-}

@@ -8,7 +8,8 @@ use super::heldout::{Fold, Score};
 use super::hypothesis::Term;
 use super::next::Menu;
 use super::scan::separations;
-use super::search::{Alternative, Cause, Found, Slot};
+use super::search::Found;
+use super::slot::{Alternative, Cause, Slot};
 use super::{DECISIVE, PROVEN, SUSPICIOUS};
 
 /// What the recording says about the model.

@@ -357,20 +357,6 @@ impl<'m> Signatures<'m> {
     }
 }
 
-impl Optics<'_> {
-    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients.
-    pub fn rf_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
-        let eta = self.slip_factor();
-        let compaction = self.compaction_jacobian(gradients);
-        let mut slope = self.dispersion_jacobian(observers, gradients) * (-1.0 / eta);
-        for (b, observer) in observers.iter().enumerate() {
-            let per_compaction = self.dispersion(observer) / (eta * eta);
-            slope.row_mut(b).iter_mut().zip(&compaction).for_each(|(s, c)| *s += per_compaction * c);
-        }
-        slope
-    }
-}
-
 impl From<OrbitError> for EffectError {
     fn from(error: OrbitError) -> Self {
         Self::Orbit { effect: "machine", error }

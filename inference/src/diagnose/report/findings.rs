@@ -39,7 +39,8 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
     let mut rows = Vec::new();
     for (i, finding) in diagnosis.findings.iter().enumerate() {
         rows.push(row(&format!("{}.", i + 1), finding));
-        rows.extend(finding.alternatives.iter().take(ALTERNATIVES).map(|other| row("or", other)));
+        let or = |other: &Finding| if other.inseparable { "or (not to be told apart)" } else { "or" };
+        rows.extend(finding.alternatives.iter().take(ALTERNATIVES).map(|other| row(or(other), other)));
     }
     let header =
         ["", "effect", "at", "s [m]", "amplitude", "unit", "ln evidence gain", "probability", "held-out gain [nat]"];

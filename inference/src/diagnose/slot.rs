@@ -1,0 +1,141 @@
+//! One effect, given the others: what competes for it, with posterior probabilities.
+
+use nalgebra::DVector;
+
+use super::data::Data;
+use super::discrepancy::Discrepancy;
+use super::fit::Fitted;
+use super::hypothesis::Term;
+use super::scan::Candidate;
+
+/// What may fill a slot.
+#[derive(Debug, Clone)]
+pub enum Cause {
+    /// An effect of the library.
+    Effect(Term),
+    /// Something else.
+    Unknown(Discrepancy),
+}
+
+/// One cause that competes for a slot.
+#[derive(Debug, Clone)]
+pub struct Alternative {
+    /// The cause.
+    pub cause: Cause,
+    /// `ln` evidence over the fit without it.
+    pub log_gain: f64,
+    /// Posterior probability within the slot.
+    pub probability: f64,
+    /// Amplitude and its standard deviation, in the unit of the kind.
+    pub amplitude: (f64, f64),
+    /// How the vars and other unknowns adapt to it, to first order, in units of their prior standard deviations.
+    pub adapting: DVector<f64>,
+    /// The exact fit with it, for the leaders.
+    pub fitted: Option<Fitted>,
+}
+
+/// One effect, given the others: who competes for it.
+#[derive(Debug, Clone)]
+pub struct Slot {
+    /// Most likely first; those of any weight.
+    pub alternatives: Vec<Alternative>,
+    /// Probability that nothing fills it.
+    pub nothing: f64,
+    /// `ln` posterior odds of something over nothing.
+    pub log_odds: f64,
+    /// All candidates, to first order.
+    pub scanned: Vec<Candidate>,
+    /// The fit without it.
+    pub without: Fitted,
+}
+
+impl Alternative {
+    /// A candidate, to first order.
+    pub(super) fn of(candidate: &Candidate) -> Self {
+        let scale = candidate.term.kind.prior_scale();
+        let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
+        Self {
+            amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
+            cause: Cause::Effect(candidate.term.clone()),
+            log_gain: candidate.log_bayes,
+            probability: 0.0,
+            adapting: &candidate.adapting * candidate.amplitude,
+            fitted: None,
+        }
+    }
+
+    /// One of the terms of a fit, beside the fit without it.
+    pub(super) fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
+        Self {
+            cause: Cause::Effect(fitted.hypothesis.terms[term].clone()),
+            log_gain: fitted.log_evidence - without.log_evidence,
+            probability: 0.0,
+            amplitude: fitted.amplitude(data, term),
+            adapting: DVector::zeros(0),
+            fitted: Some(fitted),
+        }
+    }
+
+    /// Something without a class.
+    pub(super) fn unknown(discrepancy: Discrepancy) -> Self {
+        Self {
+            amplitude: (discrepancy.size, 0.0),
+            log_gain: discrepancy.log_bayes,
+            cause: Cause::Unknown(discrepancy),
+            probability: 0.0,
+            adapting: DVector::zeros(0),
+            fitted: None,
+        }
+    }
+
+    /// The effect of the library that it is, if any.
+    pub fn term(&self) -> Option<&Term> {
+        match &self.cause {
+            Cause::Effect(term) => Some(term),
+            Cause::Unknown(_) => None,
+        }
+    }
+
+    /// True for an effect of the library.
+    pub fn is_of_library(&self) -> bool {
+        self.term().is_some()
+    }
+}
+
+/// Probability below which an alternative that was not refitted is not listed.
+const LISTED: f64 = 1e-4;
+
+impl Slot {
+    /// Normalise posterior weights (`ln`, "nothing" having 0).
+    pub(super) fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
+        weights.retain(|(_, weight)| weight.is_finite());
+        weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
+        let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
+        let nothing = (-largest).exp();
+        let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
+        let sum = nothing + something;
+        let normalised = |(alternative, weight): (Alternative, f64)| {
+            let probability = (weight - largest).exp() / sum;
+            Alternative { probability, ..alternative }
+        };
+        let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
+        let alternatives = weights.into_iter().map(normalised).filter(listed).collect();
+        let log_odds = largest + something.ln();
+        Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
+    }
+
+    /// Probability of an effect of the library.
+    pub fn library(&self) -> f64 {
+        self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
+    }
+
+    /// Probability of something else.
+    pub fn unknown(&self) -> f64 {
+        self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
+    }
+
+    /// The exact fit with the most likely effect of the library.
+    pub(super) fn leader(&self) -> Option<Fitted> {
+        self.alternatives.iter().filter(|a| a.is_of_library()).find_map(|a| a.fitted.clone())
+    }
+}
