@@ -48,7 +48,10 @@ pub fn run(options: &Prove) -> Result<(), CommandError> {
         println!("{}", tables.markdown());
     }
     if options.strict && tables.wrong.of > 0 {
-        let what = format!("something was named that is not there in {} of {} campaigns", tables.wrong.of, tables.wrong.trials);
+        let what = format!(
+            "something was named that is not there in {} of {} campaigns",
+            tables.wrong.of, tables.wrong.trials
+        );
         return Err(CommandError::Other(what));
     }
     Ok(())
