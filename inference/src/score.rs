@@ -7,7 +7,8 @@ use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 
 use crate::diagnose::average::Vars;
-use crate::diagnose::{DECISIVE, Diagnosis, Finding, Verdict};
+use crate::diagnose::slot::DECISIVE;
+use crate::diagnose::{Diagnosis, Finding, Verdict};
 
 /// What a recording was made with.
 #[derive(Debug, Clone, Serialize, Deserialize)]

@@ -7,9 +7,10 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::discrepancy::Discrepancy;
-use super::fit::{Fitted, prior};
+use super::evidence::prior;
+use super::fit::Fitted;
 use super::search::Found;
-use super::slot::{Cause, Slot};
+use super::slot::{Cause, DECISIVE, Slot};
 
 /// `ln` of the vars.
 #[derive(Debug, Clone)]
@@ -30,7 +31,7 @@ impl Vars {
     pub fn averaged(found: &Found) -> Self {
         let certainty = |slot: &&Slot| slot.alternatives.first().map_or(slot.nothing, |a| a.probability);
         let least = found.slots.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
-        Self::over(least.filter(|slot| certainty(slot) < super::DECISIVE).unwrap_or(&found.next))
+        Self::over(least.filter(|slot| certainty(slot) < DECISIVE).unwrap_or(&found.next))
     }
 
     fn over(slot: &Slot) -> Self {

@@ -8,13 +8,19 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
-use super::fit::prior;
 use crate::posterior::RANGE;
+use crate::stream::PRIOR_WIDTH;
 
 /// Precision of a var that is held.
 const HELD: f64 = 1e12;
 /// How near a bound a var is at it, in prior standard deviations.
 const AT: f64 = 1e-9;
+
+/// `(mean, sigma)` of `ln var`.
+pub fn prior() -> (f64, f64) {
+    let variance = f64::from(PRIOR_WIDTH).powi(2).ln_1p();
+    (-0.5 * variance, variance.sqrt())
+}
 
 /// A Gaussian and what the range leaves of it.
 pub struct Within {

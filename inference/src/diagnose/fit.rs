@@ -12,9 +12,8 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
 
 use super::data::Data;
-use super::evidence::{Within, bounded};
+use super::evidence::{Within, bounded, prior};
 use super::hypothesis::{Hypothesis, Unknown};
-use crate::stream::PRIOR_WIDTH;
 
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]
@@ -55,12 +54,6 @@ const HALVINGS: usize = 6;
 const SWEEPS: usize = 1000;
 /// Step of an amplitude for its derivative, in prior standard deviations.
 const DIFFERENCE: f64 = 0.02;
-
-/// `(mean, sigma)` of `ln var`.
-pub fn prior() -> (f64, f64) {
-    let variance = f64::from(PRIOR_WIDTH).powi(2).ln_1p();
-    (-0.5 * variance, variance.sqrt())
-}
 
 struct Point {
     u: DVector<f64>,

@@ -27,6 +27,8 @@ use crate::recording::Recording;
 /// Frames that are left out together.
 pub type Fold = Vec<usize>;
 
+/// Standard errors by which held-out frames have to be predicted better.
+pub const PROVEN: f64 = 2.0;
 /// Folds at most.
 const FOLDS: usize = 5;
 

@@ -34,14 +34,6 @@ use hypothesis::Term;
 use search::{Found, Search};
 pub use verdict::{Finding, Verdict};
 
-/// Probability from which on a cause is decided.
-pub const DECISIVE: f64 = 0.95;
-/// Probability of something missing from which on a recording is not consistent: where it is less, naming it would often be
-/// wrong, and too many empty recordings would be suspected.
-pub const SUSPICIOUS: f64 = 0.6;
-/// Standard errors by which held-out frames have to be predicted better.
-pub const PROVEN: f64 = 2.0;
-
 /// What is missing in the model of a recording.
 #[derive(Debug, Clone)]
 pub struct Diagnosis {

@@ -7,7 +7,8 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine, Signatures};
 
 use super::data::Data;
-use super::fit::{Fitted, prior};
+use super::evidence::prior;
+use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Rivals;
 

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector};
 
 use super::data::Data;
-use super::fit::{Fitted, prior};
+use super::evidence::prior;
+use super::fit::Fitted;
 use crate::nuts::{Density, NutsError, NutsRun, NutsSettings, Unstable, explore};
 use crate::posterior::{Bounded, params_of, unbounded_of};
 

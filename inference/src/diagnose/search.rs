@@ -14,13 +14,12 @@ use std::collections::BTreeMap;
 use nalgebra::DVector;
 use twin::{EffectError, EffectKind};
 
-use super::SUSPICIOUS;
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::scan::{Candidate, scan};
-use super::slot::{Alternative, Slot};
+use super::slot::{Alternative, SUSPICIOUS, Slot};
 use super::whereabouts::SORTS;
 use crate::posterior::softplus;
 

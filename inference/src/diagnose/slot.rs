@@ -8,6 +8,12 @@ use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Candidate;
 
+/// Probability from which on a cause is decided.
+pub const DECISIVE: f64 = 0.95;
+/// Probability of something missing from which on a recording is not consistent: where it is less, naming it would often be
+/// wrong, and too many empty recordings would be suspected.
+pub const SUSPICIOUS: f64 = 0.6;
+
 /// What may fill a slot.
 #[derive(Debug, Clone)]
 pub enum Cause {

@@ -4,13 +4,12 @@ use twin::EffectError;
 
 use super::along::{Along, Interval, thin};
 use super::data::Data;
-use super::heldout::{Fold, Score};
+use super::heldout::{Fold, PROVEN, Score};
 use super::hypothesis::Term;
 use super::next::Menu;
 use super::scan::separations;
 use super::search::Found;
-use super::slot::{Alternative, Cause, Slot};
-use super::{DECISIVE, PROVEN, SUSPICIOUS};
+use super::slot::{Alternative, Cause, DECISIVE, SUSPICIOUS, Slot};
 
 /// What the recording says about the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -8,7 +8,6 @@
 
 use nalgebra::DMatrix;
 
-use super::machine::Machine;
 use crate::lattice::{Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
 use crate::response::{Gradient, Observer, Optics, Source};
@@ -22,14 +21,18 @@ pub(super) struct Held<'r> {
 }
 
 impl<'r> Held<'r> {
-    /// By a machine, on a ring (its own, or one that stands for it) of these optics at constant momentum.
-    pub(super) fn of(machine: &Machine, ring: &'r Ring, optics: &Optics) -> Result<Self, OrbitError> {
+    /// On a ring of these optics at constant momentum: shares of the frequency and of the mean of two monitor places.
+    pub(super) fn of(
+        ring: &'r Ring,
+        optics: &Optics,
+        share: f64,
+        radial_loop: Option<([usize; 2], f64)>,
+    ) -> Result<Self, OrbitError> {
         let offset = optics.frequency_offset();
-        let share = machine.frequency_share;
         let held = || Ok((Optics::of(ring, Hold::Frequency { offset })?, share));
         let frequency = (share != 0.0).then(held).transpose()?;
         let of_place = |place: usize| optics.observe(ring.monitors[place], Plane::X);
-        let radial = machine.radial_loop.map(|(pair, share)| (pair.map(of_place), share));
+        let radial = radial_loop.map(|(pair, share)| (pair.map(of_place), share));
         Ok(Self { frequency, radial })
     }
 

@@ -168,7 +168,7 @@ impl Machine {
 
     /// Response (x, y) at the monitor places with what this machine holds constant.
     pub(super) fn held(&self, ring: &Ring, optics: &Optics) -> Result<(DMatrix<f64>, DMatrix<f64>), OrbitError> {
-        let held = Held::of(self, ring, optics)?;
+        let held = Held::of(ring, optics, self.frequency_share, self.radial_loop)?;
         let of = |plane| held.response(optics, &optics.monitor_places(plane), &optics.correctors());
         Ok((of(Plane::X), of(Plane::Y)))
     }

@@ -78,7 +78,7 @@ impl<'m> Signatures<'m> {
     /// [`OrbitError`] if the machine is unstable.
     pub fn of(machine: &'m Machine, drives: &'m Drives) -> Result<Self, OrbitError> {
         let optics = Optics::of(&machine.ring, Hold::Momentum { delta: machine.delta })?;
-        let held = Held::of(machine, &machine.ring, &optics)?;
+        let held = Held::of(&machine.ring, &optics, machine.frequency_share, machine.radial_loop)?;
         let seen = machine.seen(&machine.ring)?;
         let kick = machine.kicks(drives);
         let (x, y) = drives.positions(&seen, &kick);

@@ -24,7 +24,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
         section.tables.push(table(&caption, ["second campaign", "expected ln Bayes factor [nat]"], rows));
     }
     let mut rows = Vec::new();
-    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < super::super::DECISIVE) {
+    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < super::super::slot::DECISIVE) {
         for one in core::iter::once(finding).chain(&finding.alternatives) {
             rows.push([
                 one.phrase.clone(),
