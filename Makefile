@@ -65,7 +65,7 @@ peers: build .venv-peers ## NUTS of numpyro and blackjax beside ours, on the den
 prove: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run is taken up again (anew after `rm target/prove.jsonl`)
 	$(ORBITCAL) prove recordings/paper-vars --outcomes target/prove.jsonl --page docs/diagnosis.md --json target/prove.json
 
-prove-short: build ## the same with 80 campaigns, four minutes, and an error if anything is named that is not there
+prove-short: build ## the same with 80 campaigns, four minutes, and an error if anything is named that is not there (beside unknown physics)
 	rm -f target/prove-short.jsonl
 	$(ORBITCAL) prove recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 18 --outcomes target/prove-short.jsonl --strict
 

@@ -258,7 +258,7 @@ pub struct Prove {
     /// Fixes every random choice
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// End with an error if an effect of the library was named that is not there
+    /// End with an error if, in an empty campaign or beside effects of the library, something was named that is not there
     #[arg(long)]
     pub strict: bool,
 }

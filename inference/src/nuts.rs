@@ -78,6 +78,9 @@ pub trait Density: Send + Sync + 'static {
     /// Where there is no stable ring: the trajectory ends there.
     fn evaluate(&self, position: &[f64]) -> Result<(f64, Vec<f64>), Unstable>;
 
+    /// How many of the coordinates are vars.
+    fn vars(&self) -> usize;
+
     /// What is kept of a draw, by the names given: the vars, then anything else.
     fn expand(&self, position: &[f64]) -> Vec<f64>;
 }
@@ -167,6 +170,10 @@ impl Density for Whitened {
         Ok((value, self.laplace.whiten(&slope).as_slice().to_vec()))
     }
 
+    fn vars(&self) -> usize {
+        self.posterior.dimension()
+    }
+
     fn expand(&self, position: &[f64]) -> Vec<f64> {
         params_of(self.laplace.unbounded(position).as_slice()).iter().map(|theta| theta.exp()).collect()
     }
@@ -245,10 +252,8 @@ fn explained(
     let each = draws.iter().zip(messages).zip(starts.chunks_exact(density.dimension()));
     let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
     let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
-        let kept = DVector::from_vec(density.expand(start));
-        // anything that is no var is out of their range, or far from its ends
-        let room = kept
-            .map(|var| if (RANGE[0]..RANGE[1]).contains(&var) { (var - RANGE[0]).min(RANGE[1] - var) } else { 1.0 });
+        let kept = DVector::from_row_slice(&density.expand(start)[..density.vars()]);
+        let room = kept.map(|var| (var - RANGE[0]).min(RANGE[1] - var));
         let nearest = room.imin();
         let (name, var) = (&names[nearest], kept[nearest]);
         format!("chain {}, draw {}: {message}; {name} = {var:.4} was nearest its bound", chain + 1, draw + 1)

@@ -62,7 +62,7 @@ pub enum Grade {
 pub enum Fate {
     /// Named at its place, in a verdict that stands.
     Named,
-    /// Not decided between causes that the recording cannot tell apart, this one among them.
+    /// Not decided between causes that the recording cannot tell apart, this one among them, and proven on held-out frames.
     Together,
     /// Not decided, and listed.
     Listed,

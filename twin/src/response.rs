@@ -326,7 +326,8 @@ impl<'r> Optics<'r> {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
     }
 
-    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients.
+    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients [m per 1/m^2, or per 1/m
+    /// of a thin one].
     pub fn rf_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
         let eta = self.slip_factor();
         let compaction = self.compaction_jacobian(gradients);

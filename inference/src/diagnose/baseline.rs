@@ -59,8 +59,8 @@ impl Baseline {
 }
 
 /// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with
-/// the tune: `pi |cot(pi Q) dQ/dln k|`, `dQ/dln k` the natural chromaticity, about the tune itself. The recorded tune knows how
-/// near the integer is.
+/// the tune: `1 + pi |cot(pi Q) dQ/dln k|`, the 1 for the kicks' own growth, `dQ/dln k` the natural chromaticity, about the tune itself. The
+/// recorded tune knows how near the integer is.
 ///
 /// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
 fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {

@@ -49,6 +49,8 @@ const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2
 const ASKED: f64 = 3.0;
 /// Stretches of time.
 const STRETCHES: usize = 8;
+/// What a column of norm 1 has to add to those before it.
+const DEPENDENT: f64 = 1e-8;
 /// Highest power of the position in what a monitor may read.
 const POWERS: usize = 5;
 
@@ -116,7 +118,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectErro
     }
     let of_vars = signatures.of_vars();
     for (q, signature) in of_vars.iter().enumerate() {
-        let pattern = data.stepped(signature, fitted, &stretches);
+        let pattern = data.stepped(signature, fitted, &stretches, &speaking);
         all.push(bench.judge(Where::QuadrupoleInTime(q), &pattern, of_vars.len()));
     }
     let tunes: Vec<Cells> =
@@ -164,7 +166,8 @@ impl Bench<'_> {
     fn adapted(&self, each: &[&Cells], size: f64) -> Option<Adapted> {
         let lower = self.fitted.factor.l();
         let mut information = &lower * lower.transpose();
-        let mut slope = self.fitted.slope.clone();
+        // all vars free here, as one at a bound may come off it
+        let mut slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u;
         for cells in each {
             let mut gram = cells.gram.clone();
             (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0 / (size * size));
@@ -221,13 +224,14 @@ fn powers(position: &DVectorView<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(position.len(), POWERS, |i, power| (position[i] / scale).powi(power as i32 + 1))
 }
 
-/// The same space spanned by columns at right angles, each of rms 1.
-fn independent(columns: DMatrix<f64>) -> DMatrix<f64> {
+/// The same space spanned by columns at right angles, each of rms 1; a column that adds nothing is left out.
+fn independent(mut columns: DMatrix<f64>) -> DMatrix<f64> {
     let rows = columns.nrows() as f64;
-    let largest = columns.column_iter().map(|column| column.norm()).collect::<Vec<_>>();
-    let mut scaled = columns;
-    scaled.column_iter_mut().zip(largest).for_each(|(mut column, norm)| column /= norm.max(f64::MIN_POSITIVE));
-    scaled.qr().q() * rows.sqrt()
+    columns.column_iter_mut().for_each(|mut column| column /= column.norm().max(f64::MIN_POSITIVE));
+    let qr = columns.qr();
+    let (q, r) = (qr.q(), qr.r());
+    let adds: Vec<usize> = (0..r.ncols()).filter(|&i| r[(i, i)].abs() > DEPENDENT).collect();
+    q.select_columns(&adds) * rows.sqrt()
 }
 
 /// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
@@ -329,10 +333,16 @@ impl Data {
     }
 
     /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
-    fn stepped(&self, signature: &twin::Signature, fitted: &Fitted, stretches: &DMatrix<f64>) -> Cells {
+    fn stepped(
+        &self,
+        signature: &twin::Signature,
+        fitted: &Fitted,
+        stretches: &DMatrix<f64>,
+        monitors: &[usize],
+    ) -> Cells {
         let mut sum = Cells::none(stretches.ncols(), fitted.jacobian.ncols());
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
-        for b in self.speaking_monitors() {
+        for &b in monitors {
             let mut columns = stretches.clone();
             columns.row_iter_mut().enumerate().for_each(|(i, mut row)| row *= signature.readings[(i, b)] / rms);
             let cells = self.cells(b, fitted, &columns);

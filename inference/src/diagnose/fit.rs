@@ -176,7 +176,7 @@ impl Fitted {
         -0.5 * (self.cost + self.data(data).log_det())
     }
 
-    /// Amplitude and standard deviation of a term; (1, 0) without one.
+    /// Amplitude and standard deviation of a term, the vars' range left out of the latter; (1, 0) without one.
     pub fn amplitude(&self, data: &Data, term: usize) -> (f64, f64) {
         self.unknown(data, term).map_or((1.0, 0.0), |(at, scale)| {
             let mut unit = DVector::zeros(self.u.len());

@@ -1,7 +1,7 @@
 //! What to measure next: how far one more campaign of the same length would take two causes apart.
 //!
 //! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), with the whitened signatures of the old and the
-//! new campaign below each other, and everything that the fit leaves free adapting.
+//! new campaign below each other, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine, Signatures};

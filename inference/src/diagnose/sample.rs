@@ -84,6 +84,10 @@ impl Density for Extended {
         Ok((value, self.spread.tr_mul(&slope).as_slice().to_vec()))
     }
 
+    fn vars(&self) -> usize {
+        self.fitted.params.len()
+    }
+
     fn expand(&self, position: &[f64]) -> Vec<f64> {
         let (free, others) = self.at(position);
         params_of(free.as_slice()).iter().map(|theta| theta.exp()).chain(others.iter().copied()).collect()

@@ -137,15 +137,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     let bench = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
     for batch in terms.chunks(BATCH) {
-        let columns: Vec<DVector<f64>> = batch
-            .iter()
-            .map(|term| {
-                let scale = term.kind.prior_scale().unwrap_or(1.0);
-                // what leads to no stable machine has nothing to say
-                let signature = signatures.of_effect(term.kind, &term.place);
-                signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
-            })
-            .collect();
+        let columns: Vec<DVector<f64>> = batch.iter().map(|term| whitened(data, &signatures, term)).collect();
         let scored = bench.score(DMatrix::from_columns(&columns));
         for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
             let free = term.kind.prior_scale().is_some();
@@ -171,8 +163,8 @@ pub struct Rivals {
 }
 
 impl Rivals {
-    /// Expected `ln` Bayes factor of the cause, if it is true and `amplitude` prior standard deviations large: with the rival's
-    /// amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less what the freedom of
+    /// Expected `ln` Bayes factor of the cause, if it is true and `amplitude` prior standard deviations large (known, as far as the
+    /// prior goes): with the rival's amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less what the freedom of
     /// the one costs more than that of the other, `ln((1 + h)/(1 + h_rival))/2`.
     pub fn expected(self, amplitude: f64) -> f64 {
         let Self { power, rival, both, free: [cause_is_free, rival_is_free] } = self;
@@ -199,11 +191,8 @@ pub fn separations(
     let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let data = fitted.data(data);
-    let column = |term: &&Term| -> Result<DVector<f64>, EffectError> {
-        Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * term.kind.prior_scale().unwrap_or(1.0))
-    };
     let columns: Vec<DVector<f64>> =
-        core::iter::once(&term).chain(others).map(column).collect::<Result<_, EffectError>>()?;
+        core::iter::once(&term).chain(others).map(|term| whitened(data, &signatures, term)).collect();
     let gram = Projection::of(fitted).gram(&DMatrix::from_columns(&columns));
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let of = |(i, other): (usize, &&Term)| {
@@ -212,6 +201,13 @@ pub fn separations(
         Rivals { power, rival, both, free }.expected(amplitude)
     };
     Ok(others.iter().enumerate().map(of).collect())
+}
+
+/// The whitened signature of a term, per prior standard deviation; what leads to no stable machine has nothing to say.
+fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
+    let scale = term.kind.prior_scale().unwrap_or(1.0);
+    let signature = signatures.of_effect(term.kind, &term.place);
+    signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
 }
 
 /// `ln` Bayes factor of all members of a family having amplitudes of one of some standard deviations, to first order.

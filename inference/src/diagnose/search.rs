@@ -19,7 +19,7 @@ use super::discrepancy::{self, Discrepancy};
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::scan::{Candidate, scan};
-use super::slot::{Alternative, SUSPICIOUS, Slot};
+use super::slot::{Alternative, Slot};
 use super::whereabouts::SORTS;
 use crate::posterior::softplus;
 
@@ -28,7 +28,7 @@ const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Share of what the library does not hold.
 const UNKNOWN: f64 = 0.15;
-/// Rounds of competition for all slots, and the gain of `ln` evidence that is worth another one.
+/// Rounds of competition for all slots, and the gain of `ln` posterior that is worth another one.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
 /// Effects at most.
@@ -109,25 +109,23 @@ impl Search {
     /// [`EffectError`].
     pub fn run(&self, data: Data) -> Result<Found, EffectError> {
         let mut found = self.without_effects(data)?;
-        while found.slots.len() < MOST && found.next.nothing < 1.0 - SUSPICIOUS {
+        // effects can put each other out, so that there may be more steps than effects
+        for _ in 0..2 * MOST {
+            if found.slots.len() >= MOST || !found.next.is_suspicious() {
+                break;
+            }
             let Some(leader) = found.next.leader() else { break };
             let further = self.further(&found, leader)?;
+            // back where it was: one effect has put another out
+            let gained = self.log_posterior(&further.best) - self.log_posterior(&found.best);
+            if further.slots.len() <= found.slots.len() && gained < BETTER {
+                break;
+            }
             // something without a class may say it better than one more effect, but not than two that need each other
             if found.next.library() <= found.next.unknown() && self.log_weight(&further) < self.log_weight(&found) {
                 break;
             }
             found = further;
-        }
-        Ok(found)
-    }
-
-    /// TEMP
-    pub fn stages(&self, data: Data) -> Result<Vec<Found>, EffectError> {
-        // TEMP
-        let mut found = vec![self.without_effects(data)?];
-        while found.len() <= MOST && found.last().unwrap().next.nothing < 1.0 - SUSPICIOUS {
-            let Some(leader) = found.last().unwrap().next.leader() else { break };
-            found.push(self.further(found.last().unwrap(), leader)?);
         }
         Ok(found)
     }
@@ -149,7 +147,8 @@ impl Search {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
         let (mut best, mut slots) = self.settle(&data, leader, &found.next)?;
-        // orbits that the effects have changed are curved in another way
+        // orbits that the effects have changed are curved in another way; without them the readings would be curved as before, by
+        // less than what decides where there is so much to straighten
         if data.straighten(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
             best = straighten(&mut data, &best.hypothesis, &best.u)?;
             null = Fitted::of(&data, &null.hypothesis, &null.u)?;
@@ -162,23 +161,26 @@ impl Search {
     }
 
     /// `ln` posterior of the effects of a fit, with or without something beside them.
-    pub fn log_weight(&self, found: &Found) -> f64 {
-        let prior_of = |(i, term): (usize, &Term)| {
-            let known = self.terms.iter().position(|one| one == term).map_or(0.0, |at| self.log_prior[at]);
-            known + ((1.0 - UNKNOWN) * odds(i)).ln()
-        };
-        let prior: f64 = found.best.hypothesis.terms.iter().enumerate().map(prior_of).sum();
-        found.best.log_evidence - found.null.log_evidence + prior + softplus(found.next.log_odds)
+    fn log_weight(&self, found: &Found) -> f64 {
+        let odds: f64 = (0..found.slots.len()).map(|i| ((1.0 - UNKNOWN) * odds(i)).ln()).sum();
+        self.log_posterior(&found.best) - found.null.log_evidence + odds + softplus(found.next.log_odds)
+    }
+
+    /// `ln` posterior of a fit among those with as many effects.
+    fn log_posterior(&self, fitted: &Fitted) -> f64 {
+        let prior_of = |term: &Term| self.terms.iter().position(|one| one == term).map_or(0.0, |at| self.log_prior[at]);
+        fitted.log_evidence + fitted.hypothesis.terms.iter().map(prior_of).sum::<f64>()
     }
 
     /// Let all candidates compete for each slot, given the others, until the best one is in each; what then need not be there is
     /// taken out. The last effect of the fit has just won the competition for its slot.
     fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
         let (mut best, mut slots) = self.compete(data, fitted, Some(won))?;
-        while let Some(idle) = slots.iter().position(|slot| slot.nothing > 1.0 - SUSPICIOUS)
+        while let Some(idle) =
+            slots.iter().filter(|slot| !slot.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
             && slots.len() > 1
         {
-            (best, slots) = self.compete(data, slots.swap_remove(idle).without, None)?;
+            (best, slots) = self.compete(data, idle.without.clone(), None)?;
         }
         Ok((best, slots))
     }
@@ -196,7 +198,7 @@ impl Search {
                 let slot = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
                 // the same effects may have been fitted better from elsewhere
                 if let Some(other) = slot.leader()
-                    && other.log_evidence > best.log_evidence + BETTER
+                    && self.log_posterior(&other) > self.log_posterior(&best) + BETTER
                     && round < ROUNDS
                 {
                     (best, changed) = (other, true);
@@ -240,7 +242,10 @@ impl Search {
                 false => Alternative::of(candidate),
             };
             let alternative = known.filter(|known| known.log_gain > alternative.log_gain).unwrap_or(alternative);
-            least = alternative.fitted.as_ref().map_or(least, |fitted| least.min(fitted.cost));
+            // the costs of drifting baselines are of other numbers
+            if let Some(fitted) = alternative.fitted.as_ref().filter(|_| candidate.term.kind != EffectKind::QuadDrift) {
+                least = least.min(fitted.cost);
+            }
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }

@@ -130,6 +130,11 @@ impl Slot {
         Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
     }
 
+    /// True if something is likely to fill it.
+    pub fn is_suspicious(&self) -> bool {
+        1.0 - self.nothing > SUSPICIOUS
+    }
+
     /// Probability of an effect of the library.
     pub fn library(&self) -> f64 {
         self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()

@@ -49,7 +49,7 @@ impl Verdict {
             return Self::Unexplained;
         }
         if found.slots.is_empty() {
-            return match (1.0 - next.nothing > SUSPICIOUS, next.unknown() > next.library()) {
+            return match (next.is_suspicious(), next.unknown() > next.library()) {
                 (false, _) => Self::Consistent,
                 (true, true) => Self::Unexplained,
                 (true, false) => Self::Ambiguous,
@@ -60,7 +60,7 @@ impl Verdict {
             slot.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
         };
         let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
-        let whole = 1.0 - next.nothing <= SUSPICIOUS;
+        let whole = !next.is_suspicious();
         if found.slots.iter().zip(&found.best.hypothesis.terms).all(decided) && proven && whole {
             Self::Identified
         } else {
@@ -196,7 +196,9 @@ pub fn findings(
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match verdict {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
-        Verdict::Ambiguous if all.is_empty() => (!found.next.alternatives.is_empty()).then_some(0),
+        Verdict::Ambiguous if all.is_empty() || found.next.is_suspicious() => {
+            (!found.next.alternatives.is_empty()).then_some(0)
+        }
         _ => None,
     };
     if let Some(first) = open {
@@ -259,7 +261,9 @@ fn ambiguous(findings: &[Finding]) -> String {
         let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
         let others = finding.alternatives.iter().take(SAID).map(of);
         let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
-        let apart = if finding.together() >= DECISIVE { ", which this recording cannot tell apart" } else { "" };
+        let alike = finding.alternatives.iter().take(SAID).all(|other| other.inseparable);
+        let apart =
+            if alike && finding.together() >= DECISIVE { ", which this recording cannot tell apart" } else { "" };
         parts.push(format!("{said}{apart}"));
     }
     format!("something may be missing: {}", parts.join("; and "))
@@ -300,7 +304,8 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
         return Ok(None);
     }
     let undecided = |slot: &&Slot| slot.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
-    let slot = found.slots.iter().find(undecided).or(found.slots.first()).unwrap_or(&found.next);
+    let open = Some(&found.next).filter(|next| next.is_suspicious());
+    let slot = open.or(found.slots.iter().find(undecided)).or(found.slots.first()).unwrap_or(&found.next);
     let effects = slot.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };

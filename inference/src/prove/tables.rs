@@ -53,7 +53,7 @@ pub struct Tables {
     pub empty_identified: Share,
     /// What became of the effects of the library, by their own oracle gain.
     pub by_gain: Vec<([f64; 2], Fates)>,
-    /// Campaigns with something named, and among them those with something named that is not there, by oracle gain.
+    /// Campaigns with something named that is not there, of all but those with unknown physics.
     pub wrong: Share,
     /// Campaigns beyond the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
     pub unknown: Vec<([f64; 2], Share, usize)>,
@@ -69,7 +69,7 @@ pub struct Tables {
     pub amplitudes: (usize, f64, [Share; 2]),
     /// 95 % stretches of a gradient's place that hold it.
     pub places: Share,
-    /// NEES per var before and after, medians of single effects named right.
+    /// NEES per var before and after, medians where all effects were named right.
     pub nees: [f64; 2],
     /// Held-out gain in its standard errors, median of effects named right.
     pub heldout: f64,

@@ -47,7 +47,7 @@ impl<'r> Held<'r> {
         response
     }
 
-    /// Its derivative with respect to a gradient.
+    /// Its derivative with respect to a gradient [m/rad per 1/m^2, or per 1/m of a thin one].
     pub(super) fn jacobian(
         &self,
         optics: &Optics,

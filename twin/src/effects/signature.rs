@@ -120,7 +120,8 @@ impl<'m> Signatures<'m> {
     }
 
     /// What kicks and RF offset do to the orbit at the place of a read monitor: its position and slope in the monitor's plane,
-    /// then in the other, rows frames [m, rad]. Where no kick is in between, the orbit anywhere near is a sum of these.
+    /// then in the other, rows frames [m, rad]. But for dispersion, the orbit anywhere near is a sum of these where no kick is in
+    /// between.
     pub fn around(&self, b: usize) -> DMatrix<f64> {
         let (plane, place) = self.monitors[b];
         let at = self.machine.ring.monitors[place];
@@ -131,7 +132,7 @@ impl<'m> Signatures<'m> {
         let crossed = if plane == Plane::X { Plane::Y } else { Plane::X };
         let slope = |plane| {
             let observer = self.optics.observe_slope(at, plane);
-            let response = self.optics.response(&[observer], &self.sources);
+            let response = self.held.response(&self.optics, &[observer], &self.sources);
             let rf = -self.optics.dispersion(&observer) / self.optics.slip_factor();
             (&self.kick * response.transpose() + &self.drives.rf_offset * rf).column(0).into_owned()
         };
@@ -143,7 +144,7 @@ impl<'m> Signatures<'m> {
         ])
     }
 
-    /// What the read monitors see of a step of the beam in x, x', y and y' at a corrector, columns the four [m, m/rad]. A kick
+    /// What the read monitors see of a step of the beam in x, x', y and y' at a corrector, columns the four [1, m/rad]. A kick
     /// anywhere near is a sum of these, but for monitors in between.
     pub fn beside(&self, corrector: usize) -> DMatrix<f64> {
         let at = self.machine.ring.correctors[corrector];
