@@ -1,7 +1,9 @@
 //! Green's function tables of a ring, from its twin.
 
 use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, LowRank, SymmetricBlock};
-use twin::{ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
+use twin::{
+    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source, spurious_dispersion,
+};
 
 /// The Booster's Green's function surrogate.
 pub type BoosterGreen = estimator::booster::Green;
@@ -181,52 +183,9 @@ fn dispersion<const B: usize, const Q: usize>(
         monitor: core::array::from_fn(|b| optics.dispersion(&monitors[b]) as f32),
         node: core::array::from_fn(|q| optics.dispersion(&optics.observe(nodes[q], Plane::X)) as f32),
         second_order: core::array::from_fn(|b| second(b) as f32),
-        spurious: spurious(ring)?,
+        spurious: spurious_dispersion(ring)?.map(|ratio| ratio as f32),
         compaction: optics.momentum_compaction() as f32,
         inverse_gamma_squared: ring.particle.gamma(instruments.delta).powi(-2) as f32,
         circumference: ring.circumference as f32,
     })
-}
-
-/// Misaligned machines from which the spurious dispersion is taken, and the rms shift of their quadrupoles [m]; the ratio
-/// to the orbit does not depend on the shift.
-const MISALIGNED: u32 = 40;
-const SHIFT: f64 = 0.2e-3;
-
-/// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion.
-///
-/// The orbit that shifted quadrupoles make changes with the momentum, as every orbit does; which way, only the unknown
-/// shifts could tell.
-fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
-    for machine in 0..MISALIGNED {
-        let shifted = misaligned(ring, machine);
-        let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(RF_STEP)?, at(-RF_STEP)?, at(0.0)?);
-        for monitor in ring.monitors_read().map(|monitor| monitor.element) {
-            for (plane, coordinate, design) in
-                [(0, 0, optics.dispersion(&optics.observe(monitor, Plane::X))), (1, 2, 0.0)]
-            {
-                let slope = (up.at[monitor][coordinate] - down.at[monitor][coordinate]) / (2.0 * RF_STEP);
-                let momentum = (up.at[monitor][4] - down.at[monitor][4]) / (2.0 * RF_STEP);
-                change[plane] += (slope - design * momentum).powi(2);
-                orbit[plane] += rest.at[monitor][coordinate].powi(2);
-            }
-        }
-    }
-    // An offset and its opposite share the change with opposite signs; the core takes them for independent, so each is
-    // given twice the variance.
-    Ok([0, 1].map(|plane| f64::sqrt(2.0 * change[plane] / orbit[plane]) as f32))
-}
-
-/// The ring with its quadrupoles shifted at random, uniformly, seeded.
-fn misaligned(ring: &Ring, machine: u32) -> Ring {
-    let mut shifted = ring.clone();
-    for (q, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
-        let uniform = |plane: u32| f64::from(sobol_burley::sample(machine, 2 * q as u32 + plane, 1)) - 0.5;
-        let shift = &mut shifted.elements[at].misalignment;
-        (shift.dx, shift.dy) = (uniform(0) * SHIFT * 12f64.sqrt(), uniform(1) * SHIFT * 12f64.sqrt());
-    }
-    shifted
 }

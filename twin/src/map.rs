@@ -94,6 +94,16 @@ fn linearised(z: &mut Phase<f64>, map: impl Fn(&mut Phase<num_dual::DualSVec64<6
 }
 
 impl Misalignment {
+    /// From the ring's axes to the element's own.
+    pub(crate) fn rotation(&self) -> Matrix6<f64> {
+        let (sin, cos) = self.roll.sin_cos();
+        let mut roll = Matrix6::identity();
+        for (h, v) in [(X, Y), (PX, PY)] {
+            (roll[(h, h)], roll[(h, v)], roll[(v, h)], roll[(v, v)]) = (cos, sin, -sin, cos);
+        }
+        roll
+    }
+
     fn enter<T: Scalar>(&self, z: &mut Phase<T>) {
         if self.is_none() {
             return;

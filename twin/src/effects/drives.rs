@@ -14,7 +14,8 @@ use nalgebra::{DMatrix, DVector, RowVector2};
 use super::machine::{Instrument, Machine, planes, rows};
 use crate::lattice::{Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Place, Tunes};
+use crate::response::{Optics, Place};
+use crate::tune::Tunes;
 
 /// What drove the beam in the frames of a campaign, and the orbit that the kicks were added to.
 #[derive(Debug, Clone)]

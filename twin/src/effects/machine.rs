@@ -6,7 +6,8 @@ use super::held::Held;
 use super::{Effect, EffectError, EffectKind};
 use crate::lattice::{Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Source, Tunes};
+use crate::response::{Optics, Source};
+use crate::tune::Tunes;
 
 /// What the RF system holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -8,7 +8,8 @@ use super::machine::{Instrument, Machine};
 use crate::lattice::{Kind, Plane, Ring};
 use crate::map::{DELTA, X, Y};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError};
-use crate::response::{Optics, Tunes};
+use crate::response::Optics;
+use crate::tune::Tunes;
 
 /// What drives one machine cycle.
 #[derive(Debug, Clone)]
