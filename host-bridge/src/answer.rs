@@ -4,9 +4,9 @@ use comfy_table::{CellAlignment, Table, presets};
 use estimator::{FitQuality, Health, Marginal, MonitorState, Setup};
 use inference::nuts::NutsRun;
 use inference::stream::BoosterEstimate;
-use inference::study::Sampled;
 use inference::{BatchFit, Campaign, Recording, Summary};
 use serde::Serialize;
+use studies::Sampled;
 use twin::{Hold, Optics, Ring};
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.

@@ -1,22 +1,17 @@
-//! Offline science of orbitcal: recordings on disk, their frames, the exact batch answer, the NUTS reference, and the
-//! published studies as reports.
+//! Recordings on disk and what follows from them: their frames, the batch fit with the exact twin, the posterior, the NUTS
+//! reference, and simulated campaigns.
 
 mod cmdstan;
-pub mod diagnose;
 pub mod diagnostics;
 pub mod draws;
 pub mod map;
 pub mod model;
 pub mod nuts;
 pub mod posterior;
-pub mod prove;
 pub mod readings;
 pub mod recording;
-pub mod report;
-pub mod score;
 pub mod simulate;
 pub mod stream;
-pub mod study;
 
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use map::{BatchError, BatchFit};

@@ -180,15 +180,15 @@ impl Posterior {
 }
 
 /// One param as a function of its coordinate without bounds.
-pub(crate) struct Bounded {
+pub struct Bounded {
     /// `d theta/du`.
-    pub(crate) slope: f64,
+    pub slope: f64,
     /// `d2 theta/du2`.
-    pub(crate) bend: f64,
+    pub bend: f64,
     /// `d ln(slope)/du`.
-    pub(crate) log_slope_slope: f64,
+    pub log_slope_slope: f64,
     /// `-d2 ln(slope)/du2`.
-    pub(crate) log_curvature: f64,
+    pub log_curvature: f64,
 }
 
 /// Distance from a bound within which the map bends [ln var].
@@ -196,7 +196,7 @@ pub const BEND: f64 = 0.003;
 
 impl Bounded {
     /// `slope = s_l (1 - s_u) (1 - e^(-(upper - lower)/t))`, `s` the logistic functions of the distances from both bounds.
-    pub(crate) fn at(u: f64) -> Self {
+    pub fn at(u: f64) -> Self {
         let [lower, upper] = bounds();
         let [above_lower, above_upper] = [logistic((u - lower) / BEND), logistic((u - upper) / BEND)];
         let [below_lower, below_upper] = [logistic((lower - u) / BEND), logistic((upper - u) / BEND)];
@@ -220,7 +220,7 @@ fn logistic(x: f64) -> f64 {
 }
 
 /// `ln(1 + e^x)`.
-pub(crate) fn softplus(x: f64) -> f64 {
+pub fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 
@@ -231,7 +231,7 @@ pub fn params_of(u: &[f64]) -> Vec<f64> {
 }
 
 /// Coordinates without bounds of params; a param at a bound is taken a thousandth of the range inside.
-pub(crate) fn unbounded_of(params: &[f64]) -> DVector<f64> {
+pub fn unbounded_of(params: &[f64]) -> DVector<f64> {
     let [lower, upper] = bounds();
     let room = 1e-3 * (upper - lower);
     let one = |theta: &f64| {
@@ -252,6 +252,36 @@ impl Laplace {
     /// The gradient in whitened coordinates.
     pub fn whiten(&self, gradient: &[f64]) -> DVector<f64> {
         self.factor.tr_mul(&DVector::from_column_slice(gradient))
+    }
+
+    /// Mean and standard deviation of each var.
+    ///
+    /// The coordinate without bounds is normal; its map to the var is integrated over +-8 standard deviations.
+    pub fn moments(&self) -> (Vec<f64>, Vec<f64>) {
+        const POINTS: i32 = 400;
+        let one = |i: usize| {
+            let (centre, sigma) = (self.centre[i], self.factor.row(i).norm());
+            let (mut weight, mut first, mut second) = (0.0, 0.0, 0.0);
+            for k in -POINTS..=POINTS {
+                let z = 8.0 * f64::from(k) / f64::from(POINTS);
+                let (w, var) = ((-0.5 * z * z).exp(), params_of(&[centre + sigma * z])[0].exp());
+                (weight, first, second) = (weight + w, first + w * var, second + w * var * var);
+            }
+            let mean = first / weight;
+            (mean, (second / weight - mean * mean).max(0.0).sqrt())
+        };
+        (0..self.centre.len()).map(one).unzip()
+    }
+
+    /// Covariance of the coordinates without bounds.
+    pub fn covariance(&self) -> DMatrix<f64> {
+        &self.factor * self.factor.transpose()
+    }
+
+    /// Squared Mahalanobis distance of params.
+    pub fn distance(&self, params: &[f64]) -> f64 {
+        let away = unbounded_of(params) - &self.centre;
+        self.factor.solve_lower_triangular(&away).map_or(f64::INFINITY, |z| z.norm_squared())
     }
 }
 

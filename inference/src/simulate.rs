@@ -17,8 +17,6 @@ use crate::model::ResponseModel;
 use crate::posterior::RANGE;
 use crate::recording::Recording;
 
-#[cfg(test)]
-pub(crate) use campaign::tests as campaign_tests;
 pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
 
 /// What the simulated monitors do.

@@ -1,13 +1,13 @@
 //! Is missing physics found, and only then? On recordings made by an independent code with the effect concealed, on simulated
 //! ones of every kind, and are its error bars those of the exact posterior?
 
-use inference::diagnose::fit::Fitted;
-use inference::diagnose::hypothesis::{Hypothesis, Term};
-use inference::diagnose::scan::{candidates, scan};
-use inference::diagnose::{Diagnosis, Verdict, data::Data, sample};
+use diagnosis::fit::Fitted;
+use diagnosis::hypothesis::{Hypothesis, Term};
+use diagnosis::scan::{candidates, scan};
+use diagnosis::score::{Grade, Truth};
+use diagnosis::validation::{Case, Class, Unknown, UnknownKind};
+use diagnosis::{Diagnosis, Verdict, data::Data, sample};
 use inference::nuts::NutsSettings;
-use inference::prove::{Case, Class, Unknown, UnknownKind};
-use inference::score::{Grade, Truth};
 use inference::simulate::{self, Hardware};
 use inference::{Recording, stream};
 use nalgebra::DVector;
@@ -87,7 +87,7 @@ fn every_kind_is_found_when_it_is_strong() {
         let expected = 0.5 * seen.power * if kind.prior_scale().is_some() { size * size } else { 1.0 };
         let first = diagnosis.findings.first();
         let found = first.is_some_and(|f| {
-            let is = |f: &inference::diagnose::Finding| f.kind == kind.word() && f.at == effect.place;
+            let is = |f: &diagnosis::Finding| f.kind == kind.word() && f.at == effect.place;
             is(f) || f.alternatives.iter().any(is)
         });
         // normal gradients next to each other are imitated by each other and by the vars: their place is not asserted

@@ -6,9 +6,9 @@ use estimator::Marginal;
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::simulate::{self, Instruments};
 use inference::stream::{self, Core};
-use inference::study::{self, Kind, Options, Sampled, Subset};
 use inference::{Campaign, Posterior, Readings, Recording, ResponseModel, Width};
 use nalgebra::DMatrix;
+use studies::{self, Kind, Options, Sampled, Subset};
 use system_tests::repository;
 use twin::Ring;
 
@@ -190,7 +190,7 @@ fn error_bars_of_nuts_cover_ten_simulated_truths() {
 fn the_studies_make_a_report_and_find_d8_below_unity() {
     let (ring, recording) = read("paper-vars");
     let nuts = NutsSettings { chains: 2, warm_up: 200, draws: 300, seed: 3 };
-    let made = study::run(&ring, &recording, Options { nuts }, &mut |_, _, _| ()).unwrap();
+    let made = studies::run(&ring, &recording, Options { nuts }, &mut |_, _, _| ()).unwrap();
     let d8 = ring.var_names().iter().position(|name| name == "D8").unwrap();
     assert_eq!(made.numbers.subsets.len(), 20);
     for subset in &made.numbers.subsets {

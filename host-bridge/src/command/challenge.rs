@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use comfy_table::{Table, presets};
-use inference::diagnose::Diagnosis;
-use inference::score::{Grade, Truth};
+use diagnosis::Diagnosis;
+use diagnosis::score::{Grade, Truth};
 use serde::Serialize;
 
 use super::{CommandError, machine, progress, recording};
@@ -107,7 +107,7 @@ impl Scored {
             verdict: diagnosis.verdict.word(),
             sentence: diagnosis.sentence.clone(),
             found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
-            truth: truth.effects.iter().map(inference::score::TrueEffect::label).collect(),
+            truth: truth.effects.iter().map(diagnosis::score::TrueEffect::label).collect(),
             oracle_gain: truth.oracle_gain,
             grade: truth.grade(diagnosis),
             amplitude_pulls: truth.pulls(diagnosis),

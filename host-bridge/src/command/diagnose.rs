@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use comfy_table::{Table, presets};
-use inference::diagnose::average::Vars;
-use inference::diagnose::data::DataError;
-use inference::diagnose::heldout::Score;
-use inference::diagnose::{Diagnosis, Finding, report};
+use diagnosis::average::Vars;
+use diagnosis::data::DataError;
+use diagnosis::heldout::Score;
+use diagnosis::{Diagnosis, Finding, page};
 use serde::Serialize;
 use twin::Ring;
 
@@ -117,7 +117,7 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
         output::json(path, &answer)?;
     }
     if let Some(path) = &options.report {
-        let page = report::page(&diagnosis, &recording);
+        let page = page::page(&diagnosis, &recording);
         let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
         let written = page.write(path);
         written.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
@@ -146,7 +146,7 @@ impl Answer {
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;
         let (gain, error) = diagnosis.gain();
-        let fit = |fitted: &inference::diagnose::fit::Fitted, score: &Score| -> Result<FitAnswer, CommandError> {
+        let fit = |fitted: &diagnosis::fit::Fitted, score: &Score| -> Result<FitAnswer, CommandError> {
             Ok(FitAnswer {
                 chi2_per_dof: fitted.chi2_per_dof(data).map_err(failed)?,
                 heldout_rms_mm: score.rms * 1e3,

@@ -7,11 +7,11 @@ use std::io::Write;
 use std::path::Path;
 use std::sync::Mutex;
 
+use diagnosis::data::{Data, DataError};
+use diagnosis::scan::candidates;
+use diagnosis::validation::tables::Tables;
+use diagnosis::validation::{Case, Class, Outcome, run as prove};
 use inference::Recording;
-use inference::diagnose::data::{Data, DataError};
-use inference::diagnose::scan::candidates;
-use inference::prove::tables::Tables;
-use inference::prove::{Case, Class, Outcome, run as prove};
 use twin::Ring;
 
 use super::{CommandError, machine, progress, recording};

@@ -1,6 +1,6 @@
 //! `orbitcal study`: the published studies of a recording, as one report.
 
-use inference::study::{self, Options, StudyError};
+use studies::{self, Options, StudyError};
 
 use super::{CommandError, machine, progress, recording};
 use crate::cli::Study;
@@ -19,7 +19,7 @@ pub fn run(options: &Study) -> Result<(), CommandError> {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     };
-    let made = study::run(&ring, &recording, Options { nuts: options.sampling.into() }, &mut report);
+    let made = studies::run(&ring, &recording, Options { nuts: options.sampling.into() }, &mut report);
     bar.finish_and_clear();
     let made = made.map_err(|error| match error {
         StudyError::Readings(error) => error.into(),

@@ -189,13 +189,13 @@ fn normal(random: &mut StdRng) -> f64 {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use std::path::Path;
 
     use super::*;
 
     /// A campaign of the repository, on the ring as designed.
-    pub(crate) fn template() -> (Ring, Recording) {
+    fn template() -> (Ring, Recording) {
         let ring = Ring::booster();
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
         let recording = Recording::read(&folder, &crate::stream::layout(&ring)).unwrap();
@@ -203,13 +203,13 @@ pub(crate) mod tests {
     }
 
     /// Hardware of which nothing is seen but the orbit.
-    pub(crate) fn ideal(ring: &Ring) -> Hardware {
+    fn ideal(ring: &Ring) -> Hardware {
         let noise = vec![0.0; ring.read_monitors.len()];
         Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 }
     }
 
     /// Readings, rows frames, columns read monitors.
-    pub(crate) fn readings(recording: &Recording) -> DMatrix<f64> {
+    fn readings(recording: &Recording) -> DMatrix<f64> {
         let rows = &recording.rows;
         DMatrix::from_fn(rows.len(), rows[0].reading.len(), |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
     }

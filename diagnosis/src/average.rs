@@ -1,0 +1,67 @@
+//! The vars, all that may be true taken into account: a mixture over the causes that compete, with their probabilities.
+//!
+//! `mean = sum of p m`, `covariance = sum of p (C + (m - mean)(m - mean)^T)`.
+//!
+//! Source: J. A. Hoeting et al., Statist. Sci. 14 (1999) 382, Bayesian model averaging.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::alternatives::{Cause, DECISIVE, Slot};
+use super::discrepancy::Discrepancy;
+use super::evidence::prior;
+use super::fit::Fitted;
+use super::search::Found;
+
+/// `ln` of the vars.
+#[derive(Debug, Clone)]
+pub struct Vars {
+    /// Mean of each `ln var`.
+    pub mean: DVector<f64>,
+    /// Covariance.
+    pub covariance: DMatrix<f64>,
+}
+
+impl Vars {
+    /// Those of one fit.
+    pub fn of(fitted: &Fitted) -> Self {
+        Self { mean: DVector::from_column_slice(&fitted.params), covariance: fitted.covariance() }
+    }
+
+    /// Those of all that may fill the least certain slot.
+    pub fn averaged(found: &Found) -> Self {
+        let certainty = |slot: &&Slot| slot.alternatives.first().map_or(slot.nothing, |a| a.probability);
+        let least = found.slots.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
+        Self::over(least.filter(|slot| certainty(slot) < DECISIVE).unwrap_or(&found.next))
+    }
+
+    fn over(slot: &Slot) -> Self {
+        let plain = Self::of(&slot.without);
+        let (vars, (_, sigma)) = (plain.mean.len(), prior());
+        let mut parts = vec![(slot.nothing, plain.clone())];
+        for alternative in &slot.alternatives {
+            let part = match (&alternative.fitted, &alternative.cause) {
+                (Some(fitted), _) => Self::of(fitted),
+                (None, Cause::Unknown(Discrepancy { adapted: Some(adapted), .. })) => Self {
+                    mean: &plain.mean + adapted.step.rows(0, vars) * sigma,
+                    covariance: adapted.covariance.view((0, 0), (vars, vars)) * (sigma * sigma),
+                },
+                (None, Cause::Unknown(_)) => plain.clone(),
+                (None, Cause::Effect(_)) => {
+                    // to first order: the fit moves along with the amplitude, and shares its uncertainty
+                    let shift = alternative.adapting.rows(0, vars) * sigma;
+                    let (amplitude, error) = alternative.amplitude;
+                    let along = if amplitude == 0.0 { &shift * 0.0 } else { &shift * (error / amplitude) };
+                    Self { mean: &plain.mean + shift, covariance: &plain.covariance + &along * along.transpose() }
+                }
+            };
+            parts.push((alternative.probability, part));
+        }
+        let weight: f64 = parts.iter().map(|(p, _)| p).sum();
+        let mean = parts.iter().fold(DVector::zeros(vars), |sum, (p, part)| sum + &part.mean * (p / weight));
+        let covariance = parts.iter().fold(DMatrix::zeros(vars, vars), |sum, (p, part)| {
+            let off = &part.mean - &mean;
+            sum + (&part.covariance + &off * off.transpose()) * (p / weight)
+        });
+        Self { mean, covariance }
+    }
+}

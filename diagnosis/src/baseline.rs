@@ -1,0 +1,123 @@
+//! The orbit that the kicks are added to: what the monitors' baselines say of it, and how it moves.
+//!
+//! Quadrupoles that stand off their places make an orbit, and the monitors read it with offsets of their own. It moves with all
+//! gradients and with the RF frequency, which is what the readings of a monitor share beside its baseline.
+
+use nalgebra::{DMatrix, DVector};
+use twin::{Hold, Optics, OrbitError, Plane, Ring, Tunes};
+
+use inference::map::Screened;
+
+/// What is known of the orbit without kicks.
+#[derive(Debug, Clone)]
+pub struct Baseline {
+    /// Rms of the monitors' baselines in x and y [m].
+    pub rms: [f64; 2],
+    /// Relative change per `ln` of all gradients, in x and y [1].
+    pub sensitivity: [f64; 2],
+    /// Standard deviation of what an RF offset does to it beside the dispersion, in x and y [m].
+    pub spurious: [f64; 2],
+    /// Standard deviation of the orbit at each element (x, y) [m].
+    pub sigma: Vec<[f64; 2]>,
+}
+
+/// Offset of a monitor from the orbit [m]: what surveys of such monitors find.
+const OFFSET: f64 = 0.7e-3;
+/// Cotangent of the phase advance of a machine that still keeps its beam.
+const STEEPEST: f64 = 20.0;
+
+impl Baseline {
+    /// The orbit (x, y) at every element [m], and what is known of it, by readings without what the kicks do (rows frames, columns
+    /// monitors) and recorded tunes. `per_rms`: what an RF offset does beside the dispersion, per rms of the baselines.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring has no orbit.
+    pub fn of(
+        ring: &Ring,
+        readings: &DMatrix<f64>,
+        screened: &Screened,
+        recorded_tunes: &DMatrix<f64>,
+        per_rms: [f64; 2],
+    ) -> Result<(Vec<[f64; 2]>, Self), OrbitError> {
+        let baselines = means(readings, screened);
+        let split = ring.read_places().iter().filter(|(plane, _)| *plane == Plane::X).count();
+        let rms = [rms(&baselines[..split]), rms(&baselines[split..])];
+        let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
+        let sensitivity = sensitivity(recorded_tunes, &tunes);
+        // an orbit's change with the momentum grows towards the integer as that with the gradients does
+        let of_design = self::sensitivity(&DMatrix::zeros(0, 2), &tunes);
+        let growth = [0, 1].map(|plane| (sensitivity[plane] / of_design[plane]).max(1.0));
+        let spurious = [0, 1].map(|plane| per_rms[plane] * rms[plane] * growth[plane]);
+        let (orbit, sigma) = krige(ring, &baselines, rms)?;
+        Ok((orbit, Self { rms, sensitivity, spurious, sigma }))
+    }
+
+    /// Standard deviation of a baseline's change per `ln` of all gradients in a plane (0 x, 1 y) [m].
+    pub fn per_gradient(&self, plane: usize) -> f64 {
+        self.sensitivity[plane] * self.rms[plane]
+    }
+}
+
+/// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with
+/// the tune: `1 + pi |cot(pi Q) dQ/dln k|`, the 1 for the kicks' own growth, `dQ/dln k` the natural chromaticity, about the tune itself. The
+/// recorded tune knows how near the integer is.
+///
+/// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
+fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
+    let pi = core::f64::consts::PI;
+    [(0, design.x), (1, design.y)].map(|(plane, design)| {
+        let known: Vec<f64> = recorded.column(plane).iter().copied().filter(|tune| *tune > 0.0).collect();
+        let tune = if known.is_empty() { design } else { known.iter().sum::<f64>() / known.len() as f64 };
+        1.0 + pi * design * (pi * tune).tan().recip().abs().min(STEEPEST)
+    })
+}
+
+/// Mean of each monitor's readings [m]; none for a silent one.
+fn means(readings: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
+    let of = |b: usize| {
+        let counts = |i: usize| screened.accepted[i] >> b & 1 == 1 && !readings[(i, b)].is_nan();
+        let counting: Vec<f64> = (0..readings.nrows()).filter(|&i| counts(i)).map(|i| readings[(i, b)]).collect();
+        (!counting.is_empty()).then(|| counting.iter().sum::<f64>() / counting.len() as f64)
+    };
+    (0..readings.ncols()).map(of).collect()
+}
+
+fn rms(values: &[Option<f64>]) -> f64 {
+    let squares: Vec<f64> = values.iter().flatten().map(|v| v * v).collect();
+    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+}
+
+/// Orbit (x, y) at every element, and its standard deviation [m].
+type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
+
+/// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard
+/// deviation: kicks of random size at all quadrupoles, as many as explain the baselines' rms.
+///
+/// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
+fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {
+    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+    let (mut orbit, mut sigma) = (vec![[0.0; 2]; ring.elements.len()], vec![[0.0; 2]; ring.elements.len()]);
+    let places = ring.read_places();
+    for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
+        let direction = [[1.0, 0.0], [0.0, 1.0]][index];
+        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
+        let read: Vec<usize> = (0..places.len()).filter(|&b| places[b].0 == plane && baselines[b].is_some()).collect();
+        let seen: Vec<_> = read.iter().map(|&b| optics.observe(ring.monitors[places[b].1], plane)).collect();
+        let everywhere: Vec<_> = (0..ring.elements.len()).map(|i| optics.observe(i, plane)).collect();
+        let (at, all) = (optics.response(&seen, &sources), optics.response(&everywhere, &sources));
+        let mean_square = at.norm_squared() / (read.len().max(1)) as f64;
+        let variance = if mean_square > 0.0 { rms[index].powi(2) / mean_square } else { 0.0 };
+        let noise = DMatrix::from_diagonal_element(read.len(), read.len(), OFFSET.powi(2));
+        let Some(factor) = (&at * at.transpose() * variance + noise).cholesky() else { continue };
+        let values = DVector::from_iterator(read.len(), read.iter().filter_map(|&b| baselines[b]));
+        let cross = &all * at.transpose() * variance;
+        let mean = &cross * factor.solve(&values);
+        for i in 0..ring.elements.len() {
+            let row = cross.row(i).transpose();
+            let left = all.row(i).norm_squared() * variance - row.dot(&factor.solve(&row));
+            orbit[i][index] = mean[i];
+            sigma[i][index] = left.max(0.0).sqrt();
+        }
+    }
+    Ok((orbit, sigma))
+}

@@ -1,0 +1,539 @@
+//! A recording as one vector of independent numbers of variance 1.
+//!
+//! The readings of a monitor share what nobody knows of it: its baseline (orbit and offset), how that moves with the supplies
+//! and with the RF frequency (the misalignments' doing), and, where all quadrupoles drift, with the time. Each is a vector `u`
+//! over the frames with an unknown factor of known standard deviation, so that the readings' covariance is
+//!
+//! `S = sigma^2 (1 + U U^T)`, and with the thin decomposition `U = Q D V^T`,
+//! `S^(-1/2) = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T)/sigma`.
+//!
+//! Whitened once, everything that follows is plain least squares. The tune meter adds four numbers: the mean of each tune and
+//! its change from start to end.
+
+use estimator::{Health, MonitorState};
+use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
+use training::BoosterGreen;
+use twin::{
+    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Plane, Rf, Ring, Signature, Signatures,
+    Tracked, Tunes,
+};
+
+use super::baseline::Baseline;
+use super::settings::Settings;
+use inference::map::{Drive, Screened, first_family, screen};
+use inference::recording::{BelievedRf, Recording};
+use inference::stream::StreamError;
+
+/// A recording, whitened.
+#[derive(Debug, Clone)]
+pub struct Data {
+    /// The ring as designed.
+    pub ring: Ring,
+    /// What drove the beam, and the orbit it started from.
+    pub drives: Drives,
+    /// What is known of that orbit.
+    pub baseline: Baseline,
+    /// Which readings count, and the state of the monitors.
+    pub screened: Screened,
+    /// `ln` of each quadrupole's mean supply factor.
+    pub supplies: Vec<f64>,
+    /// Readings at the mean supply currents, without what the orbit has beyond first order in kicks and RF offset, rows frames,
+    /// columns monitors [m].
+    pub readings: DMatrix<f64>,
+    /// As recorded [m]; one that is missing is not a number.
+    recorded: DMatrix<f64>,
+    /// `ln` of the supplies' factors off their mean, of each frame.
+    fluctuation: [DVector<f64>; 2],
+    /// Noise of a reading by the recording's header [m].
+    pub expected_noise: f64,
+    channels: Vec<Channel>,
+    /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
+    tunes: DMatrix<f64>,
+    recorded_tunes: DMatrix<f64>,
+    meter: [Option<Meter>; 2],
+    /// What the operators believe the machine holds instead of the momentum.
+    pub believed: Vec<Effect>,
+    /// What each monitor's readings share, in standard deviations, but for RF frequency and drift [frames][factors] [m].
+    shared: Vec<DMatrix<f64>>,
+    /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
+    drift: f64,
+}
+
+/// The readings of one monitor that count.
+#[derive(Debug, Clone)]
+struct Channel {
+    frames: Vec<usize>,
+    sigma: f64,
+    /// `Q` [frames][factors].
+    basis: DMatrix<f64>,
+    /// `1 - (1 + D^2)^(-1/2)` of each.
+    shrink: DVector<f64>,
+    log_det: f64,
+}
+
+/// One tune: what it was in mid-campaign, and how much it changed to the end.
+#[derive(Debug, Clone)]
+struct Meter {
+    value: Vector2<f64>,
+    /// Noise of one frame's tune.
+    noise: f64,
+    /// Whitens (value, change).
+    whiten: Matrix2<f64>,
+}
+
+/// Why a recording cannot be diagnosed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DataError {
+    /// The recording does not stream.
+    #[error(transparent)]
+    Stream(#[from] StreamError),
+    /// The design has no orbit.
+    #[error("the ring as designed: {0}")]
+    Orbit(#[from] OrbitError),
+    /// No tables for this ring.
+    #[error(transparent)]
+    Training(#[from] training::TrainingError),
+    /// Too little to tell anything from.
+    #[error("{recording}: {what}: expected at least {expected}, found {found}")]
+    TooLittle {
+        /// The recording.
+        recording: String,
+        /// What is too few.
+        what: &'static str,
+        /// How many are needed.
+        expected: usize,
+        /// How many there are.
+        found: usize,
+    },
+    /// An effect that the ring cannot have.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+}
+
+/// Prior standard deviation of a baseline [m].
+const BASELINE: f64 = 20e-3;
+/// Calibration error of a tune meter [1], of the order of its resolution.
+pub const TUNE_CALIBRATION: f64 = 3e-4;
+/// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
+const FAULTY: f64 = 4.0;
+/// Monitors and correctors below which nothing can be told apart.
+const LEAST: usize = 4;
+
+impl Data {
+    /// Screen a recording by the core and whiten it.
+    ///
+    /// # Errors
+    /// [`DataError`].
+    pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, DataError> {
+        let screened = screen(ring, recording)?;
+        let driven: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(recording, row)).collect();
+        let mean = |family: usize| driven.iter().map(|d| d.strength[family]).sum::<f64>() / driven.len() as f64;
+        let means = [mean(0), mean(1)];
+        let first = first_family(ring);
+        let supplies: Vec<f64> = (0..ring.quadrupoles.len()).map(|q| means[usize::from(q >= first)]).collect();
+        let fluctuation = [0, 1].map(|family| {
+            DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
+        });
+        let mut drives = drives_of(recording, &driven, ring);
+        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed(recording))?;
+        let recorded = raw(recording, ring);
+        let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
+            recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
+        });
+        let kicked_off = &recorded - design.readings(&drives)?.0;
+        let tables: BoosterGreen = training::green::tables(ring)?;
+        let per_rms = tables.dispersion.spurious.map(f64::from);
+        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, &screened, &recorded_tunes, per_rms)?;
+        drives.orbit = orbit;
+        let shared = |b: usize| {
+            let supply = baseline.per_gradient(usize::from(ring.read_places()[b].0 == Plane::Y));
+            DMatrix::from_columns(&[
+                DVector::from_element(driven.len(), BASELINE),
+                &fluctuation[0] * supply,
+                &fluctuation[1] * supply,
+            ])
+        };
+        let mut data = Self {
+            ring: ring.clone(),
+            screened,
+            supplies,
+            readings: recorded.clone(),
+            shared: (0..recorded.ncols()).map(shared).collect(),
+            baseline,
+            recorded,
+            fluctuation,
+            expected_noise: recording.header.bpm_sigma,
+            channels: Vec::new(),
+            meter: [None, None],
+            tunes: recorded_tunes.clone(),
+            recorded_tunes,
+            believed: believed(recording),
+            drift: 0.0,
+            drives,
+        };
+        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, 0.0)).collect();
+        data.check(recording)?;
+        data.straighten(&design)?;
+        Ok(data)
+    }
+
+    /// Take away from the recorded readings and tunes what depends on the machine, and little on the details of its model: what the
+    /// supplies' fluctuations do to the kicked orbit, to first order, and what exact orbits have beyond first order: by the
+    /// bends' curvature up to some 10 um for kicks of 0.2 mrad, more near an integer tune. Returns the chi-square of what the
+    /// readings change by.
+    ///
+    /// # Errors
+    /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
+    pub fn straighten(&mut self, machine: &Machine) -> Result<f64, EffectError> {
+        let beyond = self.beyond(machine)?;
+        let slopes = Signatures::of(machine, &self.drives)?.of_vars();
+        let (mut readings, mut tunes) = (&self.recorded - beyond, self.recorded_tunes.clone());
+        let first = first_family(&self.ring);
+        for (off, range) in self.fluctuation.iter().zip([0..first, first..slopes.len()]) {
+            for slope in &slopes[range] {
+                for (b, mut column) in readings.column_iter_mut().enumerate() {
+                    column -= off.component_mul(&slope.readings.column(b));
+                }
+                tunes -= off * RowVector2::from(slope.tunes);
+            }
+        }
+        let moved = self.whiten(|b, frame| readings[(frame, b)] - self.readings[(frame, b)], [Vector2::zeros(); 2]);
+        (self.readings, self.tunes) = (readings, tunes);
+        self.meter = self.meters();
+        Ok(moved.norm_squared())
+    }
+
+    /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the core took for a first reading.
+    pub fn trim(&mut self, residual: &DVector<f64>) {
+        for (r, place) in residual.iter().zip(self.places()) {
+            if let Some((frame, b)) = place
+                && r.abs() > FAULTY
+                && self.health()[b].state != MonitorState::Ok
+            {
+                self.screened.accepted[frame] &= !(1 << b);
+            }
+        }
+        self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
+    }
+
+    /// What the exact orbits of a machine have beyond first order in kicks and RF offset, rows frames; repeats share it [m].
+    fn beyond(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
+        let tracked = Tracked::of(machine.clone(), self.drives.nominal_kick)?;
+        let settings = Settings::of(&self.drives);
+        let drives = settings.means(&self.drives);
+        let cycle = |kick: Vec<f64>, rf_offset: f64| {
+            let strength = vec![0.0; self.ring.quadrupoles.len()];
+            tracked.cycle(&Cycle { kick, strength, rf_offset, time: 0.0 })
+        };
+        let (plain, _) = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
+        let mut beyond = -machine.readings(&drives)?.0;
+        for (i, mut row) in beyond.row_iter_mut().enumerate() {
+            let (exact, _) = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
+            row.iter_mut().zip(exact.iter().zip(&plain)).for_each(|(to, (exact, plain))| *to += exact - plain);
+        }
+        Ok(beyond.select_rows(&settings.of_frame))
+    }
+
+    /// The same recording with a known signal taken out of its readings and tunes, rows frames.
+    pub fn less(&self, readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> Self {
+        let mut data = self.clone();
+        data.readings -= readings;
+        data.recorded -= readings;
+        data.tunes -= tunes;
+        data.recorded_tunes -= tunes;
+        data.meter = data.meters();
+        data
+    }
+
+    fn meters(&self) -> [Option<Meter>; 2] {
+        [0, 1].map(|plane| Meter::of(self.tunes.column(plane).iter().zip(self.drives.time.iter())))
+    }
+
+    /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
+    pub fn drifting(&self, amplitude: f64) -> Self {
+        let mut data = self.clone();
+        data.drift = amplitude;
+        data.channels = (0..self.readings.ncols()).map(|b| self.channel(b, amplitude)).collect();
+        data
+    }
+
+    /// A campaign like this one with other drives, for what it would say: its readings are of no use.
+    pub fn driven_by(&self, drives: &Drives) -> Self {
+        let mut data = Self { drives: drives.clone(), ..self.clone() };
+        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data
+    }
+
+    /// The same recording without some frames.
+    pub fn without(&self, frames: &[usize]) -> Self {
+        let mut data = self.clone();
+        for &frame in frames {
+            data.screened.accepted[frame] = 0;
+            data.tunes.row_mut(frame).fill(f64::NAN);
+        }
+        data.meter = data.meters();
+        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data
+    }
+
+    fn channel(&self, b: usize, drift: f64) -> Channel {
+        let frames: Vec<usize> = (0..self.readings.nrows()).filter(|&frame| self.counts(frame, b)).collect();
+        let shared = self.shared_of(b, &frames, drift);
+        Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
+    }
+
+    /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
+    fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
+        let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
+        let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
+        let shared = self.shared[b].select_rows(frames);
+        let at = shared.ncols();
+        let mut shared = shared.insert_column(at, 0.0);
+        shared.set_column(at, &(rf * self.baseline.spurious[plane]));
+        if drift == 0.0 {
+            return shared;
+        }
+        // to second order: near an integer tune an orbit grows faster than the quadrupoles drift
+        let time = |power: i32| {
+            let relative = (drift * self.baseline.sensitivity[plane]).powi(power) * self.baseline.rms[plane];
+            DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i].powi(power) * relative))
+        };
+        let at = shared.ncols();
+        let mut shared = shared.insert_columns(at, 2, 0.0);
+        shared.set_column(at, &time(1));
+        shared.set_column(at + 1, &time(2));
+        shared
+    }
+
+    fn check(&self, recording: &Recording) -> Result<(), DataError> {
+        let enough = |what, expected, found| {
+            if found >= expected {
+                return Ok(());
+            }
+            Err(DataError::TooLittle { recording: recording.name.clone(), what, expected, found })
+        };
+        let speaking = |channel: &&Channel| channel.frames.len() > channel.basis.ncols();
+        enough("monitors with readings", LEAST, self.channels.iter().filter(speaking).count())?;
+        enough("correctors that were moved", LEAST, self.driven_correctors().len())
+    }
+
+    /// Correctors that were set to something, by index.
+    pub fn driven_correctors(&self) -> Vec<usize> {
+        let moved = |&c: &usize| self.drives.kick.column(c).amax() > 0.05 * self.drives.nominal_kick;
+        (0..self.drives.kick.ncols()).filter(moved).collect()
+    }
+
+    /// Monitors that have readings which count, by index.
+    pub fn speaking_monitors(&self) -> Vec<usize> {
+        (0..self.channels.len()).filter(|&b| self.channels[b].frames.len() > self.channels[b].basis.ncols()).collect()
+    }
+
+    /// Number of whitened numbers.
+    pub fn size(&self) -> usize {
+        self.channels.iter().map(|c| c.frames.len()).sum::<usize>() + 4
+    }
+
+    /// `ln` of the determinant of the covariance.
+    pub fn log_det(&self) -> f64 {
+        self.channels.iter().map(|c| c.log_det).sum()
+    }
+
+    /// The readings, less those that a machine of these tunes predicts.
+    pub fn residual(&self, predicted: &DMatrix<f64>, tunes: Tunes, tune_drift: [f64; 2]) -> DVector<f64> {
+        let miss = [0, 1].map(|plane| {
+            let predicted = Vector2::new([tunes.x, tunes.y][plane], tune_drift[plane]);
+            self.meter[plane].as_ref().map_or(Vector2::zeros(), |meter| meter.miss(predicted))
+        });
+        self.whiten(|b, frame| self.readings[(frame, b)] - predicted[(frame, b)], miss)
+    }
+
+    /// Readings [m] and tunes [1] as columns, less those predicted; a tune is known up to an integer.
+    pub fn miss(&self, predicted: &DMatrix<f64>) -> DMatrix<f64> {
+        let monitors = self.readings.ncols();
+        let mut miss = -predicted;
+        let mut part = miss.columns_mut(0, monitors);
+        part += &self.readings;
+        let mut part = miss.columns_mut(monitors, 2);
+        part += &self.tunes;
+        part.apply(|tune| *tune -= tune.round());
+        miss
+    }
+
+    /// A signature, whitened.
+    pub fn signature(&self, signature: &Signature) -> DVector<f64> {
+        let tunes = [0, 1].map(|plane| {
+            let change = Vector2::new(signature.tunes[plane], signature.tune_drift[plane]);
+            self.meter[plane].as_ref().map_or(Vector2::zeros(), |meter| meter.whiten * change)
+        });
+        self.whiten(|b, frame| signature.readings[(frame, b)], tunes)
+    }
+
+    fn whiten(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
+        let mut all = DVector::zeros(self.size());
+        let mut at = 0;
+        for (b, channel) in self.channels.iter().enumerate() {
+            let n = channel.frames.len();
+            let mut part = all.rows_mut(at, n);
+            for (to, &frame) in part.iter_mut().zip(&channel.frames) {
+                *to = value(b, frame) / channel.sigma;
+            }
+            let along = channel.basis.tr_mul(&part).component_mul(&channel.shrink);
+            part.gemv(-1.0, &channel.basis, &along, 1.0);
+            at += n;
+        }
+        for tune in tunes {
+            all.fixed_rows_mut::<2>(at).copy_from(&tune);
+            at += 2;
+        }
+        all
+    }
+
+    /// Frame and monitor of each whitened number; the tune meter's have none.
+    pub fn places(&self) -> Vec<Option<(usize, usize)>> {
+        let of = |(b, channel): (usize, &Channel)| channel.frames.iter().map(|&i| Some((i, b))).collect::<Vec<_>>();
+        self.channels.iter().enumerate().flat_map(of).chain([None; 4]).collect()
+    }
+
+    /// First of a monitor's whitened numbers.
+    pub fn start(&self, b: usize) -> usize {
+        self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
+    }
+
+    /// A monitor's residuals about its baseline, and about that baseline's drift where the hypothesis says that it drifts: the
+    /// drift's factors are at their most likely values, `(1 + U^T U/sigma^2)^-1 U^T r/sigma^2`. `residual` has a row for every frame.
+    pub fn about_baseline(&self, b: usize, residual: &DVector<f64>) -> DVector<f64> {
+        let frames = self.frames(b);
+        let mut own = residual.select_rows(frames);
+        let shared = self.shared(b, frames);
+        let steady = self.shared[b].ncols() + 1;
+        let variance = self.noise(b).powi(2);
+        let information = shared.tr_mul(&shared) / variance + DMatrix::identity(shared.ncols(), shared.ncols());
+        if let Some(factor) = information.cholesky().filter(|_| shared.ncols() > steady) {
+            let factors = factor.solve(&(shared.tr_mul(&own) / variance));
+            own -= shared.columns_range(steady..) * factors.rows_range(steady..);
+        }
+        own.add_scalar_mut(-own.mean());
+        own
+    }
+
+    /// Whiten columns over all frames as readings of one monitor.
+    pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        let channel = &self.channels[b];
+        let mut part = columns.select_rows(&channel.frames) / channel.sigma;
+        let mut along = channel.basis.transpose() * &part;
+        along.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
+        part -= &channel.basis * along;
+        part
+    }
+
+    /// True if a reading counts.
+    pub fn counts(&self, frame: usize, b: usize) -> bool {
+        self.screened.accepted[frame] >> b & 1 == 1 && !self.readings[(frame, b)].is_nan()
+    }
+
+    /// Frames in which a monitor's reading counts.
+    pub fn frames(&self, b: usize) -> &[usize] {
+        &self.channels[b].frames
+    }
+
+    /// What readings of a monitor share in some frames, in standard deviations [frames][factors] [m].
+    pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
+        self.shared_of(b, frames, self.drift)
+    }
+
+    /// Noise of one reading of a monitor [m].
+    pub fn noise(&self, b: usize) -> f64 {
+        self.channels[b].sigma
+    }
+
+    /// Frames in which a tune counts.
+    pub fn tune_frames(&self, plane: usize) -> Vec<usize> {
+        let counts = |&frame: &usize| self.meter[plane].is_some() && !self.tunes[(frame, plane)].is_nan();
+        (0..self.tunes.nrows()).filter(counts).collect()
+    }
+
+    /// Noise of one reading of the tune meter [1], if it has been read often enough.
+    pub fn tune_noise(&self, plane: usize) -> Option<f64> {
+        self.meter[plane].as_ref().map(|meter| meter.noise)
+    }
+
+    /// State of the monitors.
+    pub fn health(&self) -> &[Health] {
+        &self.screened.health
+    }
+}
+
+impl Channel {
+    fn of(frames: Vec<usize>, sigma: f64, shared: DMatrix<f64>) -> Self {
+        let log_sigma = 2.0 * frames.len() as f64 * sigma.ln();
+        if frames.is_empty() {
+            return Self { frames, sigma, basis: DMatrix::zeros(0, 0), shrink: DVector::zeros(0), log_det: 0.0 };
+        }
+        let svd = (shared / sigma).svd(true, false);
+        let basis = svd.u.expect("asked for");
+        let grown = svd.singular_values.map(|d| 1.0 + d * d);
+        let log_det = log_sigma + grown.iter().map(|g| g.ln()).sum::<f64>();
+        Self { frames, sigma, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
+    }
+}
+
+impl Meter {
+    /// A line through the tunes of the frames over time.
+    fn of<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
+        let points: Vec<(f64, f64)> =
+            frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
+        // a line needs a few points, and its noise some more
+        if points.len() < 8 {
+            return None;
+        }
+        let normal = points.iter().fold(Matrix2::zeros(), |sum, &(t, _)| sum + Matrix2::new(1.0, t, t, t * t));
+        let moment = points.iter().fold(Vector2::zeros(), |sum, &(t, tune)| sum + Vector2::new(tune, t * tune));
+        let value = normal.try_inverse()? * moment;
+        // from one frame to the next, as the tune itself may move
+        let squares: f64 = points.windows(2).map(|pair| (pair[1].1 - pair[0].1).powi(2)).sum();
+        let variance = 0.5 * squares / (points.len() - 1) as f64;
+        let covariance = normal.try_inverse()? * variance + Matrix2::new(TUNE_CALIBRATION.powi(2), 0.0, 0.0, 0.0);
+        let whiten = covariance.cholesky()?.l().try_inverse()?;
+        Some(Self { value, noise: variance.sqrt(), whiten })
+    }
+
+    fn miss(&self, predicted: Vector2<f64>) -> Vector2<f64> {
+        let mut miss = self.value - predicted;
+        miss[0] -= miss[0].round();
+        self.whiten * miss
+    }
+}
+
+/// What the recording's header says was held, as an effect.
+fn believed(recording: &Recording) -> Vec<Effect> {
+    let pair = recording.header.radial_loop_monitors.as_ref();
+    let one = |kind, place: String| vec![Effect { kind, place, amplitude: 1.0 }];
+    match recording.header.believed_rf {
+        BelievedRf::FixedMomentum => Vec::new(),
+        BelievedRf::FixedFrequency => one(EffectKind::FixedRfFrequency, String::new()),
+        BelievedRf::RadialLoop => pair.map_or_else(Vec::new, |pair| one(EffectKind::RadialLoop, pair.join(","))),
+    }
+}
+
+fn exp(ln: &[f64]) -> Vec<f64> {
+    ln.iter().map(|l| l.exp()).collect()
+}
+
+fn drives_of(recording: &Recording, driven: &[Drive], ring: &Ring) -> Drives {
+    let rows: Vec<_> = driven.iter().map(|d| d.kick.transpose()).collect();
+    Drives {
+        kick: DMatrix::from_rows(&rows),
+        rf_offset: DVector::from_iterator(driven.len(), driven.iter().map(|d| d.rf_offset)),
+        time: DVector::from_vec(recording.times()),
+        nominal_kick: recording.nominal_kick(),
+        orbit: vec![[0.0; 2]; ring.elements.len()],
+    }
+}
+
+/// Readings as recorded; one that is missing is not a number.
+fn raw(recording: &Recording, ring: &Ring) -> DMatrix<f64> {
+    DMatrix::from_fn(recording.rows.len(), ring.read_monitors.len(), |i, b| {
+        recording.rows[i].reading[b].unwrap_or(f64::NAN)
+    })
+}

@@ -1,0 +1,362 @@
+//! Something without a class: a part of the data that the fit does not describe, located as well as may be.
+//!
+//! Each place is given freedom of its own: one unknown number of standard deviation `omega` for every setting (or stretch of
+//! time) at a monitor, a corrector or a place in the ring that kicks the beam. With `Z` the whitened pattern of those numbers,
+//! `P` the projection that takes away what the fit can imitate, `g = Z^T P r` and `G = Z^T P Z`:
+//!
+//! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,
+//!
+//! averaged over omega from well below the noise to millimetres. It needs no idea of the physics, and pays for its freedom.
+//!
+//! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
+
+use estimator::MonitorState;
+use nalgebra::{DMatrix, DVector, DVectorView};
+use twin::{EffectError, Plane, Signatures};
+
+use super::data::Data;
+use super::fit::Fitted;
+use super::location::Location;
+use super::settings::Settings;
+
+/// Freedom at one place, and what the data say of it.
+#[derive(Debug, Clone)]
+pub struct Discrepancy {
+    /// The place.
+    pub at: Location,
+    /// `ln` Bayes factor over the fit.
+    pub log_bayes: f64,
+    /// Most likely standard deviation of the unknown numbers [m at the monitors].
+    pub size: f64,
+    /// Places of the same sort.
+    pub sites: usize,
+    /// What the fit's unknowns become, where the data ask for the freedom.
+    pub adapted: Option<Adapted>,
+}
+
+/// The unknowns of a fit beside the freedom, which is marginalised: how they move, and their covariance, to first order.
+#[derive(Debug, Clone)]
+pub struct Adapted {
+    /// Step from the fit, in prior standard deviations.
+    pub step: DVector<f64>,
+    /// Covariance.
+    pub covariance: DMatrix<f64>,
+}
+
+/// Standard deviations tried [m].
+const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
+/// `ln` Bayes factor from which on the data ask for the freedom.
+const ASKED: f64 = 3.0;
+/// Stretches of time.
+const STRETCHES: usize = 8;
+/// What a column of norm 1 has to add to those before it.
+const DEPENDENT: f64 = 1e-8;
+/// Highest power of the position in what a monitor may read.
+const POWERS: usize = 5;
+
+/// Sums of one monitor's whitened numbers over cells (settings or stretches of time).
+struct Cells {
+    /// `E^T S^-1 E`.
+    gram: DMatrix<f64>,
+    /// `E^T S^(-1/2) J`, rows cells.
+    cross: DMatrix<f64>,
+    /// `E^T S^(-1/2) r`.
+    pull: DVector<f64>,
+}
+
+/// Everything that a scan needs of a fit.
+struct Bench<'f> {
+    fitted: &'f Fitted,
+}
+
+/// Give freedom to every place in turn.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectError> {
+    let data = fitted.data(data);
+    let bench = Bench { fitted };
+    let settings = Settings::of(&data.drives);
+    let monitors = data.readings.ncols();
+    let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
+    let stretches = stretches(data);
+    let steps: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &stretches)).collect();
+    // monitors known to be faulty scatter as they like
+    let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
+    let speaking: Vec<usize> = data.speaking_monitors().into_iter().filter(healthy).collect();
+    if speaking.is_empty() {
+        return Ok(Vec::new());
+    }
+    let (machine, drives) = fitted.machine(data)?;
+    let predicted = fitted.predicted(data)?;
+    let miss = data.miss(&predicted);
+    let signatures = Signatures::of(&machine, &drives)?;
+    let mut all = Vec::new();
+    for &b in &speaking {
+        all.push(bench.judge(Location::Monitor(b), &cells[b], speaking.len()));
+        all.push(bench.judge(Location::MonitorInTime(b), &steps[b], speaking.len()));
+        let gains = data.cells(b, fitted, &scaled(&stretches, &predicted.column(b)));
+        all.push(bench.judge(Location::GainInTime(b), &gains, speaking.len()));
+        let orbit = signatures.around(b);
+        let elsewhere = data.cells(b, fitted, &independent(orbit.clone()));
+        all.push(bench.judge(Location::MonitorElsewhere(b), &elsewhere, speaking.len()));
+        let curve = data.cells(b, fitted, &independent(powers(&orbit.column(0))));
+        all.push(bench.judge(Location::MonitorCurve(b), &curve, speaking.len()));
+    }
+    let driven = data.driven_correctors();
+    for &c in &driven {
+        let of_corrector = settings.of_corrector(c);
+        all.push(bench.judge(Location::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
+        let patterns = independent(signatures.beside(c));
+        let beside = patterned(&cells, &speaking, &settings.strength(c), &patterns);
+        all.push(bench.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
+    }
+    let patterns = kicked(&machine)?;
+    let sites = patterns.len();
+    for (quadrupole, plane, pattern) in patterns {
+        all.push(bench.judge(Location::Ring(quadrupole, plane), &weighted(&cells, &speaking, &pattern), sites));
+    }
+    let of_vars = signatures.of_vars();
+    for (q, signature) in of_vars.iter().enumerate() {
+        let pattern = data.stepped(signature, fitted, &stretches, &speaking);
+        all.push(bench.judge(Location::QuadrupoleInTime(q), &pattern, of_vars.len()));
+    }
+    let tunes: Vec<Cells> =
+        [0, 1].into_iter().filter_map(|plane| data.tune_cells(plane, &miss, fitted, &stretches)).collect();
+    all.push(bench.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
+    all.push(bench.judge_held(Location::Time, &some(&steps, &speaking)));
+    all.push(bench.judge_held(Location::Everywhere, &some(&cells, &speaking)));
+    Ok(all)
+}
+
+fn some<'c>(cells: &'c [Cells], monitors: &[usize]) -> Vec<&'c Cells> {
+    monitors.iter().map(|&b| &cells[b]).collect()
+}
+
+impl Bench<'_> {
+    /// Projected pull and Gram matrix of some numbers.
+    fn project(&self, cells: &Cells) -> (DVector<f64>, DMatrix<f64>) {
+        let taken = self.fitted.free.solve(&cells.cross.transpose());
+        let pull = &cells.pull - taken.tr_mul(&self.fitted.slope);
+        (pull, &cells.gram - &cells.cross * taken)
+    }
+
+    fn judge(&self, at: Location, cells: &Cells, sites: usize) -> Discrepancy {
+        let (pull, gram) = self.project(cells);
+        let logs = SIZES.map(|size| marginal(&pull, &gram, size));
+        self.conclude(Discrepancy::of(at, logs, sites), &[cells])
+    }
+
+    /// Many monitors with one size, the fit's own unknowns held: less than the truth, as they would adapt.
+    fn judge_held(&self, at: Location, each: &[&Cells]) -> Discrepancy {
+        let mut logs = [0.0; SIZES.len()];
+        for cells in each {
+            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&cells.pull, &cells.gram, size));
+        }
+        self.conclude(Discrepancy::of(at, logs, 1), each)
+    }
+
+    /// With what the fit's unknowns become.
+    fn conclude(&self, found: Discrepancy, each: &[&Cells]) -> Discrepancy {
+        let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
+        Discrepancy { adapted, ..found }
+    }
+
+    /// With `C = Z^T J` and `K = (Z^T Z + 1/omega^2)^-1`: covariance `(1 + J^T J - sum of C^T K C)^-1`, step `-cov sum of C^T K Z^T r`.
+    fn adapted(&self, each: &[&Cells], size: f64) -> Option<Adapted> {
+        let lower = self.fitted.factor.l();
+        let mut information = &lower * lower.transpose();
+        // all vars free here, as one at a bound may come off it
+        let mut slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u;
+        for cells in each {
+            let mut gram = cells.gram.clone();
+            (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0 / (size * size));
+            let factor = gram.cholesky()?;
+            information -= cells.cross.transpose() * factor.solve(&cells.cross);
+            slope -= cells.cross.tr_mul(&factor.solve(&cells.pull));
+        }
+        let factor = information.cholesky()?;
+        Some(Adapted { step: factor.solve(&slope), covariance: factor.inverse() })
+    }
+}
+
+impl Discrepancy {
+    fn of(at: Location, logs: [f64; SIZES.len()], sites: usize) -> Self {
+        let (best, largest) = logs
+            .iter()
+            .enumerate()
+            .fold((0, f64::NEG_INFINITY), |best, (i, &log)| if log > best.1 { (i, log) } else { best });
+        let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
+        Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
+    }
+}
+
+/// `ln` Bayes factor of unknown numbers of one size, given their projected pull and Gram matrix.
+pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
+    let variance = size * size;
+    let mut grown = gram * variance;
+    (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
+    let Some(factor) = grown.cholesky() else { return f64::NEG_INFINITY };
+    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
+    0.5 * variance * pull.dot(&factor.solve(pull)) - log_det
+}
+
+/// Steps at the edges of the stretches of time: rows frames, columns edges.
+fn stretches(data: &Data) -> DMatrix<f64> {
+    let edge = |i: usize| -1.0 + 2.0 * (i + 1) as f64 / STRETCHES as f64;
+    DMatrix::from_fn(data.readings.nrows(), STRETCHES - 1, |frame, i| {
+        f64::from(u8::from(data.drives.time[frame] >= edge(i))) - 0.5
+    })
+}
+
+/// Steps of a gain, which leave its mean alone: the steps times what is predicted, of rms 1, less their share of it.
+fn scaled(stretches: &DMatrix<f64>, predicted: &DVectorView<f64>) -> DMatrix<f64> {
+    let rms = (predicted.norm_squared() / predicted.len() as f64).sqrt().max(f64::MIN_POSITIVE);
+    let mut columns = stretches.clone();
+    columns.row_iter_mut().zip(predicted.iter()).for_each(|(mut row, p)| row *= p / rms);
+    let share = predicted.tr_mul(&columns) / predicted.norm_squared().max(f64::MIN_POSITIVE);
+    columns - predicted * share
+}
+
+/// The powers of a position, from the first on.
+fn powers(position: &DVectorView<f64>) -> DMatrix<f64> {
+    let scale = position.amax().max(f64::MIN_POSITIVE);
+    DMatrix::from_fn(position.len(), POWERS, |i, power| (position[i] / scale).powi(power as i32 + 1))
+}
+
+/// The same space spanned by columns at right angles, each of rms 1; a column that adds nothing is left out.
+fn independent(mut columns: DMatrix<f64>) -> DMatrix<f64> {
+    let rows = columns.nrows() as f64;
+    columns.column_iter_mut().for_each(|mut column| column /= column.norm().max(f64::MIN_POSITIVE));
+    let qr = columns.qr();
+    let (q, r) = (qr.q(), qr.r());
+    let adds: Vec<usize> = (0..r.ncols()).filter(|&i| r[(i, i)].abs() > DEPENDENT).collect();
+    q.select_columns(&adds) * rows.sqrt()
+}
+
+/// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
+fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, EffectError> {
+    let ring = machine.ring();
+    let optics = twin::Optics::of(ring, twin::Hold::Momentum { delta: 0.0 })?;
+    let observers = optics.read_monitors();
+    let of_plane = |plane: Plane| {
+        let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
+        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
+        let response = optics.response(&observers, &sources);
+        (0..sources.len()).map(move |q| {
+            let column = response.column(q).into_owned();
+            let read = column.iter().filter(|r| r.abs() > 0.0).count().max(1) as f64;
+            let rms = (column.norm_squared() / read).sqrt().max(f64::MIN_POSITIVE);
+            (q, plane, column / rms)
+        })
+    };
+    Ok(of_plane(Plane::X).chain(of_plane(Plane::Y)).collect())
+}
+
+/// One number for each setting that all monitors see by a pattern.
+fn weighted(cells: &[Cells], monitors: &[usize], pattern: &DVector<f64>) -> Cells {
+    let first = &cells[monitors[0]];
+    let mut sum = Cells::none(first.cross.nrows(), first.cross.ncols());
+    for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
+        sum.gram += &cells[b].gram * (pattern[b] * pattern[b]);
+        sum.cross += &cells[b].cross * pattern[b];
+        sum.pull += &cells[b].pull * pattern[b];
+    }
+    sum
+}
+
+/// One number for each pattern over the monitors (one a column), in proportion to `setting`.
+fn patterned(cells: &[Cells], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Cells {
+    let mut sum = Cells::none(patterns.ncols(), cells[monitors[0]].cross.ncols());
+    for &b in monitors {
+        let seen = patterns.row(b).transpose();
+        sum.gram += &seen * seen.transpose() * setting.dot(&(&cells[b].gram * setting));
+        sum.cross += &seen * setting.tr_mul(&cells[b].cross);
+        sum.pull += &seen * setting.dot(&cells[b].pull);
+    }
+    sum
+}
+
+/// One number for each monitor and each of some settings.
+fn blocks(cells: &[Cells], monitors: &[usize], settings: &[usize]) -> Cells {
+    let (m, p) = (settings.len(), cells[monitors[0]].cross.ncols());
+    let n = m * monitors.len();
+    let mut all = Cells { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
+    for (k, &b) in monitors.iter().enumerate() {
+        for (i, &one) in settings.iter().enumerate() {
+            for (j, &other) in settings.iter().enumerate() {
+                all.gram[(k * m + i, k * m + j)] = cells[b].gram[(one, other)];
+            }
+            all.cross.row_mut(k * m + i).copy_from(&cells[b].cross.row(one));
+            all.pull[k * m + i] = cells[b].pull[one];
+        }
+    }
+    all
+}
+
+impl Data {
+    /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
+    fn cells(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Cells {
+        let whitened = self.whiten_columns(b, indicator);
+        let (start, n) = (self.start(b), self.frames(b).len());
+        let back = whitened.transpose();
+        Cells {
+            gram: &back * &whitened,
+            cross: &back * fitted.jacobian.rows(start, n),
+            pull: back * fitted.residual.rows(start, n),
+        }
+    }
+
+    /// Sums of one tune's numbers over the columns of `indicator`, its mean left alone, in units that make its noise as large as
+    /// that of a monitor; none if the tune meter says too little.
+    fn tune_cells(
+        &self,
+        plane: usize,
+        miss: &DMatrix<f64>,
+        fitted: &Fitted,
+        indicator: &DMatrix<f64>,
+    ) -> Option<Cells> {
+        let noise = self.tune_noise(plane)?;
+        let miss = miss.column(self.readings.ncols() + plane);
+        let frames = self.tune_frames(plane);
+        let centred = |mut columns: DMatrix<f64>| {
+            columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
+            columns
+        };
+        let columns = centred(indicator.select_rows(&frames)) / self.expected_noise;
+        let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
+        Some(Cells {
+            gram: columns.tr_mul(&columns),
+            cross: DMatrix::zeros(columns.ncols(), fitted.jacobian.ncols()),
+            pull: columns.tr_mul(&miss).column(0).into_owned(),
+        })
+    }
+
+    /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
+    fn stepped(
+        &self,
+        signature: &twin::Signature,
+        fitted: &Fitted,
+        stretches: &DMatrix<f64>,
+        monitors: &[usize],
+    ) -> Cells {
+        let mut sum = Cells::none(stretches.ncols(), fitted.jacobian.ncols());
+        let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
+        for &b in monitors {
+            let mut columns = stretches.clone();
+            columns.row_iter_mut().enumerate().for_each(|(i, mut row)| row *= signature.readings[(i, b)] / rms);
+            let cells = self.cells(b, fitted, &columns);
+            sum.gram += cells.gram;
+            sum.cross += cells.cross;
+            sum.pull += cells.pull;
+        }
+        sum
+    }
+}
+
+impl Cells {
+    fn none(numbers: usize, unknowns: usize) -> Self {
+        let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
+        Self { gram, cross, pull: DVector::zeros(numbers) }
+    }
+}

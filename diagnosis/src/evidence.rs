@@ -1,0 +1,93 @@
+//! The Gaussian about the best point of a fit, within the range of the vars.
+//!
+//! A var that is pulled against a bound is held there: the others' Gaussian is that given its value, and along it the density falls as
+//! `exp(-g x - h x^2/2)` from the bound, g its slope and h its curvature with the others adapting. Of a var that is free the part
+//! of its normal within the range counts, as if the vars were independent.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+
+use inference::posterior::RANGE;
+use inference::stream::PRIOR_WIDTH;
+
+/// Precision of a var that is held.
+const HELD: f64 = 1e12;
+/// How near a bound a var is at it, in prior standard deviations.
+const AT: f64 = 1e-9;
+
+/// `(mean, sigma)` of `ln var`.
+pub fn prior() -> (f64, f64) {
+    let variance = f64::from(PRIOR_WIDTH).powi(2).ln_1p();
+    (-0.5 * variance, variance.sqrt())
+}
+
+/// A Gaussian and what the range leaves of it.
+pub struct Within {
+    /// Factor of the precision, the held vars at their bounds.
+    pub free: Cholesky<f64, Dyn>,
+    /// Slope of the log-density, zero for the held.
+    pub slope: DVector<f64>,
+    /// `ln` of the determinant of the free unknowns' precision.
+    pub log_det: f64,
+    /// `ln` of the share of the integral within the range.
+    pub log_inside: f64,
+}
+
+impl Within {
+    /// Of a precision and slope at `u`, the first `vars` of which have a range.
+    ///
+    /// # Panics
+    /// If the precision is not positive.
+    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, vars: usize) -> Self {
+        let [lower, upper] = range();
+        let against = |&i: &usize| (u[i] <= lower + AT && slope[i] < 0.0) || (u[i] >= upper - AT && slope[i] > 0.0);
+        let held: BTreeMap<usize, f64> = (0..vars).filter(against).map(|i| (i, slope[i].abs())).collect();
+        let mut matrix = precision.clone();
+        for &i in held.keys() {
+            slope[i] = 0.0;
+            matrix.row_mut(i).fill(0.0);
+            matrix.column_mut(i).fill(0.0);
+            matrix[(i, i)] = HELD;
+        }
+        let free = matrix.cholesky().expect("1 + J^T J is positive");
+        let mut log_inside = 0.0;
+        for (&i, &pull) in &held {
+            let along =
+                precision.column(i).map_with_location(|row, _, h| if held.contains_key(&row) { 0.0 } else { h });
+            log_inside += log_tail(pull, precision[(i, i)] - along.dot(&free.solve(&along)));
+        }
+        let covariance = free.inverse();
+        for i in (0..vars).filter(|i| !held.contains_key(i)) {
+            let sigma = covariance[(i, i)].sqrt();
+            log_inside += (normal_cdf((upper - u[i]) / sigma) - normal_cdf((lower - u[i]) / sigma)).ln();
+        }
+        let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        Self { free, slope, log_det: log_det - held.len() as f64 * HELD.ln(), log_inside }
+    }
+}
+
+/// Range of a var, in prior standard deviations of its logarithm.
+pub fn range() -> [f64; 2] {
+    let (mean, sigma) = prior();
+    RANGE.map(|bound| (bound.ln() - mean) / sigma)
+}
+
+/// The nearest value within the range.
+pub fn bounded(u: f64) -> f64 {
+    let [lower, upper] = range();
+    u.clamp(lower, upper)
+}
+
+/// `ln` of the integral of `exp(-g x - h x^2/2)` over x > 0, over that of a standard normal.
+fn log_tail(g: f64, h: f64) -> f64 {
+    // exp(z^2/2) (1 - cdf(z))/sqrt(h), z = g/sqrt(h); its asymptote where the tail underflows
+    let z = g / h.sqrt();
+    let scaled =
+        if z < 25.0 { (0.5 * z * z).exp() * normal_cdf(-z) } else { 1.0 / (z * core::f64::consts::TAU.sqrt()) };
+    scaled.ln() - 0.5 * h.ln()
+}
+
+fn normal_cdf(z: f64) -> f64 {
+    0.5 * statrs::function::erf::erfc(-z / core::f64::consts::SQRT_2)
+}

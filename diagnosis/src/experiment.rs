@@ -1,0 +1,170 @@
+//! What to measure next: how far one more campaign of the same length would take two causes apart.
+//!
+//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), with the whitened signatures of the old and the
+//! new campaign below each other, all vars adapting.
+
+use nalgebra::{DMatrix, DVector};
+use twin::{Drives, EffectError, EffectKind, Machine, Signatures};
+
+use super::data::Data;
+use super::evidence::prior;
+use super::fit::Fitted;
+use super::hypothesis::Term;
+use super::scan::Rivals;
+
+/// One thing that could be done.
+#[derive(Debug, Clone)]
+pub struct Proposal {
+    /// What, in words that follow "A second campaign".
+    pub what: String,
+    /// Expected `ln` Bayes factor between the two causes, old and new campaign together.
+    pub separation: f64,
+}
+
+/// The menu for two causes, best first, and the separation that the present campaign can expect.
+#[derive(Debug, Clone)]
+pub struct Menu {
+    /// Expected now.
+    pub present: f64,
+    /// What could be done.
+    pub proposals: Vec<Proposal>,
+}
+
+/// Change of a family's gradients that is tried [1]: tunes move by some 0.05.
+const RETUNE: f64 = 0.01;
+/// RF offset that is tried [1], as large as those of a dispersion measurement.
+const RF_STEP: f64 = 4e-4;
+/// Rigidity of an earlier moment of the cycle, relative.
+const EARLIER: f64 = 0.5;
+
+/// Derivatives of one campaign.
+struct Campaign {
+    jacobian: DMatrix<f64>,
+    one: DVector<f64>,
+    other: Option<DVector<f64>>,
+}
+
+impl Menu {
+    /// For a cause of some amplitude and what competes with it (another, or nothing), beside a fit.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, EffectError> {
+        let (machine, drives) = fitted.machine(data)?;
+        let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
+        let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
+        let free = [Some(one.0), other].map(|term| term.is_some_and(|term| term.kind.prior_scale().is_some()));
+        let mut proposals = Vec::new();
+        for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
+            // a machine that would lose its beam is no proposal
+            let Ok(new) = Campaign::of(data, &machine, &drives, one.0, other, weight) else { continue };
+            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, free) });
+        }
+        proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
+        Ok(Self { present: separation(&[&present], amplitude, free), proposals })
+    }
+}
+
+impl Campaign {
+    /// `weight`: how much larger the cause is than now.
+    fn of(
+        data: &Data,
+        machine: &Machine,
+        drives: &Drives,
+        one: &Term,
+        other: Option<&Term>,
+        weight: f64,
+    ) -> Result<Self, EffectError> {
+        let signatures = Signatures::of(machine, drives)?;
+        let data = &data.driven_by(drives);
+        let (_, sigma) = prior();
+        let columns: Vec<_> = signatures.of_vars().iter().map(|s| data.signature(s) * sigma).collect();
+        let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
+            let weight = if is_stray(term.kind) { weight } else { 1.0 };
+            let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
+            Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * scale)
+        };
+        Ok(Self { jacobian: DMatrix::from_columns(&columns), one: of(one)?, other: other.map(of).transpose()? })
+    }
+}
+
+/// A field of its own, which does not grow with the magnets.
+fn is_stray(kind: EffectKind) -> bool {
+    matches!(kind, EffectKind::StrayGradient | EffectKind::StraySkewGradient)
+}
+
+/// What could be done: words, machine, drives, and the weight of stray fields.
+fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<(String, Machine, Drives, f64)> {
+    let ring = machine.ring();
+    let retuned = |first: bool, factor: f64| {
+        let families = inference::map::first_family(ring);
+        let vars: Vec<f64> =
+            (0..ring.quadrupoles.len()).map(|q| if (q < families) == first { factor } else { 1.0 }).collect();
+        machine.with_vars(&vars)
+    };
+    let mut all = vec![("with the same settings".to_owned(), machine.clone(), drives.clone(), 1.0)];
+    let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };
+    all.push(("with twice the corrector settings".into(), machine.clone(), doubled, 1.0));
+    for (family, first) in [("QH", true), ("QV", false)] {
+        for (word, factor) in [("raised", 1.0 + RETUNE), ("lowered", 1.0 - RETUNE)] {
+            let what = format!("with {family} {word} by {:.0} %", RETUNE * 100.0);
+            all.push((what, retuned(first, factor), drives.clone(), 1.0));
+        }
+    }
+    let alternating = DVector::from_fn(drives.rf_offset.len(), |i, _| if i % 2 == 0 { RF_STEP } else { -RF_STEP });
+    let stepped = Drives { rf_offset: alternating, ..drives.clone() };
+    all.push((
+        format!("with the RF frequency stepped by ±{RF_STEP:.0e} in every frame"),
+        machine.clone(),
+        stepped,
+        1.0,
+    ));
+    if let Some(others) = other_correctors(data, drives) {
+        all.push(("with the correctors that were not used".into(), machine.clone(), others, 1.0));
+    }
+    if is_stray(one.kind) {
+        let stronger = Drives { kick: &drives.kick / EARLIER, ..drives.clone() };
+        let what = "earlier in the cycle, at half the momentum, where a stray field weighs twice as much".to_owned();
+        all.push((what, machine.clone(), stronger, 1.0 / EARLIER));
+    }
+    all
+}
+
+/// The same frames with the correctors that were never powered, in turn.
+fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
+    let driven = data.driven_correctors();
+    let idle: Vec<usize> = (0..drives.kick.ncols()).filter(|c| !driven.contains(c)).collect();
+    if idle.is_empty() {
+        return None;
+    }
+    let mut kick = DMatrix::zeros(drives.kick.nrows(), drives.kick.ncols());
+    for (i, &c) in driven.iter().enumerate() {
+        let mut column = kick.column_mut(idle[i % idle.len()]);
+        column += drives.kick.column(c);
+    }
+    Some(Drives { kick, ..drives.clone() })
+}
+
+/// Expected `ln` Bayes factor of the first cause over the other.
+fn separation(campaigns: &[&Campaign], amplitude: f64, free: [bool; 2]) -> f64 {
+    let p = campaigns[0].jacobian.ncols();
+    let mut normal = DMatrix::identity(p, p);
+    let (mut with_one, mut with_other) = (DVector::zeros(p), DVector::zeros(p));
+    let (mut one, mut other, mut both) = (0.0, 0.0, 0.0);
+    for campaign in campaigns {
+        let back = campaign.jacobian.transpose();
+        normal += &back * &campaign.jacobian;
+        with_one += &back * &campaign.one;
+        one += campaign.one.norm_squared();
+        if let Some(rival) = &campaign.other {
+            with_other += &back * rival;
+            other += rival.norm_squared();
+            both += rival.dot(&campaign.one);
+        }
+    }
+    let Some(factor) = normal.cholesky() else { return 0.0 };
+    let taken = factor.solve(&with_one);
+    let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
+    let rival = other - with_other.dot(&factor.solve(&with_other));
+    Rivals { power: h, rival, both: c, free }.expected(amplitude)
+}

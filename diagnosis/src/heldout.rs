@@ -1,0 +1,195 @@
+//! How well a hypothesis predicts frames that it was not fitted to.
+//!
+//! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
+//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z`, of a monitor or of the tune meter, has a
+//! normal density: the mean is the prediction `h` with what the kept readings of that instrument say of its shared factors
+//! (baseline, calibration and the like, `U`, known to `C`),
+//!
+//! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less what the factors take.
+//!
+//! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
+//! standard error of its mean over readings: given the model they are independent, also within a frame, and an effect of one corrector
+//! has few frames and many readings.
+//!
+//! Source: A. Vehtari, A. Gelman and J. Gabry, Stat. Comput. 27 (2017) 1413, eq. 4 and 23.
+
+use std::collections::BTreeMap;
+
+use estimator::MonitorState;
+use nalgebra::{DMatrix, DVector};
+use twin::EffectError;
+
+use super::data::{Data, TUNE_CALIBRATION};
+use super::fit::Fitted;
+use super::hypothesis::Hypothesis;
+use inference::recording::Recording;
+
+/// Frames that are left out together.
+pub type Fold = Vec<usize>;
+
+/// Standard errors by which held-out frames have to be predicted better.
+pub const PROVEN: f64 = 2.0;
+/// Folds at most.
+const FOLDS: usize = 5;
+
+/// One repeat of every setting in each fold.
+pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
+    let mut seen: BTreeMap<(Option<&str>, u64, u64), (usize, usize)> = BTreeMap::new();
+    let mut folds = vec![Fold::new(); FOLDS];
+    for (i, row) in recording.rows.iter().enumerate() {
+        let key = (row.corrector.as_deref(), row.setting.to_bits(), row.rf_offset.to_bits());
+        let settings = seen.len();
+        let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
+        // settings begin in different folds, so that one that is never repeated does not fall in with all others
+        folds[(*setting + *repeat) % FOLDS].push(i);
+        *repeat += 1;
+    }
+    folds.retain(|fold| !fold.is_empty());
+    folds
+}
+
+/// All frames of every fifth corrector in each fold.
+pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
+    let mut order: Vec<&str> = Vec::new();
+    let mut folds = vec![Fold::new(); FOLDS];
+    for (i, row) in recording.rows.iter().enumerate() {
+        let Some(corrector) = row.corrector.as_deref() else { continue };
+        let at = order.iter().position(|name| *name == corrector).unwrap_or_else(|| {
+            order.push(corrector);
+            order.len() - 1
+        });
+        folds[at % FOLDS].push(i);
+    }
+    folds.retain(|fold| !fold.is_empty());
+    folds
+}
+
+/// What the left-out readings say of a hypothesis.
+#[derive(Debug, Clone)]
+pub struct Score {
+    /// Log density of each reading, rows frames, columns monitors and the two tunes; 0 for one that does not count.
+    pub log_density: DMatrix<f64>,
+    /// Readings of monitors and of the tune meter.
+    pub readings: usize,
+    /// Rms of measured minus predicted, monitors in state ok [m].
+    pub rms: f64,
+    /// Fraction of readings within the central 68.3 % and 95.4 % of their density.
+    pub inside: [f64; 2],
+}
+
+impl Score {
+    /// Score a hypothesis that has been fitted to all frames.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, EffectError> {
+        let monitors = data.readings.ncols();
+        let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
+        let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
+        let (mut squares, mut plain) = (0.0, 0usize);
+        for fold in folds {
+            let kept = data.without(fold);
+            let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
+            for left in predict(data, fit.data(&kept), &fit, fold)? {
+                let z = left.innovation / left.variance.sqrt();
+                score.log_density[(left.frame, left.column)] -=
+                    0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
+                score.readings += 1;
+                score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
+                score.inside[1] += f64::from(u8::from(z.abs() < 2.0));
+                if left.column < monitors && data.health()[left.column].state == MonitorState::Ok {
+                    squares += left.innovation.powi(2);
+                    plain += 1;
+                }
+            }
+        }
+        score.rms = (squares / plain.max(1) as f64).sqrt();
+        score.inside = score.inside.map(|n| n / score.readings.max(1) as f64);
+        Ok(score)
+    }
+
+    /// Expected log predictive density.
+    pub fn elpd(&self) -> f64 {
+        self.log_density.iter().sum()
+    }
+
+    /// Gain over another, and its standard error.
+    pub fn gain_over(&self, other: &Self) -> (f64, f64) {
+        let pairs = self.log_density.iter().zip(&other.log_density);
+        let gains: Vec<f64> = pairs.filter(|(one, _)| **one != 0.0).map(|(one, other)| one - other).collect();
+        let n = gains.len() as f64;
+        let gain: f64 = gains.iter().sum();
+        let spread: f64 = gains.iter().map(|g| (g - gain / n).powi(2)).sum();
+        (gain, (spread * n / (n - 1.0).max(1.0)).sqrt())
+    }
+}
+
+/// One reading that was left out.
+struct Left {
+    frame: usize,
+    column: usize,
+    innovation: f64,
+    variance: f64,
+}
+
+/// One column of what a frame holds, a monitor or a tune: kept frames, left-out ones, noise, and what their readings share, in
+/// standard deviations.
+struct Column {
+    index: usize,
+    kept: Vec<usize>,
+    out: Vec<usize>,
+    variance: f64,
+    shared: [DMatrix<f64>; 2],
+}
+
+/// All of them of which readings are left out.
+fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
+    let monitor = |b: usize| {
+        let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
+        let shared = [kept.shared(b, kept.frames(b)), kept.shared(b, &out)];
+        Column { index: b, kept: kept.frames(b).to_vec(), out, variance: kept.noise(b).powi(2), shared }
+    };
+    let tune = |plane: usize| {
+        let noise = kept.tune_noise(plane)?;
+        let out: Vec<usize> = all.tune_frames(plane).into_iter().filter(|i| fold.contains(i)).collect();
+        let kept = kept.tune_frames(plane);
+        let shared = [kept.len(), out.len()].map(|n| DMatrix::from_element(n, 1, TUNE_CALIBRATION));
+        Some(Column { index: all.readings.ncols() + plane, kept, out, variance: noise * noise, shared })
+    };
+    let monitors = all.speaking_monitors().into_iter().map(monitor);
+    monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
+}
+
+/// Predict the left-out readings by a fit to the kept ones.
+fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, EffectError> {
+    let (residual, slopes) = (all.miss(&fit.predicted(kept)?), fit.slopes(kept)?);
+    let mut left = Vec::new();
+    for column in columns(all, kept, fold) {
+        let at = column.index;
+        let [u_in, u_out] = &column.shared;
+        let mut normal = u_in.tr_mul(u_in) / column.variance;
+        (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
+        let Some(normal) = normal.cholesky() else { continue };
+        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], at)]);
+        let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, at)]));
+        // what the kept readings say of the factors, of the residual and of each derivative
+        let back = u_in.transpose() / column.variance;
+        let factors = normal.solve(&(&back * of(&column.kept)));
+        let innovation = of(&column.out) - u_out * factors;
+        let d = rows(&column.out) - u_out * normal.solve(&(back * rows(&column.kept)));
+        let unknown = normal.l().solve_lower_triangular(&u_out.transpose()).unwrap_or_else(|| u_out.transpose() * 0.0);
+        let params = fit.factor.l().solve_lower_triangular(&d.transpose()).unwrap_or_else(|| d.transpose() * 0.0);
+        for (i, &frame) in column.out.iter().enumerate() {
+            let variance = column.variance + unknown.column(i).norm_squared() + params.column(i).norm_squared();
+            left.push(Left { frame, column: at, innovation: innovation[i], variance });
+        }
+    }
+    Ok(left)
+}
+
+/// The same fit without one of its terms.
+pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, EffectError> {
+    let vars = fitted.params.len();
+    let without: Hypothesis = fitted.hypothesis.without(term);
+    Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned())
+}

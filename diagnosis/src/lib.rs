@@ -1,0 +1,126 @@
+//! Missing physics: where simulation and recording differ, what was left out, and whether leaving it in predicts better.
+//!
+//! [`Diagnosis::of`] is the path from top to bottom: the recording is whitened ([`data`]), fitted by the exact twin without any
+//! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]) and so is freedom without a class
+//! ([`discrepancy`]); the leaders are refitted and compete ([`search`]); what is found has to predict frames that it was not
+//! fitted to ([`heldout`]); then the verdict is spoken ([`verdict`]).
+
+pub mod alternatives;
+pub mod average;
+pub mod baseline;
+pub mod data;
+pub mod discrepancy;
+pub mod evidence;
+pub mod experiment;
+pub mod fit;
+pub mod heldout;
+pub mod hypothesis;
+pub mod location;
+pub mod page;
+pub mod place_scan;
+pub mod sample;
+pub mod scan;
+pub mod score;
+pub mod search;
+pub mod settings;
+pub mod validation;
+pub mod verdict;
+
+#[cfg(test)]
+mod testing;
+
+use twin::{Effect, Ring};
+
+use average::Vars;
+use data::{Data, DataError};
+use heldout::Score;
+use hypothesis::Term;
+use inference::recording::Recording;
+use search::{Found, Search};
+pub use verdict::{Finding, Verdict};
+
+/// What is missing in the model of a recording.
+#[derive(Debug, Clone)]
+pub struct Diagnosis {
+    /// All that was found, with its fits.
+    pub found: Found,
+    /// The verdict.
+    pub verdict: Verdict,
+    /// In words.
+    pub sentence: String,
+    /// One for each effect, strongest first.
+    pub findings: Vec<Finding>,
+    /// Held-out frames without any effect.
+    pub before: Score,
+    /// Held-out frames with all effects.
+    pub after: Score,
+    /// Held-out correctors without and with the effects, where none is a corrector's own.
+    pub correctors: Option<(Score, Score)>,
+    /// Vars without any effect.
+    pub vars_before: Vars,
+    /// Vars, averaged over all that may be true.
+    pub vars_after: Vars,
+    /// What would settle it.
+    pub next_measurement: Option<String>,
+}
+
+impl Diagnosis {
+    /// Diagnose a recording; `progress` hears what is being done.
+    ///
+    /// # Errors
+    /// [`DataError`].
+    pub fn of(ring: &Ring, recording: &Recording, mut progress: impl FnMut(&str)) -> Result<Self, DataError> {
+        progress("reading");
+        let data = Data::of(ring, recording)?;
+        let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
+        progress("searching");
+        let found = Search::new(candidates).run(data)?;
+        let data = &found.data;
+        progress("held-out frames");
+        let folds = heldout::by_repeat(recording);
+        let before = Score::of(data, &found.null, &folds)?;
+        let after = if found.slots.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
+        let gains = verdict::gains(data, &found, &before, &after, &folds)?;
+        let verdict = Verdict::of(&found, &gains);
+        let findings = verdict::findings(data, &found, &gains, verdict)?;
+        progress("held-out correctors");
+        let whole = !found.slots.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
+        let correctors = if whole {
+            let folds = heldout::by_corrector(recording);
+            Some((Score::of(data, &found.null, &folds)?, Score::of(data, &found.best, &folds)?))
+        } else {
+            None
+        };
+        progress("what to measure next");
+        let next_measurement = verdict::next_measurement(data, &found, verdict)?;
+        let sentence = verdict::sentence(data, &found, verdict, &findings);
+        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
+        Ok(Self {
+            found,
+            verdict,
+            sentence,
+            findings,
+            before,
+            after,
+            correctors,
+            vars_before,
+            vars_after,
+            next_measurement,
+        })
+    }
+
+    /// The effects that were taken up, at their most likely amplitudes.
+    pub fn effects(&self) -> Vec<Effect> {
+        let best = &self.found.best;
+        let of = |(i, term): (usize, &Term)| {
+            let amplitude = best.amplitude(&self.found.data, i).0;
+            Effect { kind: term.kind, place: term.place.clone(), amplitude }
+        };
+        best.hypothesis.terms.iter().enumerate().map(of).collect()
+    }
+
+    /// Gain of held-out log predictive density by all effects, and its standard error.
+    pub fn gain(&self) -> (f64, f64) {
+        if self.found.slots.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
+    }
+}

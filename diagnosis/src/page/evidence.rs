@@ -1,0 +1,59 @@
+//! What competes in the first search, and the price that it pays.
+
+use twin::EffectError;
+
+use crate::Diagnosis;
+use crate::discrepancy;
+use crate::scan::scan;
+use crate::search::{price_of, prices};
+use report::{Axes, Figure, Ranked, Section};
+
+/// Causes shown.
+const LEADING: usize = 15;
+
+/// The leading causes, the model without any effect being the alternative.
+pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
+    let found = &diagnosis.found;
+    let (null, data) = (&found.null, &found.data);
+    let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term.clone()).collect();
+    let scanned = match found.slots.len() {
+        0 => found.next.scanned.clone(),
+        1 => found.slots[0].scanned.clone(),
+        _ => scan(null.data(data), null, &terms)?,
+    };
+    let count = scanned.len();
+    let library = scanned.into_iter().zip(prices(&terms)).map(|(candidate, price)| {
+        let (kind, place) = (candidate.term.kind.word().replace('_', " "), candidate.term.place.replace(',', ", "));
+        Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, price: Some(price) }
+    });
+    let discrepancies = discrepancy::scan(data, null)?;
+    let sites = discrepancies.len();
+    let unclassed = discrepancies.iter().map(|one| {
+        let label = format!("unclassed: {}", one.at.short(data));
+        Ranked { label, group: 1, value: one.log_bayes, price: Some(price_of(one)) }
+    });
+    let mut all: Vec<Ranked> = library.chain(unclassed).collect();
+    all.sort_by(|one, other| other.value.total_cmp(&one.value));
+    all.truncate(LEADING);
+    let axes = Axes::new(
+        "The leading causes of the first search",
+        "ln Bayes factor over the model without any effect [nat]",
+        "price of the search: a bar that ends there is chance as likely as not",
+    );
+    Ok(Section {
+        heading: "Evidence".into(),
+        text: vec![format!(
+            "{count} candidates, every effect of the library at every place, and {sites} places with freedom of their own, each alone beside \
+             the vars and to first order. Of so many, some stand out by chance: the price of the search is the logarithm of the \
+             prior odds against a candidate, and evidence counts from there on. When one effect is large, others imitate it and \
+             rank close behind; that is settled by the exact fits of the table of findings, not here."
+        )],
+        figures: vec![(
+            format!(
+                "The {LEADING} causes with the largest evidence; each pays the price at its own tick, which is higher where a kind has more places."
+            ),
+            Figure::ranking(&axes, &["effects of the library", "freedom without a class"], &all),
+        )],
+        ..Section::default()
+    })
+}

@@ -1,0 +1,144 @@
+//! Where along the beam a gradient would sit.
+
+use twin::{EffectError, EffectKind, Element, Ring};
+
+use super::signed;
+use crate::place_scan::{Interval, PlaceScan, thin};
+use crate::{Diagnosis, Verdict};
+use report::{Axes, Figure, Reference, Section, Series};
+
+/// Share of the posterior that an interval holds.
+const SHARE: f64 = 0.95;
+/// Stretches that are still listed.
+const STRETCHES: usize = 4;
+/// Density, over that of the peak, that is not worth showing, and what is shown beside it [m].
+const NEGLIGIBLE: f64 = 1e-3;
+const AROUND: f64 = 0.5;
+
+/// The scans for normal and skew gradients.
+pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
+    let mut section = Section {
+        heading: "The scan along the ring".into(),
+        text: vec![
+            "ln Bayes factor of one thin gradient at every place of the ring, given all other findings, vars adapting, to first \
+             order. Below zero the readings speak against a gradient there; a flat curve means that they cannot tell. The credible interval has a \
+             prior uniform along the beam, and assumes one thin gradient in a model that is otherwise true."
+                .into(),
+        ],
+        ..Section::default()
+    };
+    let found = &diagnosis.found;
+    for (kind, word, symbol) in
+        [(EffectKind::StrayGradient, "normal", "K1L"), (EffectKind::StraySkewGradient, "skew", "K1sL")]
+    {
+        let terms = &found.best.hypothesis.terms;
+        let own = terms.iter().position(|term| thin(term.kind) == Some(kind));
+        let along = PlaceScan::of(&found.data, &found.best, own, kind)?;
+        let settled = matches!(diagnosis.verdict, Verdict::Identified | Verdict::Ambiguous);
+        let interval = own.filter(|_| settled).map(|_| along.credible(SHARE));
+        if let (Some(own), Some(interval)) = (own, &interval) {
+            section.text.push(stated(&along, interval, word, symbol, &terms[own].label()));
+        }
+        section.figures.push(figure(diagnosis, &along, word));
+        if let Some(interval) = &interval {
+            section.figures.push(density(&along, interval, found.data.ring.circumference, word));
+        }
+    }
+    Ok(section)
+}
+
+fn stated(along: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
+    let peak = along.peak();
+    let list = if interval.len() > STRETCHES {
+        let whole: f64 = interval.iter().map(|one| (one.to_m - one.from_m).max(0.0)).sum();
+        format!("{} stretches of the ring, {whole:.0} m in all", interval.len())
+    } else {
+        let of = |one: &Interval| format!("{:.2} to {:.2} m", one.from_m, one.to_m);
+        interval.iter().map(of).collect::<Vec<_>>().join(" or ")
+    };
+    format!(
+        "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {} /m; 95 % credible interval of its \
+         place: {}.",
+        along.cells[peak].s,
+        signed(along.amplitude[peak], 4),
+        list
+    )
+}
+
+fn figure(diagnosis: &Diagnosis, along: &PlaceScan, word: &str) -> (String, Figure) {
+    let s: Vec<f64> = along.cells.iter().map(|cell| cell.s).collect();
+    let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), along.log_bayes.clone())];
+    let height = |at: f64| {
+        let nearest = (0..s.len()).min_by(|&i, &j| (s[i] - at).abs().total_cmp(&(s[j] - at).abs()));
+        nearest.map_or(f64::NAN, |i| along.log_bayes[i])
+    };
+    let of_kind = |kind: &str| EffectKind::ALL.iter().any(|one| one.word() == kind && thin(*one) == Some(along.kind));
+    let marks = diagnosis.findings.iter().flat_map(|finding| {
+        core::iter::once((finding, true)).chain(finding.alternatives.iter().map(|other| (other, false)))
+    });
+    let (mut first, mut others) = (Vec::new(), Vec::new());
+    for (one, leads) in marks.filter(|(one, _)| of_kind(one.kind)) {
+        if let Some(at) = one.s {
+            if leads { &mut first } else { &mut others }.push((at, height(at)));
+        }
+    }
+    for (label, points) in [("finding", first), ("alternative", others)] {
+        if !points.is_empty() {
+            let (x, y) = points.into_iter().unzip();
+            series.push(Series::points(label, x, y));
+        }
+    }
+    let title = format!("A thin {word} gradient along the ring");
+    let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
+    let peak = along.peak();
+    let caption = format!(
+        "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}.",
+        along.cells[peak].s,
+        nearest(&diagnosis.found.data.ring, along.cells[peak].s),
+        if series.len() > 1 {
+            "; markers are findings and alternatives that act like one, at the height of the curve"
+        } else {
+            ""
+        }
+    );
+    (caption, Figure::lines(&axes, &series))
+}
+
+/// The named element whose middle is nearest.
+fn nearest(ring: &Ring, s: f64) -> &str {
+    let away = |element: &&Element| (element.s + 0.5 * element.length - s).abs();
+    let named = ring.elements.iter().filter(|element| !element.name.is_empty());
+    named.min_by(|one, other| away(one).total_cmp(&away(other))).map_or("", |element| &element.name)
+}
+
+/// The posterior of the place, as far as it matters: all of it, and what the interval holds.
+fn density(along: &PlaceScan, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
+    let peak = along.peak();
+    let (middle, largest) = (along.cells[peak].s, along.log_bayes[peak]);
+    let weight = |i: usize| (along.log_bayes[i] - largest).exp();
+    let sum: f64 = (0..along.cells.len()).map(|i| weight(i) * along.cells[i].length).sum();
+    // unrolled about the peak: the ring begins anywhere
+    let s = |i: usize| along.cells[i].s - circumference * ((along.cells[i].s - middle) / circumference).round();
+    let mut order: Vec<usize> = (0..along.cells.len()).collect();
+    order.sort_by(|&i, &j| s(i).total_cmp(&s(j)));
+    let counts = |i: &&usize| weight(**i) > NEGLIGIBLE;
+    let (from, to) = (order.iter().find(counts), order.iter().rev().find(counts));
+    let range = from.map_or(middle, |&i| s(i) - AROUND)..=to.map_or(middle, |&i| s(i) + AROUND);
+    order.retain(|&i| range.contains(&s(i)));
+    let inside = |at: f64| {
+        interval.iter().any(|one| match one.from_m <= one.to_m {
+            true => (one.from_m..=one.to_m).contains(&at),
+            false => at >= one.from_m || at <= one.to_m,
+        })
+    };
+    let x: Vec<f64> = order.iter().map(|&i| s(i)).collect();
+    let all: Vec<f64> = order.iter().map(|&i| weight(i) / sum).collect();
+    let held = order.iter().zip(&all).map(|(&i, &y)| if inside(along.cells[i].s) { y } else { f64::NAN }).collect();
+    let series = [Series::line("posterior", x.clone(), all), Series::line("95 % credible interval", x, held)];
+    let axes =
+        Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
+    let caption = format!(
+        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring."
+    );
+    (caption, Figure::densities(&axes, &series))
+}

@@ -1,0 +1,54 @@
+//! What becomes of the quadrupoles when the effects are in the model.
+
+use nalgebra::DVector;
+
+use crate::Diagnosis;
+use crate::average::Vars;
+use report::{Axes, Band, Figure, Reference, Section};
+
+/// Standard deviations of the 95 % interval.
+const OUTER: f64 = 1.96;
+
+/// All vars, before and after.
+pub fn section(diagnosis: &Diagnosis) -> Section {
+    let (before, after) = (&diagnosis.vars_before, &diagnosis.vars_after);
+    let names = diagnosis.found.data.ring.var_names();
+    let axes = Axes::new("Quadrupole strengths: bars 68 %, lines 95 %", "quadrupole", "var [1]");
+    let axes = axes.named(&names).compared(Reference::Level(1.0));
+    let moved: DVector<f64> = (&after.mean - &before.mean).component_div(&before.covariance.diagonal().map(f64::sqrt));
+    let most = moved.iamax();
+    let mean = |vars: &Vars| 100.0 * vars.covariance.diagonal().map(f64::sqrt).mean();
+    Section {
+        heading: "Quadrupoles before and after".into(),
+        text: vec![format!(
+            "A var is the factor on the gradient of a quadrupole. What is missing in the model is made up for by wrong vars, as far as they can. \
+             Mean standard deviation {:.2} % before, {:.2} % after; {} moves most, by {:.1} of its standard deviations. After is \
+             averaged over all that may be true, with its probability.",
+            mean(before),
+            mean(after),
+            names[most],
+            moved[most].abs()
+        )],
+        figures: vec![(
+            "Each quadrupole's strength over its design, focusing ones above, defocusing ones below, without any effect (before) and averaged over \
+             what may be true (after)."
+                .into(),
+            Figure::bands(&axes, &[band("before", before), band("after", after)]),
+        )],
+        ..Section::default()
+    }
+}
+
+fn band(label: &str, vars: &Vars) -> Band {
+    let sigma = vars.covariance.diagonal().map(f64::sqrt);
+    let within = |factor: f64| {
+        let ends = |(mean, sigma): (&f64, &f64)| ((mean - factor * sigma).exp(), (mean + factor * sigma).exp());
+        vars.mean.iter().zip(sigma.iter()).map(ends).collect()
+    };
+    Band {
+        label: label.into(),
+        centre: vars.mean.iter().map(|mean| mean.exp()).collect(),
+        inner: within(1.0),
+        outer: within(OUTER),
+    }
+}

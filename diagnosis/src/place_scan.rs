@@ -1,0 +1,233 @@
+//! Where along the ring a gradient sits: the `ln` Bayes factor of a thin one at every place, all unknowns of a fit adapting.
+//!
+//! The ring is cut into cells with one trial gradient in the middle of each, and into finer ones where the gradient may be.
+//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the cell. It is that
+//! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
+
+use nalgebra::{DMatrix, DVector};
+use twin::response::Place;
+use twin::{EffectError, EffectKind, Signatures};
+
+use super::data::Data;
+use super::fit::Fitted;
+use super::scan::{BATCH, Projection, Score};
+
+/// Longest cell [m], and longest where the gradient may be.
+const STEP: f64 = 0.5;
+const FINE: f64 = 0.05;
+/// How far behind the first a place may be to be looked at more finely [nat], and as a share of the first: where nothing is,
+/// nothing is far behind.
+const BEHIND: f64 = 12.0;
+const BEHIND_SHARE: f64 = 0.5;
+
+/// A piece of the ring with one trial gradient.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cell {
+    /// Its middle along the beam [m].
+    pub s: f64,
+    /// Its length [m].
+    pub length: f64,
+    place: Place,
+}
+
+/// A stretch of the ring; one across the start of the ring ends before it begins.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Interval {
+    /// Where it begins [m].
+    pub from_m: f64,
+    /// Where it ends [m].
+    pub to_m: f64,
+}
+
+/// A thin gradient everywhere.
+#[derive(Debug, Clone)]
+pub struct PlaceScan {
+    /// Normal or skew.
+    pub kind: EffectKind,
+    /// Where, along the beam.
+    pub cells: Vec<Cell>,
+    /// `ln` Bayes factor over none, at each.
+    pub log_bayes: Vec<f64>,
+    /// Most likely amplitude at each [1/m].
+    pub amplitude: Vec<f64>,
+}
+
+/// The thin gradient that acts on the beam as a kind of effect does, if any.
+pub fn thin(kind: EffectKind) -> Option<EffectKind> {
+    match kind {
+        EffectKind::StrayGradient | EffectKind::DipoleGradient => Some(EffectKind::StrayGradient),
+        EffectKind::StraySkewGradient | EffectKind::QuadRoll => Some(EffectKind::StraySkewGradient),
+        _ => None,
+    }
+}
+
+impl PlaceScan {
+    /// Scan the ring about a fit, one of its effects left out if the scan stands in for it.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: EffectKind) -> Result<Self, EffectError> {
+        let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
+        let bench = unknown.map_or_else(|| Projection::of(fitted), |at| Projection::without(fitted, at));
+        let data = fitted.data(data);
+        let (machine, drives) = fitted.machine(data)?;
+        let signatures = Signatures::of(&machine, &drives)?;
+        let scale = kind.prior_scale().unwrap_or(1.0);
+        let judge = |cells: Vec<Cell>| -> Self {
+            let column = |cell: &Cell| data.signature(&signatures.of_thin(cell.place, kind)) * scale;
+            let of_batch = |batch: &[Cell]| {
+                let columns: Vec<DVector<f64>> = batch.iter().map(column).collect();
+                bench.score(DMatrix::from_columns(&columns)).scores
+            };
+            let scores: Vec<Score> = cells.chunks(BATCH).flat_map(of_batch).collect();
+            let judged = scores.into_iter().map(Score::of_amplitude);
+            let (amplitude, log_bayes) = judged.map(|(amplitude, log_bayes)| (amplitude * scale, log_bayes)).unzip();
+            Self { kind, cells, log_bayes, amplitude }
+        };
+        let coarse = judge(cells(data));
+        let finer = judge(coarse.likely().flat_map(|i| coarse.cells[i].split()).collect());
+        Ok(coarse.with(finer))
+    }
+
+    /// Cells that are not far behind the first.
+    fn likely(&self) -> impl Iterator<Item = usize> + '_ {
+        let first = self.log_bayes[self.peak()];
+        let limit = first - BEHIND.min(BEHIND_SHARE * first.abs());
+        (0..self.cells.len()).filter(move |&i| self.log_bayes[i] > limit)
+    }
+
+    /// The same with the likely cells replaced by finer ones.
+    fn with(&self, finer: Self) -> Self {
+        let likely: Vec<usize> = self.likely().collect();
+        let kept = (0..self.cells.len()).filter(|i| !likely.contains(i));
+        let of = |one: &Self, i: usize| (one.cells[i], one.log_bayes[i], one.amplitude[i]);
+        let mut all: Vec<_> = kept.map(|i| of(self, i)).collect();
+        all.extend((0..finer.cells.len()).map(|i| of(&finer, i)));
+        all.sort_by(|one, other| one.0.s.total_cmp(&other.0.s));
+        let mut joined = Self { cells: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
+        for (cell, log_bayes, amplitude) in all {
+            joined.cells.push(cell);
+            joined.log_bayes.push(log_bayes);
+            joined.amplitude.push(amplitude);
+        }
+        joined
+    }
+
+    /// The most likely cell.
+    pub fn peak(&self) -> usize {
+        (0..self.cells.len()).max_by(|&i, &j| self.log_bayes[i].total_cmp(&self.log_bayes[j])).unwrap_or(0)
+    }
+
+    /// The shortest stretches of the ring that hold a share of the posterior, in beam order.
+    pub fn credible(&self, share: f64) -> Vec<Interval> {
+        let largest = self.log_bayes[self.peak()];
+        let weight = |i: usize| (self.log_bayes[i] - largest).exp() * self.cells[i].length;
+        let mut order: Vec<usize> = (0..self.cells.len()).collect();
+        order.sort_by(|&i, &j| self.log_bayes[j].total_cmp(&self.log_bayes[i]));
+        let wanted = share * order.iter().map(|&i| weight(i)).sum::<f64>();
+        let (mut held, mut inside) = (0.0, vec![false; order.len()]);
+        for i in order {
+            if held >= wanted {
+                break;
+            }
+            held += weight(i);
+            inside[i] = true;
+        }
+        self.stretches(&inside)
+    }
+
+    /// Neighbours joined, across the start of the ring too.
+    fn stretches(&self, inside: &[bool]) -> Vec<Interval> {
+        let mut all: Vec<Interval> = Vec::new();
+        for (i, cell) in self.cells.iter().enumerate().filter(|(i, _)| inside[*i]) {
+            let (from_m, to_m) = (cell.s - 0.5 * cell.length, cell.s + 0.5 * cell.length);
+            match all.last_mut().filter(|_| inside[i - 1]) {
+                Some(last) => last.to_m = to_m,
+                None => all.push(Interval { from_m, to_m }),
+            }
+        }
+        if all.len() > 1 && inside[0] && inside.last() == Some(&true) {
+            let first = all.remove(0);
+            all.last_mut().expect("two less one").to_m = first.to_m;
+        }
+        all
+    }
+}
+
+impl Cell {
+    /// Finer ones in its place.
+    fn split(self) -> Vec<Cell> {
+        let start = self.s - 0.5 * self.length;
+        cut(self.place.element, start, self.place.depth - 0.5 * self.length, self.length, FINE)
+    }
+}
+
+/// The whole ring.
+fn cells(data: &Data) -> Vec<Cell> {
+    let elements = data.ring.elements.iter().enumerate().filter(|(_, element)| element.length > 0.0);
+    elements.flat_map(|(at, element)| cut(at, element.s, 0.0, element.length, STEP)).collect()
+}
+
+/// Equal pieces, at most so long, of a part of an element that begins at `s`, `depth` from its entrance.
+fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Cell> {
+    let count = (length / step).ceil().max(1.0);
+    let piece = length / count;
+    let one = |i: usize| {
+        let middle = (i as f64 + 0.5) * piece;
+        Cell { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
+    };
+    (0..count as usize).map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hypothesis::{Hypothesis, Term};
+    use crate::testing::template;
+    use inference::simulate::{Hardware, Truth, campaign};
+    use twin::Effect;
+
+    #[test]
+    fn the_scan_peaks_where_the_gradient_is() {
+        let (ring, recording) = template();
+        let hardware = Hardware::shipped(&ring, &recording);
+        // a normal gradient hides behind the vars of its neighbours: it has to be larger, and is placed less well
+        let cases =
+            [(EffectKind::StrayGradient, "SLOT_C6", 0.08, 12.0), (EffectKind::StraySkewGradient, "SLOT_E3", 0.01, 4.0)];
+        for (kind, place, amplitude, widest) in cases {
+            let effect = Effect { kind, place: place.into(), amplitude };
+            let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
+            let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
+            let mut data = Data::of(&ring, &made).unwrap();
+            let hypothesis = Hypothesis { terms: vec![Term::new(kind, place)], ..Hypothesis::default() };
+            let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
+            let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;
+            data.straighten(&machine).unwrap();
+            let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
+            let along = PlaceScan::of(&data, &fitted, Some(0), kind).unwrap();
+            let truth = ring.elements[ring.element(place).unwrap()].s;
+            let peak = along.peak();
+            let credible = along.credible(0.95);
+            let width: f64 = credible.iter().map(|one| one.to_m - one.from_m).sum();
+            println!(
+                "{place} s {truth:.2}: peak {:.2}, {width:.2} m, {:.4} /m",
+                along.cells[peak].s, along.amplitude[peak]
+            );
+            assert!(credible.iter().any(|one| (one.from_m - 1.0..one.to_m + 1.0).contains(&truth)), "{credible:?}");
+            assert!(width < widest, "{credible:?}");
+            // some three standard deviations
+            assert!((along.amplitude[peak] - amplitude).abs() < 0.3 * amplitude, "{}", along.amplitude[peak]);
+            let whole: f64 = along.cells.iter().map(|cell| cell.length).sum();
+            assert!((whole - ring.circumference).abs() < 1e-6, "{whole}");
+        }
+    }
+
+    #[test]
+    fn a_stretch_may_cross_the_start_of_the_ring() {
+        let place = Place { element: 0, depth: 0.0 };
+        let cells: Vec<Cell> = (0..10).map(|i| Cell { s: i as f64 + 0.5, length: 1.0, place }).collect();
+        let log_bayes = (0..10).map(|i| if [0, 1, 9].contains(&i) { 0.0 } else { -50.0 }).collect();
+        let along = PlaceScan { kind: EffectKind::StrayGradient, cells, log_bayes, amplitude: vec![0.0; 10] };
+        assert_eq!(along.credible(0.95), [Interval { from_m: 9.0, to_m: 2.0 }]);
+    }
+}

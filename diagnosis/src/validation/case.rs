@@ -1,0 +1,102 @@
+//! What the blind campaigns are made of: a case is its number and one seed for all.
+
+use rand::rngs::StdRng;
+use rand::seq::IndexedRandom;
+use rand::{RngExt, SeedableRng};
+use serde::{Deserialize, Serialize};
+use twin::{Effect, EffectKind, Ring};
+
+use super::unknown::{Unknown, UnknownKind};
+use crate::hypothesis::Term;
+use crate::score::{TrueEffect, Truth};
+use inference::recording::Recording;
+use inference::simulate;
+
+/// What a case is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Class {
+    /// Nothing is missing.
+    Empty,
+    /// One effect of the library.
+    Single,
+    /// Two of them.
+    Pair,
+    /// Something that the library does not hold.
+    Unknown,
+}
+
+/// One blind campaign.
+#[derive(Debug, Clone)]
+pub struct Case {
+    /// Its number.
+    pub index: usize,
+    /// What it is.
+    pub class: Class,
+    /// Factor on each quadrupole.
+    pub vars: Vec<f64>,
+    /// Effects of the library.
+    pub effects: Vec<Effect>,
+    /// Effects beyond it.
+    pub beyond: Vec<Unknown>,
+    /// Seed of the machine's hardware and noise.
+    pub seed: u64,
+}
+
+/// Amplitudes in prior standard deviations, weak to strong; the logarithm is uniform in between.
+const SIZES: [f64; 2] = [0.2, 2.5];
+
+impl Case {
+    /// Case `index` of a class; `terms` are all effects that could be seen.
+    ///
+    /// # Panics
+    /// If there is no effect to choose from.
+    pub fn draw(ring: &Ring, template: &Recording, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
+        let mut streams = simulate::seeds(seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let mut stream = || streams.next().expect("seeds do not end");
+        let vars = simulate::vars(ring, f64::from(inference::stream::PRIOR_WIDTH), true, stream())
+            .expect("a design has tunes");
+        let mut random = StdRng::seed_from_u64(stream());
+        let kinds: Vec<EffectKind> =
+            EffectKind::ALL.iter().copied().filter(|kind| terms.iter().any(|term| term.kind == *kind)).collect();
+        let mut effect = |index: usize| {
+            let kind = kinds[index % kinds.len()];
+            let of_kind: Vec<&Term> = terms.iter().filter(|term| term.kind == kind).collect();
+            let term = of_kind.choose(&mut random).expect("every kind has a place");
+            let sign = if random.random_bool(0.5) { -1.0 } else { 1.0 };
+            let size = random.random_range(SIZES[0].ln()..SIZES[1].ln()).exp();
+            let amplitude = kind.prior_scale().map_or(1.0, |scale| sign * size * scale);
+            Effect { kind, place: term.place.clone(), amplitude }
+        };
+        let effects = match class {
+            Class::Empty | Class::Unknown => Vec::new(),
+            Class::Single => vec![effect(index)],
+            Class::Pair => vec![effect(index), effect(7 * index + 3)],
+        };
+        let kind = UnknownKind::ALL[index % UnknownKind::ALL.len()];
+        let beyond =
+            if class == Class::Unknown { vec![Unknown::of(kind, ring, template, stream())] } else { Vec::new() };
+        Self { index, class, vars, effects, beyond, seed: stream() }
+    }
+
+    /// The answer key.
+    pub fn key(&self, ring: &Ring) -> Truth {
+        let library = self.effects.iter().map(|effect| TrueEffect {
+            kind: effect.kind.word().into(),
+            at: effect.place.clone(),
+            amplitude: effect.kind.prior_scale().map(|_| effect.amplitude),
+            what: None,
+        });
+        let beyond = self.beyond.iter().map(|unknown| TrueEffect {
+            kind: "unknown".into(),
+            at: unknown.place.clone(),
+            amplitude: Some(unknown.size),
+            what: Some(unknown.kind.word().into()),
+        });
+        Truth {
+            effects: library.chain(beyond).collect(),
+            vars: ring.var_names().into_iter().zip(self.vars.iter().copied()).collect(),
+            oracle_gain: None,
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! The proof of the diagnosis: simulated blind campaigns whose truth is known, among them empty ones and some with physics that
+//! no effect of the library describes.
+//!
+//! A case is drawn ([`case`]), tracked exactly, diagnosed, and scored; [`tables`] counts. Beside each verdict stands the oracle:
+//! the gain in `ln` posterior when kind, place and size are given, over the best that vars and baselines can do without. Of what
+//! the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
+
+pub mod case;
+pub mod tables;
+pub mod unknown;
+
+use std::time::Instant;
+
+use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
+use twin::{Effect, Ring};
+
+use crate::data::{Data, DataError};
+use crate::fit::Fitted;
+use crate::hypothesis::Hypothesis;
+use crate::score::{Fate, Grade, TrueEffect, Truth};
+use crate::{Diagnosis, Finding, Verdict};
+pub use case::{Case, Class};
+use inference::recording::Recording;
+use inference::simulate::{self, Beyond, Hardware};
+pub use unknown::{Unknown, UnknownKind};
+
+/// What became of one case.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Outcome {
+    /// Number of the case.
+    pub index: usize,
+    /// What it is.
+    pub class: Class,
+    /// The effects it was made with.
+    pub truth: Vec<TrueEffect>,
+    /// Gain in `ln` posterior when kind, place and size are given.
+    pub oracle_gain: f64,
+    /// Of each effect, the same beside the others, and what became of it.
+    pub fates: Vec<(f64, Fate)>,
+    /// The verdict's word.
+    pub verdict: String,
+    /// How right it is.
+    pub grade: Grade,
+    /// Kinds and places of the findings, strongest first.
+    pub found: Vec<String>,
+    /// Most likely cause (or `nothing`) of the least certain slot, its stated probability, and whether it is true.
+    pub stated: (String, f64, bool),
+    /// Probability that nothing is missing.
+    pub nothing: f64,
+    /// Held-out gain and its standard error.
+    pub heldout: (f64, f64),
+    /// Pulls of the named amplitudes.
+    pub pulls: Vec<f64>,
+    /// Whether the 95 % stretches of the place of an identified gradient hold (or touch the magnet of) the true one.
+    pub covered: Vec<bool>,
+    /// NEES per var before and after.
+    pub nees: [f64; 2],
+    /// Time of the diagnosis [s].
+    pub seconds: f64,
+}
+
+/// Simulate, diagnose and score one case; `None` if its machine keeps no beam.
+///
+/// # Errors
+/// [`DataError`] if the simulated campaign cannot be diagnosed.
+pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outcome>, DataError> {
+    let hardware = Hardware::shipped(ring, template);
+    let beyond: Vec<&dyn Beyond> = case.beyond.iter().map(|unknown| unknown as &dyn Beyond).collect();
+    let truth = simulate::Truth { vars: &case.vars, effects: &case.effects, beyond: &beyond };
+    let plain = simulate::Truth { effects: &[], beyond: &[], ..truth };
+    let simulated = |truth| simulate::campaign(template, ring, &truth, &hardware, case.seed);
+    let (Ok(recording), Ok(without)) = (simulated(truth), simulated(plain)) else { return Ok(None) };
+    let started = Instant::now();
+    let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
+    let seconds = started.elapsed().as_secs_f64();
+    let key = case.key(ring);
+    let names = ring.var_names();
+    let (oracle_gain, own) = oracle(ring, case, &recording, &without)?;
+    Ok(Some(Outcome {
+        index: case.index,
+        class: case.class,
+        oracle_gain,
+        fates: own.into_iter().zip(key.fates(&diagnosis)).collect(),
+        verdict: diagnosis.verdict.word().into(),
+        grade: key.grade(&diagnosis),
+        found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
+        stated: stated(&diagnosis, &key),
+        nothing: diagnosis.found.nothing(),
+        heldout: diagnosis.gain(),
+        pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
+        covered: covered(ring, &diagnosis, &key),
+        nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
+        truth: key.effects,
+        seconds,
+    }))
+}
+
+/// What the diagnosis thinks most likely where it is least certain, how likely, and whether it is so.
+fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
+    let least = diagnosis
+        .findings
+        .iter()
+        .filter(|f| f.kind != "unknown")
+        .min_by(|a, b| a.probability.total_cmp(&b.probability));
+    let nothing = diagnosis.found.nothing();
+    match least {
+        Some(finding) if diagnosis.verdict != Verdict::Consistent => {
+            let is_true = key.effects.iter().any(|effect| effect.is(finding));
+            (format!("{}@{}", finding.kind, finding.at), finding.probability, is_true)
+        }
+        _ if diagnosis.verdict == Verdict::Consistent => ("nothing".into(), nothing, key.effects.is_empty()),
+        _ => {
+            let unknown = diagnosis.found.next.unknown();
+            ("unknown".into(), unknown, key.effects.iter().any(|effect| effect.kind == "unknown"))
+        }
+    }
+}
+
+/// Whether the stretches of identified gradients hold the true places.
+fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
+    let named = |finding: &&Finding| {
+        diagnosis.verdict == Verdict::Identified
+            && !finding.interval.is_empty()
+            && key.effects.iter().any(|effect| effect.is(finding))
+    };
+    let touches = |finding: &Finding| -> Option<bool> {
+        let term = diagnosis.found.best.hypothesis.terms.iter().find(|term| term.place == finding.at)?;
+        let element = &ring.elements[term.element(&diagnosis.found.data)?];
+        let (from, to) = (element.s, element.s + element.length);
+        Some(finding.interval.iter().any(|one| {
+            if one.from_m <= one.to_m {
+                one.from_m <= to && one.to_m >= from
+            } else {
+                one.from_m <= to || one.to_m >= from
+            }
+        }))
+    };
+    diagnosis.findings.iter().filter(named).filter_map(touches).collect()
+}
+
+/// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
+/// others; of what the library does not hold, when its signal is taken out.
+fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<(f64, Vec<f64>), DataError> {
+    let data = Data::of(ring, recording)?;
+    let zero = DVector::zeros(ring.quadrupoles.len());
+    let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
+        let hypothesis = Hypothesis { given: given.to_vec(), ..Hypothesis::default() };
+        Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
+    };
+    let nothing = best(&data, &[])?;
+    if !case.beyond.is_empty() {
+        let cleaned = data.less(&signal(recording, without), &tunes(recording, without));
+        let gain = best(&cleaned, &[])? - nothing;
+        return Ok((gain, vec![gain]));
+    }
+    let all = best(&data, &case.effects)?;
+    let own = |i: usize| -> Result<f64, DataError> {
+        let mut others = case.effects.clone();
+        others.remove(i);
+        Ok(all - if others.is_empty() { nothing } else { best(&data, &others)? })
+    };
+    Ok((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?))
+}
+
+/// What the effect adds to each reading [m].
+fn signal(with: &Recording, without: &Recording) -> DMatrix<f64> {
+    DMatrix::from_fn(with.rows.len(), with.rows[0].reading.len(), |i, b| {
+        with.rows[i].reading[b].zip(without.rows[i].reading[b]).map_or(0.0, |(with, without)| with - without)
+    })
+}
+
+/// What it adds to each tune.
+fn tunes(with: &Recording, without: &Recording) -> DMatrix<f64> {
+    DMatrix::from_fn(with.rows.len(), 2, |i, plane| {
+        with.rows[i].tune[plane].zip(without.rows[i].tune[plane]).map_or(0.0, |(with, without)| with - without)
+    })
+}

@@ -1,0 +1,330 @@
+//! The verdict, in one word and in one sentence.
+
+use twin::EffectError;
+
+use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Slot};
+use super::data::Data;
+use super::experiment::Menu;
+use super::heldout::{Fold, PROVEN, Score};
+use super::hypothesis::Term;
+use super::place_scan::{Interval, PlaceScan, thin};
+use super::scan::separations;
+use super::search::Found;
+
+/// What the recording says about the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing is missing at the noise level.
+    Consistent,
+    /// The effects are named, and predict held-out frames better.
+    Identified,
+    /// Something is there, and the data cannot tell which of the alternatives.
+    Ambiguous,
+    /// Something is there that no effect of the library describes.
+    Unexplained,
+}
+
+/// Alternatives are listed down to this probability.
+const LISTED: f64 = 0.005;
+/// Alternatives that the sentence names.
+const SAID: usize = 3;
+/// Share of the posterior that an interval of the place holds.
+const CREDIBLE: f64 = 0.95;
+
+impl Verdict {
+    /// The word for it.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Consistent => "consistent",
+            Self::Identified => "identified",
+            Self::Ambiguous => "ambiguous",
+            Self::Unexplained => "unexplained",
+        }
+    }
+
+    /// From the competition for each slot, and the held-out gain of each effect.
+    pub fn of(found: &Found, gains: &[(f64, f64)]) -> Self {
+        let next = &found.next;
+        if next.unknown() > SUSPICIOUS {
+            return Self::Unexplained;
+        }
+        if found.slots.is_empty() {
+            return match (next.is_suspicious(), next.unknown() > next.library()) {
+                (false, _) => Self::Consistent,
+                (true, true) => Self::Unexplained,
+                (true, false) => Self::Ambiguous,
+            };
+        }
+        let decided = |(slot, term): (&Slot, &Term)| {
+            let is_it = |a: &&Alternative| a.term() == Some(term);
+            slot.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
+        };
+        let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
+        let whole = !next.is_suspicious();
+        if found.slots.iter().zip(&found.best.hypothesis.terms).all(decided) && proven && whole {
+            Self::Identified
+        } else {
+            Self::Ambiguous
+        }
+    }
+}
+
+/// One cause, with what competes with it.
+#[derive(Debug, Clone)]
+pub struct Finding {
+    /// Kind, or `unknown`.
+    pub kind: &'static str,
+    /// Place.
+    pub at: String,
+    /// Position along the beam [m].
+    pub s: Option<f64>,
+    /// Shortest stretches of the ring that hold 95 % of the posterior of its place, for a gradient.
+    pub interval: Vec<Interval>,
+    /// Amplitude and its standard deviation, in `unit`.
+    pub amplitude: (f64, f64),
+    /// Unit of the amplitude.
+    pub unit: &'static str,
+    /// In words.
+    pub phrase: String,
+    /// `ln` evidence over the fit without it.
+    pub log_evidence_gain: f64,
+    /// Posterior probability among all that compete for its slot.
+    pub probability: f64,
+    /// Gain of held-out log predictive density, and its standard error; none if it is not in the model.
+    pub heldout: Option<(f64, f64)>,
+    /// True for an alternative that such a recording is not expected to tell from the finding.
+    pub inseparable: bool,
+    /// The rest of the competition.
+    pub alternatives: Vec<Finding>,
+}
+
+impl Finding {
+    fn of(data: &Data, alternative: &Alternative) -> Self {
+        let (amplitude, sigma) = alternative.amplitude;
+        let (kind, at, s, unit, phrase) = match &alternative.cause {
+            Cause::Effect(term) => (
+                term.kind.word(),
+                term.place.clone(),
+                term.position(data),
+                term.kind.unit(),
+                term.kind.phrase(&term.place, amplitude, sigma),
+            ),
+            Cause::Unknown(one) => ("unknown", one.at.label(data), one.at.position(data), "m", one.at.phrase(data)),
+        };
+        Self {
+            kind,
+            at,
+            s,
+            interval: Vec::new(),
+            amplitude: alternative.amplitude,
+            unit,
+            phrase,
+            log_evidence_gain: alternative.log_gain,
+            probability: alternative.probability,
+            heldout: None,
+            inseparable: false,
+            alternatives: Vec::new(),
+        }
+    }
+
+    /// The first of a competition, with the others below it.
+    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Result<Self, EffectError> {
+        let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
+        let others: Vec<&Alternative> = slot.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
+        let finding = Self::of(data, &slot.alternatives[first]);
+        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
+        if let Cause::Effect(term) = &slot.alternatives[first].cause {
+            let effects: Vec<(usize, &Term)> =
+                others.iter().enumerate().filter_map(|(i, a)| Some((i, a.term()?))).collect();
+            let terms: Vec<&Term> = effects.iter().map(|(_, term)| *term).collect();
+            let separations = separations(data, &slot.without, (term, finding.amplitude.0), &terms)?;
+            for ((i, _), separation) in effects.iter().zip(separations) {
+                alternatives[*i].inseparable = separation < (DECISIVE / (1.0 - DECISIVE)).ln();
+            }
+        }
+        Ok(Self { alternatives, ..finding })
+    }
+
+    /// True if held-out frames are predicted better by more than the standard errors asked for.
+    pub fn is_proven(&self) -> bool {
+        self.heldout.is_some_and(|(gain, error)| gain > PROVEN * error)
+    }
+
+    /// Probability of this cause and of all that cannot be told from it.
+    pub fn together(&self) -> f64 {
+        self.probability + self.alternatives.iter().filter(|a| a.inseparable).map(|a| a.probability).sum::<f64>()
+    }
+}
+
+/// Held-out gain of each effect: all effects against all but this one.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn gains(
+    data: &Data,
+    found: &Found,
+    before: &Score,
+    after: &Score,
+    folds: &[Fold],
+) -> Result<Vec<(f64, f64)>, EffectError> {
+    if found.slots.len() == 1 {
+        return Ok(vec![after.gain_over(before)]);
+    }
+    found.slots.iter().map(|slot| Ok(after.gain_over(&Score::of(data, &slot.without, folds)?))).collect()
+}
+
+/// One finding for each effect, strongest first; of what is not in the model, the most likely.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn findings(
+    data: &Data,
+    found: &Found,
+    gains: &[(f64, f64)],
+    verdict: Verdict,
+) -> Result<Vec<Finding>, EffectError> {
+    let mut all: Vec<Finding> = Vec::new();
+    for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
+        let is_it = |a: &Alternative| a.term() == Some(term);
+        let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
+        let interval = match thin(term.kind) {
+            Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)?.credible(CREDIBLE),
+            None => Vec::new(),
+        };
+        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first)? });
+    }
+    all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
+    let open = match verdict {
+        Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
+        Verdict::Ambiguous if all.is_empty() || found.next.is_suspicious() => {
+            (!found.next.alternatives.is_empty()).then_some(0)
+        }
+        _ => None,
+    };
+    if let Some(first) = open {
+        all.push(Finding::of_slot(data, &found.next, first)?);
+    }
+    Ok(all)
+}
+
+/// In one sentence.
+pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Finding]) -> String {
+    let phrases =
+        |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
+    let text = match verdict {
+        Verdict::Consistent => format!("nothing is missing at the noise level; {}", power(found)),
+        Verdict::Identified => {
+            let gain: Vec<String> = findings
+                .iter()
+                .filter_map(|f| f.heldout)
+                .map(|(gain, error)| format!("{gain:.0} ± {error:.0}"))
+                .collect();
+            format!("{}; held-out frames gain {} nat", phrases("; "), gain.join(" and "))
+        }
+        Verdict::Ambiguous => ambiguous(findings),
+        Verdict::Unexplained => {
+            let last = findings.last().map_or("", |finding| finding.phrase.as_str());
+            let named = findings.iter().take(findings.len().saturating_sub(1)).map(|finding| finding.phrase.as_str());
+            let named: Vec<&str> = named.collect();
+            let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
+            format!("{named}{last}, which no effect of the library describes")
+        }
+    };
+    let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
+        format!(
+            "; all {} scatter by {} {}, which is ordinary",
+            family(scatter.kind),
+            scatter.width,
+            scatter.kind.unit()
+        )
+    });
+    let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
+        .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
+        .map(|(_, name)| name)
+        .collect();
+    let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
+    capitalised(&format!("{text}{}{faulty}", scatter.unwrap_or_default()))
+}
+
+fn family(kind: twin::EffectKind) -> String {
+    kind.word().replace("bpm", "BPM").replace("quad", "quadrupole").replace('_', " ") + "s"
+}
+
+/// The alternatives that share most of the probability.
+fn ambiguous(findings: &[Finding]) -> String {
+    let mut parts = Vec::new();
+    for finding in findings {
+        if finding.probability >= DECISIVE {
+            parts.push(finding.phrase.clone());
+            continue;
+        }
+        let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
+        let others = finding.alternatives.iter().take(SAID).map(of);
+        let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
+        let alike = finding.alternatives.iter().take(SAID).all(|other| other.inseparable);
+        let apart =
+            if alike && finding.together() >= DECISIVE { ", which this recording cannot tell apart" } else { "" };
+        parts.push(format!("{said}{apart}"));
+    }
+    format!("something may be missing: {}", parts.join("; and "))
+}
+
+/// The amplitudes that would have been seen: `ln` Bayes factor of 12 at half of the places.
+fn power(found: &Found) -> String {
+    const SEEN: f64 = 12.0;
+    let shown = [
+        twin::EffectKind::BpmGain,
+        twin::EffectKind::CorrectorGain,
+        twin::EffectKind::QuadRoll,
+        twin::EffectKind::StrayGradient,
+    ];
+    let of_kind = |kind: twin::EffectKind| {
+        let mut powers: Vec<f64> = found.next.scanned.iter().filter(|c| c.term.kind == kind).map(|c| c.power).collect();
+        powers.sort_by(f64::total_cmp);
+        let median = powers.get(powers.len() / 2).copied()?;
+        let amplitude = kind.prior_scale()? * (2.0 * SEEN / median.max(f64::MIN_POSITIVE)).sqrt();
+        Some(format!("{} {amplitude:.1$} {2}", kind.word(), if amplitude < 0.1 { 3 } else { 2 }, kind.unit()))
+    };
+    let list: Vec<String> =
+        shown.into_iter().filter_map(of_kind).map(|one| one.trim_end_matches(" 1").to_owned()).collect();
+    format!("what would have been seen at half of the places: {}", list.join(", "))
+}
+
+fn capitalised(text: &str) -> String {
+    let mut characters = text.chars();
+    characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
+}
+
+/// What could be measured, and the labels of the two causes that it would take apart, for what is not settled.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu, [String; 2])>, EffectError> {
+    if verdict != Verdict::Ambiguous {
+        return Ok(None);
+    }
+    let undecided = |slot: &&Slot| slot.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
+    let open = Some(&found.next).filter(|next| next.is_suspicious());
+    let slot = open.or(found.slots.iter().find(undecided)).or(found.slots.first()).unwrap_or(&found.next);
+    let effects = slot.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
+    let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
+    let Some((first, one)) = leaders.first() else { return Ok(None) };
+    let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);
+    let menu = Menu::of(data, &slot.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
+    let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label());
+    Ok(Some((menu, [one.label(), against])))
+}
+
+/// The measurement that would take the two most likely causes furthest apart, for what is not settled.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, EffectError> {
+    let Some((menu, [one, against])) = menu(data, found, verdict)? else { return Ok(None) };
+    Ok(menu.proposals.first().map(|best| {
+        format!(
+            "A second campaign {} would separate {one} from {against}: expected ln Bayes factor {:.1} with both campaigns, {:.1} now",
+            best.what, best.separation, menu.present
+        )
+    }))
+}
