@@ -16,10 +16,13 @@ pub mod lattice;
 pub mod map;
 pub mod orbit;
 pub mod response;
+pub mod site;
 pub mod varied;
 
 pub use effects::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked,
+    Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect,
+    HoldEffect, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin, Tracked,
+    Unit,
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
@@ -27,4 +30,5 @@ pub use lattice::{
 };
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
+pub use site::Site;
 pub use varied::{VariedOptics, VariedRing};

@@ -3,7 +3,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
+use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
 use crate::lattice::Ring;
 use crate::orbit::{ClosedOrbit, Hold};
 
@@ -40,12 +40,13 @@ fn orbit(ring: &Ring, delta: f64) -> Vec<[f64; 2]> {
 /// Every kind with some of its places: the first, the last and each seventh.
 fn effects(ring: &Ring) -> Vec<Effect> {
     let of = |&kind: &EffectKind| {
-        let sites = if kind == EffectKind::RadialLoop { vec!["x_D8,x_E6".into()] } else { kind.sites(ring) };
+        let radial_loop = || Effect::parse("radial_loop@x_D8,x_E6", ring).unwrap().site;
+        let sites = if kind == EffectKind::RadialLoop { vec![radial_loop()] } else { kind.sites(ring) };
         let step = if kind == EffectKind::BpmSwap { 41 } else { 7 };
         let amplitude = kind.prior_scale().unwrap_or(1.0);
         let last = sites.len() - 1;
         let some = sites.into_iter().enumerate().filter(move |(i, _)| i % step == 0 || *i == last);
-        some.map(move |(_, place)| Effect { kind, place, amplitude }).collect::<Vec<_>>()
+        some.map(move |(_, site)| Effect { kind, site, amplitude }).collect::<Vec<_>>()
     };
     EffectKind::ALL.iter().flat_map(of).collect()
 }
@@ -76,7 +77,7 @@ fn tracked(machine: Machine, drives: &Drives) -> DMatrix<f64> {
 fn difference(about: &[Effect], effect: &Effect, drives: &Drives) -> (DMatrix<f64>, [f64; 2], [f64; 2]) {
     let ring = Ring::booster();
     let with = |amplitude: f64| {
-        let all = [about, &[Effect { amplitude, ..effect.clone() }]].concat();
+        let all = [about, &[Effect { amplitude, ..*effect }]].concat();
         machine(&ring, &all).readings(drives).unwrap()
     };
     let (up, down, width) = match effect.kind.prior_scale() {
@@ -94,7 +95,7 @@ fn assert_derivatives(about: &[Effect], which: impl Fn(EffectKind) -> bool, tole
     let about_machine = machine(&ring, about);
     let signatures = Signatures::of(&about_machine, &drives).unwrap();
     for effect in effects(&ring).into_iter().filter(|effect| which(effect.kind)) {
-        let signature = signatures.of_effect(effect.kind, &effect.place).unwrap();
+        let signature = signatures.of_effect(effect.kind, effect.site).unwrap();
         let (readings, tunes, drift) = difference(about, &effect, &drives);
         let error = (&signature.readings - &readings).abs().max() / readings.abs().max();
         assert!(error < tolerance, "{effect:?}: {error:e}");
@@ -114,17 +115,16 @@ fn signatures_are_the_derivatives_of_the_readings() {
 
 #[test]
 fn signatures_hold_about_a_machine_with_effects() {
-    let about = |text: &str| text.split_whitespace().map(|e| e.parse().unwrap()).collect::<Vec<Effect>>();
+    let ring = Ring::booster();
+    let about = |text: &str| text.split_whitespace().map(|e| Effect::parse(e, &ring).unwrap()).collect::<Vec<_>>();
     // but for effects of monitors, which stand in the order in which they were given
-    let of_monitor = |kind: EffectKind| kind.word().starts_with("bpm");
     let read = about("bpm_gain@x_E4=0.1 corrector_gain@H_A8=0.1 stray_gradient@SLOT_F6=0.02");
-    assert_derivatives(&read, |kind| !of_monitor(kind), 2e-4);
+    assert_derivatives(&read, |kind| !kind.is_of_a_monitor(), 2e-4);
     // off momentum: what the ring holds is exact there, gradients feed down
-    let held =
-        |kind| matches!(kind, EffectKind::MomentumOffset | EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
+    let held = |kind: EffectKind| matches!(kind.class(), Class::Hold(_));
     assert_derivatives(&about("momentum_offset=0.002"), held, 5e-5);
     // where not the momentum is held, but for the curvature of a sextupole, which is taken at constant momentum
-    let linear = |kind: EffectKind| kind.prior_scale().is_some() && kind != EffectKind::SextupoleError;
+    let linear = |kind: EffectKind| !kind.is_switch() && kind != EffectKind::SextupoleError;
     assert_derivatives(&about("radial_loop@x_D8,x_E6"), linear, 2e-4);
     assert_derivatives(&about("fixed_rf_frequency"), linear, 2e-4);
 }
@@ -135,7 +135,7 @@ fn compare(real: &Ring, effect: &Effect) -> [f64; 4] {
     let aligned = Ring::booster();
     let linear = |effects: &[Effect]| {
         let real = machine(real, effects);
-        let drives = drives(&aligned, orbit(real.ring(), real.delta));
+        let drives = drives(&aligned, orbit(real.ring(), real.hold.delta));
         machine(&aligned, effects).readings(&drives).unwrap()
     };
     let exact = |effects: &[Effect]| tracked(machine(real, effects), &drives(&aligned, Vec::new()));
@@ -152,18 +152,18 @@ fn compare(real: &Ring, effect: &Effect) -> [f64; 4] {
 
 /// As large as faults are, half a standard deviation of the prior; whole where there is no amplitude.
 fn typical(effect: Effect) -> Effect {
-    let share = if effect.kind.prior_scale().is_some() { 0.5 } else { 1.0 };
+    let share = if effect.kind.is_switch() { 1.0 } else { 0.5 };
     Effect { amplitude: share * effect.amplitude, ..effect }
 }
 
-fn depends_on_the_orbit(kind: EffectKind) -> bool {
-    matches!(kind, EffectKind::BpmCubic | EffectKind::SextupoleError)
+fn depends_on_the_orbit(ring: &Ring, effect: &Effect) -> bool {
+    !effect.kind.orbit(ring, effect.site).is_empty()
 }
 
 #[test]
 fn linear_readings_are_those_of_exact_orbits() {
     let ring = Ring::booster();
-    for effect in effects(&ring).into_iter().filter(|e| !depends_on_the_orbit(e.kind)).map(typical) {
+    for effect in effects(&ring).into_iter().filter(|e| !depends_on_the_orbit(&ring, e)).map(typical) {
         let [kicked, rf, change, tune] = compare(&ring, &effect);
         // second order in the kicks: a path longer by half the square of slopes of 0.5 mrad moves the momentum by 1e-6
         // (1.8 um measured); a loop's momentum of 1.3e-4 changes the kick's own response (8.6 um)
@@ -185,7 +185,7 @@ fn linear_readings_are_those_of_exact_orbits() {
 #[test]
 fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
     let ring = displaced();
-    for effect in effects(&ring).into_iter().filter(|e| depends_on_the_orbit(e.kind)).map(typical) {
+    for effect in effects(&ring).into_iter().filter(|e| depends_on_the_orbit(&ring, e)).map(typical) {
         let [kicked, rf, change, tune] = compare(&ring, &effect);
         // measured 0.036: the orbit is taken at the entrance of a sextupole, not in its middle
         assert!(kicked < 0.05 * change, "{effect:?}: {kicked:e} of {change:e}");

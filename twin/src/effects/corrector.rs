@@ -10,7 +10,6 @@ use super::mechanism::{Measured, Mechanism, Unit};
 use super::{EffectError, Machine, Signature, Signatures};
 use crate::lattice::Ring;
 use crate::map::Scalar;
-use crate::response::corrector_axis;
 use crate::site::Site;
 
 /// What is wrong with a corrector.
@@ -139,7 +138,11 @@ impl Mechanism for CorrectorEffect {
         let name = site.name(ring);
         match self {
             Self::Gain => {
-                format!("corrector {name} kicks {} % too {}", amplitude.size(100.0), amplitude.by_sign("much", "little"))
+                format!(
+                    "corrector {name} kicks {} % too {}",
+                    amplitude.size(100.0),
+                    amplitude.by_sign("much", "little")
+                )
             }
             Self::Roll => format!("corrector {name} is rolled by {} mrad", amplitude.signed(1e3)),
             Self::Polarity => format!("corrector {name} has the wrong polarity"),
@@ -171,9 +174,9 @@ impl Kick {
 
 /// What the read monitors see of a corrector's kick, turned by a right angle [m/rad].
 fn turned(about: &Signatures, corrector: usize) -> DVector<f64> {
-    let ring = &about.machine.ring;
-    let [x, y] = corrector_axis(ring, corrector);
-    let source = about.optics.kick(ring.correctors[corrector].element, [-y, x]);
+    let corrector = &about.machine.ring.correctors[corrector];
+    let [x, y] = about.optics.axis(corrector);
+    let source = about.optics.kick(corrector.element, [-y, x]);
     about.held.response(&about.optics, &about.observers, &[source]).column(0).into_owned()
 }
 

@@ -116,7 +116,8 @@ impl Mechanism for MonitorEffect {
             Self::Swap => {
                 let later = |i: usize| read[i + 1..].iter().map(move |&other| (read[i], other));
                 let pairs = (0..read.len()).flat_map(later);
-                let of_a_plane = |(one, other): &(usize, usize)| ring.monitors[*one].plane == ring.monitors[*other].plane;
+                let of_a_plane =
+                    |(one, other): &(usize, usize)| ring.monitors[*one].plane == ring.monitors[*other].plane;
                 pairs.filter(of_a_plane).map(|(one, other)| Site::pair(one, other)).collect()
             }
         }
@@ -170,12 +171,14 @@ impl Mechanism for MonitorEffect {
                 signature.readings.set_column(i, &difference);
             }
             (Self::Gain | Self::Roll | Self::Cubic, Site::Monitor(at)) => {
-                let read = self.monitors(ring, at).into_iter().filter_map(|monitor| Some((monitor, about.read(monitor)?)));
+                let read =
+                    self.monitors(ring, at).into_iter().filter_map(|monitor| Some((monitor, about.read(monitor)?)));
                 let read: Vec<(usize, usize)> = read.collect();
                 if read.is_empty() {
                     return Err(silent());
                 }
-                read.into_iter().for_each(|(monitor, b)| signature.readings.set_column(b, &self.distortion(about, monitor)));
+                read.into_iter()
+                    .for_each(|(monitor, b)| signature.readings.set_column(b, &self.distortion(about, monitor)));
             }
             _ => return Err(self.misplaced(ring, site.name(ring))),
         }
