@@ -69,8 +69,8 @@ impl Answer {
         Self {
             machine: ring.name.clone(),
             effects,
-            bpm: ring.cells(&ring.monitors),
-            correctors: ring.cells(&ring.correctors),
+            bpm: ring.labels(ring.monitors.iter().map(|m| m.element)),
+            correctors: ring.labels(ring.correctors.iter().map(|c| c.element)),
             response_x_m_per_rad: rows(&response.x),
             response_y_m_per_rad: rows(&response.y),
             qx: response.tunes.x,
@@ -84,7 +84,7 @@ impl Answer {
         println!("{}", self.machine);
         self.effects.iter().for_each(|effect| println!("with {effect}"));
         println!("tunes {:.6} {:.6}, gamma_tr {:.4}\n", self.qx, self.qy, self.gamma_tr);
-        let horizontal = ring.correctors.iter().filter(|&&i| is_horizontal(ring, i)).count();
+        let horizontal = ring.horizontal_correctors();
         let (blocks, names) = ([&self.response_x_m_per_rad, &self.response_y_m_per_rad], ["x", "y"]);
         let mut table = Table::new();
         table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
@@ -108,10 +108,6 @@ impl Answer {
         });
         [name.into(), to.into(), format!("{rms:.3}"), format!("{value:.3}"), place]
     }
-}
-
-fn is_horizontal(ring: &Ring, element: usize) -> bool {
-    matches!(ring.elements[element].kind, twin::Kind::Corrector { plane: twin::Plane::X, .. })
 }
 
 fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {

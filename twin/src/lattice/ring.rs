@@ -92,6 +92,11 @@ impl Ring {
         &self.elements[element].label
     }
 
+    /// Short names of elements.
+    pub fn labels(&self, elements: impl IntoIterator<Item = usize>) -> Vec<String> {
+        elements.into_iter().map(|element| self.label(element).to_owned()).collect()
+    }
+
     /// Names of the params `[N]`.
     pub fn var_names(&self) -> Vec<String> {
         self.parameters.iter().map(|parameter| parameter.name.clone()).collect()
