@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, RowVector2};
 
 use super::drives::Drives;
 use super::mechanism::{Measured, Mechanism, Unit};
-use super::{EffectError, Machine, Signature, Signatures};
+use super::{EffectError, EffectKind, Machine, Signature, Signatures};
 use crate::lattice::{Bend, Element, Kind, Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
 use crate::response::{Gradient, Optics, Place};
@@ -38,6 +38,16 @@ pub enum Thin {
     Normal,
     /// `x' += K1sL y`, `y' += K1sL x`.
     Skew,
+}
+
+impl Thin {
+    /// The kind of effect that is one.
+    pub const fn kind(self) -> EffectKind {
+        match self {
+            Self::Normal => EffectKind::StrayGradient,
+            Self::Skew => EffectKind::StraySkewGradient,
+        }
+    }
 }
 
 impl FieldEffect {

@@ -85,6 +85,13 @@ impl Unit {
     pub const PER_SQUARE_METRE: Self = Self { symbol: "1/m2", shown: "/m2", factor: 1.0 };
     /// A cubic term [1/mm^2].
     pub const PER_SQUARE_MILLIMETRE: Self = Self { symbol: "1/mm2", shown: "/mm2", factor: 1.0 };
+
+    /// An amplitude to two digits, with the unit as people read it.
+    pub fn rounded(self, amplitude: f64) -> String {
+        let shown = amplitude * self.factor;
+        let digits = (1.0 - shown.abs().max(1e-9).log10().floor()).clamp(0.0, 9.0) as usize;
+        format!("{shown:.digits$} {}", self.shown).trim_end().to_owned()
+    }
 }
 
 /// An amplitude with its standard deviation.
