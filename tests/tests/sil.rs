@@ -8,7 +8,7 @@ use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
 use firmware_sim::link::{Refusal, Reply, Request, Status};
-use host_bridge::link::Link;
+use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core};
 use system_tests::qemu::{Emulator, Image, Options};

@@ -1,20 +1,20 @@
 //! `orbitcal challenge`: every recording below a folder diagnosed, and scored against the answer key beside it.
 
+use core::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use comfy_table::{Table, presets};
 use diagnosis::Diagnosis;
 use diagnosis::score::{Grade, Truth};
 use serde::Serialize;
 
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Challenge;
-use crate::output;
+use crate::output::{self, fill, table};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
-struct Answer {
+struct ChallengeResult {
     recordings: Vec<Scored>,
     /// Number of recordings by grade.
     right: usize,
@@ -49,6 +49,7 @@ struct Scored {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Challenge) -> Result<(), CommandError> {
+    check_outputs([options.common.json.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let folders = folders(&options.folder)?;
     let bar = progress(folders.len(), "recordings", options.common.quiet);
@@ -63,14 +64,7 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let answer = Answer::of(recordings);
-    if let Some(path) = &options.common.json {
-        output::json(path, &answer)?;
-    }
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        answer.print();
-    }
-    Ok(())
+    deliver(&options.common, &ChallengeResult::of(recordings))
 }
 
 /// Folders below (or the folder itself) that hold a recording and its key, sorted.
@@ -86,7 +80,8 @@ fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
 }
 
 fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> {
-    let wrong = |error: std::io::Error| CommandError::Input(format!("{}: {error}", folder.display()));
+    let wrong =
+        |error: std::io::Error| CommandError::Input(format!("{}: {}", folder.display(), output::unreadable(&error)));
     if folder.join("frames.csv").is_file() && folder.join("truth.json").is_file() {
         found.push(folder.to_owned());
     }
@@ -119,7 +114,15 @@ impl Scored {
     }
 }
 
-impl Answer {
+impl Scored {
+    /// What was concealed, and how much an oracle gains that knows it [nat].
+    fn truth(&self) -> String {
+        let gain = self.oracle_gain.map_or_else(String::new, |gain| format!(" (oracle {gain:.1})"));
+        if self.truth.is_empty() { "nothing".into() } else { self.truth.join(" + ") + &gain }
+    }
+}
+
+impl ChallengeResult {
     fn of(recordings: Vec<Scored>) -> Self {
         let count = |grade| recordings.iter().filter(|scored| scored.grade == grade).count();
         let pulls: Vec<f64> = recordings
@@ -139,40 +142,28 @@ impl Answer {
             recordings,
         }
     }
+}
 
-    fn print(&self) {
-        let mut table = Table::new();
-        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header([
-            "recording",
-            "verdict",
-            "found",
-            "truth",
-            "oracle",
-            "grade",
-            "pull",
-            "NEES/var",
-            "held-out",
-            "s",
-        ]);
+impl fmt::Display for ChallengeResult {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut table =
+            table(["recording", "found, and the truth below", "grade", "pull", "NEES/var", "held-out", "s"]);
         for scored in &self.recordings {
             let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
             table.add_row([
                 scored.recording.clone(),
-                scored.verdict.into(),
-                scored.found.join(" + "),
-                scored.truth.join(" + "),
-                scored.oracle_gain.map_or_else(String::new, |gain| format!("{gain:.1}")),
+                format!("{}: {}\ntruth: {}", scored.verdict, scored.found.join(" + "), scored.truth()),
                 format!("{:?}", scored.grade).to_lowercase(),
                 pulls.join(" "),
-                format!("{:.2} -> {:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
-                format!("{:.1} ± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
+                format!("{:.2}\n{:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
+                format!("{:.1}\n± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
                 format!("{:.1}", scored.seconds),
             ]);
         }
-        println!("{table}");
-        println!(
-            "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
+        writeln!(f, "{table}")?;
+        let summary = format!(
+            "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of \
+             squared pulls {:.1} of {}",
             self.right,
             self.partial,
             self.listed,
@@ -182,5 +173,13 @@ impl Answer {
             self.amplitude_chi2,
             self.amplitudes
         );
+        write!(
+            f,
+            "{}\n{}",
+            fill(&summary),
+            fill(
+                "NEES, normalised estimation error squared of the vars: before and after what was found is in the model."
+            )
+        )
     }
 }

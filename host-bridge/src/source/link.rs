@@ -14,7 +14,7 @@ use estimator::{FrameError, Setup, packet};
 use firmware_sim::link::{Refusal, Reply, Request, Status, TRIANGLE, Taken};
 use inference::stream::BoosterEstimate;
 
-/// Longest wait for an answer that is due, and for a device to take bytes.
+/// Longest wait for a reply that is due, and for a device to take bytes.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Longest wait for an estimate that nobody here has asked for: five cycles.
 const LULL: Duration = Duration::from_secs(1);
@@ -25,7 +25,7 @@ const BAUD: u32 = 921_600;
 
 /// Where a device is.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Source {
+pub enum Address {
     /// `tcp://HOST:PORT`
     Tcp(String),
     /// `unix:PATH`
@@ -34,7 +34,7 @@ pub enum Source {
     Serial(String, u32),
 }
 
-impl FromStr for Source {
+impl FromStr for Address {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -56,7 +56,7 @@ impl FromStr for Source {
     }
 }
 
-impl fmt::Display for Source {
+impl fmt::Display for Address {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Tcp(address) => write!(f, "tcp://{address}"),
@@ -74,7 +74,7 @@ pub enum LinkError {
     #[error("{device}: {error}")]
     Open {
         /// Where.
-        device: Source,
+        device: Address,
         /// Why.
         error: io::Error,
     },
@@ -189,28 +189,28 @@ impl Link<Box<dyn Line>> {
     ///
     /// # Errors
     /// [`LinkError::Open`].
-    pub fn open(source: &Source) -> Result<Self, LinkError> {
-        let line = connect(source).map_err(|error| LinkError::Open { device: source.clone(), error })?;
+    pub fn open(address: &Address) -> Result<Self, LinkError> {
+        let line = connect(address).map_err(|error| LinkError::Open { device: address.clone(), error })?;
         Ok(Self::new(line))
     }
 }
 
-fn connect(source: &Source) -> io::Result<Box<dyn Line>> {
-    Ok(match source {
-        Source::Tcp(address) => {
+fn connect(address: &Address) -> io::Result<Box<dyn Line>> {
+    Ok(match address {
+        Address::Tcp(address) => {
             let line = TcpStream::connect(address)?;
             line.set_nodelay(true)?;
             line.set_read_timeout(Some(GLANCE))?;
             line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
-        Source::Unix(path) => {
+        Address::Unix(path) => {
             let line = UnixStream::connect(path)?;
             line.set_read_timeout(Some(GLANCE))?;
             line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
-        Source::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
+        Address::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
     })
 }
 
@@ -236,14 +236,14 @@ impl<L: Read + Write> Link<L> {
                 Ok(Reply::Refused { why: why @ (Refusal::Setup | Refusal::NoDesign), .. }) => {
                     return Err(LinkError::Refused { what: "its setup", why });
                 }
-                // answers to somebody before us, and the half of one that was on its way when the line was opened
+                // replies to somebody before us, and the half of one that was on its way when the line was opened
                 Ok(_) | Err(LinkError::Reply(_)) => {}
                 Err(error) => return Err(error),
             }
         }
     }
 
-    /// Send a frame and wait for its answer, with the covariance.
+    /// Send a frame and wait for the reply, with the covariance.
     ///
     /// # Errors
     /// [`LinkError`].
@@ -273,7 +273,7 @@ impl<L: Read + Write> Link<L> {
             match self.gather(deadline, LULL)? {
                 Event::Heard(heard) => return Ok(heard),
                 Event::Other(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "a packet", why }),
-                Event::Other(_) => {} // an answer to somebody else
+                Event::Other(_) => {} // a reply to somebody else
             }
         }
     }
@@ -282,8 +282,8 @@ impl<L: Read + Write> Link<L> {
     fn gather(&mut self, deadline: Instant, patience: Duration) -> Result<Event, LinkError> {
         loop {
             match self.next_before(deadline, patience) {
-                Ok(Reply::Estimate(answer)) => {
-                    let estimate = answer.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
+                Ok(Reply::Estimate(reply)) => {
+                    let estimate = reply.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
                     if let Some(former) = self.coming.replace(Coming::new(estimate)) {
                         return Ok(Event::Heard(former.heard()));
                     }
@@ -478,15 +478,15 @@ mod tests {
 
     #[test]
     fn sources_are_tcp_unix_or_serial() {
-        assert_eq!("tcp://localhost:5000".parse(), Ok(Source::Tcp("localhost:5000".into())));
-        assert_eq!("unix:/run/device".parse(), Ok(Source::Unix("/run/device".into())));
-        assert_eq!("serial:/dev/ttyACM0".parse(), Ok(Source::Serial("/dev/ttyACM0".into(), 921_600)));
-        assert_eq!("serial:/dev/ttyS1@115200".parse(), Ok(Source::Serial("/dev/ttyS1".into(), 115_200)));
+        assert_eq!("tcp://localhost:5000".parse(), Ok(Address::Tcp("localhost:5000".into())));
+        assert_eq!("unix:/run/device".parse(), Ok(Address::Unix("/run/device".into())));
+        assert_eq!("serial:/dev/ttyACM0".parse(), Ok(Address::Serial("/dev/ttyACM0".into(), 921_600)));
+        assert_eq!("serial:/dev/ttyS1@115200".parse(), Ok(Address::Serial("/dev/ttyS1".into(), 115_200)));
         for wrong in ["", "tcp:localhost:5000", "tcp://localhost", "unix:", "serial:/dev/ttyS1@fast", "usb:1"] {
-            let error = wrong.parse::<Source>().unwrap_err();
+            let error = wrong.parse::<Address>().unwrap_err();
             assert!(error.ends_with(&format!("found {wrong:?}")), "{error}");
         }
         let shown = "serial:/dev/ttyS1@115200";
-        assert_eq!(shown.parse::<Source>().unwrap().to_string(), shown);
+        assert_eq!(shown.parse::<Address>().unwrap().to_string(), shown);
     }
 }
