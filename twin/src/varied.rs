@@ -128,12 +128,15 @@ impl VariedRing {
         })
     }
 
-    /// The optics at params and supplies, as in [`Ring::strengths`].
+    /// The optics with a factor on each quadrupole's gradient `[M]`, as of [`Ring::strengths`].
     ///
     /// # Errors
     /// [`OrbitError`] without a closed orbit or stable motion.
-    pub fn at(&self, params: &[f64], supplies: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
-        let strengths = self.design.strengths(params, supplies);
+    ///
+    /// # Panics
+    /// If there is not one factor for each quadrupole.
+    pub fn at(&self, factors: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
+        assert_eq!(factors.len(), self.quadrupoles.len(), "one factor for each quadrupole");
         let (mut map, mut back) = (Matrix6::identity(), Matrix6::identity());
         let mut observers = vec![RowVector6::zeros(); self.monitors];
         let mut sources = vec![Vector6::zeros(); self.correctors];
@@ -147,7 +150,7 @@ impl VariedRing {
             }
             (map, back) = (stretch.map * map, back * stretch.back);
             if let Some(quadrupole) = self.quadrupoles.get(i) {
-                let k1 = quadrupole.k1 * strengths[quadrupole.index];
+                let k1 = quadrupole.k1 * factors[quadrupole.index];
                 kernels[quadrupole.index] = back * quadrupole.kernel(k1) * map;
                 (map, back) =
                     (quadrupole.map(k1, quadrupole.length) * map, back * quadrupole.map(k1, -quadrupole.length));
@@ -244,20 +247,14 @@ impl VariedOptics<'_> {
         self.modes.fractions
     }
 
-    /// Derivative of both tunes with respect to the params `[N]`.
-    pub fn tune_gradient(&self) -> [Vec<f64>; 2] {
-        let (design, slopes) = (&self.ring.design, self.modes.slopes());
-        let mut gradient = [0, 1].map(|_| vec![0.0; design.parameters.len()]);
-        for (quadrupole, kernel) in design.quadrupoles.iter().zip(&self.kernels) {
-            let Some(parameter) = quadrupole.parameter else { continue };
-            let slope = Modes::tune_slope(&slopes, &self.turn, kernel);
-            (0..2).for_each(|mode| gradient[mode][parameter] += slope[mode]);
-        }
-        gradient
+    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient `[M]`.
+    pub fn tune_slopes(&self) -> Vec<[f64; 2]> {
+        let slopes = self.modes.slopes();
+        self.kernels.iter().map(|kernel| Modes::tune_slope(&slopes, &self.turn, kernel)).collect()
     }
 
-    /// Gradient with respect to the params `[N]` of a function of the response, from its derivative `weights` with respect
-    /// to each entry of [`VariedOptics::response`].
+    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` of a function of the response, from its derivative
+    /// `weights` with respect to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
         let mut sent: Vec<Vector6<f64>> = self.sources.iter().map(|source| self.closed * source).collect();
@@ -270,8 +267,7 @@ impl VariedOptics<'_> {
         // the slip factor moves all readings of an RF offset alike
         let by_slip: f64 = (0..seen.len()).map(|b| weights[(b, rf)] * self.dispersion(b)).sum();
         pairs += self.dispersive * self.path * (by_slip / (self.slip * self.slip * self.ring.design.circumference));
-        let design = &self.ring.design;
-        let mut gradient = vec![0.0; design.parameters.len()];
+        let mut gradient = vec![0.0; self.kernels.len()];
         for (i, stretch) in self.ring.stretches.iter().enumerate() {
             for instrument in &stretch.instruments {
                 match *instrument {
@@ -287,10 +283,8 @@ impl VariedOptics<'_> {
                     }
                 }
             }
-            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i)
-                && let Some(parameter) = design.quadrupoles[*index].parameter
-            {
-                gradient[parameter] -= self.kernels[*index].transpose().dot(&pairs);
+            if let Some(quadrupole) = self.ring.quadrupoles.get(i) {
+                gradient[quadrupole.index] = -self.kernels[quadrupole.index].transpose().dot(&pairs);
             }
         }
         gradient
@@ -321,7 +315,7 @@ mod tests {
             let (params, supplies) = wrong(&ring);
             let varied = VariedRing::of(&ring).unwrap();
             let whole = ring.with_strengths(&ring.strengths(&params, &supplies));
-            let fast = varied.at(&params, &supplies).unwrap();
+            let fast = varied.at(&ring.strengths(&params, &supplies)).unwrap();
             let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
             let expected = optics.response(&optics.read_monitors(), &optics.correctors());
             let response = fast.response();
@@ -344,22 +338,23 @@ mod tests {
         for ring in rings() {
             let (params, supplies) = wrong(&ring);
             let varied = VariedRing::of(&ring).unwrap();
-            let optics = varied.at(&params, &supplies).unwrap();
-            let (gradient, tunes) = (optics.pull_back(&weights), optics.tune_gradient());
-            assert_eq!(gradient.len(), ring.parameters.len());
+            let factors = ring.strengths(&params, &supplies);
+            let optics = varied.at(&factors).unwrap();
+            let (gradient, tunes) = (optics.pull_back(&weights), optics.tune_slopes());
+            assert_eq!(gradient.len(), ring.quadrupoles.len());
             for (q, slope) in gradient.iter().enumerate() {
                 let value = |step: f64| {
-                    let mut params = params.clone();
-                    params[q] += step;
-                    let optics = varied.at(&params, &supplies).unwrap();
+                    let mut factors = factors.clone();
+                    factors[q] *= step.exp();
+                    let optics = varied.at(&factors).unwrap();
                     let [x, y] = optics.tunes();
                     [optics.response().dot(&weights), x, y]
                 };
                 let h = 3e-4;
                 let (up, down, far_up, far_down) = (value(h), value(-h), value(2.0 * h), value(-2.0 * h));
-                for (i, slope) in [*slope, tunes[0][q], tunes[1][q]].into_iter().enumerate() {
+                for (i, slope) in [*slope, tunes[q][0], tunes[q][1]].into_iter().enumerate() {
                     let known = (8.0 * (up[i] - down[i]) - far_up[i] + far_down[i]) / (12.0 * h);
-                    // fourth order in a step that moves all 24 magnets of a family at once
+                    // fourth order in the step
                     assert!((slope / known - 1.0).abs() < 1e-6, "{q}, {i}: {slope} {known}");
                 }
             }
@@ -370,9 +365,9 @@ mod tests {
     fn on_the_way_to_the_next_integer_motion_becomes_unstable() {
         let varied = VariedRing::of(&Ring::booster()).unwrap();
         let scattered = |i: i32| -> Vec<f64> {
-            (0..48).map(|q| 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
+            (0..48).map(|q| 1.0 + 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
         };
-        let mut scan = (0..40).map(|i| varied.at(&scattered(i), &[]).map(|_| ()));
+        let mut scan = (0..40).map(|i| varied.at(&scattered(i)).map(|_| ()));
         assert!(scan.any(|optics| matches!(optics, Err(OrbitError::Unstable { half_trace, .. }) if half_trace > 1.0)));
     }
 }
