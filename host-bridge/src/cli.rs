@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use inference::nuts::NutsSettings;
-use twin::Effect;
+use twin::EffectText;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
@@ -177,7 +177,7 @@ pub struct Response {
     pub vars: Option<PathBuf>,
     /// KIND[@PLACE][=AMPLITUDE], repeatable, such as quad_roll@D8=0.01
     #[arg(long = "effect", value_name = "EFFECT")]
-    pub effects: Vec<Effect>,
+    pub effects: Vec<EffectText>,
     /// What the machine holds
     #[arg(long, value_enum, default_value_t = Rf::FixedMomentum)]
     pub rf: Rf,

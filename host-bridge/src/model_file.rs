@@ -128,12 +128,13 @@ fn take(tables: &mut BoosterGreen, due: Due, wire: &mut [u8]) -> Result<Due, Fau
 #[cfg(test)]
 mod tests {
     use estimator::surrogate::Head;
-    use twin::Ring;
+    use twin::{Effect, Ring};
 
     use super::*;
 
     fn extended() -> Box<BoosterGreen> {
-        let effects = ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|e| e.parse().unwrap());
+        let effects =
+            ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|text| Effect::parse(text, &Ring::booster()).unwrap());
         training::extended::tables(&Ring::booster(), &effects, &[1.0; 48]).unwrap().tables
     }
 
