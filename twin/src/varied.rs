@@ -20,9 +20,9 @@
 use nalgebra::{DMatrix, Matrix2, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Ring};
-use crate::map::{PATH, X, Y};
+use crate::map::{PATH, X, Y, inverse};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, close_at_momentum, inverse};
+use crate::response::{Optics, close_at_momentum};
 use crate::tune::Modes;
 
 /// A ring as a chain of quadrupoles and of what lies between them.
@@ -65,7 +65,7 @@ struct Quadrupole {
     roll: Matrix6<f64>,
 }
 
-/// The optics at given params.
+/// The optics at given strengths.
 #[derive(Debug, Clone)]
 pub struct VariedOptics<'r> {
     ring: &'r VariedRing,
@@ -128,12 +128,12 @@ impl VariedRing {
         })
     }
 
-    /// The optics at params and supplies, as in [`Ring::strengths`].
+    /// The optics with each quadrupole's gradient multiplied by its factor `[M]`; at params and supplies, that of
+    /// [`Ring::strengths`].
     ///
     /// # Errors
     /// [`OrbitError`] without a closed orbit or stable motion.
-    pub fn at(&self, params: &[f64], supplies: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
-        let strengths = self.design.strengths(params, supplies);
+    pub fn at(&self, factors: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
         let (mut map, mut back) = (Matrix6::identity(), Matrix6::identity());
         let mut observers = vec![RowVector6::zeros(); self.monitors];
         let mut sources = vec![Vector6::zeros(); self.correctors];
@@ -147,7 +147,7 @@ impl VariedRing {
             }
             (map, back) = (stretch.map * map, back * stretch.back);
             if let Some(quadrupole) = self.quadrupoles.get(i) {
-                let k1 = quadrupole.k1 * strengths[quadrupole.index];
+                let k1 = quadrupole.k1 * factors[quadrupole.index];
                 kernels[quadrupole.index] = back * quadrupole.kernel(k1) * map;
                 (map, back) =
                     (quadrupole.map(k1, quadrupole.length) * map, back * quadrupole.map(k1, -quadrupole.length));
@@ -244,19 +244,13 @@ impl VariedOptics<'_> {
         self.modes.fractions
     }
 
-    /// Derivative of both tunes with respect to the params `[N]`.
-    pub fn tune_gradient(&self) -> [Vec<f64>; 2] {
-        let (design, slopes) = (&self.ring.design, self.modes.slopes());
-        let mut gradient = [0, 1].map(|_| vec![0.0; design.parameters.len()]);
-        for (quadrupole, kernel) in design.quadrupoles.iter().zip(&self.kernels) {
-            let Some(parameter) = quadrupole.parameter else { continue };
-            let slope = Modes::tune_slope(&slopes, &self.turn, kernel);
-            (0..2).for_each(|mode| gradient[mode][parameter] += slope[mode]);
-        }
-        gradient
+    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient `[M]`; by param, see [`Ring::by_parameter`].
+    pub fn tune_slopes(&self) -> Vec<[f64; 2]> {
+        let slopes = self.modes.slopes();
+        self.kernels.iter().map(|kernel| Modes::tune_slope(&slopes, &self.turn, kernel)).collect()
     }
 
-    /// Gradient with respect to the params `[N]` of a function of the response, from its derivative `weights` with respect
+    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` (by param, see [`Ring::by_parameter`]) of a function of the response, from its derivative `weights` with respect
     /// to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
@@ -270,8 +264,7 @@ impl VariedOptics<'_> {
         // the slip factor moves all readings of an RF offset alike
         let by_slip: f64 = (0..seen.len()).map(|b| weights[(b, rf)] * self.dispersion(b)).sum();
         pairs += self.dispersive * self.path * (by_slip / (self.slip * self.slip * self.ring.design.circumference));
-        let design = &self.ring.design;
-        let mut gradient = vec![0.0; design.parameters.len()];
+        let mut gradient = vec![0.0; self.kernels.len()];
         for (i, stretch) in self.ring.stretches.iter().enumerate() {
             for instrument in &stretch.instruments {
                 match *instrument {
@@ -287,10 +280,8 @@ impl VariedOptics<'_> {
                     }
                 }
             }
-            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i)
-                && let Some(parameter) = design.quadrupoles[*index].parameter
-            {
-                gradient[parameter] -= self.kernels[*index].transpose().dot(&pairs);
+            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i) {
+                gradient[*index] = -self.kernels[*index].transpose().dot(&pairs);
             }
         }
         gradient
@@ -321,7 +312,7 @@ mod tests {
             let (params, supplies) = wrong(&ring);
             let varied = VariedRing::of(&ring).unwrap();
             let whole = ring.with_strengths(&ring.strengths(&params, &supplies));
-            let fast = varied.at(&params, &supplies).unwrap();
+            let fast = varied.at(&ring.strengths(&params, &supplies)).unwrap();
             let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
             let expected = optics.response(&optics.read_monitors(), &optics.correctors());
             let response = fast.response();
@@ -344,14 +335,17 @@ mod tests {
         for ring in rings() {
             let (params, supplies) = wrong(&ring);
             let varied = VariedRing::of(&ring).unwrap();
-            let optics = varied.at(&params, &supplies).unwrap();
-            let (gradient, tunes) = (optics.pull_back(&weights), optics.tune_gradient());
+            let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
+            let gradient = ring.by_parameter(&optics.pull_back(&weights));
+            let slopes = optics.tune_slopes();
+            let tunes =
+                [0, 1].map(|mode| ring.by_parameter(&slopes.iter().map(|slope| slope[mode]).collect::<Vec<_>>()));
             assert_eq!(gradient.len(), ring.parameters.len());
             for (q, slope) in gradient.iter().enumerate() {
                 let value = |step: f64| {
                     let mut params = params.clone();
                     params[q] += step;
-                    let optics = varied.at(&params, &supplies).unwrap();
+                    let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
                     let [x, y] = optics.tunes();
                     [optics.response().dot(&weights), x, y]
                 };
@@ -370,9 +364,9 @@ mod tests {
     fn on_the_way_to_the_next_integer_motion_becomes_unstable() {
         let varied = VariedRing::of(&Ring::booster()).unwrap();
         let scattered = |i: i32| -> Vec<f64> {
-            (0..48).map(|q| 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
+            (0..48).map(|q| 1.0 + 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
         };
-        let mut scan = (0..40).map(|i| varied.at(&scattered(i), &[]).map(|_| ()));
+        let mut scan = (0..40).map(|i| varied.at(&scattered(i)).map(|_| ()));
         assert!(scan.any(|optics| matches!(optics, Err(OrbitError::Unstable { half_trace, .. }) if half_trace > 1.0)));
     }
 }
