@@ -21,7 +21,7 @@
 use nalgebra::{DMatrix, Matrix5, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Corrector, Plane, Ring};
-use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y};
+use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, inverse};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError, invert};
 
 /// A place in the ring: inside element `element`, `depth` [m] from its entrance. Ordered along the beam.
@@ -315,11 +315,6 @@ pub(crate) fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[R
         [near, near + o.row]
     };
     observers.iter().map(rows).collect()
-}
-
-/// Inverse of a transfer map; its determinant is 1.
-pub(crate) fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
-    transfer.try_inverse().expect("maps are symplectic, so their determinant is 1")
 }
 
 #[cfg(test)]

@@ -20,9 +20,9 @@
 use nalgebra::{DMatrix, Matrix2, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Ring};
-use crate::map::{PATH, X, Y};
+use crate::map::{PATH, X, Y, inverse};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, close_at_momentum, inverse};
+use crate::response::{Optics, close_at_momentum};
 use crate::tune::Modes;
 
 /// A ring as a chain of quadrupoles and of what lies between them.
@@ -65,7 +65,7 @@ struct Quadrupole {
     roll: Matrix6<f64>,
 }
 
-/// The optics at given params.
+/// The optics at given strengths.
 #[derive(Debug, Clone)]
 pub struct VariedOptics<'r> {
     ring: &'r VariedRing,
@@ -128,15 +128,12 @@ impl VariedRing {
         })
     }
 
-    /// The optics with a factor on each quadrupole's gradient `[M]`, as of [`Ring::strengths`].
+    /// The optics with each quadrupole's gradient multiplied by its factor `[M]`; at params and supplies, that of
+    /// [`Ring::strengths`].
     ///
     /// # Errors
     /// [`OrbitError`] without a closed orbit or stable motion.
-    ///
-    /// # Panics
-    /// If there is not one factor for each quadrupole.
     pub fn at(&self, factors: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
-        assert_eq!(factors.len(), self.quadrupoles.len(), "one factor for each quadrupole");
         let (mut map, mut back) = (Matrix6::identity(), Matrix6::identity());
         let mut observers = vec![RowVector6::zeros(); self.monitors];
         let mut sources = vec![Vector6::zeros(); self.correctors];
@@ -247,14 +244,14 @@ impl VariedOptics<'_> {
         self.modes.fractions
     }
 
-    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient `[M]`.
+    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient `[M]`; by param, see [`Ring::by_parameter`].
     pub fn tune_slopes(&self) -> Vec<[f64; 2]> {
         let slopes = self.modes.slopes();
         self.kernels.iter().map(|kernel| Modes::tune_slope(&slopes, &self.turn, kernel)).collect()
     }
 
-    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` of a function of the response, from its derivative
-    /// `weights` with respect to each entry of [`VariedOptics::response`].
+    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` (by param, see [`Ring::by_parameter`]) of a function of the response, from its derivative `weights` with respect
+    /// to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
         let mut sent: Vec<Vector6<f64>> = self.sources.iter().map(|source| self.closed * source).collect();
@@ -283,8 +280,8 @@ impl VariedOptics<'_> {
                     }
                 }
             }
-            if let Some(quadrupole) = self.ring.quadrupoles.get(i) {
-                gradient[quadrupole.index] = -self.kernels[quadrupole.index].transpose().dot(&pairs);
+            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i) {
+                gradient[*index] = -self.kernels[*index].transpose().dot(&pairs);
             }
         }
         gradient
@@ -338,23 +335,25 @@ mod tests {
         for ring in rings() {
             let (params, supplies) = wrong(&ring);
             let varied = VariedRing::of(&ring).unwrap();
-            let factors = ring.strengths(&params, &supplies);
-            let optics = varied.at(&factors).unwrap();
-            let (gradient, tunes) = (optics.pull_back(&weights), optics.tune_slopes());
-            assert_eq!(gradient.len(), ring.quadrupoles.len());
+            let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
+            let gradient = ring.by_parameter(&optics.pull_back(&weights));
+            let slopes = optics.tune_slopes();
+            let tunes =
+                [0, 1].map(|mode| ring.by_parameter(&slopes.iter().map(|slope| slope[mode]).collect::<Vec<_>>()));
+            assert_eq!(gradient.len(), ring.parameters.len());
             for (q, slope) in gradient.iter().enumerate() {
                 let value = |step: f64| {
-                    let mut factors = factors.clone();
-                    factors[q] *= step.exp();
-                    let optics = varied.at(&factors).unwrap();
+                    let mut params = params.clone();
+                    params[q] += step;
+                    let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
                     let [x, y] = optics.tunes();
                     [optics.response().dot(&weights), x, y]
                 };
                 let h = 3e-4;
                 let (up, down, far_up, far_down) = (value(h), value(-h), value(2.0 * h), value(-2.0 * h));
-                for (i, slope) in [*slope, tunes[q][0], tunes[q][1]].into_iter().enumerate() {
+                for (i, slope) in [*slope, tunes[0][q], tunes[1][q]].into_iter().enumerate() {
                     let known = (8.0 * (up[i] - down[i]) - far_up[i] + far_down[i]) / (12.0 * h);
-                    // fourth order in the step
+                    // fourth order in a step that moves all 24 magnets of a family at once
                     assert!((slope / known - 1.0).abs() < 1e-6, "{q}, {i}: {slope} {known}");
                 }
             }
