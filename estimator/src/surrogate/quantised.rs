@@ -60,7 +60,12 @@ impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
 
     /// The codes of each row, up to its diagonal.
     pub fn rows(&self) -> impl Iterator<Item = &[i16]> {
-        (0..N).map(|row| self.codes.get(start(row)..start(row + 1)).unwrap_or_default())
+        (0..N).map(|row| self.row(row).unwrap_or_default())
+    }
+
+    /// The codes of one row, up to its diagonal.
+    pub fn row(&self, row: usize) -> Option<&[i16]> {
+        self.codes.get(start(row)..start(row.saturating_add(1)))
     }
 
     /// The codes of one row, to be changed.
