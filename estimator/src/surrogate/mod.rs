@@ -7,8 +7,8 @@ mod quantised;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, NONE};
 pub use low_rank::{LowRank, TERMS};
-pub use parcels::{List, RING, Table, VERSION};
-pub use quantised::{Block, SymmetricBlock};
+pub use parcels::{List, RING, Table, VERSION, shape};
+pub use quantised::{Block, SymmetricBlock, code, step};
 
 use nalgebra::SMatrix;
 

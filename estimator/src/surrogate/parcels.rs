@@ -55,7 +55,8 @@ pub enum List {
 }
 
 impl Table {
-    const ALL: [Self; 15] = [
+    /// All of them, by their number.
+    pub const ALL: [Self; 15] = [
         Self::DirectX,
         Self::DirectY,
         Self::SeenX,
@@ -80,7 +81,8 @@ impl Table {
 }
 
 impl List {
-    const ALL: [Self; 8] = [
+    /// All of them, by their number.
+    pub const ALL: [Self; 8] = [
         Self::Steps,
         Self::Weight,
         Self::MonitorDispersion,
@@ -98,7 +100,7 @@ impl List {
 }
 
 /// How many lines a ring's table has, and how many codes each; but for the rows of a triangle, each longer than the last.
-fn shape(table: Table, ring: &Sizes, terms: usize) -> (usize, usize) {
+pub fn shape(table: Table, ring: &Sizes, terms: usize) -> (usize, usize) {
     let ([bx, by], [cx, cy]) = (ring.monitors.map(usize::from), ring.correctors.map(usize::from));
     let nodes = 2 * usize::from(ring.quadrupoles);
     match table {

@@ -80,13 +80,13 @@ impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
 }
 
 /// The step with which the largest of some values just fits 16 bits.
-pub(super) fn step(values: impl Iterator<Item = f64>) -> f32 {
+pub fn step(values: impl Iterator<Item = f64>) -> f32 {
     let largest = values.fold(0.0_f64, |largest, v| largest.max(libm::fabs(v)));
     (largest / f64::from(i16::MAX)).max(f64::from(f32::MIN_POSITIVE)) as f32
 }
 
 /// The code nearest to a value.
-pub(super) fn code(value: f64, scale: f32) -> i16 {
+pub fn code(value: f64, scale: f32) -> i16 {
     libm::round(value / f64::from(scale)) as i16
 }
 
