@@ -92,7 +92,7 @@ impl VariedRing {
     pub fn of(ring: &Ring) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let orbit = ClosedOrbit::find(ring, Hold::Momentum { delta: 0.0 })?;
-        let mut along: Vec<(usize, usize)> = ring.quadrupoles.iter().copied().zip(0..).collect();
+        let mut along: Vec<(usize, usize)> = ring.quadrupoles.iter().map(|q| q.element).zip(0..).collect();
         along.sort_unstable();
         let quadrupoles = along.iter().map(|&(element, var)| Quadrupole::of(ring, element, var)).collect();
         // each stretch from the end of one quadrupole (or the ring's start) to the entrance of the next (or the end)
@@ -296,7 +296,7 @@ mod tests {
     /// Vars of a rather wrong ring with a rolled quadrupole.
     fn example() -> (Ring, Vec<f64>) {
         let mut ring = Ring::booster();
-        let rolled = ring.quadrupole("C3").unwrap();
+        let rolled = ring.quadrupoles[ring.quadrupole("C3").unwrap()].element;
         ring.elements[rolled].misalignment.roll = 0.02;
         (ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
