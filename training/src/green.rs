@@ -1,7 +1,9 @@
 //! Green's function tables of a ring, from its twin.
 
 use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, LowRank, SymmetricBlock};
-use twin::{ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
+use twin::{
+    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Quadrupole, Ring, Source, spurious_dispersion,
+};
 
 /// The Booster's Green's function surrogate.
 pub type BoosterGreen = estimator::booster::Green;
@@ -127,7 +129,10 @@ pub(crate) fn tables_with<
 }
 
 fn nodes(ring: &Ring) -> Vec<Place> {
-    let at = |&element: &usize| NODES.map(|node| Place { element, depth: node * ring.elements[element].length });
+    let at = |q: &Quadrupole| {
+        let element = q.element;
+        NODES.map(|node| Place { element, depth: node * ring.elements[element].length })
+    };
     ring.quadrupoles.iter().flat_map(at).collect()
 }
 
@@ -149,7 +154,7 @@ fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
     // seen from the monitors: G is symmetric, so a kick at a node stands for a kick at a monitor
     let (reading, mutual) = (optics.response(monitors, &kicks), optics.response(&seen, &kicks));
     let strength = |n: usize| {
-        let element = ring.quadrupoles[n / 2];
+        let element = ring.quadrupoles[n / 2].element;
         0.5 * sign * ring.gradients()[n / 2] * ring.elements[element].length
     };
     GreenPlane {
@@ -172,7 +177,7 @@ fn dispersion<const B: usize, const Q: usize>(
     let up = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency + RF_STEP })?;
     let down = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency - RF_STEP })?;
     let second = |b: usize| {
-        let at = ring.read_monitors[instruments.monitor[b]];
+        let at = ring.monitors[ring.read_monitors[instruments.monitor[b]]].element;
         let curved = up.at[at][0] + down.at[at][0] - 2.0 * optics.orbit(at)[0];
         instruments.monitor_gain[b] * curved / (2.0 * RF_STEP * RF_STEP)
     };
@@ -181,52 +186,9 @@ fn dispersion<const B: usize, const Q: usize>(
         monitor: core::array::from_fn(|b| optics.dispersion(&monitors[b]) as f32),
         node: core::array::from_fn(|q| optics.dispersion(&optics.observe(nodes[q], Plane::X)) as f32),
         second_order: core::array::from_fn(|b| second(b) as f32),
-        spurious: spurious(ring)?,
+        spurious: spurious_dispersion(ring)?.map(|spurious| spurious as f32),
         compaction: optics.momentum_compaction() as f32,
         inverse_gamma_squared: ring.particle.gamma(instruments.delta).powi(-2) as f32,
         circumference: ring.circumference as f32,
     })
-}
-
-/// Misaligned machines from which the spurious dispersion is taken, and the rms shift of their quadrupoles [m]; the ratio
-/// to the orbit does not depend on the shift.
-const MISALIGNED: u32 = 40;
-const SHIFT: f64 = 0.2e-3;
-
-/// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion.
-///
-/// The orbit that shifted quadrupoles make changes with the momentum, as every orbit does; which way, only the unknown
-/// shifts could tell.
-fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
-    for machine in 0..MISALIGNED {
-        let shifted = misaligned(ring, machine);
-        let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(RF_STEP)?, at(-RF_STEP)?, at(0.0)?);
-        for &monitor in &ring.read_monitors {
-            for (plane, coordinate, design) in
-                [(0, 0, optics.dispersion(&optics.observe(monitor, Plane::X))), (1, 2, 0.0)]
-            {
-                let slope = (up.at[monitor][coordinate] - down.at[monitor][coordinate]) / (2.0 * RF_STEP);
-                let momentum = (up.at[monitor][4] - down.at[monitor][4]) / (2.0 * RF_STEP);
-                change[plane] += (slope - design * momentum).powi(2);
-                orbit[plane] += rest.at[monitor][coordinate].powi(2);
-            }
-        }
-    }
-    // An offset and its opposite share the change with opposite signs; the core takes them for independent, so each is
-    // given twice the variance.
-    Ok([0, 1].map(|plane| f64::sqrt(2.0 * change[plane] / orbit[plane]) as f32))
-}
-
-/// The ring with its quadrupoles shifted at random, uniformly, seeded.
-fn misaligned(ring: &Ring, machine: u32) -> Ring {
-    let mut ring = ring.clone();
-    for (q, &element) in ring.quadrupoles.clone().iter().enumerate() {
-        let uniform = |plane: u32| f64::from(sobol_burley::sample(machine, 2 * q as u32 + plane, 1)) - 0.5;
-        let shift = &mut ring.elements[element].misalignment;
-        (shift.dx, shift.dy) = (uniform(0) * SHIFT * 12f64.sqrt(), uniform(1) * SHIFT * 12f64.sqrt());
-    }
-    ring
 }
