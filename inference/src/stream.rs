@@ -8,7 +8,7 @@ use estimator::{
 use training::BoosterGreen;
 use twin::Ring;
 
-use crate::recording::{Header, Layout, Recording, Row};
+use crate::recording::{Recording, Row};
 
 pub use estimator::booster::{Estimate as BoosterEstimate, Estimator as Booster, Frame as BoosterFrame};
 
@@ -81,25 +81,21 @@ pub enum StreamError {
     Unstable,
 }
 
-/// The columns that a ring's recordings have.
-pub fn layout(ring: &Ring) -> Layout {
-    Layout { monitors: ring.monitor_names(), correctors: ring.cells(&ring.correctors) }
-}
-
 /// What a header says of currents, for the core.
 ///
 /// # Errors
 /// [`StreamError::Transfer`].
 pub fn calibration(recording: &Recording) -> Result<Calibration, StreamError> {
-    let Header { kick_per_ampere, nominal, quad_transfer, .. } = &recording.header;
+    let header = &recording.header;
     let mut transfer = [0.0; 6];
-    if quad_transfer.len() > transfer.len() {
-        return Err(StreamError::Transfer { recording: recording.name.clone(), found: quad_transfer.len() });
+    let coefficients = &header.transfer[0];
+    if coefficients.len() > transfer.len() {
+        return Err(StreamError::Transfer { recording: recording.name.clone(), found: coefficients.len() });
     }
-    transfer.iter_mut().zip(quad_transfer).for_each(|(to, from)| *to = *from as f32);
+    transfer.iter_mut().zip(coefficients).for_each(|(to, from)| *to = *from as f32);
     Ok(Calibration {
-        kick_per_ampere: *kick_per_ampere as f32,
-        nominal: [nominal.dipole, nominal.qh, nominal.qv].map(|a| a as f32),
+        kick_per_ampere: header.kick_per_ampere[0] as f32,
+        nominal: [header.nominal_dipole.unwrap_or(1.0), header.nominal[0], header.nominal[1]].map(|a| a as f32),
         transfer,
         powered: POWERED,
     })
@@ -188,7 +184,7 @@ pub fn setup(recording: &Recording, process_noise: f32) -> Result<Setup, StreamE
     Ok(Setup {
         prior: Prior::lognormal(PRIOR_WIDTH),
         calibration: calibration(recording)?,
-        noise: recording.header.bpm_sigma as f32,
+        noise: recording.header.noise[0] as f32,
         gate: Gate::default(),
         process_noise,
     })
@@ -222,11 +218,11 @@ pub fn frame(recording: &Recording, row: &Row) -> Result<BoosterFrame, StreamErr
         cycle_time_us: (row.cycle_time * 1e6).round() as u32,
         corrector: [CurrentCode::default(); 48],
         magnets: MagnetCurrents {
-            dipole: current(row.currents.dipole)?,
-            qh: current(row.currents.qh)?,
-            qv: current(row.currents.qv)?,
-            sh: current(row.currents.sh)?,
-            sv: current(row.currents.sv)?,
+            dipole: current(row.dipole.unwrap_or(1.0))?,
+            qh: current(row.supply[0])?,
+            qv: current(row.supply[1])?,
+            sh: current(recording.other(row, "i_sh_A").unwrap_or(0.0))?,
+            sv: current(recording.other(row, "i_sv_A").unwrap_or(0.0))?,
         },
         rf_offset: RfCode::nearest(row.rf_offset).ok_or_else(|| beyond("rf offset", row.rf_offset))?,
         reading: [PositionCode::default(); 33],

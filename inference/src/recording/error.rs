@@ -95,12 +95,12 @@ pub enum Part {
 }
 
 impl Place {
-    pub(super) fn new(file: &Path, line: usize, part: Part) -> Self {
+    pub(crate) fn new(file: &Path, line: usize, part: Part) -> Self {
         Self { file: file.into(), line, part }
     }
 
     /// Every disagreement between a file and the format is put into words here.
-    pub(super) fn mismatch(self, expected: impl fmt::Display, found: impl fmt::Display) -> Mismatch {
+    pub(crate) fn mismatch(self, expected: impl fmt::Display, found: impl fmt::Display) -> Mismatch {
         Mismatch { at: self, expected: expected.to_string(), found: found.to_string() }
     }
 }

@@ -275,13 +275,21 @@ impl Text<'_> {
     }
 
     /// A value of every supply.
-    fn by_supply<T>(&self, key: &str, supplies: &[String], mut each: BTreeMap<String, T>) -> Result<Vec<T>, RecordingError> {
+    fn by_supply<T>(
+        &self,
+        key: &str,
+        supplies: &[String],
+        mut each: BTreeMap<String, T>,
+    ) -> Result<Vec<T>, RecordingError> {
         let take = |supply: &String| {
-            each.remove(supply).ok_or_else(|| self.refuse_key(key, &format!("missing field `{supply}`, a supply of the machine")))
+            each.remove(supply)
+                .ok_or_else(|| self.refuse_key(key, &format!("missing field `{supply}`, a supply of the machine")))
         };
         let values = supplies.iter().map(take).collect::<Result<Vec<T>, _>>()?;
         match each.keys().next() {
-            Some(unknown) => Err(self.refuse_key(key, &format!("unknown field `{unknown}`, the machine has no such supply"))),
+            Some(unknown) => {
+                Err(self.refuse_key(key, &format!("unknown field `{unknown}`, the machine has no such supply")))
+            }
             None => Ok(values),
         }
     }
@@ -301,7 +309,8 @@ impl Text<'_> {
         let mut values = vec![each.remove(DEFAULT).map(|Positive(value)| from_milli(value)); instruments];
         for (name, Positive(value)) in &each {
             let at = index(name);
-            let unknown = || self.refuse_key(key, &format!("unknown field `{name}`, the machine has no such instrument"));
+            let unknown =
+                || self.refuse_key(key, &format!("unknown field `{name}`, the machine has no such instrument"));
             values[at.ok_or_else(unknown)?] = Some(from_milli(*value));
         }
         let missing = || self.refuse_key(key, "missing field `default`, as not every instrument is named");
@@ -340,7 +349,8 @@ impl Text<'_> {
 
     /// Where a key of the top level stands.
     fn key(&self, key: &str) -> Place {
-        let is = |line: &str| line.trim_start().strip_prefix(key).is_some_and(|rest| rest.trim_start().starts_with('='));
+        let is =
+            |line: &str| line.trim_start().strip_prefix(key).is_some_and(|rest| rest.trim_start().starts_with('='));
         let line = self.text.lines().position(is).unwrap_or(0);
         Place::new(self.file, line + 1, Part::Key(key.into()))
     }
@@ -489,7 +499,9 @@ mod tests {
     #[test]
     fn a_machine_is_known_by_the_first_words_of_its_name() {
         let booster = "AGS Booster (BNL), design model";
-        for (name, known) in [("ags-booster", true), ("AGS", true), ("ags boost", false), ("", false), ("booster", false)] {
+        for (name, known) in
+            [("ags-booster", true), ("AGS", true), ("ags boost", false), ("", false), ("booster", false)]
+        {
             assert_eq!(begins(booster, name), known, "{name}");
         }
     }

@@ -63,6 +63,11 @@ impl Recording {
         self.rows.iter().map(within).collect()
     }
 
+    /// A current that the model has no use for, by its column [A].
+    pub fn other(&self, row: &Row, column: &str) -> Option<f64> {
+        self.other.iter().position(|name| name == column).map(|at| row.other[at])
+    }
+
     /// Largest kick that a corrector was set to, by read-back where settings are not recorded [rad]; 1 where none was.
     pub fn nominal_kick(&self) -> f64 {
         let kick = |(c, current): (usize, f64)| (current * self.header.kick_per_ampere[c]).abs();
@@ -72,9 +77,12 @@ impl Recording {
             currents.map(kick).fold(0.0, f64::max)
         };
         let largest = if self.rows.iter().any(|row| !row.correctors.is_empty()) { set } else { read_back() };
-        if largest > 0.0 { largest } else { 1.0 }
+        if largest > IDLE { largest } else { 1.0 }
     }
 }
+
+/// Kick below which a corrector is idle [rad]: the scatter of its read-back.
+const IDLE: f64 = 1e-6;
 
 fn powered(ring: &Ring, format: Format) -> Cow<'_, Ring> {
     match format {

@@ -89,7 +89,8 @@ impl Names {
 /// Which of [`FOCUSING`] feeds each supply in a recording of format 1 [F]: that of its quadrupoles' sign.
 pub(super) fn feeds(ring: &Ring) -> Vec<usize> {
     let gradients = ring.gradients();
-    let focuses = |supply: usize| (ring.quadrupoles.iter().zip(&gradients)).any(|(q, k)| q.supply == Some(supply) && *k > 0.0);
+    let focuses =
+        |supply: usize| (ring.quadrupoles.iter().zip(&gradients)).any(|(q, k)| q.supply == Some(supply) && *k > 0.0);
     (0..ring.supplies.len()).map(|supply| usize::from(!focuses(supply))).collect()
 }
 

@@ -39,7 +39,8 @@ impl Recording {
     }
 
     fn columns(&self, names: &Names) -> Vec<String> {
-        let mut columns: Vec<String> = ["seq", "time_s", "t_cycle_ms", "corrector", "setting_A", "drf_rel"].map(String::from).into();
+        let mut columns: Vec<String> =
+            ["seq", "time_s", "t_cycle_ms", "corrector", "setting_A", "drf_rel"].map(String::from).into();
         columns.extend(self.header.nominal_dipole.map(|_| "i_dipole_A".into()));
         columns.extend(names.supplies.iter().map(|supply| supply_column(supply)));
         columns.extend(self.other.iter().cloned());
