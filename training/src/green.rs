@@ -2,7 +2,10 @@
 
 use estimator::surrogate::{List, NONE, Table};
 use estimator::{GROUPS, Sizes};
-use twin::{ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source};
+use twin::{
+    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source,
+    spurious_dispersion,
+};
 
 use crate::rooms;
 use crate::tables::Tables;
@@ -221,7 +224,7 @@ fn dispersion(
         instruments.monitor_gain[b] * curved / (2.0 * RF_STEP * RF_STEP)
     };
     let nodes = nodes(ring);
-    let (spurious, tunes) = (spurious(ring)?, optics.tunes()?);
+    let (spurious, tunes) = (spurious_dispersion(ring)?, optics.tunes()?);
     let momentum = [
         optics.momentum_compaction(),
         ring.particle.gamma(instruments.delta).powi(-2),
@@ -232,54 +235,11 @@ fn dispersion(
     fill(tables, List::MonitorDispersion, |b| optics.dispersion(&monitors[b]));
     fill(tables, List::NodeDispersion, |q| optics.dispersion(&optics.observe(nodes[q], Plane::X)));
     fill(tables, List::SecondOrder, second);
-    let ring = spurious.into_iter().chain(momentum.map(|v| v as f32)).chain(STATED_ERROR);
+    let ring = spurious.into_iter().chain(momentum).map(|v| v as f32).chain(STATED_ERROR);
     tables.list_mut(List::Ring).iter_mut().zip(ring).for_each(|(to, v)| *to = v);
     Ok(())
 }
 
 fn fill(tables: &mut Tables, list: List, value: impl Fn(usize) -> f64) {
     tables.list_mut(list).iter_mut().enumerate().for_each(|(i, to)| *to = value(i) as f32);
-}
-
-/// Misaligned machines from which the spurious dispersion is taken, and the rms shift of their quadrupoles [m]; the ratio
-/// to the orbit does not depend on the shift.
-const MISALIGNED: u32 = 40;
-const SHIFT: f64 = 0.2e-3;
-
-/// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion.
-///
-/// The orbit that shifted quadrupoles make changes with the momentum, as every orbit does; which way, only the unknown
-/// shifts could tell.
-fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
-    for machine in 0..MISALIGNED {
-        let shifted = misaligned(ring, machine);
-        let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(RF_STEP)?, at(-RF_STEP)?, at(0.0)?);
-        for monitor in ring.monitors_read().map(|monitor| monitor.element) {
-            for (plane, coordinate, design) in
-                [(0, 0, optics.dispersion(&optics.observe(monitor, Plane::X))), (1, 2, 0.0)]
-            {
-                let slope = (up.at[monitor][coordinate] - down.at[monitor][coordinate]) / (2.0 * RF_STEP);
-                let momentum = (up.at[monitor][4] - down.at[monitor][4]) / (2.0 * RF_STEP);
-                change[plane] += (slope - design * momentum).powi(2);
-                orbit[plane] += rest.at[monitor][coordinate].powi(2);
-            }
-        }
-    }
-    // An offset and its opposite share the change with opposite signs; the core takes them for independent, so each is
-    // given twice the variance.
-    Ok([0, 1].map(|plane| f64::sqrt(2.0 * change[plane] / orbit[plane]) as f32))
-}
-
-/// The ring with its quadrupoles shifted at random, uniformly, seeded.
-fn misaligned(ring: &Ring, machine: u32) -> Ring {
-    let mut ring = ring.clone();
-    for (q, quadrupole) in ring.quadrupoles.clone().iter().enumerate() {
-        let uniform = |plane: u32| f64::from(sobol_burley::sample(machine, 2 * q as u32 + plane, 1)) - 0.5;
-        let shift = &mut ring.elements[quadrupole.element].misalignment;
-        (shift.dx, shift.dy) = (uniform(0) * SHIFT * 12f64.sqrt(), uniform(1) * SHIFT * 12f64.sqrt());
-    }
-    ring
 }

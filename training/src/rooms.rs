@@ -40,7 +40,7 @@ pub mod large {
 #[macro_export]
 macro_rules! in_room {
     ($sizes:expr, |$room:ident| $body:expr) => {{
-        let sizes: estimator::Sizes = $sizes;
+        let sizes = $sizes;
         if $crate::rooms::booster::SIZES == sizes {
             use $crate::rooms::booster as $room;
             Some($body)
@@ -54,7 +54,7 @@ macro_rules! in_room {
 #[macro_export]
 macro_rules! in_spare_room {
     ($sizes:expr, |$room:ident| $body:expr) => {{
-        let sizes: estimator::Sizes = $sizes;
+        let sizes = $sizes;
         if $crate::rooms::small::SIZES.hold(&sizes) {
             use $crate::rooms::small as $room;
             Some($body)

@@ -101,6 +101,14 @@ impl Tables {
         })
     }
 
+    /// Which of the ring's priors a param has.
+    ///
+    /// # Panics
+    /// If there is no such param.
+    pub fn prior_group(&self, param: usize) -> usize {
+        self.lines(Table::Group)[0][param] as usize
+    }
+
     /// Number of terms of low rank.
     pub fn terms(&self) -> usize {
         self.lines(Table::TermSeenX).len()

@@ -16,6 +16,7 @@ pub mod lattice;
 pub mod map;
 pub mod orbit;
 pub mod response;
+mod spurious;
 pub mod varied;
 
 pub use effects::{
@@ -27,4 +28,5 @@ pub use lattice::{
 };
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
+pub use spurious::spurious_dispersion;
 pub use varied::{VariedOptics, VariedRing};

@@ -222,13 +222,7 @@ impl<'r> Optics<'r> {
     /// Derivative of both tunes with respect to a gradient, the planes not being coupled: with `2 cos(2 pi Q) = tr M`,
     /// `dQ/dk = tr(M Q_kernel)/(4 pi sin(2 pi Q))`, which is `beta/(4 pi)` for a thin one.
     pub fn tune_slope(&self, gradient: &Gradient) -> [f64; 2] {
-        let turn = self.orbit.one_turn();
-        let change = turn * gradient.kernel;
-        [X, Y].map(|i| {
-            let cos = 0.5 * (turn[(i, i)] + turn[(i + 1, i + 1)]);
-            let sin = (1.0 - cos * cos).max(f64::MIN_POSITIVE).sqrt().copysign(turn[(i, i + 1)]);
-            (change[(i, i)] + change[(i + 1, i + 1)]) / (2.0 * core::f64::consts::TAU * sin)
-        })
+        tune_slope(self.orbit.one_turn(), &gradient.kernel)
     }
 
     /// Response of one observer to one source [m/rad].
@@ -470,6 +464,16 @@ fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[RowVector6<f
         [near, near + o.row]
     };
     observers.iter().map(rows).collect()
+}
+
+/// Change of both tunes by a gradient of this kernel, see [`Optics::tune_slope`].
+pub(crate) fn tune_slope(turn: &Matrix6<f64>, kernel: &Matrix6<f64>) -> [f64; 2] {
+    let change = turn * kernel;
+    [X, Y].map(|i| {
+        let cos = 0.5 * (turn[(i, i)] + turn[(i + 1, i + 1)]);
+        let sin = (1.0 - cos * cos).max(f64::MIN_POSITIVE).sqrt().copysign(turn[(i, i + 1)]);
+        (change[(i, i)] + change[(i + 1, i + 1)]) / (2.0 * core::f64::consts::TAU * sin)
+    })
 }
 
 /// Inverse of a transfer map; its determinant is 1.

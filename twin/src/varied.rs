@@ -22,7 +22,7 @@ use nalgebra::{DMatrix, Matrix2, Matrix6, RowVector6, Vector6};
 use crate::lattice::{Kind, Ring};
 use crate::map::{PATH, PX, PY, X, Y};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError};
-use crate::response::{Optics, close_at_momentum, inverse};
+use crate::response::{Optics, close_at_momentum, inverse, tune_slope};
 
 /// A ring as a chain of quadrupoles and of what lies between them.
 #[derive(Debug, Clone)]
@@ -74,6 +74,8 @@ pub struct VariedOptics<'r> {
     sources: Vec<Vector6<f64>>,
     /// `Q` of each quadrupole along the ring, by its var: `k1 strength` times that of a unit of gradient.
     kernels: Vec<Matrix6<f64>>,
+    /// Map of a turn from the start.
+    turn: Matrix6<f64>,
     closed: Matrix6<f64>,
     dispersive: Vector6<f64>,
     /// What a source at the start adds to the path of a turn.
@@ -154,7 +156,7 @@ impl VariedRing {
         let path = map.row(PATH) * (closed + Matrix6::identity());
         let compaction = (map.row(PATH) * dispersive)[0] / self.design.circumference;
         let slip = compaction - self.inverse_gamma_squared;
-        Ok(VariedOptics { ring: self, observers, sources, kernels, closed, dispersive, path, slip })
+        Ok(VariedOptics { ring: self, observers, sources, kernels, turn: map, closed, dispersive, path, slip })
     }
 }
 
@@ -251,6 +253,20 @@ impl VariedOptics<'_> {
         self.slip
     }
 
+    /// Fractional parts of the tunes x and y, the planes not being coupled: `2 cos(2 pi Q) = tr M`.
+    pub fn tunes(&self) -> [f64; 2] {
+        [X, Y].map(|i| {
+            let half_trace = 0.5 * (self.turn[(i, i)] + self.turn[(i + 1, i + 1)]);
+            let fraction = half_trace.acos() / core::f64::consts::TAU;
+            if self.turn[(i, i + 1)] < 0.0 { 1.0 - fraction } else { fraction }
+        })
+    }
+
+    /// Derivative of both tunes with respect to `ln` of each var.
+    pub fn tune_slopes(&self) -> Vec<[f64; 2]> {
+        self.kernels.iter().map(|kernel| tune_slope(&self.turn, kernel)).collect()
+    }
+
     /// Gradient with respect to `ln` of each var of a function of the response, from its derivative `weights` with respect
     /// to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
@@ -333,6 +349,24 @@ mod tests {
             let difference = (8.0 * (value(h) - value(-h)) - value(2.0 * h) + value(-2.0 * h)) / (12.0 * h);
             // fourth order in a step of 1e-3
             assert!((slope / difference - 1.0).abs() < 1e-6, "{q}: {slope} {difference}");
+        }
+    }
+
+    #[test]
+    fn tunes_and_their_slopes_are_those_of_the_whole_ring() {
+        let (_, vars) = example();
+        let ring = Ring::booster(); // without coupling
+        let varied = VariedRing::of(&ring).unwrap();
+        let (fast, whole) = (varied.at(&vars).unwrap(), ring.with_vars(&vars));
+        let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
+        let tunes = optics.tunes().unwrap();
+        let [x, y] = fast.tunes();
+        assert!((tunes.x.fract() - x).abs() < 1e-10 && (tunes.y.fract() - y).abs() < 1e-10, "{tunes:?} {x} {y}");
+        let gradients = optics.quadrupoles().into_iter().zip(whole.gradients());
+        for (q, (gradient, k1)) in gradients.enumerate() {
+            let exact = optics.tune_slope(&gradient).map(|slope| slope * k1);
+            let error = [0, 1].map(|plane| (fast.tune_slopes()[q][plane] - exact[plane]).abs());
+            assert!(error[0].max(error[1]) < 1e-7, "{q}: {error:?}"); // the twin's kernels are integrals by quadrature
         }
     }
 

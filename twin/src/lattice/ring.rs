@@ -25,6 +25,8 @@ pub struct Corrector {
 pub struct Ring {
     /// Name of the machine.
     pub name: String,
+    /// Name of the file it was read from, without its folder.
+    pub file: String,
     /// Length of the reference orbit [m].
     pub circumference: f64,
     /// Elements in beam order; gaps are filled with drifts.
