@@ -14,8 +14,8 @@ use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
 use training::BoosterGreen;
 use twin::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Plane, Rf, Ring, Signature, Signatures,
-    Tracked, Tunes,
+    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
+    Tunes,
 };
 
 use super::baseline::Baseline;
@@ -147,7 +147,7 @@ impl Data {
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, &screened, &recorded_tunes, per_rms)?;
         drives.orbit = orbit;
         let shared = |b: usize| {
-            let supply = baseline.per_gradient(usize::from(ring.read_places()[b].0 == Plane::Y));
+            let supply = baseline.per_gradient(usize::from(b >= ring.horizontal_monitors()));
             DMatrix::from_columns(&[
                 DVector::from_element(driven.len(), BASELINE),
                 &fluctuation[0] * supply,
@@ -285,7 +285,7 @@ impl Data {
 
     /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
-        let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
+        let plane = usize::from(b >= self.ring.horizontal_monitors());
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();

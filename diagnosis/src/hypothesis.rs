@@ -73,14 +73,14 @@ impl Term {
         let first = self.place.split(',').next().filter(|place| !place.is_empty())?;
         let (prefix, cell) = first.split_once('_').unwrap_or(("", first));
         match prefix {
-            "x" => ring.monitor(Plane::X, cell).ok(),
-            "y" => ring.monitor(Plane::Y, cell).ok(),
-            "H" => ring.corrector(Plane::X, cell).ok(),
-            "V" => ring.corrector(Plane::Y, cell).ok(),
+            "x" => ring.monitor(Plane::X, cell).ok().map(|m| ring.monitors[m].element),
+            "y" => ring.monitor(Plane::Y, cell).ok().map(|m| ring.monitors[m].element),
+            "H" => ring.corrector(Plane::X, cell).ok().map(|c| ring.correctors[c].element),
+            "V" => ring.corrector(Plane::Y, cell).ok().map(|c| ring.correctors[c].element),
             "SX" => {
-                ring.elements.iter().position(|e| matches!(e.kind, twin::Kind::Sextupole { .. }) && e.cell() == cell)
+                ring.elements.iter().position(|e| matches!(e.kind, twin::Kind::Sextupole { .. }) && e.label == cell)
             }
-            "" => ring.quadrupole(cell).ok(),
+            "" => ring.quadrupole(cell).ok().map(|q| ring.quadrupoles[q].element),
             _ => ring.element(first).ok(),
         }
     }

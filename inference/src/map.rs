@@ -277,7 +277,7 @@ impl<'r> Problem<'r> {
 
     /// Number of horizontal monitors.
     fn split(&self) -> usize {
-        self.ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count()
+        self.ring.horizontal_monitors()
     }
 
     fn families(&self) -> usize {
@@ -376,8 +376,7 @@ pub fn first_family(ring: &Ring) -> usize {
 /// [`OrbitError`] if there is none.
 pub fn rf_orbit(ring: &Ring, offset: f64) -> Result<DVector<f64>, OrbitError> {
     let orbit = ClosedOrbit::find(ring, Hold::Frequency { offset })?;
-    let vertical = |at: usize| matches!(ring.elements[at].kind, twin::Kind::Monitor { plane: Plane::Y });
-    let seen = ring.read_monitors.iter().map(|&at| orbit.at[at][if vertical(at) { 2 } else { 0 }]);
+    let seen = ring.monitors_read().map(|m| orbit.at[m.element][if m.plane == Plane::Y { 2 } else { 0 }]);
     Ok(DVector::from_iterator(ring.read_monitors.len(), seen))
 }
 

@@ -59,10 +59,9 @@ impl ResponseModel {
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn response(&self, params: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
-        let vars = exponential(params);
         match self {
-            Self::Twin(ring) => Ok(ring.at(&vars)?.response()),
-            Self::Green(green) => Ok(green.at(&vars)?.response()),
+            Self::Twin(ring) => Ok(ring.at(params, &[])?.response()),
+            Self::Green(green) => Ok(green.at(&exponential(params))?.response()),
         }
     }
 
@@ -76,15 +75,14 @@ impl ResponseModel {
         params: &[f64],
         function: impl FnOnce(&DMatrix<f64>) -> (V, DMatrix<f64>),
     ) -> Result<(V, Vec<f64>), OrbitError> {
-        let vars = exponential(params);
         match self {
             Self::Twin(ring) => {
-                let optics = ring.at(&vars)?;
+                let optics = ring.at(params, &[])?;
                 let (value, weights) = function(&optics.response());
                 Ok((value, optics.pull_back(&weights)))
             }
             Self::Green(green) => {
-                let optics = green.at(&vars)?;
+                let optics = green.at(&exponential(params))?;
                 let (value, weights) = function(&optics.response());
                 Ok((value, optics.pull_back(&weights)))
             }
@@ -96,14 +94,13 @@ impl ResponseModel {
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn jacobian(&self, params: &[f64]) -> Result<Vec<DMatrix<f64>>, OrbitError> {
-        let vars = exponential(params);
         match self {
             Self::Twin(ring) => {
-                let optics = ring.at(&vars)?;
+                let optics = ring.at(params, &[])?;
                 Ok(rows_of(&optics.response(), params.len(), |weights| optics.pull_back(weights)))
             }
             Self::Green(green) => {
-                let optics = green.at(&vars)?;
+                let optics = green.at(&exponential(params))?;
                 Ok(rows_of(&optics.response(), params.len(), |weights| optics.pull_back(weights)))
             }
         }

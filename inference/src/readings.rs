@@ -96,7 +96,7 @@ impl Campaign {
 
     /// Number of horizontal monitors; they come first.
     pub fn horizontal_monitors(&self) -> usize {
-        self.ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count()
+        self.ring.horizontal_monitors()
     }
 
     /// Drive of a frame as a row of the response: kicks, RF offset.

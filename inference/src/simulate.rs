@@ -62,7 +62,7 @@ pub fn like(
     let mut random = StdRng::seed_from_u64(seeds(seed).next().unwrap_or(seed));
     let normal = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
     let baselines = DVector::from_fn(instruments.noise.len(), |_, _| instruments.baseline * normal(&mut random));
-    let horizontal = ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count();
+    let horizontal = ring.horizontal_monitors();
     let spurious = DVector::from_fn(instruments.noise.len(), |b, _| {
         instruments.spurious[usize::from(b >= horizontal)] * normal(&mut random)
     });

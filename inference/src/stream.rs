@@ -83,7 +83,7 @@ pub enum StreamError {
 
 /// The columns that a ring's recordings have.
 pub fn layout(ring: &Ring) -> Layout {
-    Layout { monitors: ring.monitor_names(), correctors: ring.cells(&ring.correctors) }
+    Layout { monitors: ring.monitor_names(), correctors: ring.labels(ring.correctors.iter().map(|c| c.element)) }
 }
 
 /// What a header says of currents, for the core.

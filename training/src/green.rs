@@ -127,8 +127,8 @@ pub(crate) fn tables_with<
 }
 
 fn nodes(ring: &Ring) -> Vec<Place> {
-    let at = |&element: &usize| NODES.map(|node| Place { element, depth: node * ring.elements[element].length });
-    ring.quadrupoles.iter().flat_map(at).collect()
+    let at = |element: usize| NODES.map(|node| Place { element, depth: node * ring.elements[element].length });
+    ring.quadrupoles.iter().flat_map(|q| at(q.element)).collect()
 }
 
 fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
@@ -149,7 +149,7 @@ fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
     // seen from the monitors: G is symmetric, so a kick at a node stands for a kick at a monitor
     let (reading, mutual) = (optics.response(monitors, &kicks), optics.response(&seen, &kicks));
     let strength = |n: usize| {
-        let element = ring.quadrupoles[n / 2];
+        let element = ring.quadrupoles[n / 2].element;
         0.5 * sign * ring.gradients()[n / 2] * ring.elements[element].length
     };
     GreenPlane {
@@ -172,7 +172,7 @@ fn dispersion<const B: usize, const Q: usize>(
     let up = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency + RF_STEP })?;
     let down = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency - RF_STEP })?;
     let second = |b: usize| {
-        let at = ring.read_monitors[instruments.monitor[b]];
+        let at = ring.monitors[ring.read_monitors[instruments.monitor[b]]].element;
         let curved = up.at[at][0] + down.at[at][0] - 2.0 * optics.orbit(at)[0];
         instruments.monitor_gain[b] * curved / (2.0 * RF_STEP * RF_STEP)
     };
@@ -204,7 +204,7 @@ fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
         let shifted = misaligned(ring, machine);
         let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
         let (up, down, rest) = (at(RF_STEP)?, at(-RF_STEP)?, at(0.0)?);
-        for &monitor in &ring.read_monitors {
+        for monitor in ring.monitors_read().map(|monitor| monitor.element) {
             for (plane, coordinate, design) in
                 [(0, 0, optics.dispersion(&optics.observe(monitor, Plane::X))), (1, 2, 0.0)]
             {
@@ -222,11 +222,11 @@ fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
 
 /// The ring with its quadrupoles shifted at random, uniformly, seeded.
 fn misaligned(ring: &Ring, machine: u32) -> Ring {
-    let mut ring = ring.clone();
-    for (q, &element) in ring.quadrupoles.clone().iter().enumerate() {
+    let mut shifted = ring.clone();
+    for (q, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
         let uniform = |plane: u32| f64::from(sobol_burley::sample(machine, 2 * q as u32 + plane, 1)) - 0.5;
-        let shift = &mut ring.elements[element].misalignment;
+        let shift = &mut shifted.elements[at].misalignment;
         (shift.dx, shift.dy) = (uniform(0) * SHIFT * 12f64.sqrt(), uniform(1) * SHIFT * 12f64.sqrt());
     }
-    ring
+    shifted
 }

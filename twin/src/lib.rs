@@ -21,7 +21,10 @@ pub mod varied;
 pub use effects::{
     Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked,
 };
-pub use lattice::{Element, Kind, LatticeError, Particle, Plane, Ring};
+pub use lattice::{
+    Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
+    Quadrupole, Ring, Supply,
+};
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
 pub use varied::{VariedOptics, VariedRing};

@@ -51,8 +51,8 @@ impl Element {
     pub fn track_into<T: Scalar>(&self, z: &mut Phase<T>, depth: f64) {
         self.misalignment.enter(z);
         match &self.kind {
-            Kind::Drift | Kind::Marker | Kind::Monitor { .. } => drift(z, depth),
-            Kind::Corrector { kick, .. } => {
+            Kind::Drift | Kind::Marker | Kind::Monitor => drift(z, depth),
+            Kind::Corrector { kick } => {
                 z[PX] += kick[0];
                 z[PY] += kick[1];
                 drift(z, depth);
@@ -347,7 +347,7 @@ mod tests {
     use super::*;
 
     fn element(kind: Kind, length: f64) -> Element {
-        Element { name: "E".into(), kind, s: 0.0, length, misalignment: Misalignment::default() }
+        Element { kind, ..Element::drift(0.0, length) }
     }
 
     fn bend(k1: f64, e: f64) -> Element {

@@ -223,9 +223,9 @@ mod tests {
     fn a_nearby_orbit_leads_to_the_same_one() {
         let design = Ring::booster();
         let mut ring = design.with_vars(&[1.002; 48]);
-        let (quadrupole, corrector) = (ring.quadrupoles[7], ring.correctors[3]);
+        let quadrupole = ring.quadrupoles[7].element;
         ring.elements[quadrupole].misalignment.dx = 1e-3;
-        ring.elements[corrector].kind = crate::Kind::Corrector { plane: crate::Plane::X, kick: [2e-4, 0.0] };
+        ring.set_kick(3, 2e-4);
         for hold in [Hold::Momentum { delta: 1e-3 }, Hold::Frequency { offset: 2e-4 }] {
             let known = ClosedOrbit::find(&design, hold).unwrap();
             let (found, near) = (ClosedOrbit::find(&ring, hold), ClosedOrbit::near(&ring, hold, &known));

@@ -20,7 +20,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix5, Matrix6, RowVector6, Vector6};
 
-use crate::lattice::{Kind, Plane, Ring};
+use crate::lattice::{Corrector, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError, invert};
 
@@ -413,26 +413,31 @@ impl<'r> Optics<'r> {
 
     /// Observers of all read monitors, each in its own plane.
     pub fn read_monitors(&self) -> Vec<Observer> {
-        let plane = |&i: &usize| match self.ring.elements[i].kind {
-            Kind::Monitor { plane } => self.observe(i, plane),
-            _ => unreachable!("the list holds monitors"),
-        };
-        self.ring.read_monitors.iter().map(plane).collect()
+        self.ring.monitors_read().map(|monitor| self.observe(monitor.element, monitor.plane)).collect()
     }
 
     /// Observers of x or y at every monitor place.
     pub fn monitor_places(&self, plane: Plane) -> Vec<Observer> {
-        self.ring.monitors.iter().map(|&i| self.observe(i, plane)).collect()
+        self.ring.monitors.iter().map(|monitor| self.observe(monitor.element, plane)).collect()
     }
 
     /// Sources of all correctors, one radian each along its own axis (rolled if the corrector is).
     pub fn correctors(&self) -> Vec<Source> {
-        self.ring.correctors.iter().map(|&i| self.kick(i, corrector_axis(&self.ring.elements[i]))).collect()
+        self.ring.correctors.iter().map(|corrector| self.kick(corrector.element, self.axis(corrector))).collect()
     }
 
-    /// Gradients of all quadrupoles that carry a var.
+    /// Direction of a corrector's kick: `(cos, sin)` of its roll for H, `(-sin, cos)` for V.
+    fn axis(&self, corrector: &Corrector) -> [f64; 2] {
+        let (sin, cos) = self.ring.elements[corrector.element].misalignment.roll.sin_cos();
+        match corrector.plane {
+            Plane::X => [cos, sin],
+            Plane::Y => [-sin, cos],
+        }
+    }
+
+    /// Gradients of all quadrupoles `[M]`.
     pub fn quadrupoles(&self) -> Vec<Gradient> {
-        self.ring.quadrupoles.iter().map(|&i| self.gradient(i)).collect()
+        self.ring.quadrupoles.iter().map(|q| self.gradient(q.element)).collect()
     }
 }
 
@@ -467,15 +472,6 @@ fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[RowVector6<f
     observers.iter().map(rows).collect()
 }
 
-/// Direction of a corrector's kick: `(cos, sin)` of its roll for H, `(-sin, cos)` for V.
-fn corrector_axis(element: &crate::Element) -> [f64; 2] {
-    let (sin, cos) = element.misalignment.roll.sin_cos();
-    match element.kind {
-        Kind::Corrector { plane: Plane::X, .. } => [cos, sin],
-        _ => [-sin, cos],
-    }
-}
-
 /// Inverse of a transfer map; its determinant is 1.
 pub(crate) fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
     transfer.try_inverse().expect("maps are symplectic, so their determinant is 1")
@@ -484,6 +480,7 @@ pub(crate) fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lattice::Kind;
 
     const ON_MOMENTUM: Hold = Hold::Momentum { delta: 0.0 };
 
@@ -491,7 +488,7 @@ mod tests {
     fn response_equals_the_text_book_formula() {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
-        let place = ring.monitor(Plane::Y, "A1").unwrap();
+        let place = ring.monitors[ring.monitor(Plane::Y, "A1").unwrap()].element;
         // beta/2 cot(pi Q) of a kick at the monitor itself
         let own = optics.green(&optics.observe(place, Plane::Y), &optics.kick(place, [0.0, 1.0]));
         let known = 0.5 * optics.beta(place, Plane::Y) / (core::f64::consts::PI * optics.tunes().unwrap().y).tan();
@@ -501,15 +498,16 @@ mod tests {
     #[test]
     fn a_kick_closes_as_newton_says() {
         let mut ring = Ring::booster();
-        let at = ring.corrector(Plane::X, "C4").unwrap();
+        let corrector = ring.corrector(Plane::X, "C4").unwrap();
+        let at = ring.correctors[corrector].element;
         for hold in [ON_MOMENTUM, Hold::Frequency { offset: 0.0 }] {
             let plain = ring.clone();
             let optics = Optics::of(&plain, hold).unwrap();
             let linear = optics.response(&optics.monitor_places(Plane::X), &[optics.kick(at, [1e-6, 0.0])]);
-            ring.elements[at].kind = Kind::Corrector { plane: Plane::X, kick: [1e-6, 0.0] };
+            ring.set_kick(corrector, 1e-6);
             let orbit = ClosedOrbit::find(&ring, hold).unwrap();
-            for (i, &place) in ring.monitors.iter().enumerate() {
-                let newton = orbit.at[place][X];
+            for (i, monitor) in ring.monitors.iter().enumerate() {
+                let newton = orbit.at[monitor.element][X];
                 assert!((newton - linear[i]).abs() < 1e-9, "{newton:e} {:e}", linear[i]); // second order of 1e-6 rad
             }
             ring = plain;
@@ -521,13 +519,13 @@ mod tests {
     fn thick_gradients_are_exact() {
         let mut ring = Ring::booster();
         let rolled = ring.quadrupole("C3").unwrap();
-        ring.elements[rolled].misalignment.roll = 0.02;
+        let at = ring.quadrupoles[rolled].element;
+        ring.elements[at].misalignment.roll = 0.02;
         for hold in [ON_MOMENTUM, Hold::Frequency { offset: 0.0 }] {
             let optics = Optics::of(&ring, hold).unwrap();
             let (observers, sources) = (both_planes(&optics), optics.correctors());
-            for (n, &element) in
-                ring.quadrupoles.iter().enumerate().filter(|(n, _)| n % 7 == 0 || ring.quadrupoles[*n] == rolled)
-            {
+            for n in (0..48).filter(|n| n % 7 == 0 || *n == rolled) {
+                let element = ring.quadrupoles[n].element;
                 let exact = &optics.response_jacobian(&observers, &sources, &[optics.gradient(element)])[0];
                 let at = |factor: f64| {
                     let mut vars = [1.0; 48];
@@ -589,7 +587,7 @@ mod tests {
     fn tunes_follow_their_slopes() {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
-        for (n, &at) in ring.quadrupoles.iter().enumerate().filter(|(n, _)| n % 7 == 0) {
+        for (n, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate().step_by(7) {
             let tunes = |factor: f64| {
                 let mut vars = [1.0; 48];
                 vars[n] = factor;
@@ -616,7 +614,8 @@ mod tests {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         let (observers, sources) = (both_planes(&optics), optics.correctors());
-        for &at in ring.quadrupoles.iter().step_by(7) {
+        for (q, k1) in ring.quadrupoles.iter().zip(ring.gradients()).step_by(7) {
+            let at = q.element;
             let respond = |roll: f64| {
                 let mut ring = ring.clone();
                 ring.elements[at].misalignment.roll = roll;
@@ -624,7 +623,7 @@ mod tests {
                 optics.response(&both_planes(&optics), &optics.correctors())
             };
             let exact = &optics.response_jacobian(&observers, &sources, &[optics.skew_gradient(at)])[0];
-            let numeric = (respond(1e-4) - respond(-1e-4)) / (-4e-4 * ring.k1(at));
+            let numeric = (respond(1e-4) - respond(-1e-4)) / (-4e-4 * k1);
             let error = (exact - &numeric).abs().max() / exact.abs().max();
             assert!(error < 1e-6, "{}: {error:e}", ring.elements[at].name); // truncation (2e-4)^2
         }
@@ -642,7 +641,7 @@ mod tests {
     fn a_rolled_corrector_leaves_the_tunes_alone() {
         for i in 1..40 {
             let mut ring = Ring::booster();
-            let at = ring.correctors[i];
+            let at = ring.correctors[i].element;
             ring.elements[at].misalignment.roll = 1.37e-3 * i as f64;
             let tunes = Optics::of(&ring, ON_MOMENTUM).unwrap().tunes().unwrap();
             assert!((tunes.x - 4.83).abs() < 1e-9 && (tunes.y - 4.665).abs() < 1e-9, "{tunes:?}");

@@ -56,15 +56,15 @@ enum Instrument {
 
 #[derive(Debug, Clone)]
 struct Quadrupole {
-    /// Index of its var.
-    var: usize,
+    /// Index into [`Ring::quadrupoles`].
+    index: usize,
     k1: f64,
     length: f64,
     /// From the ring's axes to its own.
     roll: Matrix6<f64>,
 }
 
-/// The optics at given vars.
+/// The optics at given params.
 #[derive(Debug, Clone)]
 pub struct VariedOptics<'r> {
     ring: &'r VariedRing,
@@ -72,7 +72,7 @@ pub struct VariedOptics<'r> {
     observers: Vec<RowVector6<f64>>,
     /// Column of each corrector, brought to the start.
     sources: Vec<Vector6<f64>>,
-    /// `Q` of each quadrupole along the ring, by its var: `k1 strength` times that of a unit of gradient.
+    /// `Q` of each quadrupole, order of [`Ring::quadrupoles`]: `k1 strength` times that of a unit of gradient.
     kernels: Vec<Matrix6<f64>>,
     closed: Matrix6<f64>,
     dispersive: Vector6<f64>,
@@ -92,9 +92,9 @@ impl VariedRing {
     pub fn of(ring: &Ring) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let orbit = ClosedOrbit::find(ring, Hold::Momentum { delta: 0.0 })?;
-        let mut along: Vec<(usize, usize)> = ring.quadrupoles.iter().copied().zip(0..).collect();
+        let mut along: Vec<(usize, usize)> = ring.quadrupoles.iter().map(|q| q.element).zip(0..).collect();
         along.sort_unstable();
-        let quadrupoles = along.iter().map(|&(element, var)| Quadrupole::of(ring, element, var)).collect();
+        let quadrupoles = along.iter().map(|&(element, index)| Quadrupole::of(ring, element, index)).collect();
         // each stretch from the end of one quadrupole (or the ring's start) to the entrance of the next (or the end)
         let starts = core::iter::once(0).chain(along.iter().map(|&(element, _)| element + 1));
         let ends = along.iter().map(|&(element, _)| element).chain([ring.elements.len()]);
@@ -125,11 +125,12 @@ impl VariedRing {
         })
     }
 
-    /// The optics at given vars [48], each the gradient over that of the ring.
+    /// The optics at params and supplies, as in [`Ring::strengths`].
     ///
     /// # Errors
     /// [`OrbitError`] without a closed orbit or stable motion.
-    pub fn at(&self, vars: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
+    pub fn at(&self, params: &[f64], supplies: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
+        let strengths = self.design.strengths(params, supplies);
         let (mut map, mut back) = (Matrix6::identity(), Matrix6::identity());
         let mut observers = vec![RowVector6::zeros(); self.monitors];
         let mut sources = vec![Vector6::zeros(); self.correctors];
@@ -143,8 +144,8 @@ impl VariedRing {
             }
             (map, back) = (stretch.map * map, back * stretch.back);
             if let Some(quadrupole) = self.quadrupoles.get(i) {
-                let k1 = quadrupole.k1 * vars[quadrupole.var];
-                kernels[quadrupole.var] = back * quadrupole.kernel(k1) * map;
+                let k1 = quadrupole.k1 * strengths[quadrupole.index];
+                kernels[quadrupole.index] = back * quadrupole.kernel(k1) * map;
                 (map, back) =
                     (quadrupole.map(k1, quadrupole.length) * map, back * quadrupole.map(k1, -quadrupole.length));
             }
@@ -159,7 +160,7 @@ impl VariedRing {
 }
 
 impl Quadrupole {
-    fn of(ring: &Ring, element: usize, var: usize) -> Self {
+    fn of(ring: &Ring, element: usize, index: usize) -> Self {
         let element = &ring.elements[element];
         let Kind::Quadrupole { k1 } = element.kind else { panic!("{} is no quadrupole", element.name) };
         let (sin, cos) = element.misalignment.roll.sin_cos();
@@ -167,7 +168,7 @@ impl Quadrupole {
         for (h, v) in [(X, Y), (PX, PY)] {
             (roll[(h, h)], roll[(h, v)], roll[(v, h)], roll[(v, v)]) = (cos, sin, -sin, cos);
         }
-        Self { var, k1, length: element.length, roll }
+        Self { index, k1, length: element.length, roll }
     }
 
     fn rolled(&self, own: Matrix6<f64>) -> Matrix6<f64> {
@@ -251,7 +252,7 @@ impl VariedOptics<'_> {
         self.slip
     }
 
-    /// Gradient with respect to `ln` of each var of a function of the response, from its derivative `weights` with respect
+    /// Gradient with respect to the params `[N]` of a function of the response, from its derivative `weights` with respect
     /// to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
@@ -265,7 +266,8 @@ impl VariedOptics<'_> {
         // the slip factor moves all readings of an RF offset alike
         let by_slip: f64 = (0..seen.len()).map(|b| weights[(b, rf)] * self.dispersion(b)).sum();
         pairs += self.dispersive * self.path * (by_slip / (self.slip * self.slip * self.ring.design.circumference));
-        let mut gradient = vec![0.0; self.kernels.len()];
+        let design = &self.ring.design;
+        let mut gradient = vec![0.0; design.parameters.len()];
         for (i, stretch) in self.ring.stretches.iter().enumerate() {
             for instrument in &stretch.instruments {
                 match *instrument {
@@ -281,8 +283,10 @@ impl VariedOptics<'_> {
                     }
                 }
             }
-            if let Some(quadrupole) = self.ring.quadrupoles.get(i) {
-                gradient[quadrupole.var] = -self.kernels[quadrupole.var].transpose().dot(&pairs);
+            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i)
+                && let Some(parameter) = design.quadrupoles[*index].parameter
+            {
+                gradient[parameter] -= self.kernels[*index].transpose().dot(&pairs);
             }
         }
         gradient
@@ -293,19 +297,21 @@ impl VariedOptics<'_> {
 mod tests {
     use super::*;
 
-    /// Vars of a rather wrong ring with a rolled quadrupole.
+    /// A ring with a rolled quadrupole, and params that are rather wrong.
     fn example() -> (Ring, Vec<f64>) {
         let mut ring = Ring::booster();
-        let rolled = ring.quadrupole("C3").unwrap();
+        let rolled = ring.quadrupoles[ring.quadrupole("C3").unwrap()].element;
         ring.elements[rolled].misalignment.roll = 0.02;
-        (ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
+        (ring, (0..48).map(|i| 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
 
     #[test]
     fn responses_are_those_of_the_whole_ring() {
-        let (ring, vars) = example();
+        let (ring, params) = example();
         let varied = VariedRing::of(&ring).unwrap();
-        let (fast, whole) = (varied.at(&vars).unwrap(), ring.with_vars(&vars));
+        let supplies = [0.004, 0.006];
+        let whole = ring.with_strengths(&ring.strengths(&params, &supplies));
+        let fast = varied.at(&params, &supplies).unwrap();
         let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
         let expected = optics.response(&optics.read_monitors(), &optics.correctors());
         let response = fast.response();
@@ -319,15 +325,15 @@ mod tests {
     /// A random function of the response, by central differences.
     #[test]
     fn the_gradient_is_that_of_the_response() {
-        let (ring, vars) = example();
+        let (ring, params) = example();
         let varied = VariedRing::of(&ring).unwrap();
         let weights = DMatrix::from_fn(33, 49, |b, c| f64::sin(7.1 * b as f64 + 2.3 * c as f64));
-        let gradient = varied.at(&vars).unwrap().pull_back(&weights);
+        let gradient = varied.at(&params, &[]).unwrap().pull_back(&weights);
         for (q, slope) in gradient.iter().enumerate() {
             let value = |step: f64| {
-                let mut vars = vars.clone();
-                vars[q] *= step.exp();
-                varied.at(&vars).unwrap().response().dot(&weights)
+                let mut params = params.clone();
+                params[q] += step;
+                varied.at(&params, &[]).unwrap().response().dot(&weights)
             };
             let h = 1e-3;
             let difference = (8.0 * (value(h) - value(-h)) - value(2.0 * h) + value(-2.0 * h)) / (12.0 * h);
@@ -340,9 +346,9 @@ mod tests {
     fn on_the_way_to_the_next_integer_motion_becomes_unstable() {
         let varied = VariedRing::of(&Ring::booster()).unwrap();
         let scattered = |i: i32| -> Vec<f64> {
-            (0..48).map(|q| 1.0 + 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
+            (0..48).map(|q| 2.5e-3 * f64::from(i) + 0.05 * f64::sin(3.0 * f64::from(q))).collect()
         };
-        let mut scan = (0..40).map(|i| varied.at(&scattered(i)).map(|_| ()));
+        let mut scan = (0..40).map(|i| varied.at(&scattered(i), &[]).map(|_| ()));
         assert!(scan.any(|optics| matches!(optics, Err(OrbitError::Unstable { half_trace, .. }) if half_trace > 1.0)));
     }
 }

@@ -56,7 +56,7 @@ fn empty(ring: &Ring) -> RingMap {
         Kind::Bend(_) => Some(Symbol::Bend),
         Kind::Quadrupole { k1 } if *k1 > 0.0 => Some(Symbol::Focusing),
         Kind::Quadrupole { .. } => Some(Symbol::Defocusing),
-        Kind::Monitor { .. } => Some(Symbol::Monitor),
+        Kind::Monitor => Some(Symbol::Monitor),
         Kind::Corrector { .. } => Some(Symbol::Corrector),
         _ => None,
     };
@@ -65,7 +65,8 @@ fn empty(ring: &Ring) -> RingMap {
         .iter()
         .filter_map(|element| Some(Magnet { symbol: symbol(&element.kind)?, s: element.s, length: element.length }));
     let names: Vec<(String, f64)> = (ring.quadrupoles.iter())
-        .map(|&at| (ring.elements[at].cell().to_owned(), ring.elements[at].s + 0.5 * ring.elements[at].length))
+        .map(|q| &ring.elements[q.element])
+        .map(|magnet| (magnet.label.clone(), magnet.s + 0.5 * magnet.length))
         .collect();
     RingMap {
         title: format!("{}, {:.2} m", ring.name, ring.circumference),
@@ -77,15 +78,15 @@ fn empty(ring: &Ring) -> RingMap {
     }
 }
 
-/// Superperiods are the first letters of the half-cells, and begin where their first element does.
+/// Sectors begin where their first element does.
 fn sectors(ring: &Ring) -> Vec<(String, f64)> {
     let mut sectors: Vec<(String, f64)> = Vec::new();
-    for element in ring.elements.iter().filter(|element| element.name.contains('_')) {
-        let letter: String = element.cell().chars().take(1).collect();
-        if sectors.last().is_none_or(|(last, _)| *last != letter) {
+    for element in &ring.elements {
+        let Some(sector) = &element.sector else { continue };
+        if sectors.last().is_none_or(|(last, _)| last != sector) {
             // the first one at the start of the ring
             let s = if sectors.is_empty() { 0.0 } else { element.s };
-            sectors.push((letter, s));
+            sectors.push((sector.clone(), s));
         }
     }
     sectors

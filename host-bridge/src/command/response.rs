@@ -66,15 +66,15 @@ impl ResponseResult {
         Self {
             machine: ring.name.clone(),
             effects,
-            bpm: ring.cells(&ring.monitors),
-            correctors: ring.cells(&ring.correctors),
+            bpm: ring.labels(ring.monitors.iter().map(|m| m.element)),
+            correctors: ring.labels(ring.correctors.iter().map(|c| c.element)),
             response_x_m_per_rad: rows(&response.x),
             response_y_m_per_rad: rows(&response.y),
             qx: response.tunes.x,
             qy: response.tunes.y,
             gamma_tr: response.gamma_transition,
             dispersion_x: response.dispersion.clone(),
-            horizontal: ring.correctors.iter().filter(|&&i| is_horizontal(ring, i)).count(),
+            horizontal: ring.horizontal_correctors(),
         }
     }
 
@@ -105,10 +105,6 @@ impl fmt::Display for ResponseResult {
         writeln!(f, "{table}")?;
         write!(f, "all {} x {} elements of both planes: --json FILE", self.bpm.len(), self.correctors.len())
     }
-}
-
-fn is_horizontal(ring: &Ring, element: usize) -> bool {
-    matches!(ring.elements[element].kind, twin::Kind::Corrector { plane: twin::Plane::X, .. })
 }
 
 fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {

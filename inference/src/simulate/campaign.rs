@@ -116,8 +116,8 @@ pub fn campaign(
 
 /// Shift every quadrupole.
 fn misalign(ring: &mut Ring, sigma: [f64; 2], random: &mut StdRng) {
-    for &at in &ring.quadrupoles {
-        let misalignment = &mut ring.elements[at].misalignment;
+    for q in &ring.quadrupoles {
+        let misalignment = &mut ring.elements[q.element].misalignment;
         (misalignment.dx, misalignment.dy) = (sigma[0] * normal(random), sigma[1] * normal(random));
     }
 }
@@ -224,7 +224,7 @@ mod tests {
         let truth = Truth { vars: &[1.0; 48], ..Truth::default() };
         let hardware = Hardware::shipped(&ring, &recording);
         let one = Recording { rows: recording.rows[..1].to_vec(), ..recording };
-        let split = ring.monitor_names().iter().filter(|name| name.starts_with("x_")).count();
+        let split = ring.horizontal_monitors();
         let mut sizes: Vec<[f64; 2]> = Vec::new();
         for seed in 0..40 {
             let made = campaign(&one, &ring, &truth, &hardware, seed).unwrap();

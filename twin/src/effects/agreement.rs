@@ -26,7 +26,7 @@ fn drives(ring: &Ring, orbit: Vec<[f64; 2]>) -> Drives {
 fn displaced() -> Ring {
     let mut ring = Ring::booster();
     for (quadrupole, [dx, dy]) in [(5, [1.2e-3, 0.4e-3]), (30, [0.3e-3, 1.2e-3])] {
-        let at = ring.quadrupoles[quadrupole];
+        let at = ring.quadrupoles[quadrupole].element;
         (ring.elements[at].misalignment.dx, ring.elements[at].misalignment.dy) = (dx, dy);
     }
     ring

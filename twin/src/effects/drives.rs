@@ -119,7 +119,7 @@ impl Machine {
         drives: &Drives,
         kick: &DMatrix<f64>,
     ) -> Result<([DMatrix<f64>; 2], [f64; 2]), OrbitError> {
-        let scaled = |factor: f64| self.seen(&ring.with_vars(&vec![factor; ring.quadrupoles.len()]));
+        let scaled = |factor: f64| self.seen(&ring.with_strengths(&vec![factor; ring.quadrupoles.len()]));
         let (up, down) = (scaled(1.0 + STEP)?, scaled(1.0 - STEP)?);
         let per_step = self.drift / (2.0 * STEP);
         let tunes = [up.tunes.x - down.tunes.x, up.tunes.y - down.tunes.y].map(|change| change * per_step);
@@ -139,7 +139,7 @@ impl Machine {
                 rows(plane, x, y).column_mut(place).apply(|p| *p *= 1.0 + error)
             }
             Instrument::Cubic { plane, place, per_square_mm } => {
-                let base = drives.orbit[self.ring.monitors[place]][usize::from(plane == Plane::Y)];
+                let base = drives.orbit[self.ring.monitors[place].element][usize::from(plane == Plane::Y)];
                 let cube = |position: f64| position * (position * 1e3).powi(2);
                 rows(plane, x, y).column_mut(place).apply(|p| *p += per_square_mm * (cube(base + *p) - cube(base)));
             }
@@ -157,12 +157,11 @@ impl Machine {
 
     /// The columns of the read monitors, each in its own plane.
     pub(super) fn own_planes(&self, x: &DMatrix<f64>, y: &DMatrix<f64>) -> DMatrix<f64> {
-        let columns: Vec<_> = self
-            .ring
-            .read_places()
-            .into_iter()
-            .map(|(plane, place)| if plane == Plane::X { x.column(place) } else { y.column(place) })
-            .collect();
+        let column = |&place: &usize| match self.ring.monitors[place].plane {
+            Plane::X => x.column(place),
+            Plane::Y => y.column(place),
+        };
+        let columns: Vec<_> = self.ring.read_monitors.iter().map(column).collect();
         DMatrix::from_columns(&columns)
     }
 }

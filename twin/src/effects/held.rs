@@ -31,7 +31,7 @@ impl<'r> Held<'r> {
         let offset = optics.frequency_offset();
         let held = || Ok((Optics::of(ring, Hold::Frequency { offset })?, share));
         let frequency = (share != 0.0).then(held).transpose()?;
-        let of_place = |place: usize| optics.observe(ring.monitors[place], Plane::X);
+        let of_place = |place: usize| optics.observe(ring.monitors[place].element, Plane::X);
         let radial = radial_loop.map(|(pair, share)| (pair.map(of_place), share));
         Ok(Self { frequency, radial })
     }

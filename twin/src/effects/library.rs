@@ -1,7 +1,7 @@
 //! What is known of each kind of effect before any data: where it may act, how large it is, and how to say it.
 
 use super::EffectKind;
-use crate::lattice::{Kind, Plane, Ring};
+use crate::lattice::{Kind, Ring};
 
 impl EffectKind {
     /// Every place of a ring where the kind may act, by the names of the command line; one empty name for the whole ring.
@@ -17,7 +17,7 @@ impl EffectKind {
             Self::CorrectorGain | Self::CorrectorRoll | Self::CorrectorPolarity | Self::CorrectorEven => {
                 ring.corrector_names()
             }
-            Self::QuadRoll => ring.var_names(),
+            Self::QuadRoll => ring.quadrupoles.iter().map(|q| ring.label(q.element).to_owned()).collect(),
             Self::StrayGradient | Self::StraySkewGradient => named(|kind| matches!(kind, Kind::Marker)),
             Self::DipoleGradient => named(|kind| matches!(kind, Kind::Bend(_))),
             Self::DipoleEdge => {
@@ -25,7 +25,7 @@ impl EffectKind {
             }
             Self::SextupoleError => {
                 let sextupoles = ring.elements.iter().filter(|e| matches!(e.kind, Kind::Sextupole { .. }));
-                sextupoles.map(|e| format!("SX_{}", e.cell())).collect()
+                sextupoles.map(|e| format!("SX_{}", e.label)).collect()
             }
             Self::MomentumOffset | Self::FixedRfFrequency | Self::QuadDrift => vec![String::new()],
             Self::RadialLoop => Vec::new(),
@@ -109,17 +109,6 @@ impl EffectKind {
                 format!("all quadrupoles drifted by {} per mille from start to end", signed(2e3))
             }
         }
-    }
-}
-
-impl Ring {
-    /// Names of all correctors with their plane: `H_A2` ... `V_F7`.
-    pub fn corrector_names(&self) -> Vec<String> {
-        let name = |&at: &usize| match self.elements[at].kind {
-            Kind::Corrector { plane: Plane::Y, .. } => format!("V_{}", self.elements[at].cell()),
-            _ => format!("H_{}", self.elements[at].cell()),
-        };
-        self.correctors.iter().map(name).collect()
     }
 }
 

@@ -107,11 +107,11 @@ impl Machine {
             EffectKind::CorrectorGain => self.kick(effect, 1.0 + a)?,
             EffectKind::CorrectorPolarity => self.kick(effect, -1.0)?,
             EffectKind::CorrectorRoll => {
-                let corrector = self.ring.correctors[self.corrector(effect)?];
+                let corrector = self.ring.correctors[self.corrector(effect)?].element;
                 self.ring.elements[corrector].misalignment.roll += a;
             }
             EffectKind::QuadRoll => {
-                let at = self.ring.quadrupole(cell(place))?;
+                let at = self.ring.quadrupoles[self.ring.quadrupole(cell(place))?].element;
                 self.ring.elements[at].misalignment.roll += a;
             }
             EffectKind::StrayGradient => self.stray(effect, a, 0.0)?,
@@ -177,7 +177,8 @@ impl Machine {
         match *instrument {
             Instrument::Gain { plane, place, error } => scale(rows(plane, x, y).row_mut(place).iter_mut(), 1.0 + error),
             Instrument::Cubic { plane, place, per_square_mm } => {
-                let orbit = optics.orbit(self.ring.monitors[place])[if plane == Plane::X { 0 } else { 2 }] * 1e3;
+                let orbit =
+                    optics.orbit(self.ring.monitors[place].element)[if plane == Plane::X { 0 } else { 2 }] * 1e3;
                 // derivative of x (1 + a x^2)
                 let slope = 1.0 + 3.0 * per_square_mm * orbit * orbit;
                 scale(rows(plane, x, y).row_mut(place).iter_mut(), slope);
@@ -221,8 +222,8 @@ impl Machine {
         };
         // the monitor of that plane, or the other one of the half-cell, whose roll shows in that plane
         let of = |own: bool| {
-            let is = |e: &crate::Element| e.cell() == cell && (!own || e.kind == Kind::Monitor { plane });
-            self.ring.monitors.iter().position(|&i| is(&self.ring.elements[i]))
+            let is = |m: &crate::Monitor| self.ring.elements[m.element].is_called(cell) && (!own || m.plane == plane);
+            self.ring.monitors.iter().position(is)
         };
         let place = of(true).or_else(|| of(false)).ok_or_else(wrong)?;
         Ok((plane, place))
@@ -240,18 +241,16 @@ impl Machine {
 
     /// Index among the correctors of `H_A4` or `V_D3`.
     pub(super) fn corrector(&self, effect: &Effect) -> Result<usize, EffectError> {
-        let at = match effect.place.split_once('_') {
-            Some(("H", cell)) => self.ring.corrector(Plane::X, cell)?,
-            Some(("V", cell)) => self.ring.corrector(Plane::Y, cell)?,
-            _ => return Err(effect.wrong("a corrector such as H_A4 or V_D3")),
-        };
-        let listed = self.ring.correctors.iter().position(|&i| i == at);
-        listed.ok_or_else(|| effect.wrong("a corrector of the machine"))
+        match effect.place.split_once('_') {
+            Some(("H", cell)) => Ok(self.ring.corrector(Plane::X, cell)?),
+            Some(("V", cell)) => Ok(self.ring.corrector(Plane::Y, cell)?),
+            _ => Err(effect.wrong("a corrector such as H_A4 or V_D3")),
+        }
     }
 
     fn stray(&mut self, effect: &Effect, k1l: f64, k1sl: f64) -> Result<(), EffectError> {
         let straight = |e: &crate::Element| matches!(e.kind, Kind::Marker | Kind::Multipole { .. });
-        let named = |e: &crate::Element| e.name == effect.place || e.cell() == effect.place;
+        let named = |e: &crate::Element| e.is_called(&effect.place);
         let at = self.ring.elements.iter().position(|e| straight(e) && named(e));
         let at = at.ok_or_else(|| effect.wrong("a free straight such as SLOT_F6"))?;
         match &mut self.ring.elements[at].kind {
@@ -285,7 +284,7 @@ impl Machine {
 
     fn sextupole(&mut self, effect: &Effect) -> Result<(), EffectError> {
         let wanted = cell(&effect.place);
-        let is = |e: &crate::Element| matches!(e.kind, Kind::Sextupole { .. }) && e.cell() == wanted;
+        let is = |e: &crate::Element| matches!(e.kind, Kind::Sextupole { .. }) && e.is_called(wanted);
         let found = self.ring.elements.iter_mut().enumerate().find(|(_, e)| is(e));
         let (at, element) = found.ok_or_else(|| effect.wrong("a sextupole such as SX_A1"))?;
         if let Kind::Sextupole { k2 } = &mut element.kind {
@@ -328,7 +327,7 @@ mod tests {
     fn instruments_act_on_their_rows_and_columns() {
         let plain = respond(&[]);
         let places = Ring::booster().monitors.len();
-        let e4 = (0..places).find(|&i| Ring::booster().elements[Ring::booster().monitors[i]].cell() == "E4").unwrap();
+        let e4 = (0..places).find(|&i| Ring::booster().monitor_name(i) == "x_E4").unwrap();
         assert!((respond(&["bpm_gain@x_E4=0.1"]).x.row(e4) - plain.x.row(e4) * 1.1).abs().max() < 1e-12);
         assert!((respond(&["corrector_polarity@H_A2"]).x.column(0) + plain.x.column(0)).abs().max() < 1e-12);
         // x_read = x cos + y sin: a pure y orbit shows in x by the sine of the roll
@@ -356,9 +355,7 @@ mod tests {
     #[test]
     fn a_full_radial_loop_holds_the_mean_of_its_pair() {
         let held = respond(&["radial_loop@x_D8,x_E6"]);
-        let of = |cell: &str| {
-            Ring::booster().monitors.iter().position(|&i| Ring::booster().elements[i].cell() == cell).unwrap()
-        };
+        let of = |label: &str| Ring::booster().monitor(Plane::X, label).unwrap();
         let mean = held.x.row(of("D8")) + held.x.row(of("E6"));
         assert!(mean.abs().max() < 1e-9);
     }

@@ -11,7 +11,7 @@ use super::drives::{Drives, Seen, curved};
 use super::held::Held;
 use super::machine::{Instrument, Machine};
 use super::{Effect, EffectError, EffectKind};
-use crate::lattice::{Kind, Plane};
+use crate::lattice::{Kind, Parameter, Plane, Quadrupole};
 use crate::orbit::{Hold, OrbitError};
 use crate::response::{Gradient, Observer, Optics, Place, Source};
 
@@ -33,7 +33,6 @@ pub struct Signatures<'m> {
     /// Response of the read monitors, the RF frequency last.
     response: DMatrix<f64>,
     monitors: Vec<(Plane, usize)>,
-    correctors: Vec<String>,
 }
 
 /// What a small effect does per unit of its amplitude.
@@ -82,26 +81,32 @@ impl<'m> Signatures<'m> {
         let seen = machine.seen(&machine.ring)?;
         let kick = machine.kicks(drives);
         let (x, y) = drives.positions(&seen, &kick);
-        let monitors = machine.ring.read_places();
+        let monitors: Vec<(Plane, usize)> =
+            machine.ring.read_monitors.iter().map(|&place| (machine.ring.monitors[place].plane, place)).collect();
         let rows: Vec<RowDVector<f64>> = monitors
             .iter()
             .map(|&(plane, place)| if plane == Plane::X { seen.x.row(place) } else { seen.y.row(place) }.into_owned())
             .collect();
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
-        let correctors = machine.ring.corrector_names();
         let response = DMatrix::from_rows(&rows);
-        Ok(Self { machine, drives, optics, held, observers, sources, kick, x, y, response, monitors, correctors })
+        Ok(Self { machine, drives, optics, held, observers, sources, kick, x, y, response, monitors })
     }
 
-    /// Derivative of readings and tunes with respect to `ln` of each var.
+    /// Derivative of readings and tunes with respect to each param, the `ln` of a factor.
     pub fn of_vars(&self) -> Vec<Signature> {
-        self.unread_vars().map(|signature| self.as_read(signature)).collect()
+        let of_quadrupoles: Vec<_> = self.of_quadrupoles().map(|signature| self.as_read(signature)).collect();
+        let sum = |parameter: &Parameter| {
+            let mut sum = self.nothing();
+            parameter.quadrupoles.iter().for_each(|&q| sum.add(of_quadrupoles[q].clone()));
+            sum
+        };
+        self.machine.ring.parameters.iter().map(sum).collect()
     }
 
-    /// The same, of the orbit itself.
-    fn unread_vars(&self) -> impl Iterator<Item = Signature> {
+    /// Derivative of the orbit itself with respect to `ln` of each quadrupole's gradient.
+    fn of_quadrupoles(&self) -> impl Iterator<Item = Signature> {
         let ring = &self.machine.ring;
-        let one = |(&element, k1): (&usize, f64)| self.of_gradient(&self.optics.gradient(element), k1);
+        let one = |(q, k1): (&Quadrupole, f64)| self.of_gradient(&self.optics.gradient(q.element), k1);
         ring.quadrupoles.iter().zip(ring.gradients()).map(one)
     }
 
@@ -124,7 +129,7 @@ impl<'m> Signatures<'m> {
     /// between.
     pub fn around(&self, b: usize) -> DMatrix<f64> {
         let (plane, place) = self.monitors[b];
-        let at = self.machine.ring.monitors[place];
+        let at = self.machine.ring.monitors[place].element;
         let (own, other) = match plane {
             Plane::X => (&self.x, &self.y),
             Plane::Y => (&self.y, &self.x),
@@ -147,7 +152,7 @@ impl<'m> Signatures<'m> {
     /// What the read monitors see of a step of the beam in x, x', y and y' at a corrector, columns the four [1, m/rad]. A kick
     /// anywhere near is a sum of these, but for monitors in between.
     pub fn beside(&self, corrector: usize) -> DMatrix<f64> {
-        let at = self.machine.ring.correctors[corrector];
+        let at = self.machine.ring.correctors[corrector].element;
         let step = |i: usize| self.optics.step(at, core::array::from_fn(|j| f64::from(u8::from(i == j))));
         self.held.response(&self.optics, &self.observers, &[0, 1, 2, 3].map(step))
     }
@@ -198,7 +203,7 @@ impl<'m> Signatures<'m> {
             }
             EffectKind::BpmCubic => {
                 let (b, plane, at) = self.monitor(&effect, place)?;
-                let base = self.drives.orbit[ring.monitors[at]][usize::from(plane == Plane::Y)];
+                let base = self.drives.orbit[ring.monitors[at].element][usize::from(plane == Plane::Y)];
                 let cube = |p: f64| p * (p * 1e3).powi(2);
                 self.of_monitor(b, self.position(b).map(|p| cube(base + p) - cube(base)))
             }
@@ -218,8 +223,8 @@ impl<'m> Signatures<'m> {
             }
             EffectKind::CorrectorRoll => {
                 let c = machine.corrector(&effect)?;
-                let turned = if self.correctors[c].starts_with("H_") { [0.0, 1.0] } else { [-1.0, 0.0] };
-                let source = self.optics.kick(ring.correctors[c], turned);
+                let turned = if ring.correctors[c].plane == Plane::X { [0.0, 1.0] } else { [-1.0, 0.0] };
+                let source = self.optics.kick(ring.correctors[c].element, turned);
                 self.of_kick(
                     c,
                     self.held.response(&self.optics, &self.observers, &[source]).column(0).into_owned(),
@@ -227,7 +232,7 @@ impl<'m> Signatures<'m> {
                 )
             }
             EffectKind::QuadRoll => {
-                let at = ring.quadrupole(place)?;
+                let at = ring.quadrupoles[ring.quadrupole(place)?].element;
                 let Kind::Quadrupole { k1 } = ring.elements[at].kind else { return Err(effect.wrong("a quadrupole")) };
                 // x'' = -k1 (x cos 2a + y sin 2a)
                 self.of_gradient(&self.optics.skew_gradient(at), -2.0 * k1)
@@ -349,7 +354,7 @@ impl<'m> Signatures<'m> {
     /// All gradients in proportion to the time.
     fn of_drift(&self) -> Signature {
         let mut sum = self.nothing();
-        for one in self.unread_vars() {
+        for one in self.of_quadrupoles() {
             sum.readings += one.readings;
             sum.tune_drift = [sum.tune_drift[0] + one.tunes[0], sum.tune_drift[1] + one.tunes[1]];
         }

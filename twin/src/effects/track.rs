@@ -45,7 +45,8 @@ impl Tracked {
     pub fn of(machine: Machine, nominal_kick: f64) -> Result<Self, OrbitError> {
         let optics = Optics::of(&machine.ring, Hold::Momentum { delta: machine.delta })?;
         let radial = machine.radial_loop.map_or([0.0, 1.0], |(pair, _)| {
-            let dispersion = |place: usize| optics.dispersion(&optics.observe(machine.ring.monitors[place], Plane::X));
+            let dispersion =
+                |place: usize| optics.dispersion(&optics.observe(machine.ring.monitors[place].element, Plane::X));
             let orbit = optics.closed_orbit();
             [mean(&machine.ring, pair, orbit), 0.5 * (dispersion(pair[0]) + dispersion(pair[1]))]
         });
@@ -60,10 +61,11 @@ impl Tracked {
     pub fn cycle(&self, cycle: &Cycle) -> Result<(Vec<f64>, Tunes), OrbitError> {
         let ring = self.driven(cycle);
         let orbit = self.closed(&ring, cycle)?;
-        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(|&i| [orbit.at[i][X], orbit.at[i][Y]]).collect();
+        let mut at: Vec<[f64; 2]> =
+            ring.monitors.iter().map(|m| [orbit.at[m.element][X], orbit.at[m.element][Y]]).collect();
         self.machine.instruments.iter().for_each(|instrument| instrument.read_orbit(&mut at));
-        let read = |(plane, place): (Plane, usize)| at[place][usize::from(plane == Plane::Y)];
-        let readings = ring.read_places().into_iter().map(read).collect();
+        let read = |&place: &usize| at[place][usize::from(ring.monitors[place].plane == Plane::Y)];
+        let readings = ring.read_monitors.iter().map(read).collect();
         let hold = Hold::Momentum { delta: orbit.at[0][DELTA] };
         Ok((readings, Optics::about(&ring, hold, orbit)?.tunes()?))
     }
@@ -72,10 +74,10 @@ impl Tracked {
     fn driven(&self, cycle: &Cycle) -> Ring {
         let mut ring = self.machine.ring.clone();
         let drift = 1.0 + self.machine.drift * cycle.time;
-        for ((&at, k1), strength) in self.machine.ring.quadrupoles.iter().zip(&self.gradients).zip(&cycle.strength) {
-            ring.elements[at].kind = Kind::Quadrupole { k1: k1 * strength.exp() * drift };
+        for ((q, k1), strength) in self.machine.ring.quadrupoles.iter().zip(&self.gradients).zip(&cycle.strength) {
+            ring.elements[q.element].kind = Kind::Quadrupole { k1: k1 * strength.exp() * drift };
         }
-        for (c, (&at, &believed)) in self.machine.ring.correctors.iter().zip(&cycle.kick).enumerate() {
+        for (c, &believed) in cycle.kick.iter().enumerate() {
             let given = self.machine.instruments.iter().fold(believed, |kick, instrument| match *instrument {
                 Instrument::Kick { corrector, factor } if corrector == c => kick * factor,
                 Instrument::Even { corrector, share } if corrector == c => {
@@ -83,9 +85,7 @@ impl Tracked {
                 }
                 _ => kick,
             });
-            if let Kind::Corrector { plane, kick } = &mut ring.elements[at].kind {
-                *kick = if *plane == Plane::X { [given, 0.0] } else { [0.0, given] };
-            }
+            ring.set_kick(c, given);
         }
         ring
     }
@@ -111,7 +111,7 @@ impl Tracked {
 
 /// Mean horizontal orbit of two monitors.
 fn mean(ring: &Ring, pair: [usize; 2], orbit: &ClosedOrbit) -> f64 {
-    0.5 * pair.map(|place| orbit.at[ring.monitors[place]][X]).iter().sum::<f64>()
+    0.5 * pair.map(|place| orbit.at[ring.monitors[place].element][X]).iter().sum::<f64>()
 }
 
 impl Instrument {

@@ -1,0 +1,16 @@
+//! A ring as a list of elements, read from a machine file (`docs/machine.md`).
+
+mod element;
+mod error;
+mod family;
+mod file;
+mod label;
+mod parameter;
+mod particle;
+mod ring;
+
+pub use element::{Bend, Element, Kind, Misalignment, Plane};
+pub use error::LatticeError;
+pub use parameter::{Parameter, ParameterPrior, Quadrupole, Supply};
+pub use particle::Particle;
+pub use ring::{Corrector, Monitor, Ring};
