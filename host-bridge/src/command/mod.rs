@@ -2,6 +2,7 @@
 
 pub mod challenge;
 pub mod diagnose;
+pub mod export;
 pub mod fit;
 pub mod prove;
 pub mod replay;
