@@ -118,7 +118,7 @@ pub const TUNE_CALIBRATION: f64 = 3e-4;
 /// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
 const FAULTY: f64 = 4.0;
 /// Monitors and correctors below which nothing can be told apart.
-const LEAST: usize = 4;
+pub const LEAST: usize = 4;
 
 impl Data {
     /// Screen a recording by the core and whiten it.

@@ -18,7 +18,7 @@ mod trimming;
 
 use inference::nuts::{NutsError, NutsSettings};
 use inference::posterior::LaplaceError;
-use inference::{BatchError, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
+use inference::{BatchError, Campaign, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
 use report::Page;
 use serde::Serialize;
 use twin::Ring;
@@ -176,6 +176,12 @@ pub fn run(
         published,
     };
     Ok(Study { page, numbers })
+}
+
+/// The differences that a campaign holds, in words: what its studies of single pairs are made of.
+pub fn differences(campaign: &Campaign) -> Vec<String> {
+    let settings = settings::Settings::of(&campaign.recording, campaign.ring.correctors.len());
+    subsets::drawn(campaign).into_iter().map(|(kind, _)| settings.words(kind)).collect()
 }
 
 /// The var that is farthest from its design, in its error bars.

@@ -10,7 +10,7 @@ use diagnosis::{Diagnosis, Finding, page};
 use serde::Serialize;
 use twin::{Measured, Ring};
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
 use crate::cli::Diagnose;
 use crate::model_file;
 use crate::output::{self, fill, table};
@@ -109,7 +109,7 @@ impl From<DataError> for CommandError {
 pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     let outputs = [&options.common.json, &options.report, &options.model_out];
     check_outputs(outputs.map(Option::as_deref))?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let bar = progress(5, "", options.common.quiet);
     let made = Diagnosis::of(&ring, &recording, |what| {
