@@ -136,7 +136,8 @@ impl Data {
             DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
         });
         let mut drives = drives_of(recording, &driven, ring);
-        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed(recording))?;
+        let believed = believed(recording, ring)?;
+        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed)?;
         let recorded = raw(recording, ring);
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
             recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
@@ -168,7 +169,7 @@ impl Data {
             meter: [None, None],
             tunes: recorded_tunes.clone(),
             recorded_tunes,
-            believed: believed(recording),
+            believed,
             drift: 0.0,
             drives,
         };
@@ -506,14 +507,14 @@ impl Meter {
 }
 
 /// What the recording's header says was held, as an effect.
-fn believed(recording: &Recording) -> Vec<Effect> {
+fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
     let pair = recording.header.radial_loop_monitors.as_ref();
-    let one = |kind, place: String| vec![Effect { kind, place, amplitude: 1.0 }];
-    match recording.header.believed_rf {
-        BelievedRf::FixedMomentum => Vec::new(),
-        BelievedRf::FixedFrequency => one(EffectKind::FixedRfFrequency, String::new()),
-        BelievedRf::RadialLoop => pair.map_or_else(Vec::new, |pair| one(EffectKind::RadialLoop, pair.join(","))),
-    }
+    let held = match recording.header.believed_rf {
+        BelievedRf::FixedMomentum => None,
+        BelievedRf::FixedFrequency => Some((EffectKind::FixedRfFrequency, String::new())),
+        BelievedRf::RadialLoop => pair.map(|pair| (EffectKind::RadialLoop, pair.join(","))),
+    };
+    held.into_iter().map(|(kind, place)| Effect::at(kind, &place, 1.0, ring)).collect()
 }
 
 fn exp(ln: &[f64]) -> Vec<f64> {

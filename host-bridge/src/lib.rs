@@ -3,6 +3,7 @@
 
 pub mod cli;
 pub mod command;
+pub mod export;
 pub mod model_file;
 pub mod output;
 pub mod record;
@@ -12,3 +13,8 @@ pub mod sink;
 pub mod source;
 pub mod stop;
 pub mod watch;
+
+/// The worked examples of `docs/extending.md`, compiled and run as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/extending.md")]
+mod extending {}

@@ -229,7 +229,7 @@ impl FitResult {
             table.add_row(vars.flat_map(Var::cells));
         }
         for (i, column) in table.column_iter_mut().enumerate() {
-            column.set_padding((1, 0));
+            column.set_padding((1, u16::from(i + 1 == across * head.len())));
             column.set_cell_alignment(if i % 4 == 0 { CellAlignment::Left } else { CellAlignment::Right });
         }
         table

@@ -208,7 +208,7 @@ fn effect(entry: &Value) -> Effect {
     let kind = entry["kind"].as_str().unwrap();
     let place = entry["at"].as_str().map_or(String::new(), |at| format!("@{at}"));
     let amplitude = entry["amplitude"].as_f64().map_or(String::new(), |a| format!("={a}"));
-    format!("{kind}{place}{amplitude}").parse().unwrap()
+    Effect::parse(&format!("{kind}{place}{amplitude}"), &Ring::booster()).unwrap()
 }
 
 /// The seven cases of a code, both planes, through the words of the command line; tolerance in x and y.

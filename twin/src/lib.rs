@@ -19,6 +19,7 @@ mod map;
 mod modes;
 mod orbit;
 mod response;
+mod site;
 mod spurious;
 #[cfg(test)]
 mod testing;
@@ -28,7 +29,9 @@ mod varied;
 
 pub use calibrated::CalibratedOptics;
 pub use effects::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked,
+    Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect,
+    HoldEffect, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin, Tracked,
+    Unit,
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
@@ -37,6 +40,7 @@ pub use lattice::{
 pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source};
+pub use site::Site;
 pub use spurious::spurious_dispersion;
 pub use tune::Tunes;
 pub use twiss::Twiss;

@@ -272,7 +272,7 @@ impl<'r> Optics<'r> {
     }
 
     /// Direction of a corrector's kick: `(cos, sin)` of its roll for H, `(-sin, cos)` for V.
-    fn axis(&self, corrector: &Corrector) -> [f64; 2] {
+    pub(crate) fn axis(&self, corrector: &Corrector) -> [f64; 2] {
         let (sin, cos) = self.ring.elements[corrector.element].misalignment.roll.sin_cos();
         match corrector.plane {
             Plane::X => [cos, sin],

@@ -1,9 +1,7 @@
 //! Where it is: the ring with what was found marked on it.
 
-use twin::{EffectKind, Kind, Ring};
+use twin::{Class, Kind, Ring};
 
-use crate::data::Data;
-use crate::hypothesis::Term;
 use crate::{Diagnosis, Finding};
 use report::{Figure, Magnet, RingMap, Section, Spotted, Symbol};
 
@@ -12,13 +10,13 @@ const ALTERNATIVES: usize = 4;
 
 /// The map.
 pub fn section(diagnosis: &Diagnosis) -> Section {
-    let data = &diagnosis.found.data;
+    let ring = &diagnosis.found.data.ring;
     let (mut spotted, mut everywhere) = (Vec::new(), Vec::new());
     for finding in &diagnosis.findings {
         let others = finding.alternatives.iter().take(ALTERNATIVES).map(|other| (other, true));
         for (one, pale) in core::iter::once((finding, false)).chain(others) {
-            let places = positions(data, one);
-            let label = format!("{} {}", one.kind.replace('_', " "), one.at);
+            let places = positions(ring, one);
+            let label = format!("{} {}", one.word().replace('_', " "), one.at);
             match places.is_empty() {
                 true if pale => everywhere.push(format!("or {label} (whole ring)")),
                 true => everywhere.push(format!("{label} (whole ring)")),
@@ -26,7 +24,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             }
         }
     }
-    let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(&data.ring) });
+    let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(ring) });
     let caption = if diagnosis.findings.is_empty() {
         "The ring; nothing is missing, so nothing is marked. Names inside the path are half-cells."
     } else {
@@ -41,13 +39,12 @@ fn named(label: &str, pale: bool) -> String {
 }
 
 /// Where a finding is: exchanged monitors are at two places, what acts on the whole ring at none.
-fn positions(data: &Data, finding: &Finding) -> Vec<f64> {
-    if finding.kind == EffectKind::RadialLoop.word() || finding.s.is_none() {
-        return Vec::new();
+fn positions(ring: &Ring, finding: &Finding) -> Vec<f64> {
+    let Some(term) = finding.term() else { return finding.s.into_iter().collect() };
+    match term.kind.class() {
+        Class::Monitor(_) | Class::Corrector(_) | Class::Field(_) => term.site.positions(ring),
+        Class::Hold(_) | Class::Drift(_) => Vec::new(),
     }
-    let of = |place: &str| Term::new(EffectKind::BpmGain, place).position(data);
-    let found: Vec<f64> = finding.at.split(',').filter_map(of).collect();
-    if found.is_empty() { finding.s.into_iter().collect() } else { found }
 }
 
 /// The ring without anything marked.

@@ -4,9 +4,10 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use diagnosis::Diagnosis;
 use diagnosis::score::{Grade, Truth};
+use diagnosis::{Diagnosis, Finding, Verdict};
 use serde::Serialize;
+use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Challenge;
@@ -31,7 +32,7 @@ struct ChallengeResult {
 #[derive(Debug, Serialize)]
 struct Scored {
     recording: String,
-    verdict: &'static str,
+    verdict: Verdict,
     sentence: String,
     found: Vec<String>,
     truth: Vec<String>,
@@ -59,8 +60,8 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
         let started = Instant::now();
         let diagnosis = Diagnosis::of(&ring, &recording, |_| {})?;
         let seconds = started.elapsed().as_secs_f64();
-        let truth = Truth::read(folder).map_err(|error| CommandError::Input(error.to_string()))?;
-        recordings.push(Scored::of(&ring.var_names(), &recording.name, &diagnosis, &truth, seconds));
+        let truth = Truth::read(folder, &ring).map_err(|error| CommandError::Input(error.to_string()))?;
+        recordings.push(Scored::of(&ring, &recording.name, &diagnosis, &truth, seconds));
         bar.inc(1);
     }
     bar.finish_and_clear();
@@ -96,18 +97,19 @@ fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> 
 }
 
 impl Scored {
-    fn of(names: &[String], recording: &str, diagnosis: &Diagnosis, truth: &Truth, seconds: f64) -> Self {
+    fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis, truth: &Truth, seconds: f64) -> Self {
+        let names = ring.var_names();
         Self {
             recording: recording.into(),
-            verdict: diagnosis.verdict.word(),
+            verdict: diagnosis.verdict,
             sentence: diagnosis.sentence.clone(),
-            found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
-            truth: truth.effects.iter().map(diagnosis::score::TrueEffect::label).collect(),
+            found: diagnosis.findings.iter().map(Finding::label).collect(),
+            truth: truth.effects.iter().map(|effect| effect.label(ring)).collect(),
             oracle_gain: truth.oracle_gain,
             grade: truth.grade(diagnosis),
             amplitude_pulls: truth.pulls(diagnosis),
-            nees_per_var_before: truth.nees(names, &diagnosis.vars_before),
-            nees_per_var_after: truth.nees(names, &diagnosis.vars_after),
+            nees_per_var_before: truth.nees(&names, &diagnosis.vars_before),
+            nees_per_var_after: truth.nees(&names, &diagnosis.vars_after),
             elpd_gain: diagnosis.gain().into(),
             seconds,
         }
@@ -127,7 +129,7 @@ impl ChallengeResult {
         let count = |grade| recordings.iter().filter(|scored| scored.grade == grade).count();
         let pulls: Vec<f64> = recordings
             .iter()
-            .filter(|scored| scored.verdict == "identified")
+            .filter(|scored| scored.verdict == Verdict::Identified)
             .flat_map(|scored| scored.amplitude_pulls.iter().copied())
             .collect();
         Self {
@@ -152,7 +154,7 @@ impl fmt::Display for ChallengeResult {
             let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
             table.add_row([
                 scored.recording.clone(),
-                format!("{}: {}\ntruth: {}", scored.verdict, scored.found.join(" + "), scored.truth()),
+                format!("{}: {}\ntruth: {}", scored.verdict.word(), scored.found.join(" + "), scored.truth()),
                 format!("{:?}", scored.grade).to_lowercase(),
                 pulls.join(" "),
                 format!("{:.2}\n{:.2}", scored.nees_per_var_before, scored.nees_per_var_after),

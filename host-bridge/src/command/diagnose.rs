@@ -8,7 +8,7 @@ use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
 use diagnosis::{Diagnosis, Finding, page};
 use serde::Serialize;
-use twin::Ring;
+use twin::{Measured, Ring};
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Diagnose;
@@ -45,6 +45,9 @@ struct FindingResult {
     amplitude: f64,
     sigma: f64,
     unit: &'static str,
+    /// Amplitude and error bar as people read them.
+    #[serde(skip)]
+    measured: String,
     log_evidence_gain: f64,
     probability: f64,
     sentence: String,
@@ -141,7 +144,7 @@ fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<(), Co
     if !left_out.is_empty() {
         return Err(failed(format!("the core's tables cannot hold {}", left_out.join(", "))));
     }
-    Ok(model_file::write(path, &extended.tables)?)
+    Ok(model_file::write(path, &ring.name, &extended.tables)?)
 }
 
 impl DiagnosisResult {
@@ -219,14 +222,17 @@ impl fmt::Display for DiagnosisResult {
 
 impl FindingResult {
     fn of(finding: &Finding) -> Self {
+        let (unit, (value, sigma)) = (finding.unit(), finding.amplitude);
+        let measured = format!("{} {}", Measured { value, sigma }.signed(unit.factor), unit.shown);
         Self {
-            kind: finding.kind,
+            kind: finding.word(),
             at: finding.at.clone(),
             s_m: finding.s,
             s_interval_m: finding.interval.iter().map(|one| [one.from_m, one.to_m]).collect(),
-            amplitude: finding.amplitude.0,
-            sigma: finding.amplitude.1,
-            unit: finding.unit,
+            amplitude: value,
+            sigma,
+            unit: unit.symbol,
+            measured: if sigma > 0.0 { measured } else { String::new() },
             log_evidence_gain: finding.log_evidence_gain,
             probability: finding.probability,
             sentence: finding.phrase.clone(),
@@ -242,19 +248,12 @@ impl FindingResult {
             format!("{before}{}", self.kind),
             self.at.clone(),
             self.s_m.map_or_else(String::new, |s| format!("{s:.2}")),
-            if self.sigma > 0.0 { measured(self.amplitude, self.sigma, self.unit) } else { String::new() },
+            self.measured.clone(),
             format!("{:.1}", self.log_evidence_gain),
             format!("{:.3}", self.probability),
             gain,
         ]
     }
-}
-
-/// Digits down to the second of the error bar, and the unit if the amplitude has one.
-fn measured(value: f64, sigma: f64, unit: &str) -> String {
-    let digits = (1.0 - sigma.log10().floor()).clamp(0.0, 9.0) as usize;
-    let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
-    format!("{value:.digits$} ± {sigma:.digits$}{unit}")
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

@@ -2,6 +2,7 @@
 
 pub mod challenge;
 pub mod diagnose;
+pub mod export;
 pub mod fit;
 pub mod prove;
 pub mod replay;
@@ -110,7 +111,7 @@ fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
 /// The core's tables: those of a model file, or of the ring as designed.
 fn tables(ring: &Ring, file: Option<&Path>) -> Result<Box<BoosterGreen>, CommandError> {
     match file {
-        Some(path) => Ok(model_file::read(path)?),
+        Some(path) => Ok(model_file::read(path, &ring.name)?),
         None => Ok(Box::new(training::green::tables(ring).map_err(stream::StreamError::from)?)),
     }
 }

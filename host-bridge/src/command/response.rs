@@ -40,9 +40,11 @@ pub fn run(options: &Response) -> Result<(), CommandError> {
         ring = ring.with_vars(&vars(path, &ring)?);
     }
     let input = |error: EffectError| CommandError::Input(error.to_string());
-    let machine = Machine::new(ring.clone(), options.rf.into(), &options.effects).map_err(input)?;
+    let effects = options.effects.iter().map(|effect| effect.resolve(&ring)).collect::<Result<Vec<_>, _>>();
+    let effects = effects.map_err(input)?;
+    let machine = Machine::new(ring.clone(), options.rf.into(), &effects).map_err(input)?;
     let response = machine.response().map_err(|error| CommandError::Other(format!("{}: {error}", ring.name)))?;
-    let effects = options.effects.iter().map(|e| format!("{}@{}={}", e.kind.word(), e.place, e.amplitude)).collect();
+    let effects = effects.iter().map(|effect| effect.text(&ring).to_string()).collect();
     deliver(&options.common, &ResponseResult::of(&ring, effects, &response))
 }
 

@@ -23,6 +23,9 @@ pub fn run(options: &Serve) -> Result<(), CommandError> {
             "--json needs --feed: the result is that of a recording; --trace takes each estimate".into(),
         ));
     }
+    if options.feed.is_none() && options.publishing.no_publish && options.trace.is_none() {
+        return Err(CommandError::Input("--no-publish needs --trace or --feed: estimates would go nowhere".into()));
+    }
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = options.feed.as_ref().map(|path| recording(path, &ring)).transpose()?;
@@ -38,6 +41,11 @@ pub fn run(options: &Serve) -> Result<(), CommandError> {
 fn listen(options: &Serve, ring: &Ring, link: Link<Box<dyn Line>>) -> Result<(), CommandError> {
     let (names, stop) = (Names::of(ring), Stop::on_signals().map_err(CommandError::other)?);
     let mut sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
+    if sinks.is_empty() {
+        return Err(CommandError::Other(
+            "estimates go nowhere: they are not published, and there is no --trace".into(),
+        ));
+    }
     let mut source = Overheard::new(link, &names, options.count.unwrap_or(u64::MAX));
     let ended = serve(&mut source, &mut sinks, &stop, || {}).map_err(CommandError::other);
     let finished = sinks.finish().map_err(CommandError::other);

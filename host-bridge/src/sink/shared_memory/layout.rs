@@ -1,40 +1,6 @@
 //! A record as bytes in shared memory, the same for readers in any language.
 //!
-//! The type is `orbitcal.Estimate.v2`; a change of these tables is a new version of the name. A sample has a header of 64
-//! bytes and a payload of 4-byte words, both little-endian. N vars and B monitors are counted in the header, so that one
-//! reader serves every ring.
-//!
-//! | offset | header | type | unit |
-//! |---|---|---|---|
-//! | 0 | `time_us` | u64 | us, of the frame |
-//! | 8 | `started_ns` | u64 | ns since 1970, start of the publisher |
-//! | 16 | `published_ns` | u64 | ns since 1970 |
-//! | 24 | `sequence` | u32 | of the frame |
-//! | 28 | `frames` | u32 | used so far; a gap tells of lost estimates |
-//! | 32 | `rejected_frames` | u32 | refused so far |
-//! | 36 | `linearised` | u32 | 1: the model was relinearised since the last estimate |
-//! | 40 | `mismatch` | u32 | 0 the readings fit the model, 1 they do not, 2 not asked |
-//! | 44 | `nis` | f32 | 1, sum over the readings used |
-//! | 48 | `log_evidence` | f32 | nat |
-//! | 52 | `vars` | u32 | N |
-//! | 56 | `monitors` | u32 | B |
-//! | 60 | `text_bytes` | u32 | length of the text at the end of the payload |
-//!
-//! | payload, in this order | words | unit |
-//! |---|---|---|
-//! | `mean`, `sigma` | 2 × N f32 | 1 |
-//! | `map_params`, `centre`, `params_sigma` | 3 × N f32 | 1, of `ln var`: maximum a posteriori; normal before truncation |
-//! | `clipped` | N u32 | 1: the var sits at a bound of the prior's range |
-//! | `covariance` | N(N+1)/2 f32 | 1, of the vars |
-//! | `reading` | B u32 | 0 did not report, 1 used, 2 rejected |
-//! | `monitor_state` | B u32 | 0 ok, 1 noisy, 2 jumps, 3 dead |
-//! | `monitor_sigma` | B f32 | m, noise of one reading |
-//! | `monitor_rejected` | B u32 | readings not used so far |
-//! | text | `text_bytes`, padded with zeros to a word | UTF-8 |
-//!
-//! The covariance is its lower triangle row by row, `(0,0) (1,0) (1,1) (2,0) ..`: entry `(i, j)` with `j <= i` stands at
-//! `i (i + 1) / 2 + j`. The text is the publisher's name, the machine's, then those of the vars and of the monitors, each
-//! ended by a line feed. The Booster's record has 48 vars and 33 monitors, 6.5 kB in all.
+#![doc = include_str!("../../../../docs/shared-memory.md")]
 
 use std::sync::Arc;
 
@@ -332,6 +298,6 @@ mod tests {
         assert_eq!(refused(&header, &other), "a monitor's state has no code 9");
         let mut other = payload.clone();
         *other.last_mut().unwrap() = u32::from_le_bytes(*b"\n\n\n\n");
-        assert_eq!(refused(&header, &other), "expected 5 names in UTF-8, found 8");
+        assert_eq!(refused(&header, &other), "expected 5 names in UTF-8, found 7");
     }
 }
