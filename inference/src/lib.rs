@@ -25,4 +25,4 @@ pub use posterior::{Laplace, LaplaceError, Posterior};
 pub use prior::{Prior, Width, with_priors};
 pub use readings::{Pair, Readings, Reduced};
 pub use recording::{Recording, RecordingError};
-pub use stream::{Booster, BoosterEstimate, BoosterFrame, StreamError};
+pub use stream::{Core, Estimate, StreamError};

@@ -7,8 +7,7 @@
 mod green;
 
 use nalgebra::DMatrix;
-use training::BoosterGreen;
-use twin::{Hold, OrbitError, Ring, VariedOptics, VariedRing};
+use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 
 pub use green::GreenModel;
 
@@ -35,9 +34,7 @@ impl ResponseModel {
     /// # Errors
     /// [`training::TrainingError`] if it cannot be tabulated.
     pub fn green(ring: &Ring) -> Result<Self, training::TrainingError> {
-        let tables: BoosterGreen = training::green::tables(ring)?;
-        let tunes = twin::Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
-        Ok(Self::Green(Box::new(GreenModel::of(&tables, [tunes.x, tunes.y]))))
+        Ok(Self::Green(Box::new(GreenModel::of(&training::green::tables(ring)?))))
     }
 
     /// The word for it.

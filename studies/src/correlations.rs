@@ -14,7 +14,7 @@ pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyErr
     let (measured, made) = (reference.correlation(), simulated.correlation());
     // along the ring, where the oscillation shows
     let mut along: Vec<usize> = (0..names.len()).collect();
-    along.sort_by_key(|&j| bench.campaign.ring.quadrupoles[j]);
+    along.sort_by_key(|&j| bench.campaign.ring.quadrupoles[j].element);
     let ring_names: Vec<String> = along.iter().map(|&j| names[j].clone()).collect();
     let row = |label: &str, matrix: &nalgebra::DMatrix<f64>| {
         let y = along.iter().map(|&j| if j == var { f64::NAN } else { matrix[(var, j)] });

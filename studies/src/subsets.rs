@@ -89,7 +89,7 @@ impl Subset {
         let (initial, finals) = kind.signs();
         let sign = |setting: f64| if setting == 0.0 { 0.0 } else { setting.signum() };
         let mut pairs = Vec::new();
-        for corrector in campaign.ring.cells(&campaign.ring.correctors) {
+        for corrector in campaign.ring.labels(campaign.ring.correctors.iter().map(|c| c.element)) {
             // of several amplitudes the largest
             let own = rows.iter().filter(|row| row.corrector.as_ref() == Some(&corrector));
             let largest = own.map(|row| row.setting.abs()).fold(0.0, f64::max);

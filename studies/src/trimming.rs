@@ -72,7 +72,7 @@ pub fn faults(campaign: &Campaign, model: &ResponseModel) -> Result<Vec<Fault>, 
     let response = model.response(&params)?;
     let monitors = campaign.ring.monitor_names();
     let mut faults = Vec::new();
-    for corrector in campaign.ring.cells(&campaign.ring.correctors) {
+    for corrector in campaign.ring.labels(campaign.ring.correctors.iter().map(|c| c.element)) {
         let own = |(_, row): &(usize, &inference::recording::Row)| row.corrector.as_ref() == Some(&corrector);
         let frames: Vec<usize> = campaign.recording.rows.iter().enumerate().filter(own).map(|(i, _)| i).collect();
         for (b, monitor) in monitors.iter().enumerate() {

@@ -7,9 +7,10 @@
 
 use core::f64::consts::{PI, TAU};
 
-use estimator::surrogate::{Block, Green, GreenPlane};
+use estimator::surrogate::{List, Table};
 use nalgebra::{DMatrix, DVector, Dyn, LU};
 use serde::Serialize;
+use training::Tables;
 use twin::OrbitError;
 
 use super::Optics;
@@ -69,22 +70,20 @@ struct PlaneOptics {
 }
 
 impl GreenModel {
-    /// From the core's tables and the tunes of the design; terms of low rank, which a design has none of, are left out.
-    pub fn of<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
-        tables: &Green<BX, BY, CX, CY, Q, T>,
-        tunes: [f64; 2],
-    ) -> Self {
-        let d = &tables.dispersion;
+    /// From the core's tables; terms of low rank, which a design has none of, are left out.
+    pub fn of(tables: &Tables) -> Self {
+        let list = |list| tables.list(list).iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
+        let ring = list(List::Ring);
         Self {
-            planes: [Plane::of(&tables.x, 'x', tunes[0]), Plane::of(&tables.y, 'y', tunes[1])],
+            planes: [Plane::of_x(tables, ring[5]), Plane::of_y(tables, ring[6])],
             dispersion: Dispersion {
-                monitor: DVector::from_iterator(BX, d.monitor.iter().map(|v| f64::from(*v))),
-                node: DVector::from_iterator(Q, d.node.iter().map(|v| f64::from(*v))),
-                compaction: f64::from(d.compaction),
-                inverse_gamma_squared: f64::from(d.inverse_gamma_squared),
-                circumference: f64::from(d.circumference),
+                monitor: DVector::from_vec(list(List::MonitorDispersion)),
+                node: DVector::from_vec(list(List::NodeDispersion)),
+                compaction: ring[2],
+                inverse_gamma_squared: ring[3],
+                circumference: ring[4],
             },
-            stated_error: tables.stated_error.map(f64::from),
+            stated_error: [ring[7], ring[8]],
         }
     }
 
@@ -118,26 +117,27 @@ impl GreenModel {
 }
 
 impl Plane {
-    fn of<const B: usize, const C: usize, const Q: usize, const T: usize>(
-        plane: &GreenPlane<B, C, Q, T>,
-        mode: char,
-        tune: f64,
-    ) -> Self {
-        let mut mutual = DMatrix::zeros(Q, Q);
-        for (r, codes) in plane.mutual.rows().enumerate() {
-            for (c, code) in codes.iter().enumerate() {
-                let value = f64::from(plane.mutual.scale) * f64::from(*code);
-                (mutual[(r, c)], mutual[(c, r)]) = (value, value);
-            }
-        }
+    fn of_x(tables: &Tables, tune: f64) -> Self {
         Self {
-            mode,
+            mode: 'x',
             tune,
-            direct: matrix(&plane.direct),
-            seen: matrix(&plane.seen),
-            driven: matrix(&plane.driven),
-            mutual,
-            weight: plane.weight.iter().map(|w| f64::from(*w)).collect(),
+            direct: tables.matrix(Table::DirectX),
+            seen: tables.matrix(Table::SeenX),
+            driven: tables.matrix(Table::DrivenX),
+            mutual: tables.matrix(Table::MutualX),
+            weight: weights(tables, 1.0),
+        }
+    }
+
+    fn of_y(tables: &Tables, tune: f64) -> Self {
+        Self {
+            mode: 'y',
+            tune,
+            direct: tables.matrix(Table::DirectY),
+            seen: tables.matrix(Table::SeenY),
+            driven: tables.matrix(Table::DrivenY),
+            mutual: tables.matrix(Table::MutualY),
+            weight: weights(tables, -1.0),
         }
     }
 
@@ -188,8 +188,9 @@ impl Plane {
     }
 }
 
-fn matrix<const R: usize, const C: usize>(block: &Block<R, C>) -> DMatrix<f64> {
-    DMatrix::from_iterator(R, C, block.codes.iter().flatten().map(|code| f64::from(block.scale) * f64::from(*code)))
+/// `k L w` of each node, two alike a quadrupole.
+fn weights(tables: &Tables, sign: f64) -> Vec<f64> {
+    tables.list(List::Weight).iter().flat_map(|weight| [sign * f64::from(*weight); 2]).collect()
 }
 
 impl Optics for GreenOptics<'_> {
@@ -257,12 +258,8 @@ mod tests {
 
     fn example() -> (GreenModel, Ring, Vec<f64>) {
         let ring = Ring::booster();
-        let tables: training::BoosterGreen = training::green::tables(&ring).unwrap();
-        (
-            GreenModel::of(&tables, [4.83, 4.665]),
-            ring,
-            (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect(),
-        )
+        let tables = training::green::tables(&ring).unwrap();
+        (GreenModel::of(&tables), ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
 
     /// For kicks of 0.2 mrad and RF offsets of 2e-4, to the error that the tables state (2 um of largest error measured).

@@ -1,0 +1,312 @@
+//! What host and device say to each other besides frames: requests in, replies out, each a packet of its own kind. See
+//! `docs/device.md`.
+
+use heapless::Vec;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
+use super::{FrameError, ParcelError};
+use crate::estimate::{Estimate, Health, MonitorState};
+use crate::estimator::{GROUPS, IngestError, Setup};
+use crate::mask::Mask;
+
+/// First byte of a request: kind 1 of version 2.
+pub const REQUEST: u8 = 0x12;
+/// First byte of a reply.
+pub const REPLY: u8 = 0x22;
+/// Most entries of a covariance in one piece.
+pub const PIECE: usize = 56;
+/// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
+pub const OTHER_BYTES: usize = 1 + VARINT_32 + 3 + LENGTH + 4 * PIECE;
+
+/// What a host asks of a device: `S` is the setup of its core, `P` a parcel of its tables.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // there is no allocator to box one with
+pub enum Request<S, P> {
+    /// Forget all frames and begin at the prior.
+    Restart(S),
+    /// Take the next frame whatever its number: the front end counts anew.
+    ForgetSequence,
+    /// Send the covariance after the next estimate.
+    Covariance,
+    /// Say how the device is.
+    Status,
+    /// A part of new tables. The last one puts them in use, if they are whole.
+    Model(P),
+    /// Use the tables in flash again, which frees the slot.
+    BuiltIn,
+}
+
+/// What a device says: `A` is the answer of its core.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // there is no allocator to box one with
+pub enum Reply<A> {
+    /// The answer to a frame.
+    Estimate(A),
+    /// A part of the covariance of `theta = ln var`, lower triangle row by row.
+    Covariance {
+        /// The frame after which it was taken.
+        sequence: u32,
+        /// Place of the first entry.
+        first: u16,
+        /// The entries.
+        entries: Vec<f32, PIECE>,
+    },
+    /// A packet was refused; the posterior is as it was, except after [`Refusal::NoDesign`].
+    Refused {
+        /// Why.
+        why: Refusal,
+        /// Packets refused so far.
+        count: u32,
+    },
+    /// The device begins at the prior.
+    Restarted,
+    /// The next frame may have any number.
+    SequenceForgotten,
+    /// A part of new tables was taken, or not; or tables in use have no design, and those in flash are in use from a restart on.
+    Model(Result<Taken, ParcelError>),
+    /// How the device is.
+    Status(Status),
+}
+
+/// What became of a part of new tables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Taken {
+    /// It waits for the rest.
+    Stored,
+    /// All are in use now; the posterior is that of all frames so far under them.
+    InUse,
+    /// The tables in flash are in use.
+    BuiltIn,
+}
+
+/// Why a packet was refused: the kind of the error, without the values that disagreed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(missing_docs)] // named after `FrameError` and `IngestError`
+pub enum Refusal {
+    Framing,
+    Truncated,
+    Oversized,
+    Corrupted,
+    Version,
+    Malformed,
+    Count,
+    Range,
+    Repeated,
+    OutOfOrder,
+    Beyond,
+    NotStarted,
+    /// A setup with a number that is none, or a size that is not positive.
+    Setup,
+    /// The rest of it did not come within two cycles.
+    Stalled,
+    /// A setup for tables in flash that have no design; there is no posterior any more.
+    NoDesign,
+}
+
+impl From<FrameError> for Refusal {
+    fn from(error: FrameError) -> Self {
+        match error {
+            FrameError::Framing => Self::Framing,
+            FrameError::Truncated { .. } => Self::Truncated,
+            FrameError::Oversized { .. } => Self::Oversized,
+            FrameError::Corrupted { .. } => Self::Corrupted,
+            FrameError::Version { .. } => Self::Version,
+            FrameError::Count { .. } => Self::Count,
+            FrameError::Range { .. } => Self::Range,
+            _ => Self::Malformed,
+        }
+    }
+}
+
+impl From<IngestError> for Refusal {
+    fn from(error: IngestError) -> Self {
+        match error {
+            IngestError::Frame(error) => error.into(),
+            IngestError::Repeated { .. } => Self::Repeated,
+            IngestError::OutOfOrder { .. } => Self::OutOfOrder,
+            IngestError::Beyond(_) => Self::Beyond,
+            _ => Self::NotStarted,
+        }
+    }
+}
+
+/// What a board says of itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Vitals {
+    /// Bytes that found the receive queue or the receiver full.
+    pub lost_bytes: u32,
+    /// Machine cycles since power-on.
+    pub cycles: u32,
+    /// Whole cycles in which nothing came.
+    pub silent_cycles: u32,
+    /// Most stack used so far [bytes].
+    pub stack_bytes: u32,
+}
+
+/// How the device is.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Status {
+    /// Frames used so far.
+    pub frames: u32,
+    /// Packets refused so far.
+    pub refused: u32,
+    /// What the board says of itself.
+    pub vitals: Vitals,
+    /// CRC of the tables in use, see [`crate::Tables::digest`].
+    pub tables: u32,
+    /// The tables in use came over the wire.
+    pub loaded: bool,
+    /// See [`crate::FitQuality`].
+    pub chi_square: f32,
+    /// Degrees of freedom of that.
+    pub degrees_of_freedom: f32,
+}
+
+/// An [`Estimate`] on the wire: the same fields in the same order, lists with their length, masks as lists of words.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs)] // those of `Estimate`
+pub struct Answer<const B: usize, const N: usize, const W: usize> {
+    pub sequence: u32,
+    pub time_us: u64,
+    pub frames: u32,
+    pub rejected_frames: u32,
+    pub mean: Vec<f32, N>,
+    pub sigma: Vec<f32, N>,
+    pub map_params: Vec<f32, N>,
+    pub centre: Vec<f32, N>,
+    pub params_sigma: Vec<f32, N>,
+    pub clipped: Vec<u32, W>,
+    pub nis: f32,
+    pub accepted: Vec<u32, W>,
+    pub rejected: Vec<u32, W>,
+    pub confirmed: Vec<u32, W>,
+    pub restarted: Vec<u32, W>,
+    pub tune_innovation: [Option<f32>; 2],
+    pub setting: Option<u16>,
+    pub log_evidence: f32,
+    pub linearised: bool,
+    pub health: Vec<(u8, f32, f32, u32), B>,
+}
+
+impl<const B: usize, const N: usize, const W: usize> From<&Estimate<B, N, W>> for Answer<B, N, W> {
+    fn from(e: &Estimate<B, N, W>) -> Self {
+        let list = |values: &[f32; N]| values.iter().copied().collect();
+        let mask = |mask: &Mask<W>, bits| mask.as_words().iter().take(crate::mask::words(bits)).copied().collect();
+        Self {
+            sequence: e.sequence,
+            time_us: e.time_us,
+            frames: e.frames,
+            rejected_frames: e.rejected_frames,
+            mean: list(&e.mean),
+            sigma: list(&e.sigma),
+            map_params: list(&e.map_params),
+            centre: list(&e.centre),
+            params_sigma: list(&e.params_sigma),
+            clipped: mask(&e.clipped, N),
+            nis: e.nis,
+            accepted: mask(&e.accepted, B),
+            rejected: mask(&e.rejected, B),
+            confirmed: mask(&e.confirmed, B),
+            restarted: mask(&e.restarted, B),
+            tune_innovation: e.tune_innovation,
+            setting: e.setting,
+            log_evidence: e.log_evidence,
+            linearised: e.linearised,
+            health: e.health.iter().map(|h| (h.state as u8, h.noise, h.weighted_as, h.rejected)).collect(),
+        }
+    }
+}
+
+impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
+    /// Largest body of a reply that holds one.
+    pub const MAX_BYTES: usize = 1 + 5 * (LENGTH + 4 * N) // mean .. params_sigma
+        + 5 * (LENGTH + VARINT_32 * W) // masks
+        + LENGTH + B * (1 + 8 + VARINT_32) // health
+        + 3 * VARINT_32 + VARINT_64 // the frame, and how many
+        + 2 * 4 + 2 * 5 + 4 + 1; // nis, log_evidence, tunes, setting, linearised
+
+    /// The estimate, if every list is whole.
+    pub fn estimate(&self) -> Option<Estimate<B, N, W>> {
+        let list = |values: &Vec<f32, N>| <[f32; N]>::try_from(values.as_slice()).ok();
+        let mut health = [Health::default(); B];
+        if self.health.len() != health.len() {
+            return None;
+        }
+        for (to, &(state, noise, weighted_as, rejected)) in health.iter_mut().zip(&self.health) {
+            *to = Health { state: MonitorState::from_code(state)?, noise, weighted_as, rejected };
+        }
+        Some(Estimate {
+            sequence: self.sequence,
+            time_us: self.time_us,
+            frames: self.frames,
+            rejected_frames: self.rejected_frames,
+            mean: list(&self.mean)?,
+            sigma: list(&self.sigma)?,
+            map_params: list(&self.map_params)?,
+            centre: list(&self.centre)?,
+            params_sigma: list(&self.params_sigma)?,
+            clipped: Mask::from_words(&self.clipped),
+            nis: self.nis,
+            accepted: Mask::from_words(&self.accepted),
+            rejected: Mask::from_words(&self.rejected),
+            confirmed: Mask::from_words(&self.confirmed),
+            restarted: Mask::from_words(&self.restarted),
+            tune_innovation: self.tune_innovation,
+            setting: self.setting,
+            log_evidence: self.log_evidence,
+            linearised: self.linearised,
+            health,
+        })
+    }
+}
+
+impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
+    /// Largest body of a request that holds one.
+    pub const MAX_BYTES: usize = 1 + 16 * GROUPS // priors
+        + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
+        + 5 + LENGTH + 28 * F // dipole, supplies
+        + 3 * 4 + 5; // powered, gate, process noise, tunes
+}
+
+impl<S: Serialize, P: Serialize> Request<S, P> {
+    /// Write the request as a packet; returns its bytes.
+    ///
+    /// # Errors
+    /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REQUEST, self, out)
+    }
+}
+
+impl<S: DeserializeOwned, P: DeserializeOwned> Request<S, P> {
+    /// Read a request; `bytes` is used as work space.
+    ///
+    /// # Errors
+    /// [`FrameError`].
+    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
+        packet::unseal(REQUEST, bytes.len(), bytes)
+    }
+}
+
+impl<A: Serialize> Reply<A> {
+    /// Write the reply as a packet; returns its bytes.
+    ///
+    /// # Errors
+    /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
+    #[inline(never)] // so that a count of instructions leaves out the waiting for the line
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REPLY, self, out)
+    }
+}
+
+impl<A: DeserializeOwned> Reply<A> {
+    /// Read a reply; `bytes` is used as work space.
+    ///
+    /// # Errors
+    /// [`FrameError`].
+    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
+        packet::unseal(REPLY, bytes.len(), bytes)
+    }
+}

@@ -1,0 +1,492 @@
+//! The host's end of a device's line: requests and frames out, replies in.
+
+use core::fmt;
+use core::str::FromStr;
+use core::time::Duration;
+use std::io::{self, Read, Write};
+use std::net::TcpStream;
+use std::os::unix::net::UnixStream;
+use std::time::Instant;
+
+use estimator::booster::Green;
+use estimator::surrogate::ParcelError;
+use estimator::{FrameError, Setup, packet};
+use firmware_sim::link::{Refusal, Reply, Request, Status, TRIANGLE, Taken};
+use inference::stream::BoosterEstimate;
+
+/// Longest wait for a reply that is due, and for a device to take bytes.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// Longest wait for an estimate that nobody here has asked for: five cycles.
+const LULL: Duration = Duration::from_secs(1);
+/// Longest read or write of a line; then the time is looked at.
+const GLANCE: Duration = Duration::from_millis(200);
+/// Rate of a serial line where none is given [baud].
+const BAUD: u32 = 921_600;
+
+/// Where a device is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Address {
+    /// `tcp://HOST:PORT`
+    Tcp(String),
+    /// `unix:PATH`
+    Unix(String),
+    /// `serial:PATH[@BAUD]`
+    Serial(String, u32),
+}
+
+impl FromStr for Address {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("expected tcp://HOST:PORT, unix:PATH or serial:PATH[@BAUD], found {text:?}");
+        let (scheme, rest) = text.split_once(':').filter(|(_, rest)| !rest.is_empty()).ok_or_else(wrong)?;
+        match scheme {
+            "tcp" => match rest.strip_prefix("//") {
+                Some(address) if address.contains(':') => Ok(Self::Tcp(address.to_owned())),
+                _ => Err(wrong()),
+            },
+            "unix" => Ok(Self::Unix(rest.to_owned())),
+            "serial" => {
+                let (path, baud) = rest.split_once('@').unwrap_or((rest, ""));
+                let baud = if baud.is_empty() { Ok(BAUD) } else { baud.parse().map_err(|_| wrong()) };
+                Ok(Self::Serial(path.to_owned(), baud?))
+            }
+            _ => Err(wrong()),
+        }
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Tcp(address) => write!(f, "tcp://{address}"),
+            Self::Unix(path) => write!(f, "unix:{path}"),
+            Self::Serial(path, baud) => write!(f, "serial:{path}@{baud}"),
+        }
+    }
+}
+
+/// What goes wrong on the line.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LinkError {
+    /// Nobody is there.
+    #[error("{device}: {error}")]
+    Open {
+        /// Where.
+        device: Address,
+        /// Why.
+        error: io::Error,
+    },
+    /// The line broke.
+    #[error("the device's line: {0}")]
+    Line(io::Error),
+    /// What was due did not come.
+    #[error("the device has not said what was due for {seconds} s")]
+    Silent {
+        /// How long it was waited for.
+        seconds: u64,
+    },
+    /// The line takes no bytes.
+    #[error("the device has taken no bytes for {seconds} s")]
+    Stuck {
+        /// How long it was waited for.
+        seconds: u64,
+    },
+    /// The device has gone.
+    #[error("the device has closed its line")]
+    Closed,
+    /// A reply was damaged on its way.
+    #[error("a reply of the device: {0}")]
+    Reply(#[from] FrameError),
+    /// A reply is not the one that was due.
+    #[error("expected {expected}, the device said {found}")]
+    Unexpected {
+        /// What was due.
+        expected: &'static str,
+        /// The reply, shortened.
+        found: String,
+    },
+    /// The device refused a packet.
+    #[error("the device refused {what}: {why:?}")]
+    Refused {
+        /// What it was.
+        what: &'static str,
+        /// Why.
+        why: Refusal,
+    },
+    /// The device did not take new tables.
+    #[error("the device did not take the tables: {0}")]
+    Tables(ParcelError),
+}
+
+/// An estimate of a device, with the covariance if that followed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Heard {
+    /// The estimate.
+    pub estimate: BoosterEstimate,
+    /// Covariance of `theta = ln var`, lower triangle row by row.
+    pub covariance: Option<Box<[f32; TRIANGLE]>>,
+}
+
+/// An estimate whose covariance may follow.
+struct Coming {
+    estimate: BoosterEstimate,
+    covariance: Box<[f32; TRIANGLE]>,
+    /// Entries of it that are there.
+    place: usize,
+}
+
+impl Coming {
+    fn new(estimate: BoosterEstimate) -> Self {
+        Self { estimate, covariance: Box::new([0.0; TRIANGLE]), place: 0 }
+    }
+
+    /// Take a piece of a covariance, if it is the next one of this estimate's.
+    fn add(&mut self, sequence: u32, first: u16, entries: &[f32]) {
+        if sequence == self.estimate.sequence && usize::from(first) == self.place {
+            let room = self.covariance.iter_mut().skip(self.place);
+            self.place += room.zip(entries).map(|(to, entry)| *to = *entry).count();
+        }
+    }
+
+    /// What has come: the estimate, and its covariance if that is whole.
+    fn heard(self) -> Heard {
+        let is_whole = self.place == TRIANGLE;
+        Heard { estimate: self.estimate, covariance: is_whole.then_some(self.covariance) }
+    }
+}
+
+/// What a line brings.
+enum Event {
+    Heard(Heard),
+    /// A reply that is no part of an estimate.
+    Other(Reply),
+}
+
+impl Heard {
+    /// Covariance of two params `theta = ln var`; 0 if it was not sent.
+    pub fn covariance(&self, i: usize, j: usize) -> f32 {
+        let (i, j) = (i.max(j), i.min(j));
+        self.covariance.as_ref().map_or(0.0, |entries| entries[i * (i + 1) / 2 + j])
+    }
+}
+
+/// Both directions of a byte stream.
+pub trait Line: Read + Write {}
+
+impl<L: Read + Write> Line for L {}
+
+/// A device at the other end of a line.
+pub struct Link<L> {
+    line: L,
+    received: Vec<u8>,
+    coming: Option<Coming>,
+}
+
+impl Link<Box<dyn Line>> {
+    /// Connect to a device.
+    ///
+    /// # Errors
+    /// [`LinkError::Open`].
+    pub fn open(address: &Address) -> Result<Self, LinkError> {
+        let line = connect(address).map_err(|error| LinkError::Open { device: address.clone(), error })?;
+        Ok(Self::new(line))
+    }
+}
+
+fn connect(address: &Address) -> io::Result<Box<dyn Line>> {
+    Ok(match address {
+        Address::Tcp(address) => {
+            let line = TcpStream::connect(address)?;
+            line.set_nodelay(true)?;
+            line.set_read_timeout(Some(GLANCE))?;
+            line.set_write_timeout(Some(GLANCE))?;
+            Box::new(line)
+        }
+        Address::Unix(path) => {
+            let line = UnixStream::connect(path)?;
+            line.set_read_timeout(Some(GLANCE))?;
+            line.set_write_timeout(Some(GLANCE))?;
+            Box::new(line)
+        }
+        Address::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
+    })
+}
+
+impl<L: Read + Write> Link<L> {
+    /// A device on a line that is open already. A read of it is to time out now and then, or nothing here ends.
+    pub fn new(line: L) -> Self {
+        Self { line, received: Vec::new(), coming: None }
+    }
+
+    /// Let the device begin at the prior.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn restart(&mut self, setup: &Setup) -> Result<(), LinkError> {
+        // a zero first: half a packet of somebody before us may be waiting
+        self.write(&[0])?;
+        self.send(&Request::Restart(*setup))?;
+        self.coming = None;
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match self.next_before(deadline, PATIENCE) {
+                Ok(Reply::Restarted) => return Ok(()),
+                Ok(Reply::Refused { why: why @ (Refusal::Setup | Refusal::NoDesign), .. }) => {
+                    return Err(LinkError::Refused { what: "its setup", why });
+                }
+                // replies to somebody before us, and the half of one that was on its way when the line was opened
+                Ok(_) | Err(LinkError::Reply(_)) => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Send a frame and wait for the reply, with the covariance.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn ingest(&mut self, wire: &[u8]) -> Result<Heard, LinkError> {
+        self.send(&Request::Covariance)?;
+        self.write(wire)?;
+        match self.gather(Instant::now() + PATIENCE, PATIENCE)? {
+            Event::Heard(heard @ Heard { covariance: Some(_), .. }) => Ok(heard),
+            Event::Heard(Heard { estimate, .. }) => Err(LinkError::Unexpected {
+                expected: "an estimate and its covariance",
+                found: format!("only the estimate of frame {}", estimate.sequence),
+            }),
+            Event::Other(Reply::Refused { why, .. }) => Err(LinkError::Refused { what: "a frame", why }),
+            Event::Other(other) => Err(unexpected("an estimate", &other)),
+        }
+    }
+
+    /// Wait a second for an estimate of a frame that somebody else has sent, and for its covariance if that follows. One
+    /// whose covariance does not follow, or not whole, is heard with the next reply or after that second.
+    ///
+    /// # Errors
+    /// [`LinkError`]; after [`LinkError::Silent`], [`LinkError::Refused`] and [`LinkError::Reply`] the next estimate can be
+    /// waited for.
+    pub fn listen(&mut self) -> Result<Heard, LinkError> {
+        let deadline = Instant::now() + LULL;
+        loop {
+            match self.gather(deadline, LULL)? {
+                Event::Heard(heard) => return Ok(heard),
+                Event::Other(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "a packet", why }),
+                Event::Other(_) => {} // a reply to somebody else
+            }
+        }
+    }
+
+    /// Wait for an estimate, and for its covariance, which follows at once if at all; or for another reply.
+    fn gather(&mut self, deadline: Instant, patience: Duration) -> Result<Event, LinkError> {
+        loop {
+            match self.next_before(deadline, patience) {
+                Ok(Reply::Estimate(reply)) => {
+                    let estimate = reply.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
+                    if let Some(former) = self.coming.replace(Coming::new(estimate)) {
+                        return Ok(Event::Heard(former.heard()));
+                    }
+                }
+                Ok(Reply::Covariance { sequence, first, entries }) => {
+                    if let Some(coming) = &mut self.coming {
+                        coming.add(sequence, first, &entries);
+                    }
+                    if let Some(whole) = self.coming.take_if(|coming| coming.place == TRIANGLE) {
+                        return Ok(Event::Heard(whole.heard()));
+                    }
+                }
+                Ok(other) => return Ok(Event::Other(other)),
+                Err(error @ LinkError::Reply(_)) => return Err(error),
+                // no more will come of it
+                Err(error) => return self.coming.take().map(|coming| Event::Heard(coming.heard())).ok_or(error),
+            }
+        }
+    }
+
+    /// How the device is.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn status(&mut self) -> Result<Status, LinkError> {
+        self.send(&Request::Status)?;
+        match self.next()? {
+            Reply::Status(status) => Ok(status),
+            other => Err(unexpected("its status", &other)),
+        }
+    }
+
+    /// Put other tables in use; `progress` hears of each of their parts.
+    ///
+    /// # Errors
+    /// [`LinkError::Tables`] if the device did not take them, in which case it goes by the former ones.
+    pub fn load(&mut self, tables: &Green, mut progress: impl FnMut()) -> Result<(), LinkError> {
+        self.send(&Request::BuiltIn)?;
+        self.taken()?;
+        let mut last = Taken::BuiltIn;
+        for parcel in tables.parcels() {
+            self.send(&Request::Model(parcel))?;
+            last = self.taken()?;
+            progress();
+        }
+        if last == Taken::InUse { Ok(()) } else { Err(unexpected("tables in use", &Reply::Model(Ok(last)))) }
+    }
+
+    fn taken(&mut self) -> Result<Taken, LinkError> {
+        match self.next()? {
+            Reply::Model(taken) => taken.map_err(LinkError::Tables),
+            other => Err(unexpected("a word on tables", &other)),
+        }
+    }
+
+    /// Send bytes as they are.
+    ///
+    /// # Errors
+    /// [`LinkError::Line`] or [`LinkError::Stuck`].
+    pub fn write(&mut self, bytes: &[u8]) -> Result<(), LinkError> {
+        // not flushed: that waits until a serial line has sent all, which one that was pulled out never does
+        let (mut rest, deadline) = (bytes, Instant::now() + PATIENCE);
+        while !rest.is_empty() {
+            match self.line.write(rest) {
+                Ok(0) => return Err(LinkError::Closed),
+                Ok(n) => rest = &rest[n..],
+                Err(error) if !is_lull(&error) => return Err(broken(error)),
+                Err(_) if Instant::now() >= deadline => return Err(LinkError::Stuck { seconds: PATIENCE.as_secs() }),
+                Err(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Send a request.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn send(&mut self, request: &Request) -> Result<(), LinkError> {
+        let mut bytes = [0; packet::MAX_WIRE_BYTES];
+        let n = request.encode(&mut bytes)?;
+        self.write(&bytes[..n])
+    }
+
+    /// Wait for the next reply.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    #[allow(clippy::should_implement_trait)] // an iterator that ends with the first error would hide it
+    pub fn next(&mut self) -> Result<Reply, LinkError> {
+        self.next_before(Instant::now() + PATIENCE, PATIENCE)
+    }
+
+    /// Wait for the next reply until a deadline, after some `patience`.
+    fn next_before(&mut self, deadline: Instant, patience: Duration) -> Result<Reply, LinkError> {
+        loop {
+            if let Some(end) = self.received.iter().position(|byte| *byte == 0) {
+                let mut packet: Vec<u8> = self.received.drain(..=end).collect();
+                if packet.len() > 1 {
+                    return Ok(Reply::decode(&mut packet)?);
+                }
+                continue;
+            }
+            let got = self.received.len();
+            if got > packet::MAX_WIRE_BYTES {
+                self.received.clear();
+                return Err(FrameError::Oversized { limit: packet::MAX_WIRE_BYTES, got }.into());
+            }
+            if Instant::now() >= deadline {
+                return Err(LinkError::Silent { seconds: patience.as_secs() });
+            }
+            let mut bytes = [0; 4096];
+            match self.line.read(&mut bytes) {
+                Ok(0) => return Err(LinkError::Closed),
+                Ok(n) => self.received.extend_from_slice(&bytes[..n]),
+                Err(error) if is_lull(&error) => {}
+                Err(error) => return Err(broken(error)),
+            }
+        }
+    }
+}
+
+/// True if no byte could be read or written, and the next one may be.
+fn is_lull(error: &io::Error) -> bool {
+    use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
+    matches!(error.kind(), Interrupted | TimedOut | WouldBlock)
+}
+
+/// Why a line is of no more use.
+fn broken(error: io::Error) -> LinkError {
+    use io::ErrorKind::{BrokenPipe, ConnectionReset};
+    if matches!(error.kind(), BrokenPipe | ConnectionReset) { LinkError::Closed } else { LinkError::Line(error) }
+}
+
+fn unexpected(expected: &'static str, found: &Reply) -> LinkError {
+    LinkError::Unexpected { expected, found: format!("{found:?}").chars().take(60).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pair() -> (Link<UnixStream>, UnixStream) {
+        let (line, device) = UnixStream::pair().unwrap();
+        line.set_read_timeout(Some(GLANCE)).unwrap();
+        (Link::new(line), device)
+    }
+
+    fn sealed(reply: &Reply) -> Vec<u8> {
+        let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+        let n = reply.encode(&mut bytes).unwrap();
+        bytes.truncate(n);
+        bytes
+    }
+
+    #[test]
+    fn a_silent_device_is_named() {
+        let (mut link, device) = pair();
+        let error = link.listen().unwrap_err();
+        assert_eq!(error.to_string(), "the device has not said what was due for 1 s");
+        drop(device);
+        assert!(matches!(link.listen(), Err(LinkError::Closed)));
+    }
+
+    #[test]
+    fn others_who_talk_do_not_hold_up_a_deadline() {
+        let (mut link, mut device) = pair();
+        let others = std::thread::spawn(move || {
+            while device.write_all(&sealed(&Reply::SequenceForgotten)).is_ok() {
+                std::thread::sleep(GLANCE / 4);
+            }
+        });
+        assert!(matches!(link.listen(), Err(LinkError::Silent { seconds: 1 })));
+        drop(link);
+        others.join().unwrap();
+    }
+
+    #[test]
+    fn noise_is_not_kept_and_the_reply_after_it_is_heard() {
+        let (mut link, mut device) = pair();
+        device.write_all(&[7; 5000]).unwrap();
+        assert!(matches!(link.next(), Err(LinkError::Reply(FrameError::Oversized { .. }))));
+        device.write_all(&[0]).unwrap();
+        device.write_all(&sealed(&Reply::Restarted)).unwrap();
+        let mut next = link.next();
+        while let Err(LinkError::Reply(_)) = next {
+            next = link.next(); // the rest of it
+        }
+        assert_eq!(next.unwrap(), Reply::Restarted);
+        assert!(link.received.is_empty());
+    }
+
+    #[test]
+    fn sources_are_tcp_unix_or_serial() {
+        assert_eq!("tcp://localhost:5000".parse(), Ok(Address::Tcp("localhost:5000".into())));
+        assert_eq!("unix:/run/device".parse(), Ok(Address::Unix("/run/device".into())));
+        assert_eq!("serial:/dev/ttyACM0".parse(), Ok(Address::Serial("/dev/ttyACM0".into(), 921_600)));
+        assert_eq!("serial:/dev/ttyS1@115200".parse(), Ok(Address::Serial("/dev/ttyS1".into(), 115_200)));
+        for wrong in ["", "tcp:localhost:5000", "tcp://localhost", "unix:", "serial:/dev/ttyS1@fast", "usb:1"] {
+            let error = wrong.parse::<Address>().unwrap_err();
+            assert!(error.ends_with(&format!("found {wrong:?}")), "{error}");
+        }
+        let shown = "serial:/dev/ttyS1@115200";
+        assert_eq!(shown.parse::<Address>().unwrap().to_string(), shown);
+    }
+}
