@@ -5,10 +5,9 @@
 
 use std::path::Path;
 
-use estimator::surrogate::{Parcel, ParcelError};
-use estimator::{FrameError, packet};
-use firmware_sim::link::{REQUEST, Request};
-use training::BoosterGreen;
+use estimator::{FrameError, Parcel, ParcelError, Tables as _};
+use training::rooms::large::{PACKET, Request};
+use training::{AnyParcel, LINE, Tables};
 
 use crate::output::{self, OutputError};
 
@@ -79,9 +78,12 @@ const FIRST: &str = "orbitcal model of ";
 ///
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
-pub fn write(path: &Path, machine: &str, tables: &BoosterGreen) -> Result<(), OutputError> {
+pub fn write(path: &Path, machine: &str, tables: &Tables) -> Result<(), OutputError> {
     let first = format!("{FIRST}{}\n", line(machine));
-    output::bytes(path, &first.into_bytes().into_iter().chain(tables.parcels().flat_map(wire)).collect::<Vec<u8>>())
+    output::bytes(
+        path,
+        &first.into_bytes().into_iter().chain(tables.parcels::<LINE>().flat_map(wire)).collect::<Vec<u8>>(),
+    )
 }
 
 /// A name as it stands in a line.
@@ -89,8 +91,8 @@ fn line(name: &str) -> String {
     name.replace('\n', " ")
 }
 
-fn wire(parcel: Parcel) -> Vec<u8> {
-    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+fn wire(parcel: AnyParcel) -> Vec<u8> {
+    let mut bytes = vec![0; PACKET];
     let length = Request::Model(parcel).encode(&mut bytes).expect("a parcel fits a packet");
     bytes.truncate(length);
     bytes
@@ -100,7 +102,7 @@ fn wire(parcel: Parcel) -> Vec<u8> {
 ///
 /// # Errors
 /// [`ModelFileError`].
-pub fn read(path: &Path, machine: &str) -> Result<Box<BoosterGreen>, ModelFileError> {
+pub fn read(path: &Path, machine: &str) -> Result<Tables, ModelFileError> {
     let name = || path.display().to_string();
     let mut bytes = std::fs::read(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
     let end = bytes.iter().position(|byte| *byte == b'\n').ok_or_else(|| ModelFileError::Kind { path: name() })?;
@@ -113,8 +115,8 @@ pub fn read(path: &Path, machine: &str) -> Result<Box<BoosterGreen>, ModelFileEr
 }
 
 /// The tables of packets; or which of them, from 1, is wrong.
-fn tables(bytes: &mut [u8]) -> Result<Box<BoosterGreen>, (usize, Fault)> {
-    let mut tables = Box::new(BoosterGreen::BLANK);
+fn tables(bytes: &mut [u8]) -> Result<Tables, (usize, Fault)> {
+    let mut tables = Tables::BLANK;
     let (mut due, mut packet) = (Due::Head, 0);
     for wire in bytes.split_inclusive_mut(|byte| *byte == 0) {
         packet += 1;
@@ -145,14 +147,14 @@ impl Due {
 }
 
 /// Take one packet in; returns what is due then.
-fn take(tables: &mut BoosterGreen, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
+fn take(tables: &mut Tables, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
     let found = |found| Fault::Order { expected: due.words(), found };
-    let Request::Model(parcel) = packet::unseal(REQUEST, wire)? else { return Err(found("another request")) };
+    let Request::Model(parcel) = Request::decode(wire)? else { return Err(found("another request")) };
     let next = match (due, &parcel) {
-        (Due::Head, Parcel::Head(_)) => Due::Rest,
+        (Due::Head, Parcel::Head { .. }) => Due::Rest,
         (Due::Rest, Parcel::Codes { .. } | Parcel::Values { .. }) => Due::Rest,
         (Due::Rest, Parcel::Seal { .. }) => Due::End,
-        (_, Parcel::Head(_)) => return Err(found("a head")),
+        (_, Parcel::Head { .. }) => return Err(found("a head")),
         _ => return Err(found("a part of tables")),
     };
     tables.take(&parcel)?;
@@ -166,7 +168,7 @@ mod tests {
 
     use super::*;
 
-    fn extended() -> Box<BoosterGreen> {
+    fn extended() -> Tables {
         let effects =
             ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|text| Effect::parse(text, &Ring::booster()).unwrap());
         training::extended::tables(&Ring::booster(), &effects, &[1.0; 48]).unwrap().tables

@@ -27,6 +27,7 @@ class Header(ctypes.Structure):
         ("mismatch", ctypes.c_uint32),
         ("nis", ctypes.c_float),
         ("log_evidence", ctypes.c_float),
+        ("tune_innovation", ctypes.c_float * 2),
         ("vars", ctypes.c_uint32),
         ("monitors", ctypes.c_uint32),
         ("text_bytes", ctypes.c_uint32),
@@ -37,7 +38,7 @@ class Header(ctypes.Structure):
         return "orbitcal.Estimate.v2"
 
 
-assert ctypes.sizeof(Header) == 64
+assert ctypes.sizeof(Header) == 72
 
 
 class Estimate:

@@ -25,6 +25,8 @@ pub struct Header {
     pub mismatch: u32,
     pub nis: f32,
     pub log_evidence: f32,
+    /// Not a number where there is none.
+    pub tune_innovation: [f32; 2],
     pub vars: u32,
     pub monitors: u32,
     pub text_bytes: u32,
@@ -108,6 +110,7 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         mismatch: record.mismatch.map_or(2, u32::from),
         nis: record.nis,
         log_evidence: record.log_evidence,
+        tune_innovation: record.tune_innovation.map(|tune| tune.unwrap_or(f32::NAN)),
         vars: record.mean.len() as u32,
         monitors: record.reading.len() as u32,
         text_bytes: text.len() as u32,
@@ -163,6 +166,7 @@ pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp
         linearised: header.linearised != 0,
         mismatch: [Some(false), Some(true)].get(header.mismatch as usize).copied().flatten(),
         nis: header.nis,
+        tune_innovation: header.tune_innovation.map(|tune| Some(tune).filter(|tune| !tune.is_nan())),
         log_evidence: header.log_evidence,
         mean,
         sigma,
@@ -234,7 +238,7 @@ mod tests {
 
     #[test]
     fn the_header_is_the_documented_one() {
-        assert_eq!((size_of::<Header>(), align_of::<Header>()), (64, 8));
+        assert_eq!((size_of::<Header>(), align_of::<Header>()), (72, 8));
         macro_rules! stands_at {
             ($($field:ident $offset:literal)*) => {
                 $(assert_eq!(offset_of!(Header, $field), $offset, stringify!($field));)*
@@ -242,7 +246,7 @@ mod tests {
         }
         stands_at! {
             time_us 0 started_ns 8 published_ns 16 sequence 24 frames 28 rejected_frames 32 linearised 36
-            mismatch 40 nis 44 log_evidence 48 vars 52 monitors 56 text_bytes 60
+            mismatch 40 nis 44 log_evidence 48 tune_innovation 52 vars 60 monitors 64 text_bytes 68
         }
     }
 
@@ -281,6 +285,7 @@ mod tests {
         for (vars, monitors) in [(0, 0), (1, 2), (20, 20), (48, 33), (260, 500)] {
             let mut record = record(vars, monitors);
             (record.mismatch, record.linearised, record.nis, record.time_us) = (None, true, 2.5, 1 << 40);
+            record.tune_innovation = [None, Some(-1e-3)];
             let (header, payload) = encode(&record, &stamp());
             assert_eq!(payload.len(), words_of(&stamp().publisher, &record.names));
             assert_eq!(decode(&header, &payload).unwrap(), (record, stamp()));
