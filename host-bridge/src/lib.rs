@@ -12,3 +12,8 @@ pub mod sink;
 pub mod source;
 pub mod stop;
 pub mod watch;
+
+/// The worked examples of `docs/extending.md`, compiled and run as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/extending.md")]
+mod extending {}
