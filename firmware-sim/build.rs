@@ -1,22 +1,26 @@
-//! What the image is made of besides code: the Green's function tables of the built-in machine, and how it is linked.
+//! What the image is made of besides code: sizes and tables of its machine, the built-in one or that of the file `MACHINE`,
+//! and how it is linked.
 //!
 //! The link arguments are said here and not in `.cargo/config.toml`, so that they hold from any folder, whatever
 //! `RUSTFLAGS` says, and for no other program.
 
-use core::fmt::Write as _;
 use std::env;
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 
-use estimator::booster::Green;
-use estimator::surrogate::{Block, GreenPlane};
+use training::Tables;
+use twin::Ring;
 
 fn main() {
     println!("cargo::rerun-if-env-changed=PART");
+    println!("cargo::rerun-if-env-changed=MACHINE");
     println!("cargo::rerun-if-changed=../memory.x");
     println!("cargo::rerun-if-changed=memory");
+    match machine() {
+        Ok((ring, tables)) => write(&ring, &tables),
+        Err(error) => println!("cargo::error={error}"),
+    }
     if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os == "none") {
-        let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-        std::fs::write(out.join("tables.rs"), tables()).expect("the build folder can be written");
         // Another part's addresses come first: memory.x, which link.x includes, asks for them.
         if let Ok(part) = env::var("PART") {
             link(&format!("-T{}/memory/{part}.x", env!("CARGO_MANIFEST_DIR")));
@@ -31,48 +35,29 @@ fn link(argument: &str) {
     println!("cargo::rustc-link-arg-bins={argument}");
 }
 
-/// The tables as a Rust value, so that they lie in flash ready for use. Floats are written with the digits that read back
-/// to the same bits.
-fn tables() -> String {
-    let green: Green = training::green::tables(&twin::Ring::booster()).expect("the built-in ring has tables");
-    assert!(green.low_rank.is_empty(), "a ring as designed needs none");
-    let d = &green.dispersion;
-    let mut text = String::new();
-    write!(
-        text,
-        "Green {{ x: {}, y: {}, first_family: {}, stated_error: {:?}, low_rank: LowRank::BLANK, \
-         dispersion: Dispersion {{ monitor: {:?}, node: {:?}, \
-         second_order: {:?}, spurious: {:?}, compaction: {:?}, inverse_gamma_squared: {:?}, circumference: {:?} }} }}",
-        plane(&green.x),
-        plane(&green.y),
-        green.first_family,
-        green.stated_error,
-        d.monitor,
-        d.node,
-        d.second_order,
-        d.spurious,
-        d.compaction,
-        d.inverse_gamma_squared,
-        d.circumference,
-    )
-    .expect("a string takes all");
-    text
+/// The machine of the image, and its tables. A path is taken from the workspace's folder, where `make` runs.
+fn machine() -> Result<(Ring, Tables), Box<dyn std::error::Error>> {
+    let ring = match env::var_os("MACHINE").filter(|file| !file.is_empty()) {
+        Some(file) => {
+            let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(file);
+            println!("cargo::rerun-if-changed={}", file.display());
+            Ring::read(&file)?
+        }
+        None => Ring::booster(),
+    };
+    let tables = training::green::tables(&ring)?;
+    Ok((ring, tables))
 }
 
-fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(plane: &GreenPlane<B, C, Q, T>) -> String {
-    let mutual = &plane.mutual;
-    format!(
-        "GreenPlane {{ direct: {}, seen: {}, driven: {}, mutual: SymmetricBlock {{ scale: {:?}, codes: {:?} }}, \
-         weight: {:?} }}",
-        block(&plane.direct),
-        block(&plane.seen),
-        block(&plane.driven),
-        mutual.scale,
-        mutual.codes,
-        plane.weight,
-    )
-}
-
-fn block<const R: usize, const C: usize>(block: &Block<R, C>) -> String {
-    format!("Block {{ scale: {:?}, codes: {:?} }}", block.scale, block.codes)
+/// Sizes and tables as Rust, so that the tables lie in flash ready for use.
+fn write(ring: &Ring, tables: &Tables) {
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
+    let [bx, by, cx, cy, quadrupoles, params, supplies] = tables.sizes().all();
+    let numbers = format!(
+        "{bx} + {by} monitors, {cx} + {cy} correctors, {quadrupoles} quadrupoles, {params} params and {supplies} supplies"
+    );
+    let too_large = format!("{}: the core of {numbers} does not fit the RAM that memory.x grants", ring.name);
+    let machine = format!("{}\npub const TOO_LARGE: &str = {too_large:?};\n", tables.machine_source());
+    fs::write(out.join("machine.rs"), machine).expect("the build folder can be written");
+    fs::write(out.join("tables.rs"), tables.source()).expect("the build folder can be written");
 }

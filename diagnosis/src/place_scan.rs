@@ -5,7 +5,7 @@
 //! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
 
 use nalgebra::{DMatrix, DVector};
-use twin::response::Place;
+use twin::Place;
 use twin::{EffectError, Signatures, Thin};
 
 use super::data::Data;

@@ -8,8 +8,8 @@
 use heapless::Vec;
 
 use crate::drive::Drive;
-use crate::frame::{CurrentCode, Frame, PositionCode};
 use crate::monitor::Gate;
+use crate::wire::{CurrentCode, Frame, PositionCode, RfCode};
 
 /// The setting that a frame repeats: at most one corrector powered, or the RF moved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,21 +29,20 @@ const SAME_OFFSET: i32 = 1_000;
 
 impl Setting {
     /// The setting of a frame; none if several things are moved at once, as by a feedback.
-    pub fn of<const B: usize, const C: usize>(frame: &Frame<B, C>, powered: f32) -> Option<Self> {
+    pub fn of<const B: usize, const C: usize, const F: usize, const W: usize>(
+        frame: &Frame<B, C, F, W>,
+        powered: f32,
+    ) -> Option<Self> {
         let mut setting = Self { corrector: None, current: CurrentCode::default(), rf_offset: frame.rf_offset.steps() };
         for (c, &current) in (0..).zip(&frame.corrector) {
             if current.value().abs() > powered {
-                if setting.corrector.is_some() || setting.is_rf() {
+                if setting.corrector.is_some() || is_moved(frame.rf_offset) {
                     return None;
                 }
                 setting = Self { corrector: Some(c), current, ..setting };
             }
         }
         Some(setting)
-    }
-
-    fn is_rf(&self) -> bool {
-        self.rf_offset.abs() > SAME_OFFSET
     }
 
     /// True if two frames repeat one setting.
@@ -59,6 +58,11 @@ impl Setting {
     }
 }
 
+/// True if the RF is moved.
+pub fn is_moved(rf_offset: RfCode) -> bool {
+    rf_offset.steps().abs() > SAME_OFFSET
+}
+
 /// Bits behind the binary point of a mean.
 const FRACTION: u32 = 10;
 /// Steps of a mean in a metre.
@@ -68,53 +72,79 @@ const KICK: f32 = 1e11;
 /// Steps of a mean in a unit of strength or of RF offset; +-2 fit.
 const RATIO: f32 = 1e9;
 
+/// A mean of ratios, and of strengths, in its steps.
+pub const fn ratio_steps(ratio: f32) -> i32 {
+    (ratio * RATIO) as i32
+}
+
+/// The mean of so many steps.
+pub const fn ratio(steps: i32) -> f32 {
+    steps as f32 / RATIO
+}
+
 /// Move a mean of `n` values, the last of which is `value`.
-fn move_mean(mean: &mut i32, value: i32, n: u32) {
+pub fn move_mean(mean: &mut i32, value: i32, n: u32) {
     let n = i64::from(n.max(1));
     let step = i64::from(value) - i64::from(*mean);
     let half = if step < 0 { -n / 2 } else { n / 2 };
     *mean = mean.saturating_add(((step + half) / n) as i32);
 }
 
+/// The last reading of a monitor in a setting, moved to the mean drive, and whether it waits for a repeat that confirms it:
+/// twice its code, and 1 more if it waits.
+#[derive(Debug, Clone, Copy)]
+struct Last(i32);
+
+impl Last {
+    /// None so far.
+    const NONE: Self = Self(i32::MIN);
+
+    fn new(code: i32, waits: bool) -> Self {
+        Self(code << 1 | i32::from(waits))
+    }
+
+    fn code(self) -> Option<i32> {
+        (self.0 != Self::NONE.0).then_some(self.0 >> 1)
+    }
+
+    fn waits(self) -> bool {
+        self.0 & 1 == 1
+    }
+}
+
 /// One setting.
 #[derive(Debug, Clone)]
-pub struct Cell<const B: usize, const C: usize> {
+pub struct Cell<const B: usize, const C: usize, const F: usize> {
     setting: Setting,
     frames: u32,
     kick: [i32; C],
-    strength: [i32; 2],
+    strength: [i32; F],
     rf_offset: i32,
     reading: [i32; B],
     count: [u32; B],
-    /// The last reading, moved to the mean drive; meaningful where `heard` has a 1.
-    last: [i32; B],
-    heard: u64,
-    /// Bit `b` is 1 while the last reading of monitor `b` waits for a repeat that confirms it.
-    held: u64,
+    last: [Last; B],
 }
 
-impl<const B: usize, const C: usize> Cell<B, C> {
+impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     fn open(setting: Setting) -> Self {
         Self {
             setting,
             frames: 0,
             kick: [0; C],
-            strength: [0; 2],
+            strength: [0; F],
             rf_offset: 0,
             reading: [0; B],
             count: [0; B],
-            last: [0; B],
-            heard: 0,
-            held: 0,
+            last: [Last::NONE; B],
         }
     }
 
     /// What drove the beam, on average.
-    pub fn drive(&self) -> Drive<C> {
+    pub fn drive(&self) -> Drive<C, F> {
         Drive {
             kick: self.kick.map(|k| k as f32 / KICK),
-            strength: self.strength.map(|s| s as f32 / RATIO),
-            rf_offset: self.rf_offset as f32 / RATIO,
+            strength: self.strength.map(ratio),
+            rf_offset: ratio(self.rf_offset),
         }
     }
 
@@ -124,7 +154,7 @@ impl<const B: usize, const C: usize> Cell<B, C> {
     }
 
     /// The drive without the idle correctors.
-    pub fn alone(&self) -> Drive<C> {
+    pub fn alone(&self) -> Drive<C, F> {
         let mut drive = self.drive();
         let powered = self.setting.corrector.map(usize::from);
         drive.kick.iter_mut().enumerate().filter(|(c, _)| Some(*c) != powered).for_each(|(_, kick)| *kick = 0.0);
@@ -141,12 +171,12 @@ impl<const B: usize, const C: usize> Cell<B, C> {
     }
 
     /// Count a frame's drive into the mean.
-    pub fn add_drive(&mut self, drive: &Drive<C>) {
+    pub fn add_drive(&mut self, drive: &Drive<C, F>) {
         self.frames = self.frames.saturating_add(1);
         let n = self.frames;
         self.kick.iter_mut().zip(&drive.kick).for_each(|(mean, k)| move_mean(mean, (k * KICK) as i32, n));
-        self.strength.iter_mut().zip(&drive.strength).for_each(|(mean, s)| move_mean(mean, (s * RATIO) as i32, n));
-        move_mean(&mut self.rf_offset, (drive.rf_offset * RATIO) as i32, n);
+        self.strength.iter_mut().zip(&drive.strength).for_each(|(mean, s)| move_mean(mean, ratio_steps(*s), n));
+        move_mean(&mut self.rf_offset, ratio_steps(drive.rf_offset), n);
     }
 
     /// Mean reading of a monitor [m] and the number of readings in it.
@@ -159,14 +189,17 @@ impl<const B: usize, const C: usize> Cell<B, C> {
 
     /// Distance of the last reading, moved to the mean drive, from the mean [m].
     pub fn distance(&self, b: usize) -> f32 {
-        let last = self.last.get(b).map_or(0.0, |&last| last as f32 * PositionCode::METRES_PER_LSB);
+        let last = self.last_code(b).map_or(0.0, |last| last as f32 * PositionCode::METRES_PER_LSB);
         last - self.mean(b).0
     }
 
     /// Difference of a reading, moved to the mean drive, from the last one [m].
     pub fn difference(&self, b: usize, moved: i32) -> Option<f32> {
-        let last = self.last.get(b).filter(|_| self.heard >> b & 1 == 1)?;
-        Some(moved.saturating_sub(*last) as f32 * PositionCode::METRES_PER_LSB)
+        Some(moved.saturating_sub(self.last_code(b)?) as f32 * PositionCode::METRES_PER_LSB)
+    }
+
+    fn last_code(&self, b: usize) -> Option<i32> {
+        self.last.get(b).and_then(|last| last.code())
     }
 
     /// What the repeats say of a reading, moved to the mean drive; `sigma` is the monitor's noise [m].
@@ -177,7 +210,7 @@ impl<const B: usize, const C: usize> Cell<B, C> {
         let (mean, count) = self.mean(b);
         let reading = moved as f32 * PositionCode::METRES_PER_LSB;
         let agrees_with_last = self.difference(b, moved).is_some_and(|d| gate.agree(d, 0.0, sigma));
-        let waiting = self.held >> b & 1 == 1;
+        let waiting = self.last.get(b).is_some_and(|last| last.waits());
         if (count > 0 && gate.agree(reading, mean, sigma)) || (agrees_with_last && !waiting) {
             Verdict::Accepted
         } else if agrees_with_last {
@@ -191,12 +224,8 @@ impl<const B: usize, const C: usize> Cell<B, C> {
 
     /// Take a reading in as judged; returns the growth of the sum of squared deviations from the mean [squared steps].
     pub fn take(&mut self, b: usize, code: i32, moved: i32, verdict: Verdict) -> u64 {
-        let before = self.last.get(b).copied().unwrap_or(0);
-        if let Some(last) = self.last.get_mut(b) {
-            *last = moved;
-            self.heard |= 1 << b;
-            self.held = self.held & !(1 << b) | u64::from(verdict == Verdict::Held) << b;
-        }
+        let before = self.last_code(b).unwrap_or(0);
+        self.last.get_mut(b).into_iter().for_each(|last| *last = Last::new(moved, verdict == Verdict::Held));
         match verdict {
             Verdict::Held => 0,
             Verdict::Accepted => self.add(b, code, moved),
@@ -236,13 +265,13 @@ pub enum Verdict {
 
 /// All settings, at most `S`, and the scatter of repeats within them.
 #[derive(Debug, Clone)]
-pub struct Campaign<const B: usize, const C: usize, const S: usize> {
-    cells: Vec<Cell<B, C>, S>,
+pub struct Campaign<const B: usize, const C: usize, const F: usize, const S: usize> {
+    cells: Vec<Cell<B, C, F>, S>,
     /// Sum of squared deviations of repeats from their means, in squared steps, for each monitor.
     scatter: [u64; B],
 }
 
-impl<const B: usize, const C: usize, const S: usize> Campaign<B, C, S> {
+impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B, C, F, S> {
     /// Nothing so far.
     pub const BLANK: Self = Self { cells: Vec::new(), scatter: [0; B] };
 
@@ -253,12 +282,12 @@ impl<const B: usize, const C: usize, const S: usize> Campaign<B, C, S> {
     }
 
     /// The settings so far.
-    pub fn cells(&self) -> &[Cell<B, C>] {
+    pub fn cells(&self) -> &[Cell<B, C, F>] {
         &self.cells
     }
 
     /// One setting.
-    pub fn cell_mut(&mut self, index: u16) -> Option<&mut Cell<B, C>> {
+    pub fn cell_mut(&mut self, index: u16) -> Option<&mut Cell<B, C, F>> {
         self.cells.get_mut(usize::from(index))
     }
 
@@ -286,11 +315,11 @@ impl<const B: usize, const C: usize, const S: usize> Campaign<B, C, S> {
     }
 
     /// Mean strength over all frames: where the supplies really stand.
-    pub fn mean_strength(&self) -> [f32; 2] {
-        let (mut sum, mut frames) = ([0.0; 2], 0.0);
+    pub fn mean_strength(&self) -> [f32; F] {
+        let (mut sum, mut frames) = ([0.0; F], 0.0);
         for cell in &self.cells {
             let n = cell.frames as f32;
-            sum.iter_mut().zip(&cell.strength).for_each(|(sum, s)| *sum += n * (*s as f32 / RATIO));
+            sum.iter_mut().zip(&cell.strength).for_each(|(sum, s)| *sum += n * ratio(*s));
             frames += n;
         }
         if frames > 0.0 { sum.map(|s| s / frames) } else { sum }
@@ -322,7 +351,7 @@ mod tests {
 
     #[test]
     fn a_full_table_says_so() {
-        let mut campaign = Campaign::<1, 1, 2>::BLANK;
+        let mut campaign = Campaign::<1, 1, 1, 2>::BLANK;
         assert_eq!(campaign.find(&setting(None, 0.0, 0)), Some(0));
         assert_eq!(campaign.find(&setting(Some(0), 5.0, 0)), Some(1));
         assert_eq!(campaign.find(&setting(Some(0), -5.0, 0)), None);
@@ -331,7 +360,7 @@ mod tests {
 
     #[test]
     fn means_and_scatter_are_those_of_the_readings() {
-        let mut cell = Cell::<1, 1>::open(setting(None, 0.0, 0));
+        let mut cell = Cell::<1, 1, 1>::open(setting(None, 0.0, 0));
         let codes = [1000, -2000, 4000, 500, 900];
         let scatter: u64 = codes.iter().map(|&code| cell.take(0, code, code, Verdict::Accepted)).sum();
         let mean = codes.iter().sum::<i32>() as f32 / 5.0;
@@ -368,7 +397,7 @@ mod tests {
             ],
         ];
         for story in stories {
-            let mut cell = Cell::<1, 1>::open(setting(None, 0.0, 0));
+            let mut cell = Cell::<1, 1, 1>::open(setting(None, 0.0, 0));
             for &(code, expected, verdict) in story {
                 let judged = cell.judge(0, code, 1.5e-4, Gate::default(), expected);
                 assert_eq!(judged, verdict, "{code} in {story:?}");

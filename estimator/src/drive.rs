@@ -1,29 +1,66 @@
 //! What a frame's currents do to the beam: kicks, common changes of the quadrupoles, and the RF offset.
 
+use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{CurrentCode, Frame};
+use crate::wire::{CurrentCode, Frame};
+
+/// A number that holds for all of `L` things, or one for each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Each<const L: usize> {
+    /// For all that have none of their own.
+    pub all: f32,
+    /// Their own: none, or one for each.
+    pub own: Vec<f32, L>,
+}
+
+impl<const L: usize> Each<L> {
+    /// The same for all.
+    pub const fn same(all: f32) -> Self {
+        Self { all, own: Vec::new() }
+    }
+
+    /// That of the `i`-th.
+    pub fn of(&self, i: usize) -> f32 {
+        self.own.get(i).copied().unwrap_or(self.all)
+    }
+
+    /// True if there is none, or one for each, and all are numbers above 0.
+    pub fn is_positive(&self) -> bool {
+        let is_positive = |v: &f32| v.is_finite() && *v > 0.0;
+        is_positive(&self.all) && self.own.iter().all(is_positive) && (self.own.is_empty() || self.own.is_full())
+    }
+}
+
+/// How the current of a quadrupole supply becomes a gradient.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SupplyCalibration {
+    /// Current at which its quadrupoles have their design gradients [A].
+    pub nominal: f32,
+    /// Transfer polynomial `p(r) = sum(c_n r^n)`, r = current over nominal.
+    pub transfer: [f32; 6],
+}
 
 /// How read-backs become kicks and gradients: the constants of a recording's header.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
-    /// Kick of a corrector at nominal momentum [rad/A].
-    pub kick_per_ampere: f32,
-    /// Nominal currents of dipoles, QH and QV [A].
-    pub nominal: [f32; 3],
-    /// Transfer polynomial `p(r) = sum(c_n r^n)` of a quadrupole, r = current over nominal.
-    pub transfer: [f32; 6],
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Calibration<const C: usize, const F: usize> {
+    /// Kick of a corrector at nominal momentum [rad/A]; its sign is that of the current.
+    pub kick_per_ampere: Each<C>,
+    /// Nominal current of the dipoles [A]; without one their read-back does not count.
+    pub dipole: Option<f32>,
+    /// The supplies of quadrupoles.
+    pub supplies: Vec<SupplyCalibration, F>,
     /// Read-back above which a corrector counts as powered [A]; read-backs scatter by 20 mA.
     pub powered: f32,
 }
 
 /// What acts on the beam in one frame, or on average over the frames of one setting.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Drive<const C: usize> {
+pub struct Drive<const C: usize, const F: usize> {
     /// Kick of each corrector [rad].
     pub kick: [f32; C],
-    /// `ln` of the common factor of all QH, and of all QV gradients.
-    pub strength: [f32; 2],
+    /// `ln` of the common factor of each supply's gradients.
+    pub strength: [f32; F],
     /// Relative offset of the RF frequency.
     pub rf_offset: f32,
 }
@@ -47,7 +84,35 @@ pub struct Beyond {
     pub got: f32,
 }
 
-impl Calibration {
+impl SupplyCalibration {
+    /// A supply that nothing hangs on.
+    pub const IDLE: Self = Self { nominal: 1.0, transfer: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0] };
+
+    /// Gradients over those of the design, at nominal momentum.
+    fn factor(&self, current: CurrentCode) -> f32 {
+        self.transfer_at(current.value() / self.nominal) / self.transfer_at(1.0)
+    }
+
+    fn transfer_at(&self, ratio: f32) -> f32 {
+        self.transfer.iter().rev().fold(0.0, |sum, c| sum * ratio + c)
+    }
+
+    fn is_sound(&self) -> bool {
+        self.transfer.iter().all(|c| c.is_finite()) && self.nominal.is_finite() && self.nominal > 0.0
+    }
+}
+
+impl<const C: usize, const F: usize> Calibration<C, F> {
+    /// True if every number is one, every size positive, and there is one supply for each.
+    pub fn is_sound(&self) -> bool {
+        let is_positive = |v: f32| v.is_finite() && v > 0.0;
+        self.kick_per_ampere.is_positive()
+            && is_positive(self.powered)
+            && self.dipole.is_none_or(is_positive)
+            && self.supplies.is_full()
+            && self.supplies.iter().all(SupplyCalibration::is_sound)
+    }
+
     /// What a frame's currents do.
     ///
     /// # Errors
@@ -55,25 +120,19 @@ impl Calibration {
     ///
     /// The dipoles set the momentum, so kicks and gradients are divided by `I_dipole / nominal`:
     /// `k1 = var * k1_design * p(I / I_nominal) / p(1) / (I_dipole / I_dipole_nominal)`.
-    pub fn drive<const B: usize, const C: usize>(&self, frame: &Frame<B, C>) -> Result<Drive<C>, Beyond> {
-        let rigidity = frame.magnets.dipole.value() / self.nominal[0];
+    pub fn drive<const B: usize, const W: usize>(&self, frame: &Frame<B, C, F, W>) -> Result<Drive<C, F>, Beyond> {
+        let rigidity = self.dipole.map_or(1.0, |nominal| frame.magnets.dipole.value() / nominal);
         within("dipole current over nominal, less 1", rigidity - 1.0, STRENGTH)?;
-        let strength = |current: CurrentCode, nominal: f32| {
-            let factor = self.transfer_at(current.value() / nominal) / self.transfer_at(1.0) / rigidity;
-            within("common gradient factor, less 1", factor - 1.0, STRENGTH)?;
-            Ok(libm::logf(factor))
-        };
-        let kick = frame.corrector.map(|c| c.value() * self.kick_per_ampere / rigidity);
+        let mut kick = frame.corrector.map(CurrentCode::value);
+        kick.iter_mut().enumerate().for_each(|(c, kick)| *kick = *kick * self.kick_per_ampere.of(c) / rigidity);
         within("sum of kicks in rad", kick.iter().map(|k| k.abs()).sum(), KICKS)?;
-        Ok(Drive {
-            kick,
-            strength: [strength(frame.magnets.qh, self.nominal[1])?, strength(frame.magnets.qv, self.nominal[2])?],
-            rf_offset: within("rf offset", frame.rf_offset.value(), RF_OFFSET)?,
-        })
-    }
-
-    fn transfer_at(&self, ratio: f32) -> f32 {
-        self.transfer.iter().rev().fold(0.0, |sum, c| sum * ratio + c)
+        let mut strength = [0.0; F];
+        for ((to, supply), current) in strength.iter_mut().zip(&self.supplies).zip(frame.magnets.supply) {
+            let factor = supply.factor(current) / rigidity;
+            within("common gradient factor, less 1", factor - 1.0, STRENGTH)?;
+            *to = libm::logf(factor);
+        }
+        Ok(Drive { kick, strength, rf_offset: within("rf offset", frame.rf_offset.value(), RF_OFFSET)? })
     }
 }
 

@@ -1,5 +1,6 @@
 //! What leaves the core each cycle: plain data.
 
+use crate::mask::Mask;
 use crate::prior::{Marginal, Prior};
 
 /// How a monitor is doing.
@@ -46,7 +47,7 @@ pub struct Health {
 
 /// The vars and the state of the instruments after a frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Estimate<const B: usize, const N: usize> {
+pub struct Estimate<const B: usize, const N: usize, const W: usize> {
     /// Sequence number of the frame.
     pub sequence: u32,
     /// Time of the frame [us].
@@ -66,17 +67,19 @@ pub struct Estimate<const B: usize, const N: usize> {
     /// Its standard deviation.
     pub params_sigma: [f32; N],
     /// Bit `i` is 1 if param `i` is clipped to the prior's range.
-    pub clipped: u64,
-    /// Joint normalised innovation squared of the readings used.
+    pub clipped: Mask<W>,
+    /// Joint normalised innovation squared of the readings used, tunes included.
     pub nis: f32,
     /// Bit `b` is 1 if the reading of monitor `b` was used.
-    pub accepted: u64,
+    pub accepted: Mask<W>,
     /// Bit `b` is 1 if monitor `b` reported and its reading was not used.
-    pub rejected: u64,
+    pub rejected: Mask<W>,
     /// Bit `b` is 1 if this reading confirmed the one before in the same setting, which is now used as well.
-    pub confirmed: u64,
+    pub confirmed: Mask<W>,
     /// Bit `b` is 1 if this reading and the one before outvoted all earlier ones in the same setting.
-    pub restarted: u64,
+    pub restarted: Mask<W>,
+    /// Fractional tune in x and y, measured minus predicted, where it was used [1].
+    pub tune_innovation: [Option<f32>; 2],
     /// The setting that the frame repeats, if it is kept as one.
     pub setting: Option<u16>,
     /// `ln` of the evidence of all readings under the model.
@@ -87,7 +90,7 @@ pub struct Estimate<const B: usize, const N: usize> {
     pub health: [Health; B],
 }
 
-impl<const B: usize, const N: usize> Estimate<B, N> {
+impl<const B: usize, const N: usize, const W: usize> Estimate<B, N, W> {
     /// Marginal posterior of param `i`; none beyond the last.
     pub fn marginal(&self, i: usize, prior: &Prior) -> Option<Marginal> {
         Some(Marginal {

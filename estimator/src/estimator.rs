@@ -12,66 +12,85 @@ use heapless::Deque;
 use serde::{Deserialize, Serialize};
 
 use crate::campaign::{Campaign, Setting};
-use crate::drive::{Beyond, Calibration, Drive};
+use crate::drive::{Beyond, Calibration, Drive, Each};
 use crate::estimate::Estimate;
-use crate::frame::{Frame, FrameError, PositionCode};
 use crate::gaussian::{Gaussian, Solution};
 use crate::linear::column;
+use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor};
 use crate::prior::Prior;
+use crate::sizes::Layout;
 use crate::sum::Sum;
-use crate::surrogate::{Prediction, Surrogate};
+use crate::surrogate::{Prediction, Surrogate, Unstable};
+use crate::tune::{TuneMeter, wrapped};
+use crate::wire::{Frame, FrameError, PositionCode};
 
 pub use laplace::FitQuality;
 use screen::Screened;
 
+/// Priors that groups of params can have.
+pub const GROUPS: usize = 8;
+
 /// What is known beforehand, besides the ring.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Setup {
-    /// Prior of each `theta = ln var`.
-    pub prior: Prior,
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Setup<const B: usize, const C: usize, const F: usize> {
+    /// Prior of `theta = ln var`, for each group of params; which group a param is of stands in the surrogate's tables.
+    pub prior: [Prior; GROUPS],
     /// From read-backs to kicks and gradients.
-    pub calibration: Calibration,
-    /// Expected noise of a reading [m].
-    pub noise: f32,
+    pub calibration: Calibration<C, F>,
+    /// Expected noise of a reading of each monitor [m].
+    pub noise: Each<B>,
     /// When readings agree.
     pub gate: Gate,
     /// Random walk of each theta, standard deviation per `sqrt(frame)`; 0 for constant vars.
     pub process_noise: f32,
+    /// Calibration error of the tune meter [1], the same in all frames: the tunes of frames are readings. None, and they do
+    /// not count.
+    pub tune_calibration: Option<f32>,
 }
 
-impl Setup {
+impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
     /// True if every number is one, and every size positive.
     pub fn is_sound(&self) -> bool {
-        let Self { prior, calibration, noise, gate, process_noise } = self;
-        let sizes = [prior.sigma, *noise, gate.sigmas, calibration.powered, prior.upper - prior.lower];
-        let numbers = calibration.transfer.iter().chain(&calibration.nominal);
-        let mut numbers = numbers.chain([&calibration.kick_per_ampere, &prior.mean, process_noise]).chain(&sizes);
-        numbers.all(|v| v.is_finite())
-            && sizes.iter().chain(&calibration.nominal).all(|v| *v > 0.0)
+        let Self { prior, calibration, noise, gate, process_noise, tune_calibration } = self;
+        let is_positive = |v: f32| v.is_finite() && v > 0.0;
+        prior.iter().all(Prior::is_sound)
+            && calibration.is_sound()
+            && noise.is_positive()
+            && is_positive(gate.sigmas)
+            && process_noise.is_finite()
             && *process_noise >= 0.0
+            && tune_calibration.is_none_or(is_positive)
+    }
+
+    fn prior_of(&self, group: usize) -> Prior {
+        *self.prior.get(group).unwrap_or(&self.prior[0])
     }
 }
 
 /// The ring and all else that is known beforehand; read only. Two models can be compared on the same frames.
 #[derive(Debug)]
-pub struct Model<'a, G> {
+pub struct Model<'a, G, const B: usize, const C: usize, const F: usize> {
     /// The ring.
     pub surrogate: &'a G,
     /// All else.
-    pub setup: &'a Setup,
+    pub setup: &'a Setup<B, C, F>,
 }
 
-/// The posterior that frames have made of a model: `B` monitors, `C` correctors, `N` params, `S` settings; `T` entries make
-/// a triangle of `N`.
+/// The posterior that frames have made of a model: `B` monitors, `C` correctors, `F` supplies, `N` params, `S` settings; `K`
+/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `W` words have a bit for each
+/// monitor or param.
 #[derive(Debug, Clone)]
 pub struct Estimator<
-    G: Surrogate<B, C, N>,
+    G: Surrogate<B, C, F, N>,
     const B: usize,
     const C: usize,
+    const F: usize,
     const N: usize,
     const S: usize,
+    const K: usize,
     const T: usize,
+    const W: usize,
 > {
     started: bool,
     last_sequence: Option<u32>,
@@ -84,18 +103,19 @@ pub struct Estimator<
     /// Linearised since the last estimate.
     news: bool,
     /// `ln` of the supplies' mean factors at which it was linearised.
-    supplies: [f32; 2],
-    prediction: Prediction<B, N>,
+    supplies: [f32; F],
+    prediction: Prediction<B, F, N>,
     /// Readings that the mean drive of the frame's setting would have made [m].
     at_mean_drive: [f32; B],
     monitors: [Monitor; B],
-    campaign: Campaign<B, C, S>,
-    gaussian: Gaussian<B, N, T>,
+    tunes: [TuneMeter<F>; 2],
+    campaign: Campaign<B, C, F, S>,
+    gaussian: Gaussian<K, N, T>,
     /// The prior, and frames that belong to no setting and are not recent: they cannot be linearised anew.
-    loose: Gaussian<B, N, T>,
+    loose: Gaussian<K, N, T>,
     /// The last frames that belong to no setting.
-    recent: Deque<Loose<B, C>, RECENT>,
-    solution: Solution<N, T>,
+    recent: Deque<Loose<B, C, F, W>, RECENT>,
+    solution: Solution<N, T, W>,
     /// Rms of the baseline orbit in x and y [m].
     orbit: [f32; 2],
     /// RF offset of the frame at hand.
@@ -155,17 +175,20 @@ impl core::error::Error for IngestError {}
 
 /// A frame that belongs to no setting.
 #[derive(Debug, Clone)]
-struct Loose<const B: usize, const C: usize> {
-    drive: Drive<C>,
+struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
+    drive: Drive<C, F>,
     reading: [PositionCode; B],
-    accepted: u64,
+    accepted: Mask<W>,
 }
+
+/// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
+const BASELINE: f32 = 0.02;
 
 /// Frames without a setting that are linearised anew with the rest; older ones keep the linearisation that they had when
 /// they left this window. At the start of a stream it holds 16 times 33 readings, enough for 48 params.
 const RECENT: usize = 16;
 
-impl<const B: usize, const C: usize> Loose<B, C> {
+impl<const B: usize, const C: usize, const F: usize, const W: usize> Loose<B, C, F, W> {
     /// Measured minus predicted, before the baseline [m].
     fn innovation(&self, b: usize, predicted: &[f32; B]) -> f32 {
         match (self.reading.get(b), predicted.get(b)) {
@@ -181,9 +204,20 @@ impl<const B: usize, const C: usize> Loose<B, C> {
 /// Source: W. M. Lear's underweighting; R. Zanetti, K. DeMars and R. Bishop, J. Guid. Control Dyn. 33 (2010) 1670.
 const UNDERWEIGHT: f32 = 0.2;
 
-impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize, const T: usize>
-    Estimator<G, B, C, N, S, T>
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const W: usize,
+> Estimator<G, B, C, F, N, S, K, T, W>
 {
+    const FITS: () = assert!(K == B + 2, "a channel for each monitor and for each tune");
+
     /// Memory for one, all zero, so that it costs no flash; [`Estimator::restart`] gives it a posterior.
     pub const BLANK: Self = Self {
         started: false,
@@ -191,12 +225,13 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         prepared: false,
         frames: 0,
         rejected_frames: 0,
-        linearised: G::BLANK,
+        linearised: G::UNLINEARISED,
         news: false,
-        supplies: [0.0; 2],
+        supplies: [0.0; F],
         prediction: Prediction::BLANK,
         at_mean_drive: [0.0; B],
         monitors: [const { Monitor::BLANK }; B],
+        tunes: [const { TuneMeter::BLANK }; 2],
         campaign: Campaign::BLANK,
         gaussian: Gaussian::BLANK,
         loose: Gaussian::BLANK,
@@ -212,20 +247,26 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Start from the prior, linearised at vars = 1, all frames forgotten.
     ///
     /// # Errors
-    /// [`crate::surrogate::Unstable`] if the surrogate has no design.
-    pub fn restart(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
+    /// [`Unstable`] if the surrogate has no design.
+    pub fn restart(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
+        let () = Self::FITS;
         self.started = false;
-        model.surrogate.linearise(&[1.0; N], &mut self.linearised)?;
+        model.surrogate.linearise(&[0.0; N], &[0.0; F], &mut self.linearised)?;
         (self.last_sequence, self.prepared, self.frames, self.rejected_frames) = (None, true, 0, 0);
-        (self.supplies, self.orbit, self.rf_offset) = ([0.0; 2], [0.0; 2], 0.0);
+        (self.supplies, self.orbit, self.rf_offset) = ([0.0; F], [0.0; 2], 0.0);
         (self.nis, self.surprises, self.stale, self.news) = ((Sum::ZERO, 0), 0, false, false);
-        self.monitors.iter_mut().for_each(|monitor| monitor.expect(model.setup.noise));
+        for (b, monitor) in self.monitors.iter_mut().enumerate() {
+            monitor.expect(model.setup.noise.of(b));
+        }
+        self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.campaign.clear();
         self.recent.clear();
-        self.loose.reset(&model.setup.prior);
+        let calibration = model.setup.tune_calibration.unwrap_or(1.0);
+        self.loose
+            .reset(|i| prior_of::<G, B, C, F, N>(model, i), |channel| if channel < B { BASELINE } else { calibration });
         self.gaussian.clone_from(&self.loose);
         self.gaussian.recentre(&[0.0; N]);
-        self.solution.solve(&self.gaussian, &model.setup.prior);
+        self.solution.solve(&self.gaussian, |i| prior_of::<G, B, C, F, N>(model, i));
         self.started = true;
         Ok(())
     }
@@ -235,13 +276,17 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// # Errors
     /// [`IngestError`]; the posterior is then as it was before.
     #[inline(never)]
-    pub fn ingest(&mut self, model: &Model<'_, G>, bytes: &mut [u8]) -> Result<Estimate<B, N>, IngestError> {
+    pub fn ingest(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        bytes: &mut [u8],
+    ) -> Result<Estimate<B, N, W>, IngestError> {
         let (frame, drive) =
             self.decode(model, bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
         self.catch_up(model, &frame);
         let cell = self.find_setting(model, &frame, &drive);
         self.predict(model, &drive, cell);
-        let screened = self.screen(model, &frame, cell);
+        let screened = self.screen(model, &frame, &drive, cell);
         let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
@@ -252,7 +297,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
     /// it was done), and let the params walk for one cycle. To be called after each frame; a second call does nothing.
     #[inline(never)]
-    pub fn prepare(&mut self, model: &Model<'_, G>) -> bool {
+    pub fn prepare(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
         if !self.started || self.prepared {
             return false;
         }
@@ -271,11 +316,11 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// Go over to another model of the same machine: all frames so far are weighed anew by it.
     ///
     /// # Errors
-    /// [`crate::surrogate::Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
-    pub fn adopt(&mut self, model: &Model<'_, G>) -> Result<(), crate::surrogate::Unstable> {
+    /// [`Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
+    pub fn adopt(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         self.stale = true;
         if self.started && !self.linearise_anew(model) {
-            return Err(crate::surrogate::Unstable);
+            return Err(Unstable);
         }
         self.news |= self.started;
         Ok(())
@@ -283,11 +328,15 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
     #[inline(never)]
-    fn decode(&self, model: &Model<'_, G>, bytes: &mut [u8]) -> Result<(Frame<B, C>, Drive<C>), IngestError> {
+    fn decode(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        bytes: &mut [u8],
+    ) -> Result<(Frame<B, C, F, W>, Drive<C, F>), IngestError> {
         if !self.started {
             return Err(IngestError::NotStarted);
         }
-        let frame = Frame::decode(bytes)?;
+        let frame = Frame::decode(&model.surrogate.layout(), bytes)?;
         match self.last_sequence {
             Some(last) if frame.sequence == last => return Err(IngestError::Repeated { sequence: last }),
             Some(last) if frame.sequence < last => return Err(IngestError::OutOfOrder { last, got: frame.sequence }),
@@ -298,7 +347,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// Let the params walk for cycles that were lost since the last frame.
-    fn catch_up(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>) {
+    fn catch_up(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
         let cycles = self.last_sequence.map_or(0, |last| frame.sequence.saturating_sub(last));
         self.walk(model, cycles.saturating_sub(u32::from(self.prepared)));
         self.last_sequence = Some(frame.sequence);
@@ -307,21 +356,30 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     #[inline(never)]
-    fn walk(&mut self, model: &Model<'_, G>, cycles: u32) {
+    fn walk(&mut self, model: &Model<'_, G, B, C, F>, cycles: u32) {
         let noise = model.setup.process_noise;
         if noise > 0.0 && cycles > 0 {
             // After a long silence the vars are unknown, but not more than the range of the prior allows.
-            let prior = model.setup.prior.sigma * model.setup.prior.sigma;
-            let largest = self.solution.sigma.iter().fold(0.0, |a: f32, sigma| a.max(sigma * sigma));
+            let room = |(i, sigma): (usize, &f32)| {
+                let prior = prior_of::<G, B, C, F, N>(model, i).sigma;
+                2.0 * prior * prior - sigma * sigma
+            };
+            let params = model.surrogate.layout().params();
+            let smallest = self.solution.sigma.iter().take(params).enumerate().map(room).fold(f32::MAX, f32::min);
             let variance = noise * noise * cycles as f32;
-            let sigma = libm::sqrtf(variance.min((2.0 * prior - largest).max(0.0)));
+            let sigma = libm::sqrtf(variance.min(smallest.max(0.0)));
             self.gaussian.walk(sigma, &mut self.solution);
             self.solve(model);
         }
     }
 
     /// The cell of the frame's setting, its drive counted in. Several correctors at once belong to none.
-    fn find_setting(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, drive: &Drive<C>) -> Option<u16> {
+    fn find_setting(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+    ) -> Option<u16> {
         let setting = Setting::of(frame, model.setup.calibration.powered)?;
         let index = self.campaign.find(&setting)?;
         self.campaign.cell_mut(index)?.add_drive(drive);
@@ -330,7 +388,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// Predict what the mean drive of the frame's setting would have made, and the frame.
     #[inline(never)]
-    fn predict(&mut self, model: &Model<'_, G>, drive: &Drive<C>, cell: Option<u16>) {
+    fn predict(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>, cell: Option<u16>) {
         let mean = cell.and_then(|index| self.campaign.cells().get(usize::from(index))).map(|cell| cell.drive());
         if let Some(mean) = mean {
             model.surrogate.orbit(&self.linearised, &about(&mean, &self.supplies), &mut self.at_mean_drive);
@@ -339,7 +397,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         self.rf_offset = drive.rf_offset;
     }
 
-    fn predict_drive(&mut self, model: &Model<'_, G>, drive: &Drive<C>) {
+    fn predict_drive(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>) {
         model.surrogate.predict(&self.linearised, &about(drive, &self.supplies), &mut self.prediction);
     }
 
@@ -348,20 +406,26 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         metres(code) - self.prediction.reading.get(b).copied().unwrap_or(0.0)
     }
 
+    /// Measured minus predicted tune at `ln` of the supplies' factors.
+    fn tune_innovation(&self, model: &Model<'_, G, B, C, F>, plane: usize, tune: f32, strength: &[f32; F]) -> f32 {
+        let (predicted, _) = model.surrogate.tune(&self.linearised, plane, &less(strength, &self.supplies));
+        wrapped(tune - predicted)
+    }
+
     fn slope(&self, b: usize) -> &[f32] {
         column(self.prediction.jacobian.as_slice(), N, b)
     }
 
     /// Variance of the mean of `n` repeats: the monitor's noise, and the stated error of the surrogate, which is the same
     /// in all of them [m^2].
-    fn variance(&self, model: &Model<'_, G>, b: usize, n: u32, rf_offset: f32) -> f32 {
+    fn variance(&self, model: &Model<'_, G, B, C, F>, b: usize, n: u32, rf_offset: f32) -> f32 {
         self.noise_variance(b) / n.max(1) as f32 + self.shared_variance(model, b, rf_offset)
     }
 
     /// Variance that repeats of a reading share: the stated error of the surrogate [m^2].
-    fn shared_variance(&self, model: &Model<'_, G>, b: usize, rf_offset: f32) -> f32 {
+    fn shared_variance(&self, model: &Model<'_, G, B, C, F>, b: usize, rf_offset: f32) -> f32 {
         let [orbit_x, orbit_y] = self.orbit;
-        let orbit = if b < model.surrogate.horizontal_monitors() { orbit_x } else { orbit_y };
+        let orbit = if b < model.surrogate.layout().first_vertical() { orbit_x } else { orbit_y };
         model.surrogate.error_variance(b, rf_offset, orbit)
     }
 
@@ -370,7 +434,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     /// The `n`-th repeat `z` of mean `m` (itself included), with noise `v` of its own and an error of variance `e` that all
     /// share, moves the mean as would an independent reading `z + n e/v (z - m)` of variance
     /// `(v + (n - 1) e)(v + n e)/v`: both means then have variance `v/n + e`.
-    fn news_of(&self, model: &Model<'_, G>, b: usize, innovation: f32, cell: Option<u16>) -> (f32, f32) {
+    fn news_of(&self, model: &Model<'_, G, B, C, F>, b: usize, innovation: f32, cell: Option<u16>) -> (f32, f32) {
         let (own, shared) = (self.noise_variance(b), self.shared_variance(model, b, self.rf_offset));
         let cell = cell.and_then(|index| self.campaign.cells().get(usize::from(index)));
         let (n, distance) = cell.map_or((1, 0.0), |cell| (cell.mean(b).1.max(1), cell.distance(b)));
@@ -385,10 +449,16 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
     #[inline(never)]
-    fn condition(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, cell: Option<u16>, screened: &Screened) -> f32 {
+    fn condition(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        cell: Option<u16>,
+        screened: &Screened<W>,
+    ) -> f32 {
         let before = self.solution.cost;
         let linearised_once = cell.is_none() || !self.is_still(model);
-        for b in (0..B).filter(|b| screened.accepted >> b & 1 == 1) {
+        for b in (0..B).filter(|b| screened.accepted.has(*b)) {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
             let (innovation, variance) = self.news_of(model, b, self.innovation(b, code), cell);
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
@@ -399,25 +469,49 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             };
             self.gaussian.condition(b, innovation, variance + own, slope);
         }
+        self.condition_tunes(model, screened);
         self.gaussian.settle();
         // readings confirmed late or outvoted are counted when the past is weighted anew
-        self.stale |= screened.confirmed != 0 || screened.restarted != 0;
+        self.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
         self.solve(model);
         let nis = self.solution.cost - before;
         self.nis.0.add(nis);
-        self.nis.1 = self.nis.1.saturating_add(screened.accepted.count_ones());
+        self.nis.1 = self.nis.1.saturating_add(screened.count());
         nis
+    }
+
+    /// Add the tunes that passed.
+    fn condition_tunes(&mut self, model: &Model<'_, G, B, C, F>, screened: &Screened<W>) {
+        let linearised_once = !self.is_still(model);
+        for plane in 0..2 {
+            let variance = self.tunes.get(plane).and_then(TuneMeter::variance);
+            if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
+                let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
+                let own = if linearised_once {
+                    UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(B + plane, &slope).0)
+                } else {
+                    0.0
+                };
+                self.gaussian.condition(B + plane, *innovation, variance + own, &slope);
+            }
+        }
     }
 
     /// Keep a frame that belongs to no setting among the recent ones; the oldest of them is linearised for the last time.
     #[inline(never)]
-    fn keep_loose(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, drive: &Drive<C>, screened: &Screened) {
+    fn keep_loose(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+        screened: &Screened<W>,
+    ) {
         if self.recent.is_full()
             && let Some(oldest) = self.recent.pop_front()
         {
             self.loose.recentre(self.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
-            for b in (0..B).filter(|b| oldest.accepted >> b & 1 == 1) {
+            for b in (0..B).filter(|b| oldest.accepted.has(*b)) {
                 let variance = self.variance(model, b, 1, oldest.drive.rf_offset);
                 let slope = column(self.prediction.jacobian.as_slice(), N, b);
                 let own = UNDERWEIGHT * self.solution.variance_of(&self.loose.effective(b, slope).0);
@@ -432,21 +526,22 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     #[inline(never)]
-    fn solve(&mut self, model: &Model<'_, G>) {
-        self.solution.solve(&self.gaussian, &model.setup.prior);
-        let split = model.surrogate.horizontal_monitors();
-        self.orbit = [self.gaussian.orbit(0, split), self.gaussian.orbit(split, B)];
+    fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
+        self.solution.solve(&self.gaussian, |i| prior_of::<G, B, C, F, N>(model, i));
+        let Layout { ring, room } = model.surrogate.layout();
+        let ([x, y], [first, _]) = (ring.monitors.map(usize::from), room.monitors.map(usize::from));
+        self.orbit = [self.gaussian.orbit(0, x), self.gaussian.orbit(first, first + y)];
     }
 
     #[inline(never)]
     fn estimate(
         &mut self,
-        model: &Model<'_, G>,
-        frame: &Frame<B, C>,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
         cell: Option<u16>,
-        screened: &Screened,
+        screened: &Screened<W>,
         nis: f32,
-    ) -> Estimate<B, N> {
+    ) -> Estimate<B, N, W> {
         let linearised = core::mem::take(&mut self.news);
         let solution = &self.solution;
         let mut estimate = Estimate {
@@ -465,13 +560,14 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             rejected: screened.rejected,
             confirmed: screened.confirmed,
             restarted: screened.restarted,
+            tune_innovation: screened.tune,
             setting: cell,
             log_evidence: solution.log_evidence,
             linearised,
             health: core::array::from_fn(|b| self.monitors.get(b).map(Monitor::health).unwrap_or_default()),
         };
         for i in 0..N {
-            let moments = estimate.marginal(i, &model.setup.prior).map(|m| m.moments());
+            let moments = estimate.marginal(i, &prior_of::<G, B, C, F, N>(model, i)).map(|m| m.moments());
             if let (Some((var, spread)), Some(mean), Some(sigma)) =
                 (moments, estimate.mean.get_mut(i), estimate.sigma.get_mut(i))
             {
@@ -483,7 +579,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// Centre of a param's normal before truncation: the MAP, or for a clipped param the unbounded optimum.
     fn centre(&self, i: usize) -> f32 {
-        let clipped = self.solution.clipped >> i & 1 == 1;
+        let clipped = self.solution.clipped.has(i);
         let origin = self.gaussian.origin().get(i).copied().unwrap_or(0.0);
         let unbounded = origin + self.solution.delta.get(i).copied().unwrap_or(0.0);
         if clipped { unbounded } else { self.solution.map_params.get(i).copied().unwrap_or(unbounded) }
@@ -500,9 +596,23 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 }
 
+/// Prior of a param.
+fn prior_of<G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize>(
+    model: &Model<'_, G, B, C, F>,
+    param: usize,
+) -> Prior {
+    model.setup.prior_of(model.surrogate.prior_group(param))
+}
+
 /// A drive seen from the supplies' mean: what is left for first order.
-fn about<const C: usize>(drive: &Drive<C>, supplies: &[f32; 2]) -> Drive<C> {
-    Drive { strength: [drive.strength[0] - supplies[0], drive.strength[1] - supplies[1]], ..*drive }
+fn about<const C: usize, const F: usize>(drive: &Drive<C, F>, supplies: &[f32; F]) -> Drive<C, F> {
+    Drive { strength: less(&drive.strength, supplies), ..*drive }
+}
+
+fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
+    let mut rest = *strength;
+    rest.iter_mut().zip(supplies).for_each(|(rest, supply)| *rest -= supply);
+    rest
 }
 
 fn metres(code: i32) -> f32 {

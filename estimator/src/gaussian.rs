@@ -7,6 +7,8 @@
 //! `d = h - slope_b`, `e = innovation - mean_b`, `s = noise^2 + covariance_bb`:
 //! `information += d d^T/s`, `vector += d e/s`, `cost += e^2/s`.
 //!
+//! A tune meter is one more monitor here: its baseline is its calibration error.
+//!
 //! With constant params the covariance stays diagonal and `slope`, `mean` are running weighted means.
 //!
 //! Source: the square completion behind the Schur complement, e.g. A. Gelb, Applied Optimal Estimation (1974), ch. 4.
@@ -14,6 +16,7 @@
 use nalgebra::SMatrix;
 
 use crate::linear::{add, column, dot, zeros};
+use crate::mask::Mask;
 use crate::prior::Prior;
 use crate::sum::{LogProduct, Sum};
 use crate::triangle::Triangle;
@@ -55,9 +58,6 @@ pub struct Pool<const B: usize> {
     /// Sum of precision times residual.
     pull: [f32; B],
 }
-
-/// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
-const BASELINE: f32 = 0.02;
 
 /// Information on `N` params and `B` baselines; `T` entries make a triangle of `N`.
 #[derive(Debug, Clone, Copy)]
@@ -105,20 +105,27 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         readings: Sum::ZERO,
     };
 
-    /// The prior alone, its mean the origin.
-    pub fn reset(&mut self, prior: &Prior) {
-        let precision = 1.0 / (prior.sigma * prior.sigma);
-        self.origin = [prior.mean; N];
-        self.information.fill_diagonal(precision);
+    /// The prior alone, its mean the origin: that of each param, and the standard deviation of each baseline.
+    pub fn reset(&mut self, prior: impl Fn(usize) -> Prior, baseline: impl Fn(usize) -> f32) {
+        (self.cost, self.volume, self.readings) = (Sum::ZERO, LogProduct::ONE, Sum::ZERO);
+        self.information.fill_diagonal(0.0);
+        for (i, (row, origin)) in self.information.rows_mut().zip(&mut self.origin).enumerate() {
+            let Prior { mean, sigma, .. } = prior(i);
+            let precision = 1.0 / (sigma * sigma);
+            *origin = mean;
+            row.last_mut().into_iter().for_each(|diagonal| *diagonal = precision);
+            self.volume.add_log(-libm::logf(precision));
+        }
         self.staged_rows = 0;
         self.vector = [0.0; N];
         self.baseline = [0.0; B];
         self.slope.fill(0.0);
         self.covariance.fill(0.0);
-        self.covariance.fill_diagonal(BASELINE * BASELINE);
+        for (b, column) in self.covariance.as_mut_slice().chunks_exact_mut(B).enumerate() {
+            let sigma = baseline(b);
+            column.get_mut(b).into_iter().for_each(|diagonal| *diagonal = sigma * sigma);
+        }
         self.walked = false;
-        (self.cost, self.volume, self.readings) = (Sum::ZERO, LogProduct::ONE, Sum::ZERO);
-        self.volume.add_log(-(N as f32) * libm::logf(precision));
     }
 
     /// Params at which innovations are to be formed.
@@ -298,7 +305,7 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
     ///
     /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.
     /// `solution` is that of this Gaussian and serves as work space.
-    pub fn walk(&mut self, sigma: f32, solution: &mut Solution<N, T>) {
+    pub fn walk<const W: usize>(&mut self, sigma: f32, solution: &mut Solution<N, T, W>) {
         let variance = sigma * sigma;
         let mean = solution.delta;
         let k = &mut solution.factor;
@@ -349,7 +356,7 @@ const SUPPORT: [f32; 6] = [0.0, 1e-6, 1e-5, 1e-4, 1e-2, 1.0];
 
 /// The best point of a [`Gaussian`], and its spread.
 #[derive(Debug, Clone)]
-pub struct Solution<const N: usize, const T: usize> {
+pub struct Solution<const N: usize, const T: usize, const W: usize> {
     /// Best point without bounds, relative to the origin.
     pub delta: [f32; N],
     /// Best point within the prior's range: the MAP params.
@@ -357,7 +364,7 @@ pub struct Solution<const N: usize, const T: usize> {
     /// Standard deviation of each param.
     pub sigma: [f32; N],
     /// Bit `i` is 1 if param `i` sits at a bound.
-    pub clipped: u64,
+    pub clipped: Mask<W>,
     /// Chi-square at the best point without bounds.
     pub cost: f32,
     /// `ln` of the evidence: the density of all readings under the model.
@@ -366,13 +373,13 @@ pub struct Solution<const N: usize, const T: usize> {
     factor: Triangle<N, T>,
 }
 
-impl<const N: usize, const T: usize> Solution<N, T> {
+impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
     /// Memory for one, all zero.
     pub const BLANK: Self = Self {
         delta: [0.0; N],
         map_params: [0.0; N],
         sigma: [0.0; N],
-        clipped: 0,
+        clipped: Mask::NONE,
         cost: 0.0,
         log_evidence: 0.0,
         factor: Triangle::ZERO,
@@ -380,8 +387,8 @@ impl<const N: usize, const T: usize> Solution<N, T> {
 
     /// Solve a Gaussian. Where rounding has made its information singular, the diagonal is enlarged by as little as makes
     /// it positive again, and this is false.
-    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: &Prior) -> bool {
-        const { assert!(N <= 64, "clipped params are counted in one u64") };
+    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: impl Fn(usize) -> Prior) -> bool {
+        const { assert!(W >= crate::mask::words(N), "W words have a bit for each param") };
         let mut support = SUPPORT.into_iter();
         let log_determinant = loop {
             let Some(more) = support.next() else { return false };
@@ -408,27 +415,32 @@ impl<const N: usize, const T: usize> Solution<N, T> {
     }
 
     /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
-    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: &Prior) {
+    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: impl Fn(usize) -> Prior) {
         // not `clamp`, which panics on bounds that are crossed
-        let bounded = |theta: f32| theta.max(prior.lower).min(prior.upper);
+        let bounded = |i: usize, theta: f32| {
+            let Prior { lower, upper, .. } = prior(i);
+            theta.max(lower).min(upper)
+        };
         let mut outside = false;
-        for ((map, delta), origin) in self.map_params.iter_mut().zip(&self.delta).zip(&gaussian.origin) {
-            *map = bounded(origin + delta);
+        for (i, ((map, delta), origin)) in self.map_params.iter_mut().zip(&self.delta).zip(&gaussian.origin).enumerate()
+        {
+            *map = bounded(i, origin + delta);
             outside |= *map != origin + delta;
         }
-        self.clipped = 0;
+        self.clipped = Mask::NONE;
         if !outside {
             return;
         }
         let mut pull = gaussian.pull(&self.map_params);
         // Each sweep minimises over one param at a time; the error falls by the coupling, about a half, each sweep.
         for _ in 0..30 {
-            if !self.sweep(gaussian, &mut pull, bounded) {
+            if !self.sweep(gaussian, &mut pull, &bounded) {
                 break;
             }
         }
         for (i, &map) in self.map_params.iter().enumerate() {
-            self.clipped |= u64::from(map == prior.lower || map == prior.upper) << i;
+            let Prior { lower, upper, .. } = prior(i);
+            self.clipped.put(i, map == lower || map == upper);
         }
     }
 
@@ -438,11 +450,11 @@ impl<const N: usize, const T: usize> Solution<N, T> {
         &mut self,
         gaussian: &Gaussian<B, N, T>,
         pull: &mut [f32; N],
-        bounded: impl Fn(f32) -> f32,
+        bounded: impl Fn(usize, f32) -> f32,
     ) -> bool {
         let (mut moved, mut row) = (false, [0.0; N]);
         for (i, (map, sigma)) in self.map_params.iter_mut().zip(&self.sigma).enumerate() {
-            let to = bounded(*map + pull.get(i).copied().unwrap_or(0.0) / gaussian.information.get(i, i));
+            let to = bounded(i, *map + pull.get(i).copied().unwrap_or(0.0) / gaussian.information.get(i, i));
             let step = to - *map;
             if step.abs() > 1e-3 * sigma {
                 gaussian.information.copy_row(i, &mut row);
@@ -500,7 +512,10 @@ mod tests {
 
     use super::*;
 
+    const BASELINE: f32 = 0.02;
     const WIDE: Prior = Prior { mean: 0.0, sigma: 0.03, lower: -0.06, upper: 0.06 };
+
+    type Solved = Solution<2, 3, 1>;
 
     /// Readings of two monitors of a ring with two params.
     fn readings() -> Vec<(usize, f32, [f32; 2])> {
@@ -516,7 +531,7 @@ mod tests {
 
     fn prior() -> Gaussian<2, 2, 3> {
         let mut gaussian = Gaussian::BLANK;
-        gaussian.reset(&WIDE);
+        gaussian.reset(|_| WIDE, |_| BASELINE);
         gaussian
     }
 
@@ -552,8 +567,8 @@ mod tests {
     }
 
     fn assert_equal(gaussian: &Gaussian<2, 2, 3>, walks: &[usize], walk: f64) {
-        let mut solution = Solution::BLANK;
-        assert!(solution.solve(gaussian, &WIDE));
+        let mut solution = Solved::BLANK;
+        assert!(solution.solve(gaussian, |_| WIDE));
         let (x, p) = batch(walks, walk);
         for i in 0..2 {
             let sigma = p[(i, i)].sqrt();
@@ -592,9 +607,9 @@ mod tests {
         }
         pooled.close(&pool);
         one_by_one.settle();
-        let (mut expected, mut solution) = (Solution::BLANK, Solution::BLANK);
-        expected.solve(&one_by_one, &WIDE);
-        solution.solve(&pooled, &WIDE);
+        let (mut expected, mut solution) = (Solved::BLANK, Solved::BLANK);
+        expected.solve(&one_by_one, |_| WIDE);
+        solution.solve(&pooled, |_| WIDE);
         for i in 0..2 {
             assert!((solution.delta[i] - expected.delta[i]).abs() < 1e-3 * expected.sigma[i]); // f32 rounding
             assert!((solution.sigma[i] / expected.sigma[i] - 1.0).abs() < 1e-4);
@@ -613,10 +628,10 @@ mod tests {
     #[test]
     fn recentring_changes_nothing() {
         let mut gaussian = conditioned();
-        let (mut before, mut after) = (Solution::BLANK, Solution::BLANK);
-        before.solve(&gaussian, &WIDE);
+        let (mut before, mut after) = (Solved::BLANK, Solved::BLANK);
+        before.solve(&gaussian, |_| WIDE);
         gaussian.recentre(&[0.01, -0.02]);
-        after.solve(&gaussian, &WIDE);
+        after.solve(&gaussian, |_| WIDE);
         assert_equal(&gaussian, &[], 0.0);
         assert!((before.log_evidence - after.log_evidence).abs() < 1e-2); // cancellation of chi-squares of 1e4 in f32
     }
@@ -624,10 +639,10 @@ mod tests {
     #[test]
     fn a_walk_is_a_kalman_prediction() {
         let mut gaussian = prior();
-        let mut solution = Solution::BLANK;
+        let mut solution = Solved::BLANK;
         for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
             if i == 10 || i == 25 {
-                solution.solve(&gaussian, &WIDE);
+                solution.solve(&gaussian, |_| WIDE);
                 gaussian.walk(2e-2, &mut solution);
             }
             gaussian.condition(b, innovation, VARIANCE, &h);
@@ -639,10 +654,10 @@ mod tests {
     /// The evidence is the product of the predictive densities of the readings, one after another.
     #[test]
     fn evidence_is_the_product_of_predictions() {
-        let (mut gaussian, mut solution) = (prior(), Solution::BLANK);
+        let (mut gaussian, mut solution) = (prior(), Solved::BLANK);
         let mut log_density = 0.0;
         for (b, innovation, h) in readings() {
-            solution.solve(&gaussian, &WIDE);
+            solution.solve(&gaussian, |_| WIDE);
             let (d, baseline) = gaussian.effective(b, &h);
             let s = VARIANCE + baseline + solution.variance_of(&d);
             let e = innovation - gaussian.baseline(b) - d[0] * solution.delta[0] - d[1] * solution.delta[1];
@@ -650,7 +665,7 @@ mod tests {
             gaussian.condition(b, innovation, VARIANCE, &h);
             gaussian.settle();
         }
-        solution.solve(&gaussian, &WIDE);
+        solution.solve(&gaussian, |_| WIDE);
         assert!((solution.log_evidence - log_density).abs() < 0.02, "{} {log_density}", solution.log_evidence); // f32
     }
 
@@ -658,9 +673,9 @@ mod tests {
     fn a_param_beyond_its_range_is_clipped_and_the_other_follows() {
         let narrow = Prior { upper: 0.005, ..WIDE };
         let gaussian = conditioned();
-        let mut solution = Solution::BLANK;
-        solution.solve(&gaussian, &narrow);
-        assert_eq!(solution.clipped, 0b01);
+        let mut solution = Solved::BLANK;
+        solution.solve(&gaussian, |_| narrow);
+        assert_eq!(solution.clipped.as_words(), [0b01]);
         assert_eq!(solution.map_params[0], narrow.upper);
         // at the constrained best point nothing pulls on the free param
         let pull = gaussian.pull(&solution.map_params)[1] / gaussian.information.get(1, 1);

@@ -3,7 +3,8 @@
 //! `no_std`, no allocator, no `unsafe`, the same bits on host and chip. Start reading at [`Estimator::ingest`]; the
 //! mathematics is in `docs/model.md`, the wire format in `docs/frame.md`.
 //!
-//! Shapes: `B` monitors, `C` correctors, `N` params (one for each quadrupole), `S` settings that are kept apart.
+//! Shapes: `B` monitors, `C` correctors, `F` supplies, `M` quadrupoles, `N` params, `S` settings that are kept apart. All sizes
+//! of one machine follow from a few numbers, by [`machine!`]; the Booster's stand in [`booster`].
 #![no_std]
 #![forbid(unsafe_code)]
 
@@ -12,23 +13,33 @@ mod campaign;
 mod drive;
 mod estimate;
 mod estimator;
-mod frame;
 mod gaussian;
 mod linear;
+mod machine;
+mod mask;
 mod monitor;
-pub mod packet;
 mod prior;
+mod sizes;
+mod stream;
 mod sum;
 pub mod surrogate;
 mod triangle;
+mod tune;
+pub mod wire;
 
 pub use campaign::{Campaign, Cell, Setting, Verdict};
-pub use drive::{Beyond, Calibration, Drive};
+pub use drive::{Beyond, Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState};
-pub use estimator::{Estimator, FitQuality, IngestError, Model, Setup};
-pub use frame::{CurrentCode, Frame, FrameError, MagnetCurrents, PositionCode, RfCode, TuneCode};
+pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Setup};
 pub use gaussian::{Gaussian, Solution};
+pub use mask::{Mask, words};
 pub use monitor::{Gate, Monitor, Noise};
 pub use prior::{Marginal, Prior};
-pub use surrogate::{Prediction, Surrogate};
+pub use sizes::{Layout, Sizes, largest};
+pub use stream::Core;
+pub use surrogate::{Prediction, Surrogate, Tables};
 pub use triangle::Triangle;
+pub use wire::packet;
+pub use wire::{
+    CurrentCode, Frame, FrameError, IntensityCode, MagnetCurrents, Parcel, ParcelError, PositionCode, RfCode, TuneCode,
+};

@@ -75,6 +75,11 @@ impl Noise {
         Self { expected: sigma, sigma, ..Self::BLANK }
     }
 
+    /// Expect nothing but the order of magnitude: infinite until enough differences tell [m].
+    pub fn unknown(scale: f32) -> Self {
+        Self { expected: scale, sigma: f32::INFINITY, ..Self::BLANK }
+    }
+
     /// Noise in use [m].
     pub fn sigma(&self) -> f32 {
         self.sigma

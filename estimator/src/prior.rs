@@ -1,7 +1,7 @@
 //! Lognormal prior of a quadrupole factor, and the truncated normal that its posterior becomes.
 //!
 //! The params are `theta = ln var`; a lognormal var of mean 1 and width `w` has
-//! `sigma^2 = ln(1 + w^2)` and `mean of theta = -sigma^2/2`. Both are truncated to 0.94..1.06 (the paper's range).
+//! `sigma^2 = ln(1 + w^2)` and `mean of theta = -sigma^2/2`. It is truncated to a range, 0.94..1.06 in the paper.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,16 +19,22 @@ pub struct Prior {
 }
 
 impl Prior {
-    /// Lognormal of mean 1 and standard deviation `width`, truncated to `0.94..1.06`.
+    /// Lognormal of mean 1 and standard deviation `width`, truncated to a range of the factor.
     ///
     /// ```
-    /// let prior = estimator::Prior::lognormal(0.03);
+    /// let prior = estimator::Prior::lognormal(0.03, [0.94, 1.06]);
     /// assert!((prior.sigma - 0.02999).abs() < 1e-5 && (prior.mean + 0.00045).abs() < 1e-6);
     /// ```
-    pub fn lognormal(width: f32) -> Self {
+    pub fn lognormal(width: f32, [lower, upper]: [f32; 2]) -> Self {
         let variance = libm::log1pf(width * width);
         let sigma = libm::sqrtf(variance);
-        Self { mean: -0.5 * variance, sigma, lower: libm::logf(0.94), upper: libm::logf(1.06) }
+        Self { mean: -0.5 * variance, sigma, lower: libm::logf(lower), upper: libm::logf(upper) }
+    }
+
+    /// True if every number is one, and sizes are positive.
+    pub fn is_sound(&self) -> bool {
+        let Self { mean, sigma, lower, upper } = *self;
+        [mean, sigma, lower, upper].iter().all(|v| v.is_finite()) && sigma > 0.0 && upper > lower
     }
 }
 
@@ -163,7 +169,7 @@ mod tests {
 
     #[test]
     fn moments_match_quadrature() {
-        let bounds = Prior::lognormal(0.03);
+        let bounds = Prior::lognormal(0.03, [0.94, 1.06]);
         for (mean, sigma, sigma_error) in
             [(0.0, 0.004, 5e-4), (0.055, 0.005, 2e-3), (-0.04, 0.01, 2e-3), (0.0, 0.03, 5e-4)]
         {
@@ -176,7 +182,7 @@ mod tests {
 
     #[test]
     fn far_outside_the_range_everything_stays_within_it() {
-        let bounds = Prior::lognormal(0.03);
+        let bounds = Prior::lognormal(0.03, [0.94, 1.06]);
         for mean in [-0.3, 0.25] {
             let m = Marginal { mean, sigma: 0.01, lower: bounds.lower, upper: bounds.upper };
             let quantiles = [0.025, 0.16, 0.84, 0.975].map(|p| m.quantile(p));

@@ -7,8 +7,8 @@
 mod chip {
     use core::hint::black_box;
 
-    use estimator::booster::{Estimate, Estimator, Green};
-    use estimator::{IngestError, Model, Setup};
+    use estimator::booster::{Estimate, Estimator, Green, Setup};
+    use estimator::{IngestError, Model};
 
     unsafe extern "C" {
         fn the_core_can_panic() -> !;

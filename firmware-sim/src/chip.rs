@@ -1,8 +1,7 @@
 //! The image: what lies where in memory, and the wiring.
 
-use estimator::booster::{Estimator, Green};
-use estimator::surrogate::{Block, Dispersion, GreenPlane, LowRank, SymmetricBlock};
-use firmware_sim::link::Vitals;
+use estimator::Tables as _;
+use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Panel};
 use static_cell::ConstStaticCell;
 
@@ -10,13 +9,12 @@ use crate::board::clock::Clock;
 use crate::board::pins::Pins;
 use crate::board::watchdog::Watchdog;
 use crate::board::{stack, uart};
+use crate::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
 
-/// The tables of the built-in machine, in flash.
-static BUILT_IN: Green = include!(concat!(env!("OUT_DIR"), "/tables.rs"));
 /// The posterior. All zero at first, so that it takes no flash.
 static CORE: ConstStaticCell<Estimator> = ConstStaticCell::new(Estimator::BLANK);
 /// Room for other tables.
-static SLOT: ConstStaticCell<Green> = ConstStaticCell::new(Green::BLANK);
+static SLOT: ConstStaticCell<Tables> = ConstStaticCell::new(Tables::BLANK);
 
 /// Rate of the UART [baud].
 const BAUD: u32 = 921_600;
@@ -32,14 +30,14 @@ fn main() -> ! {
     let pins = Pins::start();
     let (mut receiver, mut sender) = uart::start(BAUD, &clock);
     let mut panel = Panel::new(pins.heartbeat, pins.attention, Watchdog::start(WATCHDOG_S, pins.supervisor));
-    let mut device = Device::new(CORE.take(), &BUILT_IN, SLOT.take());
+    let mut device = Device::<_, LINE>::new(CORE.take(), &BUILT_IN, SLOT.take());
     let vitals = || Vitals {
         lost_bytes: uart::lost(),
         cycles: clock.now(),
         stack_bytes: stack::peak() as u32,
         ..Vitals::default()
     };
-    defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest());
-    let ended = firmware_sim::run(&mut device, &mut receiver, &mut sender, &mut panel, vitals);
+    defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest::<LINE>());
+    let ended = firmware_sim::run::<_, _, _, LINE, PACKET>(&mut device, &mut receiver, &mut sender, &mut panel, vitals);
     panic!("the UART has ended: {}", ended.is_ok())
 }

@@ -2,21 +2,26 @@
 //!
 //! Each answer is a function of its own, not inlined, so that the stack holds the buffers of one of them at a time.
 
-use estimator::booster::{Estimate, Estimator, Green};
-use estimator::surrogate::{Parcel, ParcelError, Unstable};
-use estimator::{Model, Setup, packet};
+use estimator::surrogate::Unstable;
+use estimator::wire::link::{PIECE, REQUEST, Refusal, Status, Taken, Vitals};
+use estimator::wire::{ParcelError, link};
+use estimator::{Core, Parcel, Tables, packet};
 use heapless::Vec;
 
-use crate::link::{PIECE, REQUEST, Refusal, Reply, Request, Status, TRIANGLE, Taken, Vitals};
+/// What a device of this core says.
+pub type Reply<E> = link::Reply<<E as Core>::Answer>;
+/// What it is asked; a line of its tables has at most `L` entries.
+pub type Request<E, const L: usize> = link::Request<<E as Core>::Setup, Parcel<L>>;
 
-/// The core and its tables: those in flash, and one slot for others that came over the wire.
+/// The core and its tables: those in flash, and one slot for others that came over the wire. A line of them has at most `L`
+/// entries.
 #[derive(Debug)]
-pub struct Device<'m> {
-    core: &'m mut Estimator,
-    built_in: &'m Green,
-    slot: &'m mut Green,
+pub struct Device<'m, E: Core, const L: usize> {
+    core: &'m mut E,
+    built_in: &'m E::Tables,
+    slot: &'m mut E::Tables,
     contents: Contents,
-    setup: Option<Setup>,
+    setup: Option<E::Setup>,
     wants_covariance: bool,
     refused: u32,
 }
@@ -32,9 +37,9 @@ enum Contents {
     InUse,
 }
 
-impl<'m> Device<'m> {
+impl<'m, E: Core, const L: usize> Device<'m, E, L> {
     /// A device that waits for its setup.
-    pub fn new(core: &'m mut Estimator, built_in: &'m Green, slot: &'m mut Green) -> Self {
+    pub fn new(core: &'m mut E, built_in: &'m E::Tables, slot: &'m mut E::Tables) -> Self {
         Self { core, built_in, slot, contents: Contents::Nothing, setup: None, wants_covariance: false, refused: 0 }
     }
 
@@ -44,8 +49,8 @@ impl<'m> Device<'m> {
         &mut self,
         bytes: &mut [u8],
         vitals: impl FnOnce() -> Vitals,
-        reply: &mut impl FnMut(&Reply),
-    ) -> Option<Estimate> {
+        reply: &mut impl FnMut(&Reply<E>),
+    ) -> Option<E::Estimate> {
         if packet::kind(bytes) == Some(REQUEST) {
             self.obey(bytes, vitals, reply);
             return None;
@@ -56,7 +61,7 @@ impl<'m> Device<'m> {
     /// What can be done between packets. See [`estimator::Estimator::prepare`].
     pub fn prepare(&mut self) -> bool {
         let Some(setup) = &self.setup else { return false };
-        self.core.prepare(&Model { surrogate: tables(self.contents, self.built_in, self.slot), setup })
+        self.core.prepare(tables(self.contents, self.built_in, self.slot), setup)
     }
 
     /// Packets refused so far.
@@ -66,24 +71,23 @@ impl<'m> Device<'m> {
 
     /// Count a packet that was none, and say so.
     #[inline(never)]
-    pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply)) {
+    pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply<E>)) {
         self.refused = self.refused.saturating_add(1);
-        reply(&Reply::Refused { why: why.into(), count: self.refused });
+        reply(&link::Reply::Refused { why: why.into(), count: self.refused });
     }
 
     /// A frame: the answer, and what was asked for with it.
     #[inline(never)]
-    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply)) -> Option<Estimate> {
+    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply<E>)) -> Option<E::Estimate> {
         let Some(setup) = &self.setup else {
             self.refuse(estimator::IngestError::NotStarted, reply);
             return None;
         };
-        let model = Model { surrogate: tables(self.contents, self.built_in, self.slot), setup };
-        match self.core.ingest(&model, bytes) {
+        match self.core.ingest(tables(self.contents, self.built_in, self.slot), setup, bytes) {
             Ok(estimate) => {
-                reply(&Reply::Estimate((&estimate).into()));
+                reply(&link::Reply::Estimate((&estimate).into()));
                 if core::mem::take(&mut self.wants_covariance) {
-                    self.send_covariance(estimate.sequence, reply);
+                    self.send_covariance(E::sequence(&estimate), reply);
                 }
                 Some(estimate)
             }
@@ -95,43 +99,44 @@ impl<'m> Device<'m> {
     }
 
     #[inline(never)]
-    fn send_covariance(&self, sequence: u32, reply: &mut impl FnMut(&Reply)) {
-        let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
-        for first in (0..TRIANGLE as u16).step_by(PIECE) {
+    fn send_covariance(&self, sequence: u32, reply: &mut impl FnMut(&Reply<E>)) {
+        let params = self.built_in.layout().params();
+        let mut places = (0..params).flat_map(|i| (0..=i).map(move |j| (i, j)));
+        for first in (0..(params * (params + 1) / 2) as u16).step_by(PIECE) {
             let entries: Vec<f32, PIECE> =
                 places.by_ref().take(PIECE).map(|(i, j)| self.core.covariance(i, j)).collect();
-            reply(&Reply::Covariance { sequence, first, entries });
+            reply(&link::Reply::Covariance { sequence, first, entries });
         }
     }
 
     #[inline(never)]
-    fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(&Reply)) {
-        match packet::unseal::<Request>(REQUEST, bytes) {
-            Ok(Request::Restart(setup)) => self.restart(setup, reply),
-            Ok(Request::ForgetSequence) => {
+    fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(&Reply<E>)) {
+        match Request::<E, L>::decode(bytes) {
+            Ok(link::Request::Restart(setup)) => self.restart(setup, reply),
+            Ok(link::Request::ForgetSequence) => {
                 self.core.forget_sequence();
-                say(|| Reply::SequenceForgotten, reply);
+                say(|| link::Reply::SequenceForgotten, reply);
             }
-            Ok(Request::Covariance) => self.wants_covariance = true,
-            Ok(Request::Status) => {
+            Ok(link::Request::Covariance) => self.wants_covariance = true,
+            Ok(link::Request::Status) => {
                 let status = self.status(vitals());
-                say(|| Reply::Status(status), reply);
+                say(|| link::Reply::Status(status), reply);
             }
-            Ok(Request::Model(parcel)) => {
+            Ok(link::Request::Model(parcel)) => {
                 let taken = self.load(&parcel);
-                say(|| Reply::Model(taken), reply);
+                say(|| link::Reply::Model(taken), reply);
             }
-            Ok(Request::BuiltIn) => {
+            Ok(link::Request::BuiltIn) => {
                 let taken = self.go_back();
-                say(|| Reply::Model(taken), reply);
+                say(|| link::Reply::Model(taken), reply);
             }
             Err(error) => self.refuse(error, reply),
         }
     }
 
     #[inline(never)]
-    fn restart(&mut self, setup: Setup, reply: &mut impl FnMut(&Reply)) {
-        if !setup.is_sound() {
+    fn restart(&mut self, setup: E::Setup, reply: &mut impl FnMut(&Reply<E>)) {
+        if !E::is_sound(&setup) {
             self.refuse(Refusal::Setup, reply);
             return;
         }
@@ -139,28 +144,33 @@ impl<'m> Device<'m> {
         if began.is_err() && self.contents == Contents::InUse {
             // not the setup's fault: the tables that came over the wire have no design, those in flash do
             self.contents = Contents::Nothing;
-            say(|| Reply::Model(Err(ParcelError::Unstable)), reply);
+            say(|| link::Reply::Model(Err(ParcelError::Unstable)), reply);
             began = self.begin(&setup);
         }
         // a core that has not begun has lost its posterior: it waits for a setup again
         self.setup = began.is_ok().then_some(setup);
         match began {
-            Ok(()) => say(|| Reply::Restarted, reply),
+            Ok(()) => say(|| link::Reply::Restarted, reply),
             Err(Unstable) => self.refuse(Refusal::NoDesign, reply),
         }
     }
 
-    fn begin(&mut self, setup: &Setup) -> Result<(), Unstable> {
-        self.core.restart(&Model { surrogate: tables(self.contents, self.built_in, self.slot), setup })
+    fn begin(&mut self, setup: &E::Setup) -> Result<(), Unstable> {
+        self.core.restart(tables(self.contents, self.built_in, self.slot), setup)
     }
 
     /// Write a part of new tables into the slot; with the last one they are put in use.
     #[inline(never)]
-    fn load(&mut self, parcel: &Parcel) -> Result<Taken, ParcelError> {
+    fn load(&mut self, parcel: &Parcel<L>) -> Result<Taken, ParcelError> {
         match (self.contents, parcel) {
             (Contents::InUse, _) => return Err(ParcelError::Busy),
             (Contents::Nothing, Parcel::Codes { .. } | Parcel::Values { .. } | Parcel::Seal { .. }) => {
                 return Err(ParcelError::Headless);
+            }
+            // another ring's would fit, if it were smaller; but frames and posterior are of this one
+            (_, Parcel::Head { sizes, .. }) if *sizes != self.built_in.layout().ring => {
+                self.contents = Contents::Nothing;
+                return Err(ParcelError::Sizes { room: self.built_in.layout().ring, got: *sizes });
             }
             _ => {}
         }
@@ -172,10 +182,10 @@ impl<'m> Device<'m> {
             return Ok(Taken::Stored);
         }
         if let Some(setup) = &self.setup
-            && self.core.adopt(&Model { surrogate: &*self.slot, setup }).is_err()
+            && self.core.adopt(self.slot, setup).is_err()
         {
             // the tables in flash have described all frames so far, so they can again
-            let _ = self.core.adopt(&Model { surrogate: self.built_in, setup });
+            let _ = self.core.adopt(self.built_in, setup);
             return Err(ParcelError::Unstable);
         }
         self.contents = Contents::InUse;
@@ -185,10 +195,10 @@ impl<'m> Device<'m> {
     #[inline(never)]
     fn go_back(&mut self) -> Result<Taken, ParcelError> {
         if let (Contents::InUse, Some(setup)) = (self.contents, &self.setup)
-            && self.core.adopt(&Model { surrogate: self.built_in, setup }).is_err()
+            && self.core.adopt(self.built_in, setup).is_err()
         {
             // the tables in the slot have described all frames so far, so they can again
-            let _ = self.core.adopt(&Model { surrogate: &*self.slot, setup });
+            let _ = self.core.adopt(self.slot, setup);
             return Err(ParcelError::Unstable);
         }
         self.contents = Contents::Nothing;
@@ -198,12 +208,12 @@ impl<'m> Device<'m> {
     #[inline(never)]
     fn status(&mut self, vitals: Vitals) -> Status {
         let tables = tables(self.contents, self.built_in, self.slot);
-        let quality = self.setup.as_ref().map(|setup| self.core.fit_quality(&Model { surrogate: tables, setup }));
+        let quality = self.setup.as_ref().map(|setup| self.core.fit_quality(tables, setup));
         Status {
             frames: self.core.frames(),
             refused: self.refused,
             vitals,
-            tables: tables.digest(),
+            tables: tables.digest::<L>(),
             loaded: self.contents == Contents::InUse,
             chi_square: quality.map_or(0.0, |q| q.chi_square),
             degrees_of_freedom: quality.map_or(0.0, |q| q.degrees_of_freedom),
@@ -214,11 +224,11 @@ impl<'m> Device<'m> {
 /// Say something. Not inlined: room for a reply is more than a kilobyte, which is not to lie on the stack while the core
 /// goes over to other tables.
 #[inline(never)]
-fn say(what: impl FnOnce() -> Reply, reply: &mut impl FnMut(&Reply)) {
+fn say<A>(what: impl FnOnce() -> link::Reply<A>, reply: &mut impl FnMut(&link::Reply<A>)) {
     reply(&what());
 }
 
 /// The tables in use.
-fn tables<'t>(contents: Contents, built_in: &'t Green, slot: &'t Green) -> &'t Green {
+fn tables<'t, G>(contents: Contents, built_in: &'t G, slot: &'t G) -> &'t G {
     if contents == Contents::InUse { slot } else { built_in }
 }

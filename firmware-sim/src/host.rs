@@ -4,18 +4,19 @@ use std::io::{self, Read as _, Write as _};
 
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, Write};
-use estimator::booster::{Estimator, Green};
-use firmware_sim::link::Vitals;
+use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Panel};
+
+use crate::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
 
 /// Run until standard input ends.
 pub fn run() -> io::Result<()> {
-    let tables = training::green::tables(&twin::Ring::booster()).expect("the built-in ring has tables");
-    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-    let mut device = Device::new(&mut core, &tables, &mut slot);
+    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Tables::BLANK));
+    let mut device = Device::<_, LINE>::new(&mut *core, &BUILT_IN, &mut *slot);
     let (mut source, mut sink) = (Stdin(io::stdin()), Stdout(io::stdout()));
     let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
-    let ended = firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
+    let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+    let ended = run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
     ended.map_err(|kind| io::Error::other(format!("{kind:?}")))
 }
 

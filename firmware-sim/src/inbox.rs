@@ -1,17 +1,15 @@
 //! From bytes to packets: what stands between two zeros.
 
 use embedded_io::{Error, ErrorKind, Read};
-use estimator::packet;
-
-use crate::link::Refusal;
+use estimator::wire::link::Refusal;
 
 /// Cycles without a byte after which the rest of a packet will not come: its sender has stalled, or begun anew.
 const PATIENCE: u32 = 2;
 
-/// The packet that is coming in.
+/// The packet that is coming in, of `P` bytes at most.
 #[derive(Debug)]
-pub struct Inbox {
-    bytes: [u8; packet::MAX_WIRE_BYTES],
+pub struct Inbox<const P: usize> {
+    bytes: [u8; P],
     length: usize,
     /// More came than any packet has; what follows up to the next zero is dropped.
     overflown: bool,
@@ -34,13 +32,13 @@ pub enum Event<'i> {
     End,
 }
 
-impl Default for Inbox {
+impl<const P: usize> Default for Inbox<P> {
     fn default() -> Self {
-        Self { bytes: [0; packet::MAX_WIRE_BYTES], length: 0, overflown: false, silence: 0, silent_cycles: 0 }
+        Self { bytes: [0; P], length: 0, overflown: false, silence: 0, silent_cycles: 0 }
     }
 }
 
-impl Inbox {
+impl<const P: usize> Inbox<P> {
     /// Whole cycles, from tick to tick, in which nothing came, since power-on.
     pub fn silent_cycles(&self) -> u32 {
         self.silent_cycles
@@ -53,7 +51,7 @@ impl Inbox {
     /// What the source reports, but [`ErrorKind::TimedOut`].
     pub fn next<R: Read>(&mut self, source: &mut R) -> Result<Event<'_>, R::Error> {
         let mut byte = [0];
-        for _ in 0..2 * packet::MAX_WIRE_BYTES {
+        for _ in 0..2 * P {
             match source.read(&mut byte) {
                 Ok(0) => return Ok(Event::End),
                 Ok(_) => self.silence = 0,
@@ -99,6 +97,9 @@ impl Inbox {
 mod tests {
     use super::*;
 
+    const MOST: usize = 1544;
+    type Small = Inbox<MOST>;
+
     /// A source of bytes, with cycles that pass where a `None` stands.
     struct Script<'s>(&'s [Option<u8>]);
 
@@ -121,7 +122,7 @@ mod tests {
 
     #[test]
     fn packets_end_with_a_zero_and_may_begin_with_one() {
-        let (script, mut inbox) = (bytes([0, 0, 2, 7, 0, 3, 0, 9]), Inbox::default());
+        let (script, mut inbox) = (bytes([0, 0, 2, 7, 0, 3, 0, 9]), Small::default());
         let mut source = Script(&script);
         assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [2, 7, 0])));
         assert_eq!(inbox.next(&mut source), Ok(Event::Packet(&mut [3, 0])));
@@ -130,11 +131,10 @@ mod tests {
 
     #[test]
     fn a_packet_that_is_too_long_does_not_spoil_the_one_after() {
-        const MOST: usize = packet::MAX_WIRE_BYTES;
         for length in [MOST - 1, MOST, MOST + 1, MOST + 9] {
             let mut script = [Some(1); MOST + 12];
             (script[length], script[length + 2]) = (Some(0), Some(0));
-            let (mut source, mut inbox) = (Script(&script), Inbox::default());
+            let (mut source, mut inbox) = (Script(&script), Small::default());
             match inbox.next(&mut source) {
                 Ok(Event::Packet(bytes)) => assert_eq!((bytes.len(), bytes.last()), (MOST, Some(&0)), "{length} bytes"),
                 other => assert_eq!((other, length >= MOST), (Ok(Event::Broken(Refusal::Oversized)), true), "{length}"),
@@ -146,8 +146,8 @@ mod tests {
     #[test]
     fn a_stream_without_packets_is_left_now_and_then() {
         for noise in [0, 1] {
-            let script = [Some(noise); 3 * packet::MAX_WIRE_BYTES];
-            let (mut source, mut inbox) = (Script(&script), Inbox::default());
+            let script = [Some(noise); 3 * MOST];
+            let (mut source, mut inbox) = (Script(&script), Small::default());
             assert_eq!(inbox.next(&mut source), Ok(Event::Silence));
             assert_eq!(inbox.next(&mut source), Ok(Event::End));
         }
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn a_stalled_sender_does_not_spoil_the_packet_after() {
         let script = [Some(5), None, Some(6), None, None, None, Some(7), Some(0)];
-        let (mut source, mut inbox) = (Script(&script), Inbox::default());
+        let (mut source, mut inbox) = (Script(&script), Small::default());
         assert_eq!(inbox.next(&mut source), Ok(Event::Silence), "one cycle is no stall");
         assert_eq!(inbox.next(&mut source), Ok(Event::Silence));
         assert_eq!(inbox.next(&mut source), Ok(Event::Broken(Refusal::Stalled)));
@@ -168,7 +168,7 @@ mod tests {
     #[test]
     fn a_stream_of_a_packet_a_cycle_has_no_silent_cycle() {
         let script = [Some(5), Some(0), None].repeat(20);
-        let (mut source, mut inbox) = (Script(&script), Inbox::default());
+        let (mut source, mut inbox) = (Script(&script), Small::default());
         while inbox.next(&mut source) != Ok(Event::End) {}
         assert_eq!(inbox.silent_cycles(), 0);
     }

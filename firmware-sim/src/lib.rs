@@ -7,11 +7,10 @@ extern crate std;
 
 mod device;
 mod inbox;
-pub mod link;
 mod panel;
 mod run;
 
-pub use device::Device;
+pub use device::{Device, Reply, Request};
 pub use inbox::{Event, Inbox};
 pub use panel::Panel;
 pub use run::run;

@@ -8,6 +8,7 @@ mod board;
 mod chip;
 #[cfg(not(target_os = "none"))]
 mod host;
+mod machine;
 
 #[cfg(not(target_os = "none"))]
 fn main() -> std::io::Result<()> {

@@ -1,8 +1,6 @@
 //! What a person, and a watchdog, can see of a device: three pins.
 
 use embedded_hal::digital::OutputPin;
-use estimator::MonitorState;
-use estimator::booster::Estimate;
 
 /// Two lamps, one that follows the cycle and one that says that something needs a look; and the line that keeps an
 /// external watchdog from resetting the device, fed by an edge.
@@ -34,14 +32,14 @@ impl<P: OutputPin, W: OutputPin> Panel<P, W> {
         Self { heartbeat, attention, watchdog: Line { pin: watchdog, is_high: false } }
     }
 
-    /// Show an estimate: the heartbeat toggles, and attention lights while any monitor is not ok or any var clipped.
+    /// Show an estimate: the heartbeat toggles, and attention lights while a person should have a look, see
+    /// [`estimator::Core::needs_attention`].
     ///
     /// # Errors
     /// What the pins report.
-    pub fn show(&mut self, estimate: &Estimate) -> Result<(), P::Error> {
+    pub fn show(&mut self, needs_attention: bool) -> Result<(), P::Error> {
         self.heartbeat.toggle()?;
-        let faulty = estimate.health.iter().any(|h| h.state != MonitorState::Ok);
-        self.attention.set_state((faulty || estimate.clipped != 0).into())
+        self.attention.set_state(needs_attention.into())
     }
 
     /// Light attention until the next good estimate: a packet was refused.
@@ -64,33 +62,8 @@ impl<P: OutputPin, W: OutputPin> Panel<P, W> {
 #[cfg(test)]
 mod tests {
     use embedded_hal_mock::eh1::digital::{Mock, State, Transaction};
-    use estimator::Health;
 
     use super::*;
-
-    fn estimate(state: MonitorState) -> Estimate {
-        Estimate {
-            sequence: 0,
-            time_us: 0,
-            frames: 1,
-            rejected_frames: 0,
-            mean: [1.0; 48],
-            sigma: [0.01; 48],
-            map_params: [0.0; 48],
-            centre: [0.0; 48],
-            params_sigma: [0.01; 48],
-            clipped: 0,
-            nis: 1.0,
-            accepted: 1,
-            rejected: 0,
-            confirmed: 0,
-            restarted: 0,
-            setting: None,
-            log_evidence: 0.0,
-            linearised: false,
-            health: [Health { state, ..Health::default() }; 33],
-        }
-    }
 
     fn pin(states: &[State]) -> Mock {
         Mock::new(&states.iter().map(|state| Transaction::set(*state)).collect::<std::vec::Vec<_>>())
@@ -104,11 +77,11 @@ mod tests {
         let [heartbeat, attention, watchdog] = pins.clone();
         let mut panel = Panel::new(heartbeat, attention, watchdog);
         // when two turns show a good, a faulty and a good estimate, and an alarm
-        panel.show(&estimate(MonitorState::Ok)).unwrap();
+        panel.show(false).unwrap();
         panel.feed().unwrap();
-        panel.show(&estimate(MonitorState::Noisy)).unwrap();
+        panel.show(true).unwrap();
         panel.feed().unwrap();
-        panel.show(&estimate(MonitorState::Ok)).unwrap();
+        panel.show(false).unwrap();
         panel.alarm().unwrap();
         // then nothing else was done to them
         pins.iter_mut().for_each(Mock::done);

@@ -2,35 +2,35 @@
 
 use embedded_hal::digital::OutputPin;
 use embedded_io::{Read, Write};
-use estimator::packet;
+use estimator::Core;
+use estimator::wire::link::Vitals;
 
-use crate::device::Device;
+use crate::device::{Device, Reply};
 use crate::inbox::{Event, Inbox};
-use crate::link::{Reply, Vitals};
 use crate::panel::Panel;
 
-/// Run until the source ends.
+/// Run until the source ends. No packet has more than `P` bytes.
 ///
 /// `source` reports [`embedded_io::ErrorKind::TimedOut`] once a machine cycle while nothing comes; `vitals` asks the board
 /// how it is, when a host asks for that.
 ///
 /// # Errors
 /// What the source or the sink report.
-pub fn run<R: Read, W: Write<Error = R::Error>>(
-    device: &mut Device<'_>,
+pub fn run<E: Core, R: Read, W: Write<Error = R::Error>, const L: usize, const P: usize>(
+    device: &mut Device<'_, E, L>,
     source: &mut R,
     sink: &mut W,
     panel: &mut Panel<impl OutputPin, impl OutputPin>,
     vitals: impl Fn() -> Vitals,
 ) -> Result<(), R::Error> {
-    let mut inbox = Inbox::default();
+    let mut inbox = Inbox::<P>::default();
     loop {
         let silent_cycles = inbox.silent_cycles();
         let event = inbox.next(source)?;
         let mut sent = Ok(());
-        let mut reply = |reply: &Reply| {
+        let mut reply = |reply: &Reply<E>| {
             if sent.is_ok() {
-                sent = send(sink, reply);
+                sent = send::<E, W, P>(sink, reply);
             }
         };
         let refused = device.refused();
@@ -44,7 +44,7 @@ pub fn run<R: Read, W: Write<Error = R::Error>>(
             Event::End => return sink.flush(),
         };
         // a lamp that does not light is no reason to stop
-        let _ = answer.map(|estimate| panel.show(&estimate));
+        let _ = answer.map(|estimate| panel.show(E::needs_attention(&estimate)));
         let _ = (device.refused() != refused).then(|| panel.alarm());
         sent?;
         let _ = panel.feed();
@@ -54,8 +54,8 @@ pub fn run<R: Read, W: Write<Error = R::Error>>(
 }
 
 #[inline(never)] // its buffers are not to lie on the stack meanwhile
-fn send<W: Write>(sink: &mut W, reply: &Reply) -> Result<(), W::Error> {
-    let mut outbox = [0; packet::MAX_WIRE_BYTES];
+fn send<E: Core, W: Write, const P: usize>(sink: &mut W, reply: &Reply<E>) -> Result<(), W::Error> {
+    let mut outbox = [0; P];
     // a reply always fits its buffer
     let bytes = reply.encode(&mut outbox).ok().and_then(|n| outbox.get(..n)).unwrap_or_default();
     sink.write_all(bytes)

@@ -35,6 +35,8 @@ pub enum Command {
     Study(Study),
     /// What is missing in the model of a recording, in a sentence, with proof on held-out frames
     Diagnose(Diagnose),
+    /// The calibrated ring as a lattice file of another code
+    Export(Export),
     /// Diagnose every recording below a folder and score it against the truth.json beside it
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns and count how often it is right
@@ -235,6 +237,41 @@ pub struct Diagnose {
     /// The model with what was identified, for `orbitcal replay --model-file` and for a device
     #[arg(long, value_name = "FILE")]
     pub model_out: Option<PathBuf>,
+}
+
+/// `orbitcal export`.
+#[derive(Debug, Args)]
+pub struct Export {
+    /// JSON of fit, replay or diagnose
+    #[arg(value_name = "FIT.json")]
+    pub result: PathBuf,
+    /// Which format
+    #[arg(long = "as", value_enum)]
+    pub format: Format,
+    /// The file, `-` for stdout
+    #[arg(long, value_name = "FILE", default_value = "-")]
+    pub out: PathBuf,
+    /// Machine file; the built-in AGS Booster without it
+    #[arg(long, value_name = "FILE")]
+    pub machine: Option<PathBuf>,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
+}
+
+/// Lattice formats.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// A sequence for MAD-X
+    Madx,
+    /// A lattice for Bmad and Tao
+    Bmad,
+    /// JSON for pyAT
+    At,
+    /// JSON for Xsuite
+    Xsuite,
+    /// JSON in the Particle Accelerator Lattice Standard
+    Pals,
 }
 
 /// `orbitcal challenge`.

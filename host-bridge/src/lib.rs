@@ -3,6 +3,7 @@
 
 pub mod cli;
 pub mod command;
+pub mod export;
 pub mod model_file;
 pub mod output;
 pub mod record;

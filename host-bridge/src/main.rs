@@ -7,7 +7,7 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, diagnose, fit, prove, replay, response, serve, study, surrogate, watch,
+    CommandError, challenge, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -30,6 +30,7 @@ fn main() -> ExitCode {
         Command::Study(options) => study::run(options),
         Command::Diagnose(options) => diagnose::run(options),
         Command::Challenge(options) => challenge::run(options),
+        Command::Export(options) => export::run(options),
         Command::Prove(options) => prove::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Surrogate(options) => surrogate::run(options),

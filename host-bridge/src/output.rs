@@ -20,7 +20,8 @@ pub struct OutputError {
 }
 
 impl OutputError {
-    fn of(path: &Path, reason: impl Display) -> Self {
+    /// For a file.
+    pub fn of(path: &Path, reason: impl Display) -> Self {
         Self { path: path.display().to_string(), reason: reason.to_string() }
     }
 }

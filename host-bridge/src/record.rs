@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use estimator::MonitorState;
-use inference::stream::BoosterEstimate;
+use inference::stream::Estimate;
 use twin::Ring;
 
 /// Whose numbers a record holds.
@@ -53,8 +53,10 @@ pub struct EstimateRecord {
     pub linearised: bool,
     /// The readings are further off than noise explains; none where that was not asked.
     pub mismatch: Option<bool>,
-    /// Joint normalised innovation squared of the readings used [1].
+    /// Joint normalised innovation squared of the readings used, tunes included [1].
     pub nis: f32,
+    /// Measured less predicted tunes x and y; none where the meter did not report, or does not count [1].
+    pub tune_innovation: [Option<f32>; 2],
     /// `ln` of the evidence of all readings under the model [nat].
     pub log_evidence: f32,
     /// Mean of each var [N] [1].
@@ -86,18 +88,16 @@ impl EstimateRecord {
     /// What a core says after a frame, with the covariance of two `ln var` and its mismatch alarm.
     pub fn of(
         names: &Arc<Names>,
-        estimate: &BoosterEstimate,
+        estimate: &Estimate,
         of_params: impl Fn(usize, usize) -> f32,
         mismatch: Option<bool>,
     ) -> Self {
-        let (vars, monitors) = (names.vars.len(), names.monitors.len());
-        let bit = |mask: u64, i: usize| mask >> i & 1 == 1;
-        let reading = |b| match (bit(estimate.accepted, b), bit(estimate.rejected, b)) {
+        let reading = |(accepted, rejected): (&bool, &bool)| match (accepted, rejected) {
             (true, _) => ReadingUse::Used,
             (false, true) => ReadingUse::Rejected,
             (false, false) => ReadingUse::Absent,
         };
-        let mean = &estimate.mean;
+        let Estimate { mean, health, .. } = estimate;
         Self {
             names: names.clone(),
             sequence: estimate.sequence,
@@ -107,18 +107,19 @@ impl EstimateRecord {
             linearised: estimate.linearised,
             mismatch,
             nis: estimate.nis,
+            tune_innovation: estimate.tune_innovation,
             log_evidence: estimate.log_evidence,
-            mean: mean.to_vec(),
-            sigma: estimate.sigma.to_vec(),
-            map_params: estimate.map_params.to_vec(),
-            centre: estimate.centre.to_vec(),
-            params_sigma: estimate.params_sigma.to_vec(),
-            clipped: (0..vars).map(|i| bit(estimate.clipped, i)).collect(),
-            covariance: triangle(vars, |i, j| mean[i] * mean[j] * of_params(i, j)),
-            reading: (0..monitors).map(reading).collect(),
-            monitor_state: estimate.health.iter().map(|health| health.state).collect(),
-            monitor_sigma: estimate.health.iter().map(|health| health.noise).collect(),
-            monitor_rejected: estimate.health.iter().map(|health| health.rejected).collect(),
+            mean: mean.clone(),
+            sigma: estimate.sigma.clone(),
+            map_params: estimate.map_params.clone(),
+            centre: estimate.centre.clone(),
+            params_sigma: estimate.params_sigma.clone(),
+            clipped: estimate.clipped.clone(),
+            covariance: triangle(mean.len(), |i, j| mean[i] * mean[j] * of_params(i, j)),
+            reading: estimate.accepted.iter().zip(&estimate.rejected).map(reading).collect(),
+            monitor_state: health.iter().map(|health| health.state).collect(),
+            monitor_sigma: health.iter().map(|health| health.noise).collect(),
+            monitor_rejected: health.iter().map(|health| health.rejected).collect(),
         }
     }
 
@@ -131,9 +132,9 @@ impl EstimateRecord {
         self.covariance[row * (row + 1) / 2 + column]
     }
 
-    /// NIS per reading used [1]: about 1 if the model and the noise are right; none if no reading was used.
+    /// NIS per reading used, tunes included [1]: about 1 if the model and the noise are right; none if no reading was used.
     pub fn nis_per_reading(&self) -> Option<f32> {
-        let readings = self.readings(ReadingUse::Used);
+        let readings = self.readings(ReadingUse::Used) + self.tune_innovation.iter().flatten().count();
         (readings > 0).then(|| self.nis / readings as f32)
     }
 
@@ -178,6 +179,7 @@ pub(crate) mod tests {
             linearised: false,
             mismatch: Some(false),
             nis: 0.0,
+            tune_innovation: [None; 2],
             log_evidence: 0.0,
             mean: vec![1.0; vars],
             sigma: vec![0.01; vars],
@@ -205,8 +207,7 @@ pub(crate) mod tests {
     fn a_record_says_what_the_core_says() {
         let ring = Ring::booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let layout = inference::stream::layout(&ring);
-        let recording = inference::Recording::read(&folder, &layout).unwrap();
+        let recording = inference::Recording::read(&folder, &ring).unwrap();
         let mut core = inference::stream::estimator(&ring, &recording, 0.0).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
@@ -218,6 +219,7 @@ pub(crate) mod tests {
             assert_eq!(of_vars, record.mean[i.max(j)] * record.mean[i.min(j)] * of_params, "({i}, {j})");
         }
         assert_eq!(record.monitor_sigma[32], estimate.health[32].noise);
-        assert_eq!(record.readings(ReadingUse::Used), estimate.accepted.count_ones() as usize);
+        assert_eq!(record.readings(ReadingUse::Used), estimate.accepted.iter().filter(|used| **used).count());
+        assert_eq!(record.tune_innovation.iter().flatten().count(), 2);
     }
 }

@@ -3,20 +3,18 @@
 use core::fmt;
 
 use comfy_table::{CellAlignment, Table};
-use estimator::{FitQuality, Health, Marginal, MonitorState, Prior, Setup};
-use inference::nuts::NutsRun;
-use inference::{BatchFit, Campaign, Recording, Summary};
+use estimator::{FitQuality, Health, Marginal, MonitorState, Prior};
+use inference::nuts::{NutsRun, UNMIXED};
+use inference::{BatchFit, Campaign, FittedTune, Lack, Recording, Reduced, Summary};
 use serde::Serialize;
 use studies::Sampled;
-use twin::{Hold, Optics, Ring};
+use twin::{Hold, Optics, OrbitError, Ring};
 
 use crate::output::{fill, table};
 use crate::record::EstimateRecord;
 
-/// Largest R-hat of chains that have mixed.
-///
-/// Source: Vehtari, Gelman, Simpson, Carpenter and Bürkner, Bayesian Analysis 16 (2021) 667.
-const MIXED: f64 = 1.01;
+/// Standard deviations between a measured tune and the model's that noise does not explain.
+const TUNES_DISAGREE: f64 = 4.0;
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
 #[derive(Debug, Clone, Serialize)]
@@ -35,6 +33,10 @@ pub struct FitResult {
     pub mismatch: Option<bool>,
     /// The model's.
     pub tunes: Option<Tunes>,
+    pub tunes_measured: TunesMeasured,
+    /// What the recording lacks to say anything: the vars are then those of the prior, but for measured tunes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lack: Option<String>,
     pub monitors: Vec<Monitor>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_evidence: Option<f64>,
@@ -63,11 +65,27 @@ pub struct Var {
 }
 
 /// Tunes of the twin at the means.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct Tunes {
     pub x: f64,
     pub y: f64,
+}
+
+/// Tunes as the meter measured them, with the model's integer parts; none without enough readings of it.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct TunesMeasured {
+    pub x: Option<TuneMeasured>,
+    pub y: Option<TuneMeasured>,
+}
+
+/// Mean of what the meter says of one tune, and its standard deviation, the meter's calibration included.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct TuneMeasured {
+    pub mean: f64,
+    pub sigma: f64,
 }
 
 /// State of one monitor.
@@ -136,28 +154,38 @@ impl Var {
 }
 
 impl FitResult {
-    /// What a core says after its last frame, here or on a device.
+    /// What a core says after its last frame, here or on a device; with the prior of each param.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring as designed is not stable.
     pub fn of_core(
         ring: &Ring,
         recording: &Recording,
-        setup: &Setup,
+        priors: &[Prior],
         last: &EstimateRecord,
         quality: FitQuality,
         timing: Timing,
-    ) -> Self {
-        let Prior { lower, upper, .. } = setup.prior;
-        let marginal = |i: usize| Marginal { mean: last.centre[i], sigma: last.params_sigma[i], lower, upper };
-        let names = ring.var_names().into_iter().enumerate();
-        let vars: Vec<Var> = names.map(|(i, name)| Var::of_marginal(name, &marginal(i), last.clipped[i])).collect();
-        let n = vars.len();
-        Self {
+    ) -> Result<Self, OrbitError> {
+        let marginal = |(i, Prior { lower, upper, .. }): (usize, &Prior)| Marginal {
+            mean: last.centre[i],
+            sigma: last.params_sigma[i],
+            lower: *lower,
+            upper: *upper,
+        };
+        let marginals = priors.iter().enumerate().map(marginal);
+        let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
+        let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
+        let (n, tunes, campaign) = (vars.len(), tunes(ring, &vars), Campaign::of(ring, recording)?);
+        Ok(Self {
             recording: recording.name.clone(),
             method: "laplace",
             model: "green",
             frames: last.frames as usize,
             rejected_frames: last.rejected_frames,
             covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),
-            tunes: tunes(ring, &vars),
+            tunes_measured: TunesMeasured::of_campaign(&campaign, tunes.as_ref()),
+            lack: lack(&campaign).map(|lack| lack.to_string()),
+            tunes,
             vars,
             chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),
             mismatch: Some(quality.is_mismatch()),
@@ -166,53 +194,59 @@ impl FitResult {
             timing: Some(timing),
             nuts: None,
             notes: Vec::new(),
-        }
+        })
     }
 
     /// What the batch fit says.
-    pub fn of_fit(ring: &Ring, recording: &Recording, fit: &BatchFit) -> Self {
+    pub fn of_fit(campaign: &Campaign, fit: &BatchFit) -> Self {
         let bounds = |m: &Marginal| m.mean <= m.lower || m.mean >= m.upper;
-        let each = ring.var_names().into_iter().zip(&fit.marginals);
+        let each = campaign.ring.var_names().into_iter().zip(&fit.marginals);
         let vars: Vec<Var> = each.map(|(name, marginal)| Var::of_marginal(name, marginal, bounds(marginal))).collect();
         Self {
-            recording: recording.name.clone(),
             method: "map",
             model: "twin",
-            frames: recording.rows.len(),
-            rejected_frames: 0,
             covariance: covariance(&vars, |i, j| fit.covariance[(i, j)]),
             vars,
-            chi2_per_dof: fit.chi2_per_dof,
-            mismatch: None,
-            tunes: Some(Tunes { x: fit.tunes.x, y: fit.tunes.y }),
-            monitors: monitors(ring, &fit.screened.health),
-            log_evidence: None,
-            timing: None,
-            nuts: None,
-            notes: Vec::new(),
+            ..Self::of_both(campaign, fit)
         }
     }
 
     /// What draws of the posterior say.
-    pub fn of_draws(ring: &Ring, campaign: &Campaign, model: &'static str, run: &NutsRun) -> Self {
+    pub fn of_draws(reduced: &Reduced, model: &'static str, run: &NutsRun) -> Self {
         let sampled = Sampled::of(&run.draws);
         let vars: Vec<Var> = sampled.summary.iter().map(Var::of_draws).collect();
         let covariance = sampled.covariance();
         Self {
-            recording: campaign.recording.name.clone(),
             method: "nuts",
             model,
-            frames: campaign.recording.rows.len(),
-            rejected_frames: 0,
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
-            tunes: tunes(ring, &vars),
+            tunes: tunes(&reduced.campaign.ring, &vars),
             vars,
-            chi2_per_dof: campaign.fit.chi2_per_dof,
+            nuts: Some(Sampling::of(&sampled, run)),
+            ..Self::of_both(&reduced.campaign, &reduced.fit)
+        }
+    }
+
+    /// What the batch fit says and the draws leave as it is.
+    fn of_both(campaign: &Campaign, fit: &BatchFit) -> Self {
+        let [x, y] = &fit.tunes;
+        Self {
+            recording: campaign.recording.name.clone(),
+            method: "",
+            model: "",
+            frames: campaign.frames(),
+            rejected_frames: 0,
+            vars: Vec::new(),
+            covariance: Vec::new(),
+            chi2_per_dof: fit.chi2_per_dof,
             mismatch: None,
-            monitors: monitors(ring, &campaign.fit.screened.health),
+            tunes: Some(Tunes { x: x.model, y: y.model }),
+            tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
+            lack: fit.lack.map(|lack| lack.to_string()),
+            monitors: monitors(&campaign.ring, &campaign.screened.health),
             log_evidence: None,
             timing: None,
-            nuts: Some(Sampling::of(&sampled, run)),
+            nuts: None,
             notes: Vec::new(),
         }
     }
@@ -229,7 +263,7 @@ impl FitResult {
             table.add_row(vars.flat_map(Var::cells));
         }
         for (i, column) in table.column_iter_mut().enumerate() {
-            column.set_padding((1, 0));
+            column.set_padding((1, u16::from(i + 1 == across * head.len())));
             column.set_cell_alignment(if i % 4 == 0 { CellAlignment::Left } else { CellAlignment::Right });
         }
         table
@@ -239,6 +273,8 @@ impl FitResult {
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
         let remarks = [
+            self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
+            self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),
             (self.mismatch == Some(true))
                 .then(|| "model and machine disagree beyond the noise: orbitcal diagnose may say why".into()),
@@ -257,7 +293,7 @@ impl fmt::Display for FitResult {
         self.remarks().iter().try_for_each(|remark| writeln!(f, "{}", fill(remark)))?;
         write!(f, "chi2/dof {:.4}", self.chi2_per_dof)?;
         if let Some(tunes) = &self.tunes {
-            write!(f, ", tunes {:.4} {:.4}", tunes.x, tunes.y)?;
+            write!(f, ", tunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
         }
         if self.rejected_frames > 0 {
             write!(f, ", {} frames refused", self.rejected_frames)?;
@@ -268,6 +304,52 @@ impl fmt::Display for FitResult {
         }
         self.notes.iter().try_for_each(|note| write!(f, "\n{}", fill(note)))
     }
+}
+
+impl TunesMeasured {
+    /// What the meter says of a campaign, with the integer parts of the model's.
+    fn of_campaign(campaign: &Campaign, model: Option<&Tunes>) -> Self {
+        let one = |plane: usize, model: f64| {
+            let meter = campaign.meters[plane].as_ref()?;
+            Some(TuneMeasured { mean: meter.near(model), sigma: meter.sigma })
+        };
+        Self { x: one(0, model.map_or(0.0, |tunes| tunes.x)), y: one(1, model.map_or(0.0, |tunes| tunes.y)) }
+    }
+
+    /// What is wrong with the model's, if anything is.
+    fn remark(&self, model: &Tunes) -> Option<String> {
+        let away = |plane: &str, measured: Option<TuneMeasured>, model: f64| {
+            let pull = measured.map(|tune| (tune.mean - model) / tune.sigma)?;
+            (pull.abs() > TUNES_DISAGREE).then(|| format!("tune {plane} by {pull:+.1} standard deviations"))
+        };
+        let both = [away("x", self.x, model.x), away("y", self.y, model.y)];
+        let both: Vec<String> = both.into_iter().flatten().collect();
+        (!both.is_empty()).then(|| {
+            format!("measured tunes differ from the model's, {}: a wrong kick constant does that", both.join(" and "))
+        })
+    }
+}
+
+impl fmt::Display for TunesMeasured {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let word = |tune: Option<TuneMeasured>| {
+            tune.map_or_else(|| "-".into(), |tune| format!("{:.4} ± {:.4}", tune.mean, tune.sigma))
+        };
+        match (self.x, self.y) {
+            (None, None) => f.write_str("not measured"),
+            (x, y) => write!(f, "measured {}, {}", word(x), word(y)),
+        }
+    }
+}
+
+fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
+    tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
+}
+
+/// What a campaign lacks, by what was read and what was moved.
+fn lack(campaign: &Campaign) -> Option<Lack> {
+    let is_moved = campaign.settings.count > 1;
+    if !campaign.has_readings() { Some(Lack::Readings) } else { (!is_moved).then_some(Lack::Kick) }
 }
 
 impl Sampling {
@@ -286,10 +368,10 @@ impl Sampling {
     /// What is wrong with the sampling, if anything is.
     fn remark(&self) -> Option<String> {
         // not a number where a chain has not moved at all
-        let has_mixed = self.rhat_max <= MIXED;
+        let has_mixed = self.rhat_max <= UNMIXED;
         (!has_mixed).then(|| {
             format!(
-                "R-hat is {:.3}, above {MIXED}: the chains do not agree yet. Sample longer (--warm-up, --draws) before \
+                "R-hat is {:.3}, above {UNMIXED}: the chains do not agree yet. Sample longer (--warm-up, --draws) before \
                  you use these numbers",
                 self.rhat_max
             )
@@ -299,19 +381,9 @@ impl Sampling {
 
 /// Vars from means and standard deviations of `ln var`, truncated to the prior's range.
 pub fn vars_of(ring: &Ring, mean: &[f64], sigma: &[f64]) -> Vec<Var> {
-    let prior = Prior::lognormal(inference::stream::PRIOR_WIDTH);
-    let marginal = |(mean, sigma): (&f64, &f64)| Marginal {
-        mean: *mean as f32,
-        sigma: *sigma as f32,
-        lower: prior.lower,
-        upper: prior.upper,
-    };
-    let marginals = mean.iter().zip(sigma).map(marginal);
-    ring.var_names()
-        .into_iter()
-        .zip(marginals)
-        .map(|(name, marginal)| Var::of_marginal(name, &marginal, false))
-        .collect()
+    let prior = inference::Prior::of(ring);
+    let var = |(i, name)| Var::of_marginal(name, &prior.marginal(i, mean[i], sigma[i]), false);
+    ring.var_names().into_iter().enumerate().map(var).collect()
 }
 
 /// Covariance of the vars, `mean_i mean_j` times that of their logarithms.

@@ -50,6 +50,11 @@ impl Sinks {
         self
     }
 
+    /// True if estimates go nowhere.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
     /// Hand an estimate to all of them.
     ///
     /// # Errors

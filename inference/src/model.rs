@@ -1,13 +1,13 @@
 //! What predicts the readings: the exact twin, or the surrogate's Green's function in f64.
 //!
 //! Both answer with the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
-//! frequency: `-D/eta`, the orbit of a unit of relative offset [m]. And both give the gradient of any function of it.
+//! frequency: `-D/eta`, the orbit of a unit of relative offset [m]; and with the tunes. And both give the gradient of any function of
+//! these.
 
 mod green;
 
 use nalgebra::DMatrix;
-use training::BoosterGreen;
-use twin::{OrbitError, Ring, VariedRing};
+use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 
 pub use green::GreenModel;
 
@@ -34,8 +34,7 @@ impl ResponseModel {
     /// # Errors
     /// [`training::TrainingError`] if it cannot be tabulated.
     pub fn green(ring: &Ring) -> Result<Self, training::TrainingError> {
-        let tables: BoosterGreen = training::green::tables(ring)?;
-        Ok(Self::Green(Box::new(GreenModel::of(&tables))))
+        Ok(Self::Green(Box::new(GreenModel::of(&training::green::tables(ring)?))))
     }
 
     /// The word for it.
@@ -54,57 +53,109 @@ impl ResponseModel {
         }
     }
 
-    /// Response at `params`, `ln` of each gradient factor: rows monitors, columns correctors and the RF.
+    /// What it predicts at `ln` of the factor on each quadrupole's gradient [M].
     ///
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
-    pub fn response(&self, params: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
+    pub fn predict(&self, strength: &[f64]) -> Result<Prediction, OrbitError> {
+        let factors = exponential(strength);
         match self {
-            Self::Twin(ring) => Ok(ring.at(params, &[])?.response()),
-            Self::Green(green) => Ok(green.at(&exponential(params))?.response()),
+            Self::Twin(ring) => Ok(ring.at(&factors)?.prediction()),
+            Self::Green(green) => Ok(green.at(&factors)?.prediction()),
         }
     }
 
-    /// Evaluate a function of the response, which returns its value and its derivative with respect to each entry; returns
-    /// the value and its gradient with respect to the params.
+    /// Evaluate a function of the prediction, which returns its value and its derivative with respect to each number of it; returns
+    /// the value and its gradient with respect to `ln` of each quadrupole's gradient [M].
     ///
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn differentiate<V>(
         &self,
-        params: &[f64],
-        function: impl FnOnce(&DMatrix<f64>) -> (V, DMatrix<f64>),
+        strength: &[f64],
+        function: impl FnOnce(&Prediction) -> (V, Prediction),
     ) -> Result<(V, Vec<f64>), OrbitError> {
+        let factors = exponential(strength);
         match self {
-            Self::Twin(ring) => {
-                let optics = ring.at(params, &[])?;
-                let (value, weights) = function(&optics.response());
-                Ok((value, optics.pull_back(&weights)))
-            }
-            Self::Green(green) => {
-                let optics = green.at(&exponential(params))?;
-                let (value, weights) = function(&optics.response());
-                Ok((value, optics.pull_back(&weights)))
-            }
+            Self::Twin(ring) => Ok(pull_back(&ring.at(&factors)?, function)),
+            Self::Green(green) => Ok(pull_back(&green.at(&factors)?, function)),
         }
     }
 
-    /// Derivative of the response at monitor `b`, rows as its columns, columns params.
+    /// Derivative of the response at each monitor, rows as its columns, columns quadrupoles, and of both tunes.
     ///
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
-    pub fn jacobian(&self, params: &[f64]) -> Result<Vec<DMatrix<f64>>, OrbitError> {
+    pub fn jacobian(&self, strength: &[f64]) -> Result<(Vec<DMatrix<f64>>, DMatrix<f64>), OrbitError> {
+        let factors = exponential(strength);
         match self {
-            Self::Twin(ring) => {
-                let optics = ring.at(params, &[])?;
-                Ok(rows_of(&optics.response(), params.len(), |weights| optics.pull_back(weights)))
-            }
-            Self::Green(green) => {
-                let optics = green.at(&exponential(params))?;
-                Ok(rows_of(&optics.response(), params.len(), |weights| optics.pull_back(weights)))
-            }
+            Self::Twin(ring) => Ok(slopes(&ring.at(&factors)?, strength.len())),
+            Self::Green(green) => Ok(slopes(&green.at(&factors)?, strength.len())),
         }
     }
+}
+
+/// What a model predicts, or the derivative of a function of it.
+#[derive(Debug, Clone)]
+pub struct Prediction {
+    /// Rows monitors, columns correctors and the RF.
+    pub response: DMatrix<f64>,
+    /// Fractional tunes x and y [1].
+    pub tunes: [f64; 2],
+}
+
+/// A model at given strengths.
+trait Optics {
+    /// Response [m/rad], rows monitors, columns correctors and the RF [m].
+    fn response(&self) -> DMatrix<f64>;
+
+    /// Fractional tunes.
+    fn tunes(&self) -> [f64; 2];
+
+    /// Gradient with respect to `ln` of each quadrupole's gradient of a function of the response, from its derivative `weights`.
+    fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64>;
+
+    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient.
+    fn tune_slopes(&self) -> Vec<[f64; 2]>;
+
+    fn prediction(&self) -> Prediction {
+        Prediction { response: self.response(), tunes: self.tunes() }
+    }
+}
+
+impl Optics for VariedOptics<'_> {
+    fn response(&self) -> DMatrix<f64> {
+        self.response()
+    }
+
+    fn tunes(&self) -> [f64; 2] {
+        self.tunes()
+    }
+
+    fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
+        self.pull_back(weights)
+    }
+
+    fn tune_slopes(&self) -> Vec<[f64; 2]> {
+        self.tune_slopes()
+    }
+}
+
+fn pull_back<V>(optics: &impl Optics, function: impl FnOnce(&Prediction) -> (V, Prediction)) -> (V, Vec<f64>) {
+    let (value, weights) = function(&optics.prediction());
+    let mut gradient = optics.pull_back(&weights.response);
+    if weights.tunes != [0.0; 2] {
+        for (slope, [x, y]) in gradient.iter_mut().zip(optics.tune_slopes()) {
+            *slope += weights.tunes[0] * x + weights.tunes[1] * y;
+        }
+    }
+    (value, gradient)
+}
+
+fn slopes(optics: &impl Optics, quadrupoles: usize) -> (Vec<DMatrix<f64>>, DMatrix<f64>) {
+    let tunes = optics.tune_slopes();
+    let rows = rows_of(&optics.response(), quadrupoles, |weights| optics.pull_back(weights));
+    (rows, DMatrix::from_fn(2, quadrupoles, |plane, m| tunes[m][plane]))
 }
 
 fn exponential(params: &[f64]) -> Vec<f64> {

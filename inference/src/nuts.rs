@@ -18,8 +18,8 @@ use nuts_rs::{
 
 use rand::Rng;
 
-use crate::draws::{Chain, DrawStats, Draws};
-use crate::posterior::{Laplace, Posterior, RANGE, params_of};
+use crate::draws::{Chain, DrawStats, Draws, Summary};
+use crate::posterior::{Laplace, Posterior};
 
 /// How to sample.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -78,8 +78,8 @@ pub trait Density: Send + Sync + 'static {
     /// Where there is no stable ring: the trajectory ends there.
     fn evaluate(&self, position: &[f64]) -> Result<(f64, Vec<f64>), Unstable>;
 
-    /// How many of the coordinates are vars.
-    fn vars(&self) -> usize;
+    /// Range of each var; the vars are the first of what is kept.
+    fn ranges(&self) -> Vec<[f64; 2]>;
 
     /// What is kept of a draw, by the names given: the vars, then anything else.
     fn expand(&self, position: &[f64]) -> Vec<f64>;
@@ -94,6 +94,19 @@ impl Unstable {
     /// With its reason.
     pub fn new(reason: impl core::error::Error + Send + Sync + 'static) -> Self {
         Self(Box::new(reason))
+    }
+}
+
+/// R-hat of chains that have not mixed: their draws are not yet those of one distribution.
+///
+/// Source: A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P. Buerkner, Bayesian Anal. 16 (2021) 667, sec. 4.
+pub const UNMIXED: f64 = 1.01;
+
+impl NutsRun {
+    /// The quantity with the largest R-hat, if that says that the chains have not mixed.
+    pub fn unmixed(&self) -> Option<Summary> {
+        let worst = self.draws.summary().into_iter().max_by(|one, other| one.r_hat.total_cmp(&other.r_hat));
+        worst.filter(|summary| summary.r_hat.is_nan() || summary.r_hat > UNMIXED)
     }
 }
 
@@ -170,12 +183,13 @@ impl Density for Whitened {
         Ok((value, self.laplace.whiten(&slope).as_slice().to_vec()))
     }
 
-    fn vars(&self) -> usize {
-        self.posterior.dimension()
+    fn ranges(&self) -> Vec<[f64; 2]> {
+        self.posterior.prior.range.iter().map(|range| range.map(f64::exp)).collect()
     }
 
     fn expand(&self, position: &[f64]) -> Vec<f64> {
-        params_of(self.laplace.unbounded(position).as_slice()).iter().map(|theta| theta.exp()).collect()
+        let u = self.laplace.unbounded(position);
+        self.posterior.coordinates.params(u.as_slice()).iter().map(|theta| theta.exp()).collect()
     }
 }
 
@@ -252,9 +266,9 @@ fn explained(
     let each = draws.iter().zip(messages).zip(starts.chunks_exact(density.dimension()));
     let kept = each.filter(|((draw, _), _)| **draw as usize >= warm_up);
     let sentence = |((draw, message), start): ((&u64, &String), &[f64])| {
-        let kept = DVector::from_row_slice(&density.expand(start)[..density.vars()]);
-        let room = kept.map(|var| (var - RANGE[0]).min(RANGE[1] - var));
-        let nearest = room.imin();
+        let (kept, ranges) = (density.expand(start), density.ranges());
+        let room = kept.iter().zip(&ranges).map(|(var, range)| (var - range[0]).min(range[1] - var));
+        let nearest = DVector::from_iterator(ranges.len(), room).imin();
         let (name, var) = (&names[nearest], kept[nearest]);
         format!("chain {}, draw {}: {message}; {name} = {var:.4} was nearest its bound", chain + 1, draw + 1)
     };

@@ -1,6 +1,6 @@
-//! What a recording says of the orbit response: one quadratic form a monitor, baselines eliminated.
+//! What a campaign says of the orbit response: one quadratic form a monitor, baselines eliminated; and of the tunes.
 //!
-//! A prediction is linear in the response `rho` of a monitor (a row of [`crate::ResponseModel::response`]) once the frame's
+//! A prediction is linear in the response `rho` of a monitor (a row of [`crate::ResponseModel::predict`]) once the frame's
 //! drive `k` (kicks, RF offset) is known, so that all frames together say
 //!
 //! `chi2 = rho^T A rho - 2 m rho + const`, `A = sum of k k^T/variance`, `m = sum of k reading/variance`,
@@ -12,39 +12,37 @@
 //! Two data modes: all frames with baselines ([`Readings::of_frames`]), and, as the paper did, differences of one frame pair
 //! a corrector ([`Readings::of_pairs`]).
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
-use twin::{OrbitError, Ring};
+use twin::OrbitError;
 
-use crate::map::{BatchError, BatchFit, Drive, first_family, rf_orbit};
-use crate::model::ResponseModel;
-use crate::recording::{Recording, Row};
+use crate::campaign::{Campaign, Linearised, Meter};
+use crate::map_fit::{BatchFit, TuneUse};
+use crate::model::{Prediction, ResponseModel};
 
-/// A recording with what the exact batch fit found out about it.
+/// A campaign with its fit, its readings linear in the response.
 #[derive(Debug, Clone)]
-pub struct Campaign {
-    /// The ring as designed.
-    pub ring: Ring,
-    /// Its frames.
-    pub recording: Recording,
-    /// MAP, monitors, and which readings count.
+pub struct Reduced {
+    /// The campaign.
+    pub campaign: Campaign,
+    /// Its batch fit.
     pub fit: BatchFit,
-    /// What drove the beam in each frame.
-    drives: Vec<Drive>,
-    /// Mean `ln` of the supplies' factors.
-    supplies: [f64; 2],
-    /// Readings at the mean supply currents, first order in the RF offset [frame][monitor] [m].
-    reduced: Vec<Vec<Option<f64>>>,
-    /// Rms of what misalignments add to the dispersion [m per unit of RF offset], in x and y.
-    spurious: [f64; 2],
+    /// Readings at the mean supply currents, first order in the RF offset, rows frames, columns monitors [m].
+    readings: DMatrix<f64>,
 }
 
-/// The quadratic forms.
+/// The quadratic forms, and the tunes.
 #[derive(Debug, Clone, Serialize)]
 pub struct Readings {
     forms: Vec<Form>,
-    /// `ln` of each quadrupole's supply factor, to be added to the params.
+    /// What each tune meter says, where it counts.
+    meters: [Option<Meter>; 2],
+    /// `ln` of each quadrupole's supply factor [M].
     supplies: Vec<f64>,
+    /// Param of each quadrupole [M].
+    parameters: Vec<Option<usize>>,
+    /// Number of params.
+    dimension: usize,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -63,139 +61,90 @@ pub struct Pair {
     pub last: usize,
 }
 
-/// Why a recording cannot be reduced.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ReadingsError {
-    /// There is no batch answer.
-    #[error(transparent)]
-    Fit(#[from] BatchError),
-    /// The ring at the MAP has no closed orbit.
-    #[error("no closed orbit at the MAP: {0}")]
-    Orbit(#[from] OrbitError),
-    /// No tables for this ring.
-    #[error(transparent)]
-    Training(#[from] training::TrainingError),
-}
-
-impl Campaign {
-    /// Fit a recording by the twin; `progress` hears of each Gauss-Newton step.
+impl Reduced {
+    /// Take from each reading what is not linear in the response at the fit's params.
     ///
     /// # Errors
-    /// [`ReadingsError`].
-    pub fn of(ring: &Ring, recording: &Recording, progress: impl FnMut(usize)) -> Result<Self, ReadingsError> {
-        let fit = BatchFit::of(ring, recording, progress)?;
-        let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(recording, row)).collect();
-        let mean = |family: usize| drives.iter().map(|d| d.strength[family]).sum::<f64>() / drives.len() as f64;
-        let tables: training::BoosterGreen = training::green::tables(ring)?;
-        let spurious = [0, 1].map(|plane| f64::from(tables.dispersion.spurious[plane]) * fit.orbit[plane]);
-        let supplies = [mean(0), mean(1)];
-        let reduced = reduce(ring, recording, &fit, &drives, supplies)?;
-        Ok(Self { ring: ring.clone(), recording: recording.clone(), fit, drives, supplies, reduced, spurious })
-    }
-
-    /// Number of horizontal monitors; they come first.
-    pub fn horizontal_monitors(&self) -> usize {
-        self.ring.horizontal_monitors()
+    /// [`OrbitError`] if these have no closed orbit.
+    pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
+        let Campaign { ring, supplies, drives, .. } = &campaign;
+        let params = DVector::from_column_slice(&fit.map_params);
+        let exact = Linearised::of(ring, &params, supplies, drives)?.orbits(drives);
+        let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
+        let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
+        let mut readings = &campaign.readings - exact;
+        for (mut row, drive) in readings.row_iter_mut().zip(drives) {
+            row += (&response * drive.kick.push(drive.rf_offset)).transpose();
+        }
+        Ok(Self { campaign, fit, readings })
     }
 
     /// Drive of a frame as a row of the response: kicks, RF offset.
     pub fn drive(&self, frame: usize) -> DVector<f64> {
-        self.drives[frame].kick.clone().push(self.drives[frame].rf_offset)
+        let drive = &self.campaign.drives[frame];
+        drive.kick.push(drive.rf_offset)
     }
 
     /// Reading of a monitor in a frame, if it counts, at the mean supply currents [m].
     pub fn reading(&self, frame: usize, b: usize) -> Option<f64> {
-        self.reduced[frame][b].filter(|_| self.fit.screened.accepted[frame] >> b & 1 == 1)
+        self.campaign.counts(frame, b).then(|| self.readings[(frame, b)])
     }
 
     /// The same, whether it counts or not [m].
     pub fn raw(&self, frame: usize, b: usize) -> Option<f64> {
-        self.reduced[frame][b]
+        Some(self.readings[(frame, b)]).filter(|reading| !reading.is_nan())
     }
 
     /// Noise of one reading of a monitor [m].
     pub fn noise(&self, b: usize) -> f64 {
-        f64::from(self.fit.screened.health[b].weighted_as)
+        self.campaign.noise(b)
     }
 
-    /// `ln` of each quadrupole's mean supply factor.
-    pub fn supplies(&self) -> Vec<f64> {
-        let first = first_family(&self.ring);
-        (0..self.ring.quadrupoles.len()).map(|q| self.supplies[usize::from(q >= first)]).collect()
+    /// `ln` of the factor on each quadrupole's gradient at some params [M].
+    pub fn strength(&self, params: &[f64]) -> Vec<f64> {
+        let factors = self.campaign.ring.strengths(params, &self.campaign.supplies);
+        factors.iter().map(|factor| factor.ln()).collect()
     }
 
     /// Error that readings of one setting share: the model's own, and the dispersion of unknown misalignments [m].
     fn shared_error(&self, model: &ResponseModel, b: usize, rf_offset: f64) -> f64 {
-        let plane = usize::from(b >= self.horizontal_monitors());
-        model.stated_error(b).hypot(self.spurious[plane] * rf_offset)
+        model
+            .stated_error(b)
+            .hypot(self.campaign.spurious[self.campaign.plane(b)] * self.fit.orbit[self.campaign.plane(b)] * rf_offset)
     }
 
     /// Number of frames that repeat each frame's setting, itself included.
     fn repeats(&self) -> Vec<usize> {
-        let same = |one: &Row, other: &Row| {
-            (one.corrector.as_ref(), one.setting, one.rf_offset)
-                == (other.corrector.as_ref(), other.setting, other.rf_offset)
-        };
-        let rows = &self.recording.rows;
-        rows.iter().map(|row| rows.iter().filter(|other| same(row, other)).count()).collect()
+        let rows = &self.campaign.recording.rows;
+        rows.iter().map(|row| rows.iter().filter(|other| row.repeats(other)).count()).collect()
     }
-}
 
-/// Take from each reading what is not linear in the response: the effect of its own supply currents and the second order
-/// of its RF offset.
-fn reduce(
-    ring: &Ring,
-    recording: &Recording,
-    fit: &BatchFit,
-    drives: &[Drive],
-    supplies: [f64; 2],
-) -> Result<Vec<Vec<Option<f64>>>, ReadingsError> {
-    let first = first_family(ring);
-    let model = ResponseModel::twin(ring)?;
-    let moved = |step: [f64; 2]| -> Vec<f64> {
-        let at = |(q, theta): (usize, &f64)| theta + supplies[usize::from(q >= first)] + step[usize::from(q >= first)];
-        fit.map_params.iter().enumerate().map(at).collect()
-    };
-    const STEP: f64 = 1e-4;
-    let slope = |family: usize| -> Result<DMatrix<f64>, OrbitError> {
-        let mut step = [0.0; 2];
-        step[family] = STEP;
-        let up = model.response(&moved(step))?;
-        Ok((up - model.response(&moved(step.map(|s| -s)))?) / (2.0 * STEP))
-    };
-    let (slopes, here) = ([slope(0)?, slope(1)?], moved([0.0; 2]));
-    let dispersion = model.response(&here)?.column(drives[0].kick.len()).into_owned();
-    let whole = ring.with_vars(&here.iter().map(|theta| theta.exp()).collect::<Vec<_>>());
-    let mut bent: Vec<(f64, DVector<f64>)> = Vec::new(); // second order of each RF offset
-    let mut reduced = Vec::with_capacity(drives.len());
-    for (drive, row) in drives.iter().zip(&recording.rows) {
-        let offset = drive.rf_offset;
-        if offset != 0.0 && bent.iter().all(|(known, _)| *known != offset) {
-            bent.push((offset, rf_orbit(&whole, offset)? - &dispersion * offset));
+    /// The forms of all monitors beside tunes and circuits.
+    fn readings(&self, forms: Vec<Form>, tunes: TuneUse) -> Readings {
+        let ring = &self.campaign.ring;
+        Readings {
+            forms,
+            meters: if tunes == TuneUse::Readings { self.campaign.meters.clone() } else { [None, None] },
+            supplies: self.strength(&[]),
+            parameters: ring.quadrupoles.iter().map(|quadrupole| quadrupole.parameter).collect(),
+            dimension: ring.parameters.len(),
         }
-        let k = drive.kick.clone().push(offset);
-        let mut correction = (&slopes[0] * &k) * (drive.strength[0] - supplies[0]);
-        correction += (&slopes[1] * &k) * (drive.strength[1] - supplies[1]);
-        bent.iter().filter(|(known, _)| *known == offset).for_each(|(_, second)| correction += second);
-        reduced.push(row.reading.iter().zip(&correction).map(|(reading, c)| reading.map(|r| r - c)).collect());
     }
-    Ok(reduced)
 }
 
 impl Readings {
     /// All frames, the baseline of each monitor unknown.
-    pub fn of_frames(campaign: &Campaign, model: &ResponseModel) -> Self {
-        let repeats = campaign.repeats();
+    pub fn of_frames(reduced: &Reduced, model: &ResponseModel, tunes: TuneUse) -> Self {
+        let (repeats, drives) = (reduced.repeats(), reduced.campaign.ring.correctors.len() + 1);
         let of_monitor = |b: usize| {
-            let mut form = Form::new(campaign.drives[0].kick.len() + 1);
-            let (mut weight, mut pull, mut slope) = (0.0, 0.0, DVector::zeros(form.moment.len()));
+            let mut form = Form::new(drives);
+            let (mut weight, mut pull, mut slope) = (0.0, 0.0, DVector::zeros(drives));
             for (frame, &repeats) in repeats.iter().enumerate() {
-                let Some(reading) = campaign.reading(frame, b) else { continue };
-                let (k, offset) = (campaign.drive(frame), campaign.drives[frame].rf_offset);
+                let Some(reading) = reduced.reading(frame, b) else { continue };
+                let k = reduced.drive(frame);
                 // repeats share the error: their mean has the variance of one over n, plus all of it
-                let shared = campaign.shared_error(model, b, offset).powi(2) * repeats as f64;
-                let w = 1.0 / (campaign.noise(b).powi(2) + shared);
+                let shared = reduced.shared_error(model, b, k[k.len() - 1]).powi(2) * repeats as f64;
+                let w = 1.0 / (reduced.noise(b).powi(2) + shared);
                 form.add(&k, reading, w);
                 (weight, pull) = (weight + w, pull + w * reading);
                 slope.axpy(w, &k, 1.0);
@@ -203,34 +152,45 @@ impl Readings {
             form.eliminate(&slope, pull, weight);
             form
         };
-        Self { forms: (0..campaign.noises()).map(of_monitor).collect(), supplies: campaign.supplies() }
+        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes)
     }
 
-    /// Differences of frame pairs, each independent of the others.
-    pub fn of_pairs(campaign: &Campaign, model: &ResponseModel, pairs: &[Pair]) -> Self {
+    /// Differences of frame pairs, each independent of the others; no tunes, as in the paper.
+    pub fn of_pairs(reduced: &Reduced, model: &ResponseModel, pairs: &[Pair]) -> Self {
         let of_monitor = |b: usize| {
-            let mut form = Form::new(campaign.drives[0].kick.len() + 1);
+            let mut form = Form::new(reduced.campaign.ring.correctors.len() + 1);
             for pair in pairs {
-                let (Some(initial), Some(last)) = (campaign.reading(pair.initial, b), campaign.reading(pair.last, b))
+                let (Some(initial), Some(last)) = (reduced.reading(pair.initial, b), reduced.reading(pair.last, b))
                 else {
                     continue;
                 };
-                let k = campaign.drive(pair.last) - campaign.drive(pair.initial);
-                let shared = campaign.shared_error(model, b, k[k.len() - 1]);
-                form.add(&k, last - initial, 1.0 / (2.0 * campaign.noise(b).powi(2) + shared.powi(2)));
+                let k = reduced.drive(pair.last) - reduced.drive(pair.initial);
+                let shared = reduced.shared_error(model, b, k[k.len() - 1]);
+                form.add(&k, last - initial, 1.0 / (2.0 * reduced.noise(b).powi(2) + shared.powi(2)));
             }
             form
         };
-        Self { forms: (0..campaign.noises()).map(of_monitor).collect(), supplies: campaign.supplies() }
+        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), TuneUse::LeftOut)
     }
 
-    /// `ln` of each quadrupole's supply factor, to be added to the params.
-    pub fn supplies(&self) -> &[f64] {
-        &self.supplies
+    /// `ln` of the factor on each quadrupole's gradient at some params [M].
+    pub fn strength(&self, params: &[f64]) -> Vec<f64> {
+        let param = |parameter: &Option<usize>| parameter.map_or(0.0, |parameter| params[parameter]);
+        self.parameters.iter().zip(&self.supplies).map(|(parameter, supply)| param(parameter) + supply).collect()
     }
 
-    /// Chi-square at a response, and its derivative with respect to each entry.
-    pub fn chi_square(&self, response: &DMatrix<f64>) -> (f64, DMatrix<f64>) {
+    /// Derivative with respect to each param of what has these derivatives with respect to each quadrupole's strength.
+    pub fn gather(&self, gradient: &[f64]) -> Vec<f64> {
+        let mut gathered = vec![0.0; self.dimension];
+        for (parameter, slope) in self.parameters.iter().zip(gradient) {
+            parameter.into_iter().for_each(|parameter| gathered[*parameter] += slope);
+        }
+        gathered
+    }
+
+    /// Chi-square of a prediction, and its derivative with respect to each number of it.
+    pub fn chi_square(&self, predicted: &Prediction) -> (f64, Prediction) {
+        let response = &predicted.response;
         let (mut chi_square, mut weights) = (0.0, DMatrix::zeros(response.nrows(), response.ncols()));
         let (mut rho, mut image) = (DVector::zeros(response.ncols()), DVector::zeros(response.ncols()));
         for (b, form) in self.forms.iter().enumerate() {
@@ -240,20 +200,43 @@ impl Readings {
             image.axpy(-2.0, &form.moment, 2.0);
             weights.row_mut(b).tr_copy_from(&image);
         }
-        (chi_square, weights)
+        let mut tunes = [0.0; 2];
+        for (plane, meter) in self.meters.iter().enumerate() {
+            let Some(meter) = meter else { continue };
+            let miss = meter.miss(Vector2::new(predicted.tunes[plane], 0.0));
+            chi_square += miss.norm_squared();
+            tunes[plane] = -2.0 * miss.dot(&meter.whiten.column(0));
+        }
+        (chi_square, Prediction { response: weights, tunes })
     }
 
-    /// Half the second derivative of chi-square along a Jacobian of the response: `sum of J^T A J`.
-    pub fn curvature(&self, jacobian: &[DMatrix<f64>]) -> DMatrix<f64> {
-        let params = jacobian.first().map_or(0, DMatrix::ncols);
-        let each = self.forms.iter().zip(jacobian).map(|(form, j)| j.tr_mul(&(&form.gram * j)));
-        each.fold(DMatrix::zeros(params, params), |sum, one| sum + one)
+    /// Half the second derivative of chi-square with respect to the params, that of the prediction left out: `sum of J^T A J`.
+    ///
+    /// # Errors
+    /// [`OrbitError`] where there is no stable ring.
+    pub fn curvature(&self, model: &ResponseModel, params: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
+        let (jacobian, tune_slopes) = model.jacobian(&self.strength(params))?;
+        let mut curvature = DMatrix::zeros(self.dimension, self.dimension);
+        for (form, of_quadrupoles) in self.forms.iter().zip(&jacobian) {
+            let j = self.gather_columns(of_quadrupoles);
+            curvature += j.tr_mul(&(&form.gram * &j));
+        }
+        let tune_slopes = self.gather_columns(&tune_slopes);
+        for (plane, meter) in self.meters.iter().enumerate() {
+            let Some(meter) = meter else { continue };
+            let slope = tune_slopes.row(plane).transpose();
+            curvature.ger(meter.whiten.column(0).norm_squared(), &slope, &slope, 1.0);
+        }
+        Ok(curvature)
     }
-}
 
-impl Campaign {
-    fn noises(&self) -> usize {
-        self.fit.screened.health.len()
+    /// Columns of quadrupoles as columns of params.
+    fn gather_columns(&self, of_quadrupoles: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut gathered = DMatrix::zeros(of_quadrupoles.nrows(), self.dimension);
+        for (parameter, column) in self.parameters.iter().zip(of_quadrupoles.column_iter()) {
+            parameter.into_iter().for_each(|&parameter| gathered.column_mut(parameter).axpy(1.0, &column, 1.0));
+        }
+        gathered
     }
 }
 

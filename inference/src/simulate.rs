@@ -9,12 +9,11 @@ use nalgebra::DVector;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, Normal, StandardNormal};
-use training::{BoosterGreen, TrainingError};
-use twin::{Hold, Optics, OrbitError, Ring, Tunes};
+use twin::{Hold, Optics, OrbitError, ParameterPrior, Ring, Tunes, spurious_dispersion};
 
-use crate::map::{Drive, first_family, rf_orbit};
+use crate::campaign::{Drive, rf_orbit};
 use crate::model::ResponseModel;
-use crate::posterior::RANGE;
+use crate::prior::Width;
 use crate::recording::Recording;
 
 pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
@@ -34,13 +33,12 @@ impl Instruments {
     /// Every monitor with the noise that the recording's header states, and the closed orbit and offsets of the machine.
     ///
     /// # Errors
-    /// [`TrainingError`] if the ring has no tables, which say how much its dispersion is spurious.
-    pub fn healthy(ring: &Ring, recording: &Recording) -> Result<Self, TrainingError> {
-        let tables: BoosterGreen = training::green::tables(ring)?;
+    /// [`OrbitError`] if the ring has no closed orbit.
+    pub fn healthy(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let baseline = 2e-3;
-        // the tables give each of two opposite offsets twice the variance
-        let spurious = tables.dispersion.spurious.map(|rms| f64::from(rms) / 2f64.sqrt() * baseline);
-        Ok(Self { noise: vec![recording.header.bpm_sigma; ring.read_monitors.len()], baseline, spurious })
+        // what is stated gives each of two opposite offsets twice the variance
+        let spurious = spurious_dispersion(ring)?.map(|rms| rms / 2f64.sqrt() * baseline);
+        Ok(Self { noise: recording.header.noise.clone(), baseline, spurious })
     }
 }
 
@@ -62,26 +60,26 @@ pub fn like(
     let mut random = StdRng::seed_from_u64(seeds(seed).next().unwrap_or(seed));
     let normal = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
     let baselines = DVector::from_fn(instruments.noise.len(), |_, _| instruments.baseline * normal(&mut random));
+    let ring = &*recording.powered(ring);
     let horizontal = ring.horizontal_monitors();
     let spurious = DVector::from_fn(instruments.noise.len(), |b, _| {
         instruments.spurious[usize::from(b >= horizontal)] * normal(&mut random)
     });
     let model = ResponseModel::twin(ring)?;
-    let first = first_family(ring);
+    let params: Vec<f64> = vars.iter().map(|var| var.ln()).collect();
     let orbit = |drive: &Drive| -> Result<DVector<f64>, OrbitError> {
-        let theta = |(q, var): (usize, &f64)| var.ln() + drive.strength[usize::from(q >= first)];
-        let params: Vec<f64> = vars.iter().enumerate().map(theta).collect();
-        let mut orbit = model.response(&params)?.columns(0, drive.kick.len()) * &drive.kick;
+        let factors = ring.strengths(&params, drive.strength.as_slice());
+        let strength: Vec<f64> = factors.iter().map(|factor| factor.ln()).collect();
+        let mut orbit = model.predict(&strength)?.response.columns(0, drive.kick.len()) * &drive.kick;
         if drive.rf_offset != 0.0 {
-            let strength: Vec<f64> = params.iter().map(|theta| theta.exp()).collect();
-            orbit += rf_orbit(&ring.with_vars(&strength), drive.rf_offset)? + &spurious * drive.rf_offset;
+            orbit += rf_orbit(&ring.with_strengths(&factors), drive.rf_offset)? + &spurious * drive.rf_offset;
         }
         Ok(orbit)
     };
     let mut simulated = recording.clone();
     simulated.name = format!("{} (simulated)", recording.name);
     for (row, given) in simulated.rows.iter_mut().zip(&recording.rows) {
-        let orbit = orbit(&Drive::of(recording, given))? + &baselines;
+        let orbit = orbit(&Drive::of(&recording.header, given))? + &baselines;
         for (b, reading) in row.reading.iter_mut().enumerate() {
             let noise = instruments.noise[b] * normal(&mut random);
             *reading = reading.map(|_| orbit[b] + noise);
@@ -98,25 +96,17 @@ pub const TUNE_CUT: f64 = 0.05;
 /// now and then by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again.
 const STOP_BAND: f64 = 0.03;
 
-/// Vars drawn from the truncated lognormal prior of a width; with the tune cut, those whose ring's tunes are within
+/// Vars drawn from the truncated priors of a ring's params; with the tune cut, those whose ring's tunes are within
 /// [`TUNE_CUT`] of the design's. Without it, those of rings that keep their beam: both tunes between the same half integers
 /// as the design's, and not on one.
 ///
 /// # Errors
 /// [`OrbitError`] if the design has no tunes.
-pub fn vars(ring: &Ring, width: f64, tune_cut: bool, seed: u64) -> Result<Vec<f64>, OrbitError> {
+pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, OrbitError> {
     let mut random = StdRng::seed_from_u64(seed);
-    let variance = width.powi(2).ln_1p();
-    let prior = Normal::new(-0.5 * variance, variance.sqrt()).expect("a width is positive");
     let design = tunes(ring)?;
     loop {
-        let one = |random: &mut StdRng| loop {
-            let var = prior.sample(random).exp();
-            if (RANGE[0]..=RANGE[1]).contains(&var) {
-                return var;
-            }
-        };
-        let vars: Vec<f64> = ring.quadrupoles.iter().map(|_| one(&mut random)).collect();
+        let vars: Vec<f64> = ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
         let near = |at: f64, design: f64| {
             let from_below = at - (2.0 * design).floor() / 2.0;
             (STOP_BAND..=0.5 - STOP_BAND).contains(&from_below) && (!tune_cut || (at - design).abs() < TUNE_CUT)
@@ -126,6 +116,18 @@ pub fn vars(ring: &Ring, width: f64, tune_cut: bool, seed: u64) -> Result<Vec<f6
             && near(at.y, design.y)
         {
             return Ok(vars);
+        }
+    }
+}
+
+/// A factor from its truncated lognormal prior.
+fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
+    let (mean, precision) = Width::Lognormal(prior.width).normal();
+    let normal = Normal::new(mean, precision.sqrt().recip()).expect("a width is positive");
+    loop {
+        let var = normal.sample(random).exp();
+        if (prior.range[0]..=prior.range[1]).contains(&var) {
+            return var;
         }
     }
 }

@@ -62,8 +62,8 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {
         let extended = training::extended::tables(ring, effects, vars).unwrap();
-        model_file::write(path.path(), &extended.tables).unwrap();
-        let core = Core::with_tables(model_file::read(path.path()).unwrap(), setup).unwrap();
+        model_file::write(path.path(), &ring.name, &extended.tables).unwrap();
+        let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup).unwrap();
         answer(core, recording, truth)
     };
     let first = by_file(&design.vars);

@@ -85,7 +85,7 @@ impl PlainRing {
         let design = Ring::booster().gradients();
         let planes = [0, 1].map(|plane| {
             let constant = |i: usize| {
-                let matrix = ring.elements[i].linearise(&mut twin::map::Phase::zeros());
+                let matrix = ring.elements[i].linearise(&mut twin::Phase::zeros());
                 matrix.fixed_view::<2, 2>(2 * plane, 2 * plane).map(Dual::from_re)
             };
             let mut matrices: Vec<_> = (0..ring.elements.len()).map(constant).collect();

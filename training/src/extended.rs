@@ -7,17 +7,18 @@
 //! and 0.5 % (QV), a term is off by 3 % rms of itself, 0.8 um for a quadrupole rolled by 18 mrad and kicks of 0.2 mrad.
 
 use estimator::surrogate::TERMS;
-use estimator::{Drive, Surrogate};
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Effect, EffectKind, Machine, Rf, Ring, Site};
 
-use crate::green::{BoosterGreen, Instruments, TrainingError, tables_with};
+use crate::green::{Instruments, TrainingError, tables_with};
+use crate::response::responses;
+use crate::tables::Tables;
 
 /// Tables of a ring with effects.
 #[derive(Debug, Clone)]
 pub struct Extended {
     /// The tables.
-    pub tables: Box<BoosterGreen>,
+    pub tables: Tables,
     /// Effects that they carry.
     pub carried: Vec<Effect>,
     /// Effects that no response has, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `quad_drift`
@@ -30,22 +31,19 @@ pub struct Extended {
 /// Rms of a remainder that is left alone [m/rad]: 0.4 um at 0.2 mrad, less than the tables' stated error.
 const NEGLIGIBLE: f64 = 2e-3;
 
-/// RF offset at which the tables are asked: their second order is below the first by 1e-3 there, and cancels.
-const RF_OFFSET: f32 = 1e-4;
-
 /// Tables of a ring with effects; `vars` [N] is where the part of low rank is exact.
 ///
 /// # Errors
 /// [`TrainingError`] if an effect names a place that the ring lacks, or if the ring is unstable with them.
 ///
 /// # Panics
-/// If there is not one var for each quadrupole.
+/// If there is not one var for each param.
 pub fn tables(ring: &Ring, effects: &[Effect], vars: &[f64]) -> Result<Extended, TrainingError> {
     let (left_out, carried): (Vec<Effect>, Vec<Effect>) =
         effects.iter().copied().partition(|e| Form::of(e.kind) == Form::None);
     let changed: Vec<Effect> = carried.iter().copied().filter(|e| Form::of(e.kind) == Form::Optics).collect();
     let changed = Machine::new(ring.clone(), Rf::FixedMomentum, &changed)?;
-    let mut tables: Box<BoosterGreen> = Box::new(tables_with(changed.ring(), &instruments(ring, &carried))?);
+    let mut tables = tables_with(changed.ring(), &instruments(ring, &carried))?;
     let exact = response(&Machine::new(ring.with_vars(vars), Rf::FixedMomentum, &carried)?)?;
     let remainder = exact - predicted(ring, &tables, vars)?;
     let missing = complete(&mut tables, remainder);
@@ -125,30 +123,13 @@ fn response(machine: &Machine) -> Result<DMatrix<f64>, TrainingError> {
 }
 
 /// The same by the core.
-fn predicted(ring: &Ring, tables: &BoosterGreen, vars: &[f64]) -> Result<DMatrix<f64>, TrainingError> {
-    let strength: [f32; 48] = core::array::from_fn(|q| vars[q] as f32);
-    let mut at = <BoosterGreen as Surrogate<33, 48, 48>>::BLANK;
-    let solved = Surrogate::<33, 48, 48>::linearise(tables, &strength, &mut at);
-    solved.map_err(|_| TrainingError::Unstable { ring: ring.name.clone() })?;
-    let orbit = |kick: [f32; 48], rf_offset: f32| {
-        let mut orbit = [0.0; 33];
-        Surrogate::<33, 48, 48>::orbit(tables, &at, &Drive { kick, strength: [0.0; 2], rf_offset }, &mut orbit);
-        orbit.map(f64::from)
-    };
-    let mut response = DMatrix::zeros(33, 49);
-    for c in 0..48 {
-        let mut kick = [0.0; 48];
-        kick[c] = 1.0;
-        response.column_mut(c).copy_from_slice(&orbit(kick, 0.0));
-    }
-    let (up, down) = (orbit([0.0; 48], RF_OFFSET), orbit([0.0; 48], -RF_OFFSET));
-    let slope = |b: usize| (up[b] - down[b]) / (2.0 * f64::from(RF_OFFSET));
-    response.column_mut(48).iter_mut().enumerate().for_each(|(b, to)| *to = slope(b));
-    Ok(response)
+fn predicted(ring: &Ring, tables: &Tables, vars: &[f64]) -> Result<DMatrix<f64>, TrainingError> {
+    let core = responses(tables, &[vars.to_vec()]).pop().flatten();
+    Ok(core.ok_or_else(|| TrainingError::Unstable { ring: ring.name.clone() })?.response)
 }
 
 /// Add the largest products of a remainder, as many as matter and have room; returns the rms of the rest.
-fn complete(tables: &mut BoosterGreen, remainder: DMatrix<f64>) -> f64 {
+fn complete(tables: &mut Tables, remainder: DMatrix<f64>) -> f64 {
     let entries = remainder.len() as f64;
     let svd = remainder.svd(true, true);
     let (Some(u), Some(v_t)) = (&svd.u, &svd.v_t) else { unreachable!("both were asked for") };
@@ -159,8 +140,8 @@ fn complete(tables: &mut BoosterGreen, remainder: DMatrix<f64>) -> f64 {
         let share = sizes[term].sqrt();
         let seen: Vec<f64> = u.column(term).iter().map(|v| v * share).collect();
         let driven: Vec<f64> = v_t.row(term).iter().map(|v| v * share).collect();
-        let (seen, (driven, rf)) = (seen.split_at(15), driven.split_at(48));
-        tables.low_rank.push([seen.0, seen.1], [&driven[..24], &driven[24..]], rf[0]);
+        let Some((rf, driven)) = driven.split_last() else { unreachable!("a column is that of the RF") };
+        tables.push_term(&seen, driven, *rf);
     }
     rest(terms)
 }
@@ -200,9 +181,8 @@ mod tests {
     }
 
     /// Rms of the terms alone, kicks [m/rad].
-    fn block(terms: &BoosterGreen) -> f64 {
-        let mut without = terms.clone();
-        without.low_rank = estimator::surrogate::LowRank::BLANK;
+    fn block(terms: &Tables) -> f64 {
+        let without = terms.without_terms();
         let (ring, ones) = (Ring::booster(), vec![1.0; 48]);
         let of = |tables| predicted(&ring, tables, &ones).unwrap();
         rms(&(of(terms) - of(&without)).columns(0, 48).into_owned())
@@ -212,7 +192,7 @@ mod tests {
     fn without_effects_the_tables_are_those_of_the_design() {
         let ring = Ring::booster();
         let extended = tables(&ring, &[], &at_and_moved().0).unwrap();
-        assert_eq!(*extended.tables, crate::green::tables(&ring).unwrap());
+        assert_eq!(extended.tables, crate::green::tables(&ring).unwrap());
     }
 
     /// Measured: 0.6e-3 m/rad, the tables' own error; 1.1e-3 with edges everywhere.
@@ -229,7 +209,7 @@ mod tests {
             let effects = effects(&words);
             let [kicks, rf] = error(&effects, &at, &moved);
             assert!(kicks < 1.3e-3 && rf < 1e-3, "{words:?}: {kicks:.5} {rf:.5}");
-            assert!(tables(&Ring::booster(), &effects, &at).unwrap().tables.low_rank.is_empty(), "{words:?}");
+            assert!(tables(&Ring::booster(), &effects, &at).unwrap().tables.terms() == 0, "{words:?}");
         }
     }
 
@@ -248,7 +228,7 @@ mod tests {
         ] {
             let effects = effects(&[word]);
             let extended = tables(&Ring::booster(), &effects, &at).unwrap();
-            assert!(extended.tables.low_rank.len() <= most && extended.missing < 1e-3, "{word}: {extended:?}");
+            assert!(extended.tables.terms() <= most && extended.missing < 1e-3, "{word}: {extended:?}");
             let [kicks, rf] = error(&effects, &at, &at);
             assert!(kicks < 0.7e-3 && rf < 1.5e-3, "{word}: {kicks:.5} {rf:.5}");
             let [kicks, _] = error(&effects, &at, &moved);

@@ -1,25 +1,37 @@
 //! Green's function tables of a ring, from its twin.
 
-use estimator::surrogate::{Block, Dispersion, Green, GreenPlane, LowRank, SymmetricBlock};
-use twin::{ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, Place, Plane, Ring, Source};
+use estimator::surrogate::{List, NONE, Table};
+use estimator::{GROUPS, Sizes};
+use twin::{
+    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source,
+    spurious_dispersion,
+};
 
-/// The Booster's Green's function surrogate.
-pub type BoosterGreen = estimator::booster::Green;
+use crate::rooms;
+use crate::tables::Tables;
 
 /// Why no tables can be made for a ring.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainingError {
-    /// The ring has other numbers of things than the tables.
-    #[error("{ring} has {found} {what}; these tables are for {expected}")]
-    Count {
+    /// The ring is larger than the largest core.
+    #[error("{ring} has {found} {what}; there is room for at most {most}")]
+    Room {
         /// The machine.
         ring: String,
         /// What was counted.
         what: &'static str,
-        /// How many the tables hold.
-        expected: usize,
+        /// How many there is room for.
+        most: u16,
         /// How many the ring has.
+        found: u16,
+    },
+    /// Params with more kinds of priors than a core tells apart.
+    #[error("{ring}: its params have {found} priors that differ in width or range; at most {GROUPS} can be told apart")]
+    Priors {
+        /// The machine.
+        ring: String,
+        /// How many kinds there are.
         found: usize,
     },
     /// The design ring has no stable orbit.
@@ -80,50 +92,91 @@ const RF_STEP: f64 = 2e-4;
 /// Rms error that the tables state, in x and y [m]: what `orbitcal surrogate check` measures, rounded up.
 const STATED_ERROR: [f32; 2] = [1.5e-6, 0.5e-6];
 
+/// How many of everything a ring has.
+///
+/// # Errors
+/// [`TrainingError::Room`] if there is no core that large.
+pub fn sizes(ring: &Ring) -> Result<Sizes, TrainingError> {
+    let (monitors, correctors) = (ring.read_monitors.len(), ring.correctors.len());
+    let (monitors_x, correctors_x) = (ring.horizontal_monitors(), ring.horizontal_correctors());
+    let sizes = Sizes::new(
+        [monitors_x, monitors - monitors_x],
+        [correctors_x, correctors - correctors_x],
+        [ring.quadrupoles.len(), ring.parameters.len(), ring.supplies.len()],
+    );
+    let what = [
+        "horizontal monitors",
+        "vertical monitors",
+        "horizontal correctors",
+        "vertical correctors",
+        "quadrupoles",
+        "params",
+        "supplies",
+    ];
+    let each = what.into_iter().zip(sizes.all()).zip(rooms::large::SIZES.all());
+    match each.into_iter().find(|((_, found), most)| found > most) {
+        Some(((what, found), most)) => Err(TrainingError::Room { ring: ring.name.clone(), what, most, found }),
+        None => Ok(sizes),
+    }
+}
+
+/// The priors that a ring's params have, each once, and which of them each param has.
+///
+/// # Errors
+/// [`TrainingError::Priors`] if there are more than a core tells apart.
+pub fn prior_groups(ring: &Ring) -> Result<(Vec<ParameterPrior>, Vec<usize>), TrainingError> {
+    let mut groups: Vec<ParameterPrior> = Vec::new();
+    let mut group_of = |prior: ParameterPrior| {
+        groups.iter().position(|group| *group == prior).unwrap_or_else(|| {
+            groups.push(prior);
+            groups.len() - 1
+        })
+    };
+    let of = ring.parameters.iter().map(|parameter| group_of(parameter.prior)).collect();
+    if groups.len() > GROUPS {
+        return Err(TrainingError::Priors { ring: ring.name.clone(), found: groups.len() });
+    }
+    Ok((groups, of))
+}
+
 /// Tables of the design ring.
 ///
 /// # Errors
-/// [`TrainingError`] if the ring's counts differ from the table's, or if it is unstable.
-pub fn tables<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
-    ring: &Ring,
-) -> Result<Green<BX, BY, CX, CY, Q, T>, TrainingError> {
+/// [`TrainingError`] if the ring is too large, or unstable.
+pub fn tables(ring: &Ring) -> Result<Tables, TrainingError> {
     tables_with(ring, &Instruments::sound(ring))
 }
 
 /// Tables of a ring as its instruments show it.
-pub(crate) fn tables_with<
-    const BX: usize,
-    const BY: usize,
-    const CX: usize,
-    const CY: usize,
-    const Q: usize,
-    const T: usize,
->(
-    ring: &Ring,
-    instruments: &Instruments,
-) -> Result<Green<BX, BY, CX, CY, Q, T>, TrainingError> {
+pub(crate) fn tables_with(ring: &Ring, instruments: &Instruments) -> Result<Tables, TrainingError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: instruments.delta })?;
-    let count = |what, expected, found| {
-        if expected == found {
-            Ok(())
-        } else {
-            Err(TrainingError::Count { ring: ring.name.clone(), what, expected, found })
-        }
-    };
-    count("read monitors", BX + BY, ring.read_monitors.len())?;
-    count("correctors", CX + CY, ring.correctors.len())?;
-    count("quadrupoles", Q / 2, ring.quadrupoles.len())?;
+    let mut tables = Tables::zeros(sizes(ring)?);
     let (monitors, correctors) = (instruments.monitors(&optics), instruments.correctors(&optics));
-    let (monitors_x, monitors_y) = monitors.split_at(BX);
-    let (correctors_x, correctors_y) = correctors.split_at(CX);
-    Ok(Green {
-        x: plane(ring, &optics, Plane::X, monitors_x, correctors_x),
-        y: plane(ring, &optics, Plane::Y, monitors_y, correctors_y),
-        dispersion: dispersion(ring, &optics, instruments, monitors_x)?,
-        low_rank: LowRank::BLANK,
-        first_family: ring.gradients().iter().filter(|k| **k > 0.0).count() as u16,
-        stated_error: STATED_ERROR,
-    })
+    let (monitors_x, monitors_y) = monitors.split_at(ring.horizontal_monitors());
+    let (correctors_x, correctors_y) = correctors.split_at(ring.horizontal_correctors());
+    let of_x = [Table::DirectX, Table::SeenX, Table::DrivenX, Table::MutualX];
+    let of_y = [Table::DirectY, Table::SeenY, Table::DrivenY, Table::MutualY];
+    plane(ring, &optics, Plane::X, (monitors_x, correctors_x), &mut tables, of_x);
+    plane(ring, &optics, Plane::Y, (monitors_y, correctors_y), &mut tables, of_y);
+    dispersion(ring, &optics, instruments, monitors_x, &mut tables)?;
+    wiring(ring, &mut tables)?;
+    Ok(tables)
+}
+
+/// What each quadrupole has: its strength, its param, its supply; and the prior of each param.
+fn wiring(ring: &Ring, tables: &mut Tables) -> Result<(), TrainingError> {
+    let index = |i: Option<usize>| i.map_or(NONE, |i| i as i16);
+    let strengths = ring.gradients().into_iter().zip(&ring.quadrupoles);
+    for (to, (k1, q)) in tables.list_mut(List::Weight).iter_mut().zip(strengths) {
+        *to = (0.5 * k1 * ring.elements[q.element].length) as f32;
+    }
+    let params = ring.quadrupoles.iter().map(|q| index(q.parameter));
+    tables.line_mut(Table::Param).iter_mut().zip(params).for_each(|(to, param)| *to = param);
+    let supplies = ring.quadrupoles.iter().map(|q| index(q.supply));
+    tables.line_mut(Table::Supply).iter_mut().zip(supplies).for_each(|(to, supply)| *to = supply);
+    let (_, groups) = prior_groups(ring)?;
+    tables.line_mut(Table::Group).iter_mut().zip(groups).for_each(|(to, group)| *to = group as i16);
+    Ok(())
 }
 
 fn nodes(ring: &Ring) -> Vec<Place> {
@@ -131,43 +184,37 @@ fn nodes(ring: &Ring) -> Vec<Place> {
     ring.quadrupoles.iter().flat_map(|q| at(q.element)).collect()
 }
 
-fn plane<const B: usize, const C: usize, const Q: usize, const T: usize>(
+fn plane(
     ring: &Ring,
     optics: &Optics,
     plane: Plane,
-    monitors: &[Observer],
-    correctors: &[Source],
-) -> GreenPlane<B, C, Q, T> {
-    let (direction, sign) = match plane {
-        Plane::X => ([1.0, 0.0], 1.0),
-        Plane::Y => ([0.0, 1.0], -1.0),
-    };
+    (monitors, correctors): (&[Observer], &[Source]),
+    tables: &mut Tables,
+    [direct, seen, driven, mutual]: [Table; 4],
+) {
+    let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
     let nodes = nodes(ring);
-    let seen: Vec<Observer> = nodes.iter().map(|&n| optics.observe(n, plane)).collect();
+    let observers: Vec<Observer> = nodes.iter().map(|&n| optics.observe(n, plane)).collect();
     let kicks: Vec<Source> = nodes.iter().map(|&n| optics.kick(n, direction)).collect();
-    let (direct, driven) = (optics.response(monitors, correctors), optics.response(&seen, correctors));
+    let response = optics.response(monitors, correctors);
+    tables.quantise(direct, |b, c| response[(b, c)]);
     // seen from the monitors: G is symmetric, so a kick at a node stands for a kick at a monitor
-    let (reading, mutual) = (optics.response(monitors, &kicks), optics.response(&seen, &kicks));
-    let strength = |n: usize| {
-        let element = ring.quadrupoles[n / 2].element;
-        0.5 * sign * ring.gradients()[n / 2] * ring.elements[element].length
-    };
-    GreenPlane {
-        direct: Block::quantise(|b, c| direct[(b, c)]),
-        seen: Block::quantise(|q, b| reading[(b, q)]),
-        driven: Block::quantise(|q, c| driven[(q, c)]),
-        // the average of both orders removes what rounding of the transfer maps leaves of an asymmetry
-        mutual: SymmetricBlock::quantise(|i, j| 0.5 * (mutual[(i, j)] + mutual[(j, i)])),
-        weight: core::array::from_fn(|n| strength(n) as f32),
-    }
+    let response = optics.response(monitors, &kicks);
+    tables.quantise(seen, |q, b| response[(b, q)]);
+    let response = optics.response(&observers, correctors);
+    tables.quantise(driven, |q, c| response[(q, c)]);
+    let response = optics.response(&observers, &kicks);
+    // the average of both orders removes what rounding of the transfer maps leaves of an asymmetry
+    tables.quantise(mutual, |i, j| 0.5 * (response[(i, j)] + response[(j, i)]));
 }
 
-fn dispersion<const B: usize, const Q: usize>(
+fn dispersion(
     ring: &Ring,
     optics: &Optics,
     instruments: &Instruments,
     monitors: &[Observer],
-) -> Result<Dispersion<B, Q>, OrbitError> {
+    tables: &mut Tables,
+) -> Result<(), OrbitError> {
     let frequency = optics.frequency_offset();
     let up = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency + RF_STEP })?;
     let down = ClosedOrbit::find(ring, Hold::Frequency { offset: frequency - RF_STEP })?;
@@ -177,56 +224,22 @@ fn dispersion<const B: usize, const Q: usize>(
         instruments.monitor_gain[b] * curved / (2.0 * RF_STEP * RF_STEP)
     };
     let nodes = nodes(ring);
-    Ok(Dispersion {
-        monitor: core::array::from_fn(|b| optics.dispersion(&monitors[b]) as f32),
-        node: core::array::from_fn(|q| optics.dispersion(&optics.observe(nodes[q], Plane::X)) as f32),
-        second_order: core::array::from_fn(|b| second(b) as f32),
-        spurious: spurious(ring)?,
-        compaction: optics.momentum_compaction() as f32,
-        inverse_gamma_squared: ring.particle.gamma(instruments.delta).powi(-2) as f32,
-        circumference: ring.circumference as f32,
-    })
+    let (spurious, tunes) = (spurious_dispersion(ring)?, optics.tunes()?);
+    let momentum = [
+        optics.momentum_compaction(),
+        ring.particle.gamma(instruments.delta).powi(-2),
+        ring.circumference,
+        tunes.x,
+        tunes.y,
+    ];
+    fill(tables, List::MonitorDispersion, |b| optics.dispersion(&monitors[b]));
+    fill(tables, List::NodeDispersion, |q| optics.dispersion(&optics.observe(nodes[q], Plane::X)));
+    fill(tables, List::SecondOrder, second);
+    let ring = spurious.into_iter().chain(momentum).map(|v| v as f32).chain(STATED_ERROR);
+    tables.list_mut(List::Ring).iter_mut().zip(ring).for_each(|(to, v)| *to = v);
+    Ok(())
 }
 
-/// Misaligned machines from which the spurious dispersion is taken, and the rms shift of their quadrupoles [m]; the ratio
-/// to the orbit does not depend on the shift.
-const MISALIGNED: u32 = 40;
-const SHIFT: f64 = 0.2e-3;
-
-/// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion.
-///
-/// The orbit that shifted quadrupoles make changes with the momentum, as every orbit does; which way, only the unknown
-/// shifts could tell.
-fn spurious(ring: &Ring) -> Result<[f32; 2], OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
-    for machine in 0..MISALIGNED {
-        let shifted = misaligned(ring, machine);
-        let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(RF_STEP)?, at(-RF_STEP)?, at(0.0)?);
-        for monitor in ring.monitors_read().map(|monitor| monitor.element) {
-            for (plane, coordinate, design) in
-                [(0, 0, optics.dispersion(&optics.observe(monitor, Plane::X))), (1, 2, 0.0)]
-            {
-                let slope = (up.at[monitor][coordinate] - down.at[monitor][coordinate]) / (2.0 * RF_STEP);
-                let momentum = (up.at[monitor][4] - down.at[monitor][4]) / (2.0 * RF_STEP);
-                change[plane] += (slope - design * momentum).powi(2);
-                orbit[plane] += rest.at[monitor][coordinate].powi(2);
-            }
-        }
-    }
-    // An offset and its opposite share the change with opposite signs; the core takes them for independent, so each is
-    // given twice the variance.
-    Ok([0, 1].map(|plane| f64::sqrt(2.0 * change[plane] / orbit[plane]) as f32))
-}
-
-/// The ring with its quadrupoles shifted at random, uniformly, seeded.
-fn misaligned(ring: &Ring, machine: u32) -> Ring {
-    let mut shifted = ring.clone();
-    for (q, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
-        let uniform = |plane: u32| f64::from(sobol_burley::sample(machine, 2 * q as u32 + plane, 1)) - 0.5;
-        let shift = &mut shifted.elements[at].misalignment;
-        (shift.dx, shift.dy) = (uniform(0) * SHIFT * 12f64.sqrt(), uniform(1) * SHIFT * 12f64.sqrt());
-    }
-    shifted
+fn fill(tables: &mut Tables, list: List, value: impl Fn(usize) -> f64) {
+    tables.list_mut(list).iter_mut().enumerate().for_each(|(i, to)| *to = value(i) as f32);
 }

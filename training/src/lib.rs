@@ -3,7 +3,13 @@
 pub mod check;
 pub mod extended;
 pub mod green;
+mod response;
+pub mod rooms;
+mod source;
+mod tables;
 
 pub use check::{SurrogateError, check};
 pub use extended::Extended;
-pub use green::{BoosterGreen, TrainingError};
+pub use green::TrainingError;
+pub use rooms::with_stack;
+pub use tables::{AnyParcel, LINE, Tables};

@@ -48,8 +48,17 @@ const HALVINGS: u32 = 4;
 /// While the params have walked less than this share of an error bar, the past still counts as one ring.
 const WALKED: f32 = 0.1;
 
-impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize, const T: usize>
-    Estimator<G, B, C, N, S, T>
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const W: usize,
+> Estimator<G, B, C, F, N, S, K, T, W>
 {
     /// True if the MAP has left the origin, or the past has to be weighted anew.
     pub(super) fn is_due(&self) -> bool {
@@ -59,7 +68,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
 
     /// Linearise at the MAP, by a damped Gauss-Newton step: halved while it leads uphill or to an unstable ring.
     #[inline(never)]
-    pub(super) fn linearise_anew(&mut self, model: &Model<'_, G>) -> bool {
+    pub(super) fn linearise_anew(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
         let from = *self.gaussian.origin();
         let mut to = self.solution.map_params;
         // A past that is weighted anew has another chi-square; the step is then judged with the next one.
@@ -77,14 +86,9 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         back
     }
 
-    fn linearise_at(&mut self, model: &Model<'_, G>, params: &[f32; N]) -> bool {
+    fn linearise_at(&mut self, model: &Model<'_, G, B, C, F>, params: &[f32; N]) -> bool {
         let supplies = self.campaign.mean_strength();
-        let first = model.surrogate.first_family();
-        let mut strength = [0.0; N];
-        for (i, (strength, theta)) in strength.iter_mut().zip(params).enumerate() {
-            *strength = libm::expf(theta + if i < first { supplies[0] } else { supplies[1] });
-        }
-        if model.surrogate.linearise(&strength, &mut self.linearised).is_err() {
+        if model.surrogate.linearise(params, &supplies, &mut self.linearised).is_err() {
             return false;
         }
         self.supplies = supplies;
@@ -97,7 +101,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// True while all frames so far have seen the same ring.
-    pub(super) fn is_still(&self, model: &Model<'_, G>) -> bool {
+    pub(super) fn is_still(&self, model: &Model<'_, G, B, C, F>) -> bool {
         let walked = model.setup.process_noise * libm::sqrtf(self.frames as f32);
         self.solution.sigma.iter().all(|sigma| walked <= WALKED * sigma)
     }
@@ -106,7 +110,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     ///
     /// Settings of one kind differ by the powered corrector's current, so that one derivative serves them all. The 20 mA by
     /// which idle correctors scatter count in the orbit and not in its derivative, a thousandth of it.
-    fn rebuild(&mut self, model: &Model<'_, G>, params: &[f32; N]) {
+    fn rebuild(&mut self, model: &Model<'_, G, B, C, F>, params: &[f32; N]) {
         self.gaussian.recentre(params);
         let level = *self.gaussian.baselines();
         self.gaussian.clone_from(&self.loose);
@@ -118,19 +122,19 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                 continue;
             }
             model.surrogate.predict(&self.linearised, &first.alone(), &mut self.prediction);
-            let by_family = self.prediction.by_family(model.surrogate.first_family());
+            let by_supply = self.prediction.by_supply;
             let mut lines = [Line::default(); B];
             for cell in from_here.iter().filter(|cell| cell.is_kind_of(first)) {
                 let (drive, share) = (cell.drive(), cell.share(first));
-                let [qh, qv] = about(&drive, &self.supplies).strength;
-                let direct = Drive { strength: [0.0; 2], ..drive };
+                let strength = about(&drive, &self.supplies).strength;
+                let direct = Drive { strength: [0.0; F], ..drive };
                 model.surrogate.orbit(&self.linearised, &direct, &mut self.prediction.reading);
-                for (b, (line, [by_qh, by_qv])) in lines.iter_mut().zip(&by_family).enumerate() {
+                for (b, (line, by_supply)) in lines.iter_mut().zip(&by_supply).enumerate() {
                     let (mean, number) = cell.mean(b);
                     let (Some(orbit), Some(level), 1..) = (self.prediction.reading.get(b), level.get(b), number) else {
                         continue;
                     };
-                    let residual = mean - orbit - share * (qh * by_qh + qv * by_qv) - level;
+                    let residual = mean - orbit - share * dot(&strength, by_supply) - level;
                     let variance = self.variance(model, b, number, drive.rf_offset);
                     let repeats = Repeats { number, noise: self.noise_variance(b), variance };
                     self.gaussian.count(line, share, residual, &repeats);
@@ -141,10 +145,11 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
             }
         }
         self.gaussian.close(&pool);
+        self.count_tunes(model);
         for frame in &self.recent {
             let drive = about(&frame.drive, &self.supplies);
             model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for b in (0..B).filter(|b| frame.accepted >> b & 1 == 1) {
+            for b in (0..B).filter(|b| frame.accepted.has(*b)) {
                 let slope = column(self.prediction.jacobian.as_slice(), N, b);
                 let innovation = frame.innovation(b, &self.prediction.reading);
                 self.gaussian.condition(b, innovation, self.variance(model, b, 1, drive.rf_offset), slope);
@@ -156,19 +161,33 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         }
     }
 
+    /// Count the tunes of all frames so far, as their mean.
+    fn count_tunes(&mut self, model: &Model<'_, G, B, C, F>) {
+        for plane in 0..2 {
+            let Some(meter) = self.tunes.get(plane) else { continue };
+            if let (Some(variance), (mean, strength, count @ 1..)) = (meter.variance(), meter.mean()) {
+                let innovation = self.tune_innovation(model, plane, mean, &strength);
+                let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
+                self.gaussian.condition(B + plane, innovation, variance / count as f32, &slope);
+            }
+        }
+    }
+
     /// How well the model describes the readings of monitors in state ok, by the expected noise.
     ///
     /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk:
     /// innovations, each against the vars of its own time, counted in NIS.
-    pub fn fit_quality(&mut self, model: &Model<'_, G>) -> FitQuality {
+    pub fn fit_quality(&mut self, model: &Model<'_, G, B, C, F>) -> FitQuality {
         if !self.is_still(model) {
             return FitQuality { chi_square: self.nis.0.value(), degrees_of_freedom: self.nis.1 as f32 };
         }
-        let expected = model.setup.noise * model.setup.noise;
-        let is_ok = |(_, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok;
+        let layout = model.surrogate.layout();
+        let expected = |b: usize| model.setup.noise.of(b) * model.setup.noise.of(b);
+        let is_spare = |b: usize| (0..layout.monitors()).all(|index| layout.monitor(index) != b);
+        let is_ok = |(b, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok && !is_spare(*b);
         let (mut sum, mut readings, mut baselines) = (Sum::default(), 0.0, 0.0);
         for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-            sum.add(self.campaign.scatter(b) / expected);
+            sum.add(self.campaign.scatter(b) / expected(b));
             baselines += 1.0;
         }
         for cell in self.campaign.cells() {
@@ -179,10 +198,10 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
                 let (d, _) = self.gaussian.effective(b, column(self.prediction.jacobian.as_slice(), N, b));
                 let predicted = self.prediction.reading.get(b).copied().unwrap_or(0.0) + self.gaussian.baseline(b);
                 let residual = mean - predicted - dot(&d, &self.solution.delta);
-                sum.add(count as f32 * residual * residual / expected);
+                sum.add(count as f32 * residual * residual / expected(b));
                 readings += count as f32;
             }
         }
-        FitQuality { chi_square: sum.value(), degrees_of_freedom: readings - baselines - N as f32 }
+        FitQuality { chi_square: sum.value(), degrees_of_freedom: readings - baselines - layout.params() as f32 }
     }
 }

@@ -1,49 +1,67 @@
 //! Which readings of a frame are used: what their repeats say, and where there are none, the model.
 
 use super::{Estimator, Model, UNDERWEIGHT};
-use crate::campaign::Verdict;
-use crate::frame::{Frame, PositionCode};
+use crate::campaign::{Verdict, is_moved};
+use crate::drive::Drive;
 use crate::linear::dot;
+use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
+use crate::wire::{Frame, PositionCode};
 
 /// Which readings of a frame are used.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Screened {
-    pub accepted: u64,
-    pub rejected: u64,
-    pub confirmed: u64,
-    pub restarted: u64,
+pub(super) struct Screened<const W: usize> {
+    pub accepted: Mask<W>,
+    pub rejected: Mask<W>,
+    pub confirmed: Mask<W>,
+    pub restarted: Mask<W>,
+    /// Innovation of each tune that is used [1].
+    pub tune: [Option<f32>; 2],
 }
 
-impl Screened {
+impl<const W: usize> Screened<W> {
     fn note(&mut self, b: usize, verdict: Verdict) {
-        let bit = 1 << b;
-        match verdict {
-            Verdict::Accepted => self.accepted |= bit,
-            Verdict::Held => self.rejected |= bit,
-            Verdict::Confirms { outvotes } => {
-                self.accepted |= bit;
-                self.confirmed |= bit;
-                self.restarted |= if outvotes { bit } else { 0 };
-            }
-        }
+        self.accepted.put(b, verdict != Verdict::Held);
+        self.rejected.put(b, verdict == Verdict::Held);
+        self.confirmed.put(b, matches!(verdict, Verdict::Confirms { .. }));
+        self.restarted.put(b, verdict == Verdict::Confirms { outvotes: true });
+    }
+
+    /// Number of readings that are used.
+    pub fn count(&self) -> u32 {
+        self.accepted.count() + self.tune.iter().flatten().count() as u32
     }
 }
 
 /// Frames in a row that must surprise all over before the model is at fault, and not the beam.
 const CONVINCED: u32 = 3;
 
-impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, const S: usize, const T: usize>
-    Estimator<G, B, C, N, S, T>
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const W: usize,
+> Estimator<G, B, C, F, N, S, K, T, W>
 {
     /// Decide which readings to use, and learn each monitor's noise from its repeats.
     #[inline(never)]
-    pub(super) fn screen(&mut self, model: &Model<'_, G>, frame: &Frame<B, C>, cell: Option<u16>) -> Screened {
+    pub(super) fn screen(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+        cell: Option<u16>,
+    ) -> Screened<W> {
         let mut screened = Screened::default();
         for b in 0..B {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
-            let valid = frame.is_valid(b);
+            let valid = frame.valid.has(b);
             let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
             if usable {
                 match cell {
@@ -58,27 +76,57 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
         if cell.is_none() {
             self.excuse(&mut screened);
         }
+        self.screen_tunes(model, frame, drive, &mut screened);
         screened
+    }
+
+    /// Tunes count where the RF is not moved: what the chromaticity makes of them then is not in the model.
+    fn screen_tunes(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+        screened: &mut Screened<W>,
+    ) {
+        if model.setup.tune_calibration.is_none() || is_moved(frame.rf_offset) {
+            return;
+        }
+        for (plane, code) in frame.tune.iter().enumerate() {
+            let (Some(code), Some(meter)) = (code, self.tunes.get_mut(plane)) else { continue };
+            let predicted = |strength: &[f32; F]| model.surrogate.tune(&self.linearised, plane, strength).0;
+            let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
+            let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
+            self.stale |= meter.judge();
+            let innovation = self.tune_innovation(model, plane, code.value(), &drive.strength);
+            screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
+        }
     }
 
     /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the beam was lost or
     /// the model is at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before
     /// are not. (In a setting the repeats decide.)
-    fn excuse(&mut self, screened: &mut Screened) {
-        let (accepted, rejected) = (screened.accepted.count_ones(), screened.rejected.count_ones());
+    fn excuse(&mut self, screened: &mut Screened<W>) {
+        let (accepted, rejected) = (screened.accepted.count(), screened.rejected.count());
         if 8 * rejected <= accepted + rejected {
             self.surprises = 0;
             return;
         }
         let each = self.monitors.iter_mut().enumerate();
-        each.filter(|(b, _)| screened.rejected >> b & 1 == 1).for_each(|(_, monitor)| monitor.pardon());
-        let all = screened.accepted | screened.rejected;
+        each.filter(|(b, _)| screened.rejected.has(*b)).for_each(|(_, monitor)| monitor.pardon());
+        let (all, none) = (screened.accepted.or(&screened.rejected), Mask::NONE);
         self.surprises = self.surprises.saturating_add(1);
-        (screened.accepted, screened.rejected) = if self.surprises >= CONVINCED { (all, 0) } else { (0, all) };
+        (screened.accepted, screened.rejected) = if self.surprises >= CONVINCED { (all, none) } else { (none, all) };
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
-    fn screen_repeat(&mut self, model: &Model<'_, G>, b: usize, code: i32, index: u16, screened: &mut Screened) {
+    fn screen_repeat(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        b: usize,
+        code: i32,
+        index: u16,
+        screened: &mut Screened<W>,
+    ) {
         let (expected, moved) = (self.is_expected(model, b, code), self.moved_to_mean_drive(b, code));
         let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
         if let Some(difference) = cell.difference(b, moved) {
@@ -96,7 +144,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// A reading without a setting passes if the model expects it.
-    fn screen_loose(&mut self, model: &Model<'_, G>, b: usize, code: i32, screened: &mut Screened) {
+    fn screen_loose(&mut self, model: &Model<'_, G, B, C, F>, b: usize, code: i32, screened: &mut Screened<W>) {
         let verdict = if self.is_expected(model, b, code) { Verdict::Accepted } else { Verdict::Held };
         if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
             monitor.reject();
@@ -105,7 +153,7 @@ impl<G: Surrogate<B, C, N>, const B: usize, const C: usize, const N: usize, cons
     }
 
     /// True if the model, with all its uncertainty, expects a reading.
-    fn is_expected(&self, model: &Model<'_, G>, b: usize, code: i32) -> bool {
+    fn is_expected(&self, model: &Model<'_, G, B, C, F>, b: usize, code: i32) -> bool {
         let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
         let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
         let surprise = self.innovation(b, code) - predicted;

@@ -9,6 +9,9 @@
 //! `Z_qc = G_qc - Z_qq D G_qc`, `Z_qb = G_qb - Z_qq D G_qb`, `R = G_bc - Z_bq D G_qc`, and
 //! `dR_bc/d(ln strength) = - sum over the quadrupole's nodes of k L w strength Z_qb Z_qc`.
 //!
+//! The product of all `1 + e g_n` is `det(1 + G_qq D)`, which gives the tunes: `sin^2(pi Q) = sin^2(pi Q0) det(1 + G_qq D)`, and
+//! `dQ/d(ln strength) = tan(pi Q)/(2 pi) sum over the quadrupole's nodes of k L w strength Z_nn`.
+//!
 //! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent; what couples
 //! them, and whatever else a ring has beyond its design, is a short sum of products on top, see [`LowRank`].
 //!
@@ -20,7 +23,11 @@ use nalgebra::SMatrix;
 use super::{Block, LowRank, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
 use crate::linear::{add, add_four, add_four_twice, combine, dot, zeros};
+use crate::sizes::Sizes;
 use crate::triangle::Triangle;
+
+/// In place of the number of a param or of a supply: none.
+pub const NONE: i16 = -1;
 
 /// One plane: `B` monitors, `C` correctors, `Q` nodes (two a quadrupole), `T = Q (Q + 1)/2` pairs of nodes.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,8 +40,6 @@ pub struct GreenPlane<const B: usize, const C: usize, const Q: usize, const T: u
     pub driven: Block<Q, C>,
     /// Nodes to nodes, `G_qq` [m/rad].
     pub mutual: SymmetricBlock<Q, T>,
-    /// `k L w` of each node, focusing in this plane positive [1/m].
-    pub weight: [f32; Q],
 }
 
 /// Horizontal dispersion and the slip factor, for frames with an RF offset.
@@ -57,41 +62,71 @@ pub struct Dispersion<const B: usize, const Q: usize> {
     pub circumference: f32,
 }
 
-/// Green's function surrogate of a ring with monitors and correctors in two planes.
+/// Green's function surrogate of a ring with monitors and correctors in two planes, `M` quadrupoles and `N` params.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Green<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize> {
+pub struct Green<
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const M: usize,
+    const N: usize,
+    const Q: usize,
+    const T: usize,
+> {
+    /// How much of all the room the ring takes.
+    pub sizes: Sizes,
     /// Horizontal plane: the first `BX` monitors and `CX` correctors.
     pub x: GreenPlane<BX, CX, Q, T>,
     /// Vertical plane: the rest.
     pub y: GreenPlane<BY, CY, Q, T>,
+    /// `k L w` of both nodes of each quadrupole [1/m], those that focus in x positive and first; in y with the other sign.
+    pub weight: [f32; M],
+    /// Param of each quadrupole, or [`NONE`].
+    pub param: [i16; M],
+    /// Supply of each quadrupole, or [`NONE`] in series with the dipoles.
+    pub supply: [i16; M],
+    /// Which of the setup's priors each param has.
+    pub group: [i16; N],
     /// Momentum.
     pub dispersion: Dispersion<BX, Q>,
+    /// Design tunes [1].
+    pub tune: [f32; 2],
     /// What is beyond both planes' Green's functions; none in a ring as designed.
     pub low_rank: LowRank<BX, BY, CX, CY>,
-    /// Number of quadrupoles on the first (QH) supply; they come first.
-    pub first_family: u16,
     /// Stated rms error in x and y [m].
     pub stated_error: [f32; 2],
 }
 
 /// One plane at given strengths.
 #[derive(Debug, Clone)]
-struct PlaneLinearised<const B: usize, const C: usize, const Q: usize> {
+struct PlaneLinearised<const B: usize, const C: usize, const M: usize, const Q: usize> {
     /// Nodes to monitors, `Z_qb`.
     seen: SMatrix<f32, Q, B>,
     /// Nodes to correctors, `Z_qc`.
     driven: SMatrix<f32, Q, C>,
     /// Monitors to correctors, `R`.
     response: SMatrix<f32, B, C>,
-    /// `k L w strength` of each node.
-    slope: [f32; Q],
+    /// Tune up to an integer [1].
+    tune: f32,
+    /// Derivative of the tune with respect to `ln` of each quadrupole's strength.
+    tune_slope: [f32; M],
 }
 
 /// The surrogate at given strengths.
 #[derive(Debug, Clone)]
-pub struct GreenLinearised<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize> {
-    x: PlaneLinearised<BX, CX, Q>,
-    y: PlaneLinearised<BY, CY, Q>,
+pub struct GreenLinearised<
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const M: usize,
+    const Q: usize,
+> {
+    x: PlaneLinearised<BX, CX, M, Q>,
+    y: PlaneLinearised<BY, CY, M, Q>,
+    /// `k L w strength` of both nodes of each quadrupole; in y with the other sign.
+    slope: [f32; M],
     /// Dispersion at the monitors [m].
     monitor_dispersion: [f32; BX],
     /// Dispersion at the nodes [m].
@@ -100,17 +135,30 @@ pub struct GreenLinearised<const BX: usize, const BY: usize, const CX: usize, co
     slip: f32,
 }
 
-impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
-    const BLANK: Self = Self { seen: zeros(), driven: zeros(), response: zeros(), slope: [0.0; Q] };
+impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
+    const BLANK: Self = Self { seen: zeros(), driven: zeros(), response: zeros(), tune: 0.0, tune_slope: [0.0; M] };
 }
 
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
-    Green<BX, BY, CX, CY, Q, T>
+impl<
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const M: usize,
+    const N: usize,
+    const Q: usize,
+    const T: usize,
+> Green<BX, BY, CX, CY, M, N, Q, T>
 {
     /// Memory for tables, all zero.
     pub const BLANK: Self = Self {
+        sizes: Sizes::new([0; 2], [0; 2], [0; 3]),
         x: GreenPlane::BLANK,
         y: GreenPlane::BLANK,
+        weight: [0.0; M],
+        param: [0; M],
+        supply: [0; M],
+        group: [0; N],
         dispersion: Dispersion {
             monitor: [0.0; BX],
             node: [0.0; Q],
@@ -120,19 +168,14 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
             inverse_gamma_squared: 0.0,
             circumference: 0.0,
         },
+        tune: [0.0; 2],
         low_rank: LowRank::BLANK,
-        first_family: 0,
         stated_error: [0.0; 2],
     };
-    /// Bytes of the tables, without room for terms of low rank.
-    pub const BYTES: usize =
-        GreenPlane::<BX, CX, Q, T>::BYTES + GreenPlane::<BY, CY, Q, T>::BYTES + 4 * (2 * BX + Q + 5);
-    /// Entries of the tables.
-    pub const PARAMETERS: usize = BX * CX + BY * CY + Q * (BX + BY + CX + CY + 3) + 2 * T + 2 * BX + 5;
 }
 
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize>
-    GreenLinearised<BX, BY, CX, CY, Q>
+impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const M: usize, const Q: usize>
+    GreenLinearised<BX, BY, CX, CY, M, Q>
 {
     /// Response of the horizontal monitors to the horizontal correctors [m/rad].
     pub fn response_x(&self) -> &SMatrix<f32, BX, CX> {
@@ -145,87 +188,99 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
     }
 
     /// Relative momentum that an RF offset makes.
-    fn delta<const C: usize>(&self, drive: &Drive<C>) -> f32 {
+    fn delta<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> f32 {
         -drive.rf_offset / self.slip
     }
 
     /// Kicks in x and y that a unit of `ln strength` adds at each node: `-k L w strength` times the orbit there [rad].
-    fn pushes<const C: usize>(&self, drive: &Drive<C>) -> [[f32; Q]; 2] {
+    fn pushes<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> [[f32; Q]; 2] {
         let (kick_x, kick_y) = drive.kick.split_at(CX.min(C));
         let delta = self.delta(drive);
-        [self.x.push(kick_x, self.node_dispersion.map(|d| d * delta)), self.y.push(kick_y, [0.0; Q])]
-    }
-
-    /// Add the derivative of the momentum through the slip factor, `d(slip)/d(ln strength) = -sum of k L w strength D^2 / C`;
-    /// `scale` is the momentum over the circumference.
-    fn differentiate_slip(&self, scale: f32, jacobian: &mut [f32]) {
-        for (slopes, dispersion) in jacobian.chunks_exact_mut(Q / 2).zip(&self.monitor_dispersion) {
-            let scale = dispersion * scale / self.slip;
-            let nodes = self.node_dispersion.chunks_exact(2).zip(self.x.slope.chunks_exact(2));
-            for (slope, (d, k)) in slopes.iter_mut().zip(nodes) {
-                *slope += scale * (k[0] * d[0] * d[0] + k[1] * d[1] * d[1]);
-            }
+        let mut pushes = [
+            self.x.orbit_at_nodes(kick_x, self.node_dispersion.map(|d| d * delta)),
+            self.y.orbit_at_nodes(kick_y, [0.0; Q]),
+        ];
+        let [x, y] = &mut pushes;
+        let nodes = x.as_chunks_mut::<2>().0.iter_mut().zip(y.as_chunks_mut::<2>().0);
+        for ((x, y), k) in nodes.zip(&self.slope) {
+            x.iter_mut().for_each(|x| *x *= -k);
+            y.iter_mut().for_each(|y| *y *= k);
         }
+        pushes
     }
 }
 
 impl<
     const B: usize,
     const C: usize,
-    const N: usize,
+    const F: usize,
     const BX: usize,
     const BY: usize,
     const CX: usize,
     const CY: usize,
+    const M: usize,
+    const N: usize,
     const Q: usize,
     const T: usize,
-> Surrogate<B, C, N> for Green<BX, BY, CX, CY, Q, T>
+> Surrogate<B, C, F, N> for Green<BX, BY, CX, CY, M, N, Q, T>
 {
-    type Linearised = GreenLinearised<BX, BY, CX, CY, Q>;
+    type Linearised = GreenLinearised<BX, BY, CX, CY, M, Q>;
 
-    const BLANK: Self::Linearised = GreenLinearised {
+    const UNLINEARISED: Self::Linearised = GreenLinearised {
         x: PlaneLinearised::BLANK,
         y: PlaneLinearised::BLANK,
+        slope: [0.0; M],
         monitor_dispersion: [0.0; BX],
         node_dispersion: [0.0; Q],
         slip: 0.0,
     };
 
     #[inline(never)] // 19 kB of stack, for as long as it runs
-    fn linearise(&self, strength: &[f32; N], at: &mut Self::Linearised) -> Result<(), Unstable> {
-        const { assert!(B == BX + BY && C == CX + CY && Q == 2 * N, "planes and nodes add up") };
+    fn linearise(&self, params: &[f32; N], supplies: &[f32; F], at: &mut Self::Linearised) -> Result<(), Unstable> {
+        const { assert!(B == BX + BY && C == CX + CY && Q == 2 * M, "planes and nodes add up") };
+        let mut strength = self.ln_strength(params, supplies);
+        strength.iter_mut().for_each(|s| *s = libm::expf(*s));
+        let excess_y = self.excess(&strength, -1.0);
         let mut mutual = Triangle::ZERO;
-        let first_family = usize::from(self.first_family);
-        self.y.linearise(strength, first_family, &mut at.y, &mut mutual)?;
+        at.slope = product(&strength, self.weight.iter().copied());
+        let slope_y = at.slope.map(|k| -k);
+        let focusing = self.focusing();
+        self.y.linearise(&excess_y, (self.tune[1], &slope_y), focusing, &mut at.y, &mut mutual)?;
         // x last: what it leaves between the nodes is used once more, for the dispersion
-        self.x.linearise(strength, first_family, &mut at.x, &mut mutual)?;
-        self.linearise_dispersion(&self.x.excess(strength), at, &mutual);
+        let excess_x = excess_y.map(|e| -e);
+        self.x.linearise(&excess_x, (self.tune[0], &at.slope), focusing, &mut at.x, &mut mutual)?;
+        self.linearise_dispersion(&excess_x, at, &mutual);
         Ok(())
     }
 
-    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut [f32; B]) {
+    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut [f32; B]) {
         // without a change of current, what the nodes would add is not needed
-        let pushes = if drive.strength == [0.0; 2] { [[0.0; Q]; 2] } else { at.pushes(drive) };
+        let pushes = if drive.strength == [0.0; F] { [[0.0; Q]; 2] } else { at.pushes(drive) };
         self.read(at, drive, &pushes, into);
     }
 
-    fn predict(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut Prediction<B, N>) {
+    fn predict(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut Prediction<B, F, N>) {
         let pushes = at.pushes(drive);
         self.read(at, drive, &pushes, &mut into.reading);
         let (jacobian_x, jacobian_y) = into.jacobian.as_mut_slice().split_at_mut(N * BX.min(B));
-        at.x.differentiate(&pushes[0], jacobian_x);
-        at.y.differentiate(&pushes[1], jacobian_y);
+        let (by_supply_x, by_supply_y) = into.by_supply.split_at_mut(BX.min(B));
+        self.differentiate(&at.x, &pushes[0], jacobian_x, by_supply_x);
+        self.differentiate(&at.y, &pushes[1], jacobian_y, by_supply_y);
         if drive.rf_offset != 0.0 {
-            at.differentiate_slip(at.delta(drive) / self.dispersion.circumference, jacobian_x);
+            let scale = at.delta(drive) / self.dispersion.circumference;
+            self.differentiate_slip(at, scale, jacobian_x, by_supply_x);
         }
     }
 
-    fn first_family(&self) -> usize {
-        usize::from(self.first_family)
+    fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
+        let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
+        let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
+        self.spread(slopes.iter().copied(), &mut by_param, &mut by_supply);
+        (tune + dot(&by_supply, strength), by_param)
     }
 
-    fn horizontal_monitors(&self) -> usize {
-        BX
+    fn prior_group(&self, param: usize) -> usize {
+        self.group.get(param).map_or(0, |group| *group as usize)
     }
 
     fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
@@ -235,15 +290,95 @@ impl<
     }
 }
 
-impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>
-    Green<BX, BY, CX, CY, Q, T>
+impl<
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const M: usize,
+    const N: usize,
+    const Q: usize,
+    const T: usize,
+> Green<BX, BY, CX, CY, M, N, Q, T>
 {
+    /// Number of quadrupoles that focus in x; they come first.
+    fn focusing(&self) -> usize {
+        self.weight.iter().take_while(|weight| **weight > 0.0).count()
+    }
+
+    /// `ln` of each quadrupole's strength: that of its param and of its supply, where it has them. ([`NONE`] as an index is
+    /// beyond any list.)
+    fn ln_strength(&self, params: &[f32], supplies: &[f32]) -> [f32; M] {
+        let mut strength = [0.0; M];
+        for (to, (param, supply)) in strength.iter_mut().zip(self.param.iter().zip(&self.supply)) {
+            let of = |list: &[f32], i: i16| list.get(i as usize).copied().unwrap_or(0.0);
+            *to = of(params, *param) + of(supplies, *supply);
+        }
+        strength
+    }
+
+    /// `D` of a plane, the integrated gradient error of each node [1/m].
+    fn excess(&self, strength: &[f32; M], sign: f32) -> [f32; Q] {
+        let mut excess = [0.0; Q];
+        for (pair, (weight, strength)) in excess.as_chunks_mut::<2>().0.iter_mut().zip(self.weight.iter().zip(strength))
+        {
+            *pair = [sign * weight * (strength - 1.0); 2];
+        }
+        excess
+    }
+
+    /// Add derivatives with respect to `ln` of each quadrupole's strength to those of its param and of its supply. ([`NONE`] as
+    /// an index is beyond any list.)
+    #[inline]
+    fn spread(&self, slopes: impl Iterator<Item = f32>, by_param: &mut [f32], by_supply: &mut [f32]) {
+        for (slope, (param, supply)) in slopes.zip(self.param.iter().zip(&self.supply)) {
+            by_param.get_mut(*param as usize).into_iter().for_each(|to| *to += slope);
+            by_supply.get_mut(*supply as usize).into_iter().for_each(|to| *to += slope);
+        }
+    }
+
+    /// Derivatives of the readings of a plane, one column a monitor, for the pushes of the nodes.
+    fn differentiate<const B: usize, const C: usize, const F: usize>(
+        &self,
+        plane: &PlaneLinearised<B, C, M, Q>,
+        push: &[f32; Q],
+        jacobian: &mut [f32],
+        by_supply: &mut [[f32; F]],
+    ) {
+        let push = push.as_chunks::<2>().0;
+        let seen = plane.seen.as_slice().chunks_exact(Q);
+        for ((by_param, by_supply), seen) in jacobian.chunks_exact_mut(N).zip(by_supply).zip(seen) {
+            by_param.fill(0.0);
+            by_supply.fill(0.0);
+            let slopes = seen.as_chunks::<2>().0.iter().zip(push).map(|(z, x)| z[0] * x[0] + z[1] * x[1]);
+            self.spread(slopes, by_param, by_supply);
+        }
+    }
+
+    /// Add the derivative of the momentum through the slip factor, `d(slip)/d(ln strength) = -sum of k L w strength D^2 / C`;
+    /// `scale` is the momentum over the circumference.
+    fn differentiate_slip<const F: usize>(
+        &self,
+        at: &GreenLinearised<BX, BY, CX, CY, M, Q>,
+        scale: f32,
+        jacobian: &mut [f32],
+        by_supply: &mut [[f32; F]],
+    ) {
+        let each = jacobian.chunks_exact_mut(N).zip(by_supply).zip(&at.monitor_dispersion);
+        for ((by_param, by_supply), dispersion) in each {
+            let scale = dispersion * scale / at.slip;
+            let nodes = at.node_dispersion.as_chunks::<2>().0.iter().zip(&at.slope);
+            let slopes = nodes.map(|(d, k)| scale * (k * d[0] * d[0] + k * d[1] * d[1]));
+            self.spread(slopes, by_param, by_supply);
+        }
+    }
+
     #[inline(never)]
     /// Dispersion `D' = D - Z_qq D_q D` at the nodes, alike at the monitors, and the slip factor.
     fn linearise_dispersion(
         &self,
         excess: &[f32; Q],
-        at: &mut GreenLinearised<BX, BY, CX, CY, Q>,
+        at: &mut GreenLinearised<BX, BY, CX, CY, M, Q>,
         mutual: &Triangle<Q, T>,
     ) {
         let d = &self.dispersion;
@@ -258,30 +393,30 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
         at.slip = compaction - d.inverse_gamma_squared;
     }
 
-    /// The orbit: kicks by the response, a known change of a family's current as a change of `ln strength`, and the
+    /// The orbit: kicks by the response, a known change of a supply's current as a change of `ln strength`, and the
     /// momentum `delta = -offset/slip` that an RF offset makes.
-    fn read<const C: usize>(
+    fn read<const C: usize, const F: usize>(
         &self,
-        at: &GreenLinearised<BX, BY, CX, CY, Q>,
-        drive: &Drive<C>,
+        at: &GreenLinearised<BX, BY, CX, CY, M, Q>,
+        drive: &Drive<C, F>,
         pushes: &[[f32; Q]; 2],
         reading: &mut [f32],
     ) {
         let (kick_x, kick_y) = drive.kick.split_at(CX.min(C));
         let (x, y) = reading.split_at_mut(BX.min(reading.len()));
-        let first = 2 * usize::from(self.first_family);
         at.x.read(kick_x, x);
         at.y.read(kick_y, y);
         self.low_rank.read([kick_x, kick_y], drive.rf_offset, [&mut *x, &mut *y]);
-        if drive.strength != [0.0; 2] {
-            at.x.read_nodes(&scaled(&pushes[0], first, drive.strength), x);
-            at.y.read_nodes(&scaled(&pushes[1], first, drive.strength), y);
+        let strength = self.ln_strength(&[], &drive.strength);
+        if drive.strength != [0.0; F] {
+            at.x.read_nodes(&scaled(&pushes[0], &strength), x);
+            at.y.read_nodes(&scaled(&pushes[1], &strength), y);
         }
         if drive.rf_offset == 0.0 {
             return;
         }
-        let change = scaled(&at.x.slope, first, drive.strength);
-        let slip: f32 = change.iter().zip(&at.node_dispersion).map(|(k, d)| k * d * d).sum();
+        let change = at.slope.iter().zip(&strength).zip(at.node_dispersion.as_chunks::<2>().0);
+        let slip = change.fold(0.0, |sum, ((k, s), d)| sum + k * s * d[0] * d[0] + k * s * d[1] * d[1]);
         let relative = 1.0 + slip / (at.slip * self.dispersion.circumference);
         let (delta, offset) = (at.delta(drive) * relative, drive.rf_offset);
         let each = at.monitor_dispersion.iter().zip(&self.dispersion.second_order);
@@ -289,75 +424,73 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q
     }
 }
 
-/// Each node's value times the `ln` factor of its family.
-fn scaled<const Q: usize>(values: &[f32; Q], first_family: usize, strength: [f32; 2]) -> [f32; Q] {
+/// Each node's value times the `ln` strength of its quadrupole.
+fn scaled<const Q: usize, const M: usize>(values: &[f32; Q], strength: &[f32; M]) -> [f32; Q] {
     let mut scaled = *values;
-    let (first, second) = scaled.split_at_mut(first_family.min(Q));
-    first.iter_mut().for_each(|v| *v *= strength[0]);
-    second.iter_mut().for_each(|v| *v *= strength[1]);
+    let pairs = scaled.as_chunks_mut::<2>().0.iter_mut().zip(strength);
+    pairs.for_each(|(pair, s)| pair.iter_mut().for_each(|v| *v *= s));
     scaled
 }
 
 impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<B, C, Q, T> {
-    /// Bytes of the tables of one plane.
-    pub const BYTES: usize =
-        Block::<B, C>::BYTES + Block::<Q, B>::BYTES + Block::<Q, C>::BYTES + SymmetricBlock::<Q, T>::BYTES + 4 * Q;
-    const BLANK: Self = Self {
-        direct: Block::BLANK,
-        seen: Block::BLANK,
-        driven: Block::BLANK,
-        mutual: SymmetricBlock::BLANK,
-        weight: [0.0; Q],
-    };
+    const BLANK: Self =
+        Self { direct: Block::BLANK, seen: Block::BLANK, driven: Block::BLANK, mutual: SymmetricBlock::BLANK };
 
-    /// `D`, the integrated gradient error of each node [1/m].
-    fn excess<const N: usize>(&self, strength: &[f32; N]) -> [f32; Q] {
-        let mut excess = self.weight;
-        for (pair, strength) in excess.chunks_exact_mut(2).zip(strength) {
-            pair.iter_mut().for_each(|e| *e *= strength - 1.0);
-        }
-        excess
-    }
-
+    /// The plane at the errors of its nodes; `tune` is that of the design, `slope` is `k L w strength` of each quadrupole.
     #[inline(never)]
-    fn linearise<const N: usize>(
+    fn linearise<const M: usize>(
         &self,
-        strength: &[f32; N],
-        first_family: usize,
-        at: &mut PlaneLinearised<B, C, Q>,
+        excess: &[f32; Q],
+        (tune, slope): (f32, &[f32; M]),
+        focusing: usize,
+        at: &mut PlaneLinearised<B, C, M, Q>,
         mutual: &mut Triangle<Q, T>,
     ) -> Result<(), Unstable> {
-        let excess = self.excess(strength);
         self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
-        // a quadrupole of each family together: in between, the tunes stay between the design's and the ring's
-        for k in 0..first_family.max(N - first_family.min(N)) {
-            let (one, other) = (2 * k, 2 * (k + first_family));
-            let one = if k < first_family { [one, one + 1] } else { [Q; 2] };
-            switch_on(mutual, &excess, [one[0], one[1], other, other + 1])?;
+        let mut determinant = 1.0;
+        // a quadrupole that focuses and one that does not together: in between, the tunes stay between the design's and the
+        // ring's
+        for k in 0..focusing.max(M - focusing.min(M)) {
+            let (one, other) = (2 * k, 2 * (k + focusing));
+            let one = if k < focusing { [one, one + 1] } else { [Q; 2] };
+            determinant *= switch_on(mutual, excess, [one[0], one[1], other, other + 1])?;
         }
-        fill(at.seen.as_mut_slice(), &self.seen, mutual, &excess);
-        fill(at.driven.as_mut_slice(), &self.driven, mutual, &excess);
+        at.tune = tune_at(tune, determinant)?;
+        let steep = libm::tanf(core::f32::consts::PI * at.tune) / core::f32::consts::TAU;
+        for (q, (to, slope)) in at.tune_slope.iter_mut().zip(slope).enumerate() {
+            *to = steep * slope * (mutual.get(2 * q, 2 * q) + mutual.get(2 * q + 1, 2 * q + 1));
+        }
+        fill(at.seen.as_mut_slice(), &self.seen, mutual, excess);
+        fill(at.driven.as_mut_slice(), &self.driven, mutual, excess);
         let responses = at.response.as_mut_slice().chunks_exact_mut(B);
         for (c, response) in responses.enumerate() {
-            let kick = product(&excess, self.driven.column(c));
+            let kick = product(excess, self.driven.column(c));
             let seen = at.seen.as_slice().chunks_exact(Q);
             for ((to, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(seen) {
                 *to = direct - dot(seen, &kick);
             }
         }
-        at.slope = self.weight;
-        for (pair, strength) in at.slope.chunks_exact_mut(2).zip(strength) {
-            pair.iter_mut().for_each(|k| *k *= strength);
-        }
         Ok(())
     }
 }
 
-impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
-    /// What a unit of `ln strength` adds at each node to the kicks, on top of the `orbit` that the momentum makes there.
-    fn push(&self, kick: &[f32], mut orbit: [f32; Q]) -> [f32; Q] {
+/// The tune up to an integer of a ring whose closure `4 sin^2(pi Q)` is `determinant` times that of the design, on the
+/// design's side of the half-integer.
+fn tune_at(design: f32, determinant: f32) -> Result<f32, Unstable> {
+    let sine = libm::sinf(core::f32::consts::PI * design);
+    let square = sine * sine * determinant;
+    if !(0.0..1.0).contains(&square) {
+        return Err(Unstable);
+    }
+    let tune = libm::asinf(libm::sqrtf(square)) * core::f32::consts::FRAC_1_PI;
+    let fraction = design - libm::floorf(design);
+    Ok(if fraction < 0.5 { tune } else { 1.0 - tune })
+}
+
+impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
+    /// The orbit that kicks make at the nodes, on top of the `orbit` that the momentum makes there [m].
+    fn orbit_at_nodes(&self, kick: &[f32], mut orbit: [f32; Q]) -> [f32; Q] {
         combine(&mut orbit, acting(kick, self.driven.as_slice().chunks_exact(Q)));
-        orbit.iter_mut().zip(&self.slope).for_each(|(x, k)| *x *= -k);
         orbit
     }
 
@@ -371,16 +504,6 @@ impl<const B: usize, const C: usize, const Q: usize> PlaneLinearised<B, C, Q> {
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
         let seen = self.seen.as_slice().chunks_exact(Q);
         reading.iter_mut().zip(seen).for_each(|(reading, seen)| *reading += dot(seen, kick));
-    }
-
-    /// Derivatives of the readings, one column a monitor, for the pushes of the nodes.
-    fn differentiate(&self, push: &[f32; Q], jacobian: &mut [f32]) {
-        let push = push.as_chunks::<2>().0;
-        for (slopes, seen) in jacobian.chunks_exact_mut(Q / 2).zip(self.seen.as_slice().chunks_exact(Q)) {
-            for (slope, (z, x)) in slopes.iter_mut().zip(seen.as_chunks::<2>().0.iter().zip(push)) {
-                *slope = z[0] * x[0] + z[1] * x[1];
-            }
-        }
     }
 }
 
@@ -430,7 +553,8 @@ fn product<const Q: usize>(a: &[f32; Q], b: impl Iterator<Item = f32>) -> [f32; 
     product
 }
 
-/// Switch on the errors of four nodes, one after the other; a node beyond the last has none.
+/// Switch on the errors of four nodes, one after the other; a node beyond the last has none. Returns the product of their
+/// `1 + e g_n`.
 ///
 /// `1 + e g_n` is the ring's closure with the node's error over that without; it reaches zero at an integer resonance,
 /// and a ring beyond one is not connected with the design.
@@ -439,8 +563,8 @@ fn switch_on<const Q: usize, const T: usize>(
     mutual: &mut Triangle<Q, T>,
     excess: &[f32; Q],
     nodes: [usize; 4],
-) -> Result<(), Unstable> {
-    let (mut columns, mut weights) = ([[0.0; Q]; 4], [0.0; 4]);
+) -> Result<f32, Unstable> {
+    let (mut columns, mut weights, mut determinant) = ([[0.0; Q]; 4], [0.0; 4], 1.0);
     for (i, &node) in nodes.iter().enumerate() {
         let (Some((done, [column, ..])), Some(error)) = (columns.split_at_mut_checked(i), excess.get(node)) else {
             continue;
@@ -454,6 +578,7 @@ fn switch_on<const Q: usize, const T: usize>(
             return Err(Unstable);
         }
         weights.get_mut(i).into_iter().for_each(|w| *w = error / pivot);
+        determinant *= pivot;
     }
     let factors = |r: usize| {
         let mut factors = weights;
@@ -461,7 +586,7 @@ fn switch_on<const Q: usize, const T: usize>(
         factors
     };
     mutual.add_products(factors, columns.each_ref().map(<[f32; Q]>::as_slice));
-    Ok(())
+    Ok(determinant)
 }
 
 #[cfg(test)]
@@ -488,15 +613,34 @@ mod tests {
     fn node_by_node_is_the_resolvent() {
         let (g, excess) = example();
         let mut mutual = triangle(&g);
-        switch_on(&mut mutual, &excess, [0, 1, 4, 5]).unwrap();
-        switch_on(&mut mutual, &excess, [2, 3, 6, 7]).unwrap();
-        let d = SMatrix::from_diagonal(&excess.into());
-        let exact = (SMatrix::identity() + g * d).try_inverse().unwrap() * g;
+        let first = switch_on(&mut mutual, &excess, [0, 1, 4, 5]).unwrap();
+        let second = switch_on(&mut mutual, &excess, [2, 3, 6, 7]).unwrap();
+        let closure = SMatrix::identity() + g * SMatrix::from_diagonal(&excess.into());
+        let exact = closure.try_inverse().unwrap() * g;
+        assert!((first * second - closure.determinant()).abs() < 1e-5); // f32 rounding
         for r in 0..6 {
             for c in 0..=r {
                 assert!((mutual.get(r, c) - exact[(r, c)]).abs() < 1e-5); // f32 rounding
             }
         }
+    }
+
+    /// A thin quadrupole of `k L` at `beta` shifts a tune by `cos(2 pi Q') = cos(2 pi Q) - k L beta sin(2 pi Q)/2`.
+    ///
+    /// Source: S. Y. Lee, Accelerator Physics, ch. 2, effect of quadrupole field error.
+    #[test]
+    fn a_thin_quadrupole_shifts_the_tune() {
+        for (design, gradient) in [(4.83_f64, 0.01), (4.17, 0.01), (2.3, -0.02)] {
+            let (beta, angle) = (7.0, core::f64::consts::TAU * design);
+            let green = beta * libm::cos(0.5 * angle) / (2.0 * libm::sin(0.5 * angle));
+            let cosine = libm::cos(angle) - 0.5 * gradient * beta * libm::sin(angle);
+            let exact = libm::acos(cosine) / core::f64::consts::TAU;
+            let fraction = design - libm::floor(design);
+            let exact = if fraction < 0.5 { exact } else { 1.0 - exact };
+            let tune = tune_at(design as f32, (1.0 + gradient * green) as f32).unwrap();
+            assert!((f64::from(tune) - exact).abs() < 1e-6, "{tune} {exact}"); // f32 rounding
+        }
+        assert_eq!(tune_at(0.45, 2.0), Err(Unstable));
     }
 
     #[test]

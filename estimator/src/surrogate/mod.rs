@@ -1,75 +1,101 @@
-//! A fast stand-in for the twin: the orbit that a drive makes at given gradients, and its derivative.
+//! A fast stand-in for the twin: the orbit that a drive makes at given gradients, its derivative, and the tunes.
 
 mod green;
 mod low_rank;
-mod parcel;
+mod parcels;
 mod quantised;
 
-pub use green::{Dispersion, Green, GreenLinearised, GreenPlane};
+pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, NONE};
 pub use low_rank::{LowRank, TERMS};
-pub use parcel::{Head, List, Parcel, ParcelError, Table};
-pub use quantised::{Block, SymmetricBlock};
+pub use parcels::{List, RING, Table, VERSION, shape};
+pub use quantised::{Block, SymmetricBlock, code, step};
 
 use nalgebra::SMatrix;
 
 use crate::drive::Drive;
 use crate::linear::zeros;
+use crate::sizes::{Layout, Sizes};
+use crate::wire::{Parcel, ParcelError};
 
-/// The orbit at the monitors, and its derivative with respect to `ln` of every gradient.
+/// The orbit at the monitors, and its derivative with respect to every param and `ln` of every supply's factor.
 #[derive(Debug, Clone)]
-pub struct Prediction<const B: usize, const N: usize> {
+pub struct Prediction<const B: usize, const F: usize, const N: usize> {
     /// Change of the orbit made by the drive [m] [B].
     pub reading: [f32; B],
     /// Derivative with respect to `theta` [m], one column a monitor [N][B].
     pub jacobian: SMatrix<f32, N, B>,
+    /// Derivative with respect to `ln` of each supply's factor [m] [B][F].
+    pub by_supply: [[f32; F]; B],
 }
 
-impl<const B: usize, const N: usize> Prediction<B, N> {
+impl<const B: usize, const F: usize, const N: usize> Prediction<B, F, N> {
     /// Memory for one, all zero.
-    pub const BLANK: Self = Self { reading: [0.0; B], jacobian: zeros() };
-
-    /// Derivative with respect to `ln` of the QH and of the QV current at each monitor [m]; the first `first_family` of the
-    /// gradients hang on QH.
-    pub fn by_family(&self, first_family: usize) -> [[f32; 2]; B] {
-        let mut by_family = [[0.0; 2]; B];
-        for (to, slope) in by_family.iter_mut().zip(self.jacobian.as_slice().chunks_exact(N)) {
-            let (first, second) = slope.split_at(first_family.min(N));
-            *to = [first.iter().sum(), second.iter().sum()];
-        }
-        by_family
-    }
+    pub const BLANK: Self = Self { reading: [0.0; B], jacobian: zeros(), by_supply: [[0.0; F]; B] };
 }
 
-/// No linearisation there: the ring would cross an integer resonance on the way from its design.
+/// No linearisation there: the ring would cross an integer or a half-integer resonance on the way from its design.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Unstable;
 
-/// A model of the ring that is linearised now and then, and asked every frame.
-pub trait Surrogate<const B: usize, const C: usize, const N: usize> {
+/// Tables that travel in parcels, whatever they are of.
+pub trait Tables {
+    /// Memory for tables, all zero.
+    const BLANK: Self;
+    /// What they have room for.
+    const ROOM: Sizes;
+
+    /// What the ring has, among what there is room for.
+    fn layout(&self) -> Layout;
+
+    /// All parts of the ring's tables but the seal, always in the same order, the head first. Spare slots are left out, so
+    /// that one ring has the same parcels whatever the room.
+    fn parts<const L: usize>(&self) -> impl Iterator<Item = Parcel<L>> + '_;
+
+    /// Write a parcel where it belongs.
+    ///
+    /// # Errors
+    /// [`ParcelError`].
+    fn take<const L: usize>(&mut self, parcel: &Parcel<L>) -> Result<(), ParcelError>;
+
+    /// CRC-32 (ISO-HDLC) of the bodies of all parts, in postcard, one after the other.
+    fn digest<const L: usize>(&self) -> u32 {
+        Parcel::<L>::digest(self.parts())
+    }
+
+    /// The tables in parcels, the seal last.
+    fn parcels<const L: usize>(&self) -> impl Iterator<Item = Parcel<L>> + '_ {
+        self.parts().chain(core::iter::once_with(|| Parcel::Seal { crc: self.digest::<L>() }))
+    }
+}
+
+/// A model of the ring that is linearised now and then, and asked every frame: `B` monitors, `C` correctors, `F` supplies,
+/// `N` params.
+pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usize>: Tables {
     /// What one linearisation leaves behind.
     type Linearised;
 
     /// Memory for a linearisation, all zero.
-    const BLANK: Self::Linearised;
+    const UNLINEARISED: Self::Linearised;
 
-    /// Linearise at `strength`, the gradient of each quadrupole over its design value [N].
+    /// Linearise at params [N] and at `ln` of the supplies' factors [F].
     ///
     /// # Errors
     /// [`Unstable`]; `into` is then not to be used.
-    fn linearise(&self, strength: &[f32; N], into: &mut Self::Linearised) -> Result<(), Unstable>;
+    fn linearise(&self, params: &[f32; N], supplies: &[f32; F], into: &mut Self::Linearised) -> Result<(), Unstable>;
 
     /// The orbit that a drive makes [m].
-    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut [f32; B]);
+    fn orbit(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut [f32; B]);
 
     /// The orbit that a drive makes, and its derivative.
-    fn predict(&self, at: &Self::Linearised, drive: &Drive<C>, into: &mut Prediction<B, N>);
+    fn predict(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut Prediction<B, F, N>);
 
-    /// Number of horizontal monitors; they come first.
-    fn horizontal_monitors(&self) -> usize;
+    /// The tune in a plane (0 for x) up to an integer, and its derivative with respect to every param; `strength` is `ln` of
+    /// the supplies' factors about where it was linearised.
+    fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]);
 
-    /// Number of quadrupoles on the first (QH) supply; they come first.
-    fn first_family(&self) -> usize;
+    /// Which of the setup's priors a param has.
+    fn prior_group(&self, param: usize) -> usize;
 
     /// Stated mean square error of a prediction at one monitor [m^2]: the same at every repeat of a setting, unlike noise.
     ///

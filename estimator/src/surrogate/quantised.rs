@@ -60,7 +60,12 @@ impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
 
     /// The codes of each row, up to its diagonal.
     pub fn rows(&self) -> impl Iterator<Item = &[i16]> {
-        (0..N).map(|row| self.codes.get(start(row)..start(row + 1)).unwrap_or_default())
+        (0..N).map(|row| self.row(row).unwrap_or_default())
+    }
+
+    /// The codes of one row, up to its diagonal.
+    pub fn row(&self, row: usize) -> Option<&[i16]> {
+        self.codes.get(start(row)..start(row.saturating_add(1)))
     }
 
     /// The codes of one row, to be changed.
@@ -75,13 +80,13 @@ impl<const N: usize, const T: usize> SymmetricBlock<N, T> {
 }
 
 /// The step with which the largest of some values just fits 16 bits.
-pub(super) fn step(values: impl Iterator<Item = f64>) -> f32 {
+pub fn step(values: impl Iterator<Item = f64>) -> f32 {
     let largest = values.fold(0.0_f64, |largest, v| largest.max(libm::fabs(v)));
     (largest / f64::from(i16::MAX)).max(f64::from(f32::MIN_POSITIVE)) as f32
 }
 
 /// The code nearest to a value.
-pub(super) fn code(value: f64, scale: f32) -> i16 {
+pub fn code(value: f64, scale: f32) -> i16 {
     libm::round(value / f64::from(scale)) as i16
 }
 

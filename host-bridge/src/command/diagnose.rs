@@ -144,7 +144,7 @@ fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<(), Co
     if !left_out.is_empty() {
         return Err(failed(format!("the core's tables cannot hold {}", left_out.join(", "))));
     }
-    Ok(model_file::write(path, &extended.tables)?)
+    Ok(model_file::write(path, &ring.name, &extended.tables)?)
 }
 
 impl DiagnosisResult {

@@ -4,16 +4,13 @@ use std::sync::Arc;
 
 use indicatif::ProgressBar;
 use inference::nuts::{self, NutsRun};
-use inference::{BatchFit, Campaign, Posterior, Readings, Recording, ResponseModel, Width};
+use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
 use crate::output;
 use crate::result::FitResult;
-
-/// Width of the prior of a var, the paper's.
-const WIDTH: Width = Width::Lognormal(inference::stream::PRIOR_WIDTH as f64);
 
 /// Run it.
 ///
@@ -44,29 +41,36 @@ fn check(options: &Fit) -> Result<(), CommandError> {
 
 /// Damped Gauss-Newton on the twin.
 fn by_steps(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
-    let spinner = spinner(options);
-    let fit = BatchFit::of(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
-    spinner.finish_and_clear();
-    let fit = fit?;
+    let (campaign, fit) = fitted(options, ring, recording)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
-    Ok(FitResult { notes, ..FitResult::of_fit(ring, recording, &fit) })
+    Ok(FitResult { notes, ..FitResult::of_fit(&campaign, &fit) })
+}
+
+/// The campaign and its batch fit, measured tunes as readings.
+fn fitted(options: &Fit, ring: &Ring, recording: &Recording) -> Result<(Campaign, BatchFit), CommandError> {
+    let spinner = spinner(options);
+    let campaign = Campaign::of(ring, recording)?;
+    let fit = BatchFit::of(&campaign, TuneUse::Readings, |step| {
+        spinner.set_message(format!("Gauss-Newton step {step}"));
+    });
+    spinner.finish_and_clear();
+    Ok((campaign, fit?))
 }
 
 /// NUTS about the Laplace approximation.
 fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let spinner = spinner(options);
-    let campaign = Campaign::of(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
-    spinner.finish_and_clear();
-    let campaign = campaign?;
+    let (campaign, fit) = fitted(options, ring, recording)?;
+    let reduced = Reduced::of(campaign, fit)?;
+    let ring = &reduced.campaign.ring;
     let model = match options.model {
         FitModel::Twin => ResponseModel::twin(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Green => ResponseModel::green(ring).map_err(|e| failed(e.to_string()))?,
     };
     let word = model.word();
-    let readings = Readings::of_frames(&campaign, &model);
-    let posterior = Posterior { model, readings, width: WIDTH };
-    let laplace = posterior.laplace(&campaign.fit.map_params).map_err(|e| failed(e.to_string()))?;
+    let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
+    let posterior = Posterior::new(model, readings, Prior::of(ring));
+    let laplace = posterior.laplace(&reduced.fit.map_params).map_err(|e| failed(e.to_string()))?;
     let settings = options.sampling.into();
     let nuts::NutsSettings { chains, warm_up, draws, .. } = settings;
     let bar = progress(chains * (warm_up + draws), "draws", options.common.quiet);
@@ -78,7 +82,7 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
     if let Some(folder) = &options.save_draws {
         run.draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
     }
-    Ok(FitResult { notes: notes(&run), ..FitResult::of_draws(ring, &campaign, word, &run) })
+    Ok(FitResult { notes: notes(&run), ..FitResult::of_draws(&reduced, word, &run) })
 }
 
 /// How well the posterior was sampled.

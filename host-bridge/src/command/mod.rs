@@ -2,6 +2,7 @@
 
 pub mod challenge;
 pub mod diagnose;
+pub mod export;
 pub mod fit;
 pub mod prove;
 pub mod replay;
@@ -16,10 +17,9 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::readings::ReadingsError;
 use inference::{BatchError, Recording, RecordingError, stream};
 use serde::Serialize;
-use training::BoosterGreen;
+use training::Tables;
 use twin::{LatticeError, Ring};
 
 use crate::cli::{Common, Publishing};
@@ -86,19 +86,13 @@ impl From<OutputError> for CommandError {
 
 impl From<BatchError> for CommandError {
     fn from(error: BatchError) -> Self {
-        match error {
-            BatchError::Stream(error) => error.into(),
-            error => Self::Other(error.to_string()),
-        }
+        Self::Other(error.to_string())
     }
 }
 
-impl From<ReadingsError> for CommandError {
-    fn from(error: ReadingsError) -> Self {
-        match error {
-            ReadingsError::Fit(error) => error.into(),
-            error => Self::Other(error.to_string()),
-        }
+impl From<twin::OrbitError> for CommandError {
+    fn from(error: twin::OrbitError) -> Self {
+        Self::Other(format!("no stable ring: {error}"))
     }
 }
 
@@ -108,10 +102,10 @@ fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
 }
 
 /// The core's tables: those of a model file, or of the ring as designed.
-fn tables(ring: &Ring, file: Option<&Path>) -> Result<Box<BoosterGreen>, CommandError> {
+fn tables(ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
     match file {
-        Some(path) => Ok(model_file::read(path)?),
-        None => Ok(Box::new(training::green::tables(ring).map_err(stream::StreamError::from)?)),
+        Some(path) => Ok(model_file::read(path, &ring.name)?),
+        None => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
     }
 }
 
@@ -160,7 +154,7 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
 }
 
 fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
-    Recording::read(path, &stream::layout(ring))
+    Recording::read(path, ring)
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.

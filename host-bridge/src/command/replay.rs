@@ -1,5 +1,6 @@
 //! `orbitcal replay`: recording to wire bytes to core to shared memory, frame by frame.
 
+use estimator::Prior;
 use inference::stream::{self, Core};
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables};
@@ -17,9 +18,10 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
-    let tables = tables(&ring, options.model_file.as_deref())?;
-    let setup = stream::setup(&recording, options.process_noise)?;
-    let core = Core::with_tables(tables, setup)?;
+    let powered = recording.powered(&ring);
+    let tables = tables(&powered, options.model_file.as_deref())?;
+    let core = Core::with_tables(tables, stream::setup(&powered, &recording, options.process_noise)?)?;
+    let priors: Vec<Prior> = (0..powered.parameters.len()).map(|i| core.prior(i)).collect();
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
@@ -27,5 +29,5 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(&ring, &recording, &setup, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(&ring, &recording, &priors, &last, quality, timing)?)
 }

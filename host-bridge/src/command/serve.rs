@@ -1,6 +1,8 @@
 //! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
 
+use estimator::{Prior, Tables as _};
 use inference::{Recording, stream};
+use training::LINE;
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables};
@@ -23,6 +25,9 @@ pub fn run(options: &Serve) -> Result<(), CommandError> {
             "--json needs --feed: the result is that of a recording; --trace takes each estimate".into(),
         ));
     }
+    if options.feed.is_none() && options.publishing.no_publish && options.trace.is_none() {
+        return Err(CommandError::Input("--no-publish needs --trace or --feed: estimates would go nowhere".into()));
+    }
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = options.feed.as_ref().map(|path| recording(path, &ring)).transpose()?;
@@ -38,6 +43,11 @@ pub fn run(options: &Serve) -> Result<(), CommandError> {
 fn listen(options: &Serve, ring: &Ring, link: Link<Box<dyn Line>>) -> Result<(), CommandError> {
     let (names, stop) = (Names::of(ring), Stop::on_signals().map_err(CommandError::other)?);
     let mut sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
+    if sinks.is_empty() {
+        return Err(CommandError::Other(
+            "estimates go nowhere: they are not published, and there is no --trace".into(),
+        ));
+    }
     let mut source = Overheard::new(link, &names, options.count.unwrap_or(u64::MAX));
     let ended = serve(&mut source, &mut sinks, &stop, || {}).map_err(CommandError::other);
     let finished = sinks.finish().map_err(CommandError::other);
@@ -51,25 +61,27 @@ fn feed(
     recording: &Recording,
     mut link: Link<Box<dyn Line>>,
 ) -> Result<(), CommandError> {
-    let setup = stream::setup(recording, options.process_noise)?;
+    let powered = recording.powered(ring);
+    let setup = stream::setup(&powered, recording, options.process_noise)?;
     let CoreModel::Green = options.model;
-    let tables = tables(ring, options.model_file.as_deref())?;
+    let tables = tables(&powered, options.model_file.as_deref())?;
+    let priors: Vec<Prior> = (0..powered.parameters.len()).map(|i| setup.priors[tables.prior_group(i)]).collect();
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {
         // restarted already: there are no frames of somebody before us that they would have to describe
-        let bar = progress(tables.parcels().count(), "tables", options.common.quiet);
+        let bar = progress(tables.parcels::<LINE>().count(), "tables", options.common.quiet);
         link.load(&tables, || bar.inc(1)).map_err(CommandError::other)?;
         bar.finish_and_clear();
         link.restart(&setup).map_err(CommandError::other)?;
     }
-    expect_tables(&mut link, tables.digest())?;
+    expect_tables(&mut link, tables.digest::<LINE>())?;
     let (names, stop) = (Names::of(ring), Stop::on_signals().map_err(CommandError::other)?);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
     let mut source = Fed::new(recording, &names, &mut link, Clock::new(options.rate, &stop));
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(ring, recording, &setup, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(ring, recording, &priors, &last, quality, timing)?)
 }
 
 /// A device goes by the tables that it has, whatever ring they are of.

@@ -1,6 +1,6 @@
 //! `orbitcal study`: the published studies of a recording, as one report.
 
-use studies::{self, Options, StudyError};
+use studies::{self, Options};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Study;
@@ -22,12 +22,7 @@ pub fn run(options: &Study) -> Result<(), CommandError> {
     };
     let made = studies::run(&ring, &recording, Options { nuts: options.sampling.into() }, &mut report);
     bar.finish_and_clear();
-    let made = made.map_err(|error| match error {
-        StudyError::Readings(error) => error.into(),
-        StudyError::Stream(error) => error.into(),
-        error @ StudyError::NoPairs { .. } => CommandError::Input(error.to_string()),
-        error => CommandError::Other(format!("{}: {error}", recording.name)),
-    })?;
+    let made = made.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
     output::bytes(&options.report, made.page.render().as_bytes())?;
     if let Some(path) = &options.common.json {
         output::json(path, &made.numbers)?;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use tempfile::NamedTempFile;
 
 use super::{Sink, SinkError};
-use crate::output;
+use crate::output::{self, OutputError};
 use crate::record::{EstimateRecord, Names, ReadingUse};
 
 /// Why a trace was not written.
@@ -15,13 +15,8 @@ use crate::record::{EstimateRecord, Names, ReadingUse};
 #[non_exhaustive]
 pub enum TraceError {
     /// The file cannot be written.
-    #[error("{path}: {reason}")]
-    Write {
-        /// The file.
-        path: String,
-        /// Why.
-        reason: String,
-    },
+    #[error(transparent)]
+    Write(#[from] OutputError),
     /// An estimate is not of the vars whose columns the trace has.
     #[error("{path}: an estimate of {found}; the columns are those of {columns}")]
     Ring {
@@ -48,7 +43,7 @@ impl Trace {
     /// # Errors
     /// [`TraceError::Write`].
     pub fn create(path: &Path) -> Result<Self, TraceError> {
-        let file = output::temporary(path).map_err(|e| wrong(path, &e))?;
+        let file = output::temporary(path)?;
         Ok(Self { path: path.to_owned(), rows: csv::Writer::from_writer(BufWriter::new(file)), names: None })
     }
 
@@ -117,7 +112,7 @@ impl Sink for Trace {
 }
 
 fn wrong(path: &Path, reason: &dyn core::fmt::Display) -> TraceError {
-    TraceError::Write { path: path.display().to_string(), reason: reason.to_string() }
+    OutputError::of(path, reason).into()
 }
 
 #[cfg(test)]

@@ -4,8 +4,8 @@ use std::io::{Read, Write};
 use std::sync::Arc;
 
 use estimator::FitQuality;
-use firmware_sim::link::Request;
 use inference::{Recording, stream};
+use training::rooms::large::Request;
 
 use super::link::{Heard, Link, LinkError};
 use super::{Clock, Next, Source, SourceError, Times};

@@ -8,11 +8,11 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::time::Instant;
 
-use estimator::booster::Green;
-use estimator::surrogate::ParcelError;
-use estimator::{FrameError, Setup, packet};
-use firmware_sim::link::{Refusal, Reply, Request, Status, TRIANGLE, Taken};
-use inference::stream::BoosterEstimate;
+use estimator::wire::link::{Refusal, Status, Taken};
+use estimator::{FrameError, ParcelError, Tables as _};
+use inference::stream::{Estimate, Setup};
+use training::rooms::large::{PACKET, Reply, Request};
+use training::{LINE, Tables};
 
 /// Longest wait for a reply that is due, and for a device to take bytes.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -124,37 +124,46 @@ pub enum LinkError {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Heard {
     /// The estimate.
-    pub estimate: BoosterEstimate,
+    pub estimate: Estimate,
     /// Covariance of `theta = ln var`, lower triangle row by row.
-    pub covariance: Option<Box<[f32; TRIANGLE]>>,
+    pub covariance: Option<Vec<f32>>,
 }
 
 /// An estimate whose covariance may follow.
 struct Coming {
-    estimate: BoosterEstimate,
-    covariance: Box<[f32; TRIANGLE]>,
-    /// Entries of it that are there.
-    place: usize,
+    estimate: Estimate,
+    /// Entries that are there.
+    covariance: Vec<f32>,
 }
 
 impl Coming {
-    fn new(estimate: BoosterEstimate) -> Self {
-        Self { estimate, covariance: Box::new([0.0; TRIANGLE]), place: 0 }
+    fn new(estimate: Estimate) -> Self {
+        Self { covariance: Vec::with_capacity(triangle(&estimate)), estimate }
     }
 
     /// Take a piece of a covariance, if it is the next one of this estimate's.
     fn add(&mut self, sequence: u32, first: u16, entries: &[f32]) {
-        if sequence == self.estimate.sequence && usize::from(first) == self.place {
-            let room = self.covariance.iter_mut().skip(self.place);
-            self.place += room.zip(entries).map(|(to, entry)| *to = *entry).count();
+        if sequence == self.estimate.sequence && usize::from(first) == self.covariance.len() {
+            let room = triangle(&self.estimate) - self.covariance.len();
+            self.covariance.extend(entries.iter().take(room));
         }
+    }
+
+    fn is_whole(&self) -> bool {
+        self.covariance.len() == triangle(&self.estimate)
     }
 
     /// What has come: the estimate, and its covariance if that is whole.
     fn heard(self) -> Heard {
-        let is_whole = self.place == TRIANGLE;
+        let is_whole = self.is_whole();
         Heard { estimate: self.estimate, covariance: is_whole.then_some(self.covariance) }
     }
+}
+
+/// Entries of the covariance of its params.
+fn triangle(estimate: &Estimate) -> usize {
+    let params = estimate.mean.len();
+    params * (params + 1) / 2
 }
 
 /// What a line brings.
@@ -227,7 +236,7 @@ impl<L: Read + Write> Link<L> {
     pub fn restart(&mut self, setup: &Setup) -> Result<(), LinkError> {
         // a zero first: half a packet of somebody before us may be waiting
         self.write(&[0])?;
-        self.send(&Request::Restart(*setup))?;
+        self.send(&Request::Restart(setup.on_wire()))?;
         self.coming = None;
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -283,7 +292,7 @@ impl<L: Read + Write> Link<L> {
         loop {
             match self.next_before(deadline, patience) {
                 Ok(Reply::Estimate(reply)) => {
-                    let estimate = reply.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
+                    let estimate = Estimate::of_answer(&reply).ok_or(LinkError::Reply(FrameError::Malformed))?;
                     if let Some(former) = self.coming.replace(Coming::new(estimate)) {
                         return Ok(Event::Heard(former.heard()));
                     }
@@ -292,7 +301,7 @@ impl<L: Read + Write> Link<L> {
                     if let Some(coming) = &mut self.coming {
                         coming.add(sequence, first, &entries);
                     }
-                    if let Some(whole) = self.coming.take_if(|coming| coming.place == TRIANGLE) {
+                    if let Some(whole) = self.coming.take_if(|coming| coming.is_whole()) {
                         return Ok(Event::Heard(whole.heard()));
                     }
                 }
@@ -320,11 +329,11 @@ impl<L: Read + Write> Link<L> {
     ///
     /// # Errors
     /// [`LinkError::Tables`] if the device did not take them, in which case it goes by the former ones.
-    pub fn load(&mut self, tables: &Green, mut progress: impl FnMut()) -> Result<(), LinkError> {
+    pub fn load(&mut self, tables: &Tables, mut progress: impl FnMut()) -> Result<(), LinkError> {
         self.send(&Request::BuiltIn)?;
         self.taken()?;
         let mut last = Taken::BuiltIn;
-        for parcel in tables.parcels() {
+        for parcel in tables.parcels::<LINE>() {
             self.send(&Request::Model(parcel))?;
             last = self.taken()?;
             progress();
@@ -363,7 +372,7 @@ impl<L: Read + Write> Link<L> {
     /// # Errors
     /// [`LinkError`].
     pub fn send(&mut self, request: &Request) -> Result<(), LinkError> {
-        let mut bytes = [0; packet::MAX_WIRE_BYTES];
+        let mut bytes = [0; PACKET];
         let n = request.encode(&mut bytes)?;
         self.write(&bytes[..n])
     }
@@ -388,9 +397,9 @@ impl<L: Read + Write> Link<L> {
                 continue;
             }
             let got = self.received.len();
-            if got > packet::MAX_WIRE_BYTES {
+            if got > PACKET {
                 self.received.clear();
-                return Err(FrameError::Oversized { limit: packet::MAX_WIRE_BYTES, got }.into());
+                return Err(FrameError::Oversized { limit: PACKET, got }.into());
             }
             if Instant::now() >= deadline {
                 return Err(LinkError::Silent { seconds: patience.as_secs() });
@@ -433,7 +442,7 @@ mod tests {
     }
 
     fn sealed(reply: &Reply) -> Vec<u8> {
-        let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+        let mut bytes = vec![0; PACKET];
         let n = reply.encode(&mut bytes).unwrap();
         bytes.truncate(n);
         bytes

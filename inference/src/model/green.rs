@@ -5,10 +5,15 @@
 //!
 //! `df/d(ln strength of node n) = -k L w_n strength (Z_qb w Z_qc^T)_nn`.
 
-use estimator::surrogate::{Block, Green, GreenPlane};
-use nalgebra::{DMatrix, DVector};
+use core::f64::consts::{PI, TAU};
+
+use estimator::surrogate::{List, Table};
+use nalgebra::{DMatrix, DVector, Dyn, LU};
 use serde::Serialize;
+use training::Tables;
 use twin::OrbitError;
+
+use super::Optics;
 
 /// Green's function tables in f64; serialised, they are all that another code needs to predict the same orbits.
 #[derive(Debug, Clone, Serialize)]
@@ -20,6 +25,10 @@ pub struct GreenModel {
 
 #[derive(Debug, Clone, Serialize)]
 struct Plane {
+    /// `x` or `y`.
+    mode: char,
+    /// Tune of the design.
+    tune: f64,
     direct: DMatrix<f64>,
     seen: DMatrix<f64>,
     driven: DMatrix<f64>,
@@ -54,24 +63,27 @@ struct PlaneOptics {
     response: DMatrix<f64>,
     /// `k L w strength` of each node.
     slope: Vec<f64>,
+    /// Fractional tune.
+    tune: f64,
+    /// Factors of `1 + G_qq D`.
+    closure: LU<f64, Dyn, Dyn>,
 }
 
 impl GreenModel {
     /// From the core's tables; terms of low rank, which a design has none of, are left out.
-    pub fn of<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const Q: usize, const T: usize>(
-        tables: &Green<BX, BY, CX, CY, Q, T>,
-    ) -> Self {
-        let d = &tables.dispersion;
+    pub fn of(tables: &Tables) -> Self {
+        let list = |list| tables.list(list).iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
+        let ring = list(List::Ring);
         Self {
-            planes: [Plane::of(&tables.x), Plane::of(&tables.y)],
+            planes: [Plane::of_x(tables, ring[5]), Plane::of_y(tables, ring[6])],
             dispersion: Dispersion {
-                monitor: DVector::from_iterator(BX, d.monitor.iter().map(|v| f64::from(*v))),
-                node: DVector::from_iterator(Q, d.node.iter().map(|v| f64::from(*v))),
-                compaction: f64::from(d.compaction),
-                inverse_gamma_squared: f64::from(d.inverse_gamma_squared),
-                circumference: f64::from(d.circumference),
+                monitor: DVector::from_vec(list(List::MonitorDispersion)),
+                node: DVector::from_vec(list(List::NodeDispersion)),
+                compaction: ring[2],
+                inverse_gamma_squared: ring[3],
+                circumference: ring[4],
             },
-            stated_error: tables.stated_error.map(f64::from),
+            stated_error: [ring[7], ring[8]],
         }
     }
 
@@ -105,20 +117,27 @@ impl GreenModel {
 }
 
 impl Plane {
-    fn of<const B: usize, const C: usize, const Q: usize, const T: usize>(plane: &GreenPlane<B, C, Q, T>) -> Self {
-        let mut mutual = DMatrix::zeros(Q, Q);
-        for (r, codes) in plane.mutual.rows().enumerate() {
-            for (c, code) in codes.iter().enumerate() {
-                let value = f64::from(plane.mutual.scale) * f64::from(*code);
-                (mutual[(r, c)], mutual[(c, r)]) = (value, value);
-            }
-        }
+    fn of_x(tables: &Tables, tune: f64) -> Self {
         Self {
-            direct: matrix(&plane.direct),
-            seen: matrix(&plane.seen),
-            driven: matrix(&plane.driven),
-            mutual,
-            weight: plane.weight.iter().map(|w| f64::from(*w)).collect(),
+            mode: 'x',
+            tune,
+            direct: tables.matrix(Table::DirectX),
+            seen: tables.matrix(Table::SeenX),
+            driven: tables.matrix(Table::DrivenX),
+            mutual: tables.matrix(Table::MutualX),
+            weight: weights(tables, 1.0),
+        }
+    }
+
+    fn of_y(tables: &Tables, tune: f64) -> Self {
+        Self {
+            mode: 'y',
+            tune,
+            direct: tables.matrix(Table::DirectY),
+            seen: tables.matrix(Table::SeenY),
+            driven: tables.matrix(Table::DrivenY),
+            mutual: tables.matrix(Table::MutualY),
+            weight: weights(tables, -1.0),
         }
     }
 
@@ -146,22 +165,37 @@ impl Plane {
         let mut kicks = self.driven.clone();
         kicks.row_iter_mut().zip(&excess).for_each(|(mut row, e)| row *= *e);
         let optics = PlaneOptics {
+            tune: self.tune(lu.determinant())?,
             response: &self.direct - seen.tr_mul(&kicks),
             seen,
             driven: sides.columns(monitors, correctors).into_owned(),
             slope: self.weight.iter().enumerate().map(|(n, w)| w * vars[n / 2]).collect(),
+            closure: lu,
         };
         Ok((optics, sides.column(monitors + correctors).into_owned()))
     }
 }
 
-fn matrix<const R: usize, const C: usize>(block: &Block<R, C>) -> DMatrix<f64> {
-    DMatrix::from_iterator(R, C, block.codes.iter().flatten().map(|code| f64::from(block.scale) * f64::from(*code)))
+impl Plane {
+    /// Fractional tune between the same half integers as the design's: `sin^2(pi Q) = sin^2(pi Q0) det(1 + G_qq D)`.
+    fn tune(&self, determinant: f64) -> Result<f64, OrbitError> {
+        let square = (PI * self.tune).sin().powi(2) * determinant;
+        if !(0.0..=1.0).contains(&square) {
+            return Err(OrbitError::Unstable { mode: self.mode, half_trace: 1.0 - 2.0 * square });
+        }
+        let tune = square.sqrt().asin() / PI;
+        Ok(if self.tune.rem_euclid(1.0) > 0.5 { 1.0 - tune } else { tune })
+    }
 }
 
-impl GreenOptics<'_> {
-    /// Response [m/rad], rows monitors, columns correctors and the RF [m]; the planes are independent.
-    pub fn response(&self) -> DMatrix<f64> {
+/// `k L w` of each node, two alike a quadrupole.
+fn weights(tables: &Tables, sign: f64) -> Vec<f64> {
+    tables.list(List::Weight).iter().flat_map(|weight| [sign * f64::from(*weight); 2]).collect()
+}
+
+impl Optics for GreenOptics<'_> {
+    /// The planes are independent.
+    fn response(&self) -> DMatrix<f64> {
         let [x, y] = &self.planes;
         let ((bx, cx), (by, cy)) = (x.response.shape(), y.response.shape());
         let mut response = DMatrix::zeros(bx + by, cx + cy + 1);
@@ -171,8 +205,7 @@ impl GreenOptics<'_> {
         response
     }
 
-    /// Gradient with respect to `ln` of each var of a function of the response, from its derivative `weights`.
-    pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
+    fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let [x, y] = &self.planes;
         let ((bx, cx), (by, cy)) = (x.response.shape(), y.response.shape());
         let rf = weights.view((0, cx + cy), (bx, 1)).into_owned();
@@ -189,9 +222,27 @@ impl GreenOptics<'_> {
         let of_node = |n: usize| -x.slope[n] * along_x[n] - y.slope[n] * along_y[n];
         (0..along_x.len() / 2).map(|q| of_node(2 * q) + of_node(2 * q + 1)).collect()
     }
+
+    fn tunes(&self) -> [f64; 2] {
+        self.planes.each_ref().map(|plane| plane.tune)
+    }
+
+    fn tune_slopes(&self) -> Vec<[f64; 2]> {
+        let [x, y] = [0, 1].map(|plane| self.planes[plane].tune_slopes(&self.model.planes[plane].mutual));
+        x.into_iter().zip(y).map(|(x, y)| [x, y]).collect()
+    }
 }
 
 impl PlaneOptics {
+    /// `dQ/d(ln k) = tan(pi Q)/(2 pi) sum of k L w strength Z_nn` over a quadrupole's nodes, `Z = (1 + G D)^-1 G`.
+    fn tune_slopes(&self, mutual: &DMatrix<f64>) -> Vec<f64> {
+        let mut closed = mutual.clone();
+        self.closure.solve_mut(&mut closed); // regular: it was solved before
+        let scale = (PI * self.tune).tan() / TAU;
+        let of_node = |n: usize| scale * self.slope[n] * closed[(n, n)];
+        (0..self.slope.len() / 2).map(|q| of_node(2 * q) + of_node(2 * q + 1)).collect()
+    }
+
     /// Diagonal of `Z_qb w Z_qc^T`.
     fn contract(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let sent = &self.driven * weights.transpose();
@@ -207,7 +258,7 @@ mod tests {
 
     fn example() -> (GreenModel, Ring, Vec<f64>) {
         let ring = Ring::booster();
-        let tables: training::BoosterGreen = training::green::tables(&ring).unwrap();
+        let tables = training::green::tables(&ring).unwrap();
         (GreenModel::of(&tables), ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
 
@@ -215,13 +266,26 @@ mod tests {
     #[test]
     fn it_answers_as_the_twin() {
         let (model, ring, vars) = example();
-        let exact = VariedRing::of(&ring)
-            .unwrap()
-            .at(&vars.iter().map(|var| var.ln()).collect::<Vec<_>>(), &[])
-            .unwrap()
-            .response();
+        let exact = VariedRing::of(&ring).unwrap().at(&vars).unwrap().response();
         let error = (model.at(&vars).unwrap().response() - &exact) * 2e-4;
         assert!(error.amax() < 1e-5, "{}", error.amax());
+    }
+
+    #[test]
+    fn tunes_and_their_slopes_are_those_of_the_twin() {
+        let (model, ring, vars) = example();
+        let varied = VariedRing::of(&ring).unwrap();
+        let (exact, own) = (varied.at(&vars).unwrap(), model.at(&vars).unwrap());
+        for plane in [0, 1] {
+            // two nodes a quadrupole: the tune is some 1e-5 off
+            assert!((exact.tunes()[plane] - own.tunes()[plane]).abs() < 1e-4, "{:?} {:?}", exact.tunes(), own.tunes());
+            for (q, (exact, own)) in exact.tune_slopes().iter().zip(own.tune_slopes()).enumerate() {
+                assert!(
+                    (exact[plane] - own[plane]).abs() < 1e-3 * exact[plane].abs().max(0.01),
+                    "{q}: {exact:?} {own:?}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -17,13 +17,13 @@ use rand_distr::{Distribution, StandardNormal};
 use twin::{Cycle, Effect, EffectError, Machine, OrbitError, Rf, Ring, Tracked, Tunes};
 
 use super::seeds;
-use crate::map::{Drive, first_family};
+use crate::campaign::Drive;
 use crate::recording::{Recording, Row};
 
 /// What is true of a simulated machine.
 #[derive(Clone, Copy, Default)]
 pub struct Truth<'a> {
-    /// Factor on each quadrupole's gradient, order of [`Ring::quadrupoles`].
+    /// Factor of each param, order of [`Ring::parameters`].
     pub vars: &'a [f64],
     /// Effects of the library.
     pub effects: &'a [Effect],
@@ -77,7 +77,7 @@ impl Hardware {
     /// header states it, x_C6 four times noisier with jumps, y_B5 with jumps, a tune meter good to 5e-4.
     pub fn shipped(ring: &Ring, recording: &Recording) -> Self {
         let named = |name: &str| ring.monitor_names().iter().position(|known| known == name);
-        let mut noise = vec![recording.header.bpm_sigma; ring.read_monitors.len()];
+        let mut noise = recording.header.noise.clone();
         let (noisy, jumping) = (named("x_C6"), named("y_B5"));
         noisy.into_iter().for_each(|monitor| noise[monitor] *= NOISY);
         let jumps = |monitor, rate| Jumps { monitor, rate, size: [1e-3, 9e-3] };
@@ -99,7 +99,7 @@ pub fn campaign(
 ) -> Result<Recording, EffectError> {
     let mut streams = seeds(seed).map(StdRng::seed_from_u64);
     let mut stream = || streams.next().expect("seeds do not end");
-    let mut ring = ring.with_vars(truth.vars);
+    let mut ring = template.powered(ring).with_vars(truth.vars);
     misalign(&mut ring, hardware.misalignment, &mut stream());
     truth.beyond.iter().for_each(|beyond| beyond.alter_ring(&mut ring));
     let mut cycles = cycles(template, &ring);
@@ -116,19 +116,18 @@ pub fn campaign(
 
 /// Shift every quadrupole.
 fn misalign(ring: &mut Ring, sigma: [f64; 2], random: &mut StdRng) {
-    for q in &ring.quadrupoles {
-        let misalignment = &mut ring.elements[q.element].misalignment;
+    for quadrupole in &ring.quadrupoles {
+        let misalignment = &mut ring.elements[quadrupole.element].misalignment;
         (misalignment.dx, misalignment.dy) = (sigma[0] * normal(random), sigma[1] * normal(random));
     }
 }
 
 /// What drove each frame.
 fn cycles(template: &Recording, ring: &Ring) -> Vec<Cycle> {
-    let first = first_family(ring);
-    let families: Vec<usize> = (0..ring.quadrupoles.len()).map(|q| usize::from(q >= first)).collect();
     let of = |(row, time): (&Row, f64)| {
-        let drive = Drive::of(template, row);
-        let strength = families.iter().map(|&family| drive.strength[family]).collect();
+        let drive = Drive::of(&template.header, row);
+        let factors = ring.strengths(&[], drive.strength.as_slice());
+        let strength = factors.iter().map(|factor| factor.ln()).collect();
         Cycle { kick: drive.kick.iter().copied().collect(), strength, rf_offset: drive.rf_offset, time }
     };
     template.rows.iter().zip(template.times()).map(of).collect()
@@ -198,7 +197,7 @@ mod tests {
     fn template() -> (Ring, Recording) {
         let ring = Ring::booster();
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let recording = Recording::read(&folder, &crate::stream::layout(&ring)).unwrap();
+        let recording = Recording::read(&folder, &ring).unwrap();
         (ring, recording)
     }
 
@@ -267,7 +266,7 @@ mod tests {
             let truth = Truth { vars: &[1.0; 48], effects, ..Truth::default() };
             readings(&campaign(&few, &ring, &truth, &hardware, seed).unwrap())
         };
-        let (plain, gain) = (made(&[], 7), made(&[Effect::parse("bpm_gain@x_E4=0.1", &ring).unwrap()], 7));
+        let (plain, gain) = (made(&[], 7), made(&["bpm_gain@x_E4=0.1".parse().unwrap()], 7));
         let e4 = ring.monitor_names().iter().position(|name| name == "x_E4").unwrap();
         let change = &gain - &plain;
         for (b, column) in change.column_iter().enumerate() {
@@ -293,7 +292,7 @@ mod tests {
         for (b, name) in ring.monitor_names().iter().enumerate() {
             let mut sizes: Vec<f64> = off.column(b).iter().filter(|v| v.is_finite()).map(|v| v.abs()).collect();
             sizes.sort_by(f64::total_cmp);
-            let sigma = sizes[sizes.len() / 2] / 0.6745 / recording.header.bpm_sigma;
+            let sigma = sizes[sizes.len() / 2] / 0.6745 / recording.header.noise[0];
             let far = sizes.iter().filter(|v| **v > 1e-3).count();
             let (stated, jumps) = if name == "x_C6" { (4.3, true) } else { (1.0, name == "y_B5") };
             // the median of 346 absolute values scatters by 6 %

@@ -15,7 +15,8 @@ use super::machine::Machine;
 use super::{drift, field};
 use crate::lattice::{Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Tunes};
+use crate::response::Optics;
+use crate::tune::Tunes;
 
 /// What drove the beam in the frames of a campaign, and the orbit that the kicks were added to.
 #[derive(Debug, Clone)]

@@ -10,8 +10,9 @@ use super::{Effect, EffectError};
 use crate::lattice::{Plane, Ring};
 use crate::map::{X, Y};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Tunes};
+use crate::response::Optics;
 use crate::site::Site;
+use crate::tune::Tunes;
 
 /// A ring with effects applied.
 #[derive(Debug, Clone)]

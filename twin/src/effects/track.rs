@@ -10,7 +10,8 @@ use super::machine::Machine;
 use crate::lattice::Ring;
 use crate::map::{DELTA, X, Y};
 use crate::orbit::{Hold, OrbitError};
-use crate::response::{Optics, Tunes};
+use crate::response::Optics;
+use crate::tune::Tunes;
 
 /// What drives one machine cycle.
 #[derive(Debug, Clone)]

@@ -119,12 +119,13 @@ impl Ring {
     pub fn parse(text: &str, path: &str) -> Result<Self, LatticeError> {
         let file: MachineFile =
             serde_json::from_str(text).map_err(|source| LatticeError::Syntax { path: path.into(), source })?;
-        file.ring()
+        let name = Path::new(path).file_name().unwrap_or_default().to_string_lossy().into_owned();
+        file.ring(name)
     }
 }
 
 impl MachineFile {
-    fn ring(self) -> Result<Ring, LatticeError> {
+    fn ring(self, file: String) -> Result<Ring, LatticeError> {
         let particle = self.particle()?;
         let (elements, at) = self.line()?;
         let listed = self.quadrupoles(&elements, &at);
@@ -139,6 +140,7 @@ impl MachineFile {
             parameters: circuits.parameters,
             circumference: self.circumference_m,
             name: self.name,
+            file,
             elements,
             particle,
         };

@@ -1,5 +1,7 @@
 //! A ring: its elements, and which of them are read, set, powered and fitted.
 
+use core::ops::AddAssign;
+
 use super::{Element, Kind, LatticeError, Parameter, Particle, Plane, Quadrupole, Supply};
 
 /// One plane of a beam position monitor.
@@ -25,6 +27,8 @@ pub struct Corrector {
 pub struct Ring {
     /// Name of the machine.
     pub name: String,
+    /// Name of the file it was read from, without its folder.
+    pub file: String,
     /// Length of the reference orbit [m].
     pub circumference: f64,
     /// Elements in beam order; gaps are filled with drifts.
@@ -158,6 +162,18 @@ impl Ring {
         self.quadrupoles.iter().map(|q| (of(params, q.parameter) + of(supplies, q.supply)).exp()).collect()
     }
 
+    /// Derivative with respect to each param `[N]` of what has these derivatives with respect to `ln` of each quadrupole's
+    /// gradient `[M]`: the sum over its quadrupoles.
+    pub fn by_parameter<T: Clone + AddAssign>(&self, of_quadrupoles: &[T]) -> Vec<T> {
+        let sum = |parameter: &Parameter| {
+            let mut all = parameter.quadrupoles.iter().map(|&q| of_quadrupoles[q].clone());
+            let mut sum = all.next().expect("a param scales at least one quadrupole");
+            all.for_each(|slope| sum += slope);
+            sum
+        };
+        self.parameters.iter().map(sum).collect()
+    }
+
     /// The same ring with each quadrupole's gradient multiplied by its factor `[M]`.
     ///
     /// # Panics
@@ -185,7 +201,7 @@ impl Ring {
     pub fn set_kick(&mut self, corrector: usize, angle: f64) {
         let Corrector { element, plane } = self.correctors[corrector];
         match &mut self.elements[element].kind {
-            Kind::Corrector { kick } => kick[usize::from(plane == Plane::Y)] = angle,
+            Kind::Corrector { kick } => kick[plane.index()] = angle,
             _ => unreachable!("the list holds correctors"),
         }
     }

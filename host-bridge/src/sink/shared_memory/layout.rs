@@ -1,40 +1,6 @@
 //! A record as bytes in shared memory, the same for readers in any language.
 //!
-//! The type is `orbitcal.Estimate.v2`; a change of these tables is a new version of the name. A sample has a header of 64
-//! bytes and a payload of 4-byte words, both little-endian. N vars and B monitors are counted in the header, so that one
-//! reader serves every ring.
-//!
-//! | offset | header | type | unit |
-//! |---|---|---|---|
-//! | 0 | `time_us` | u64 | us, of the frame |
-//! | 8 | `started_ns` | u64 | ns since 1970, start of the publisher |
-//! | 16 | `published_ns` | u64 | ns since 1970 |
-//! | 24 | `sequence` | u32 | of the frame |
-//! | 28 | `frames` | u32 | used so far; a gap tells of lost estimates |
-//! | 32 | `rejected_frames` | u32 | refused so far |
-//! | 36 | `linearised` | u32 | 1: the model was relinearised since the last estimate |
-//! | 40 | `mismatch` | u32 | 0 the readings fit the model, 1 they do not, 2 not asked |
-//! | 44 | `nis` | f32 | 1, sum over the readings used |
-//! | 48 | `log_evidence` | f32 | nat |
-//! | 52 | `vars` | u32 | N |
-//! | 56 | `monitors` | u32 | B |
-//! | 60 | `text_bytes` | u32 | length of the text at the end of the payload |
-//!
-//! | payload, in this order | words | unit |
-//! |---|---|---|
-//! | `mean`, `sigma` | 2 × N f32 | 1 |
-//! | `map_params`, `centre`, `params_sigma` | 3 × N f32 | 1, of `ln var`: maximum a posteriori; normal before truncation |
-//! | `clipped` | N u32 | 1: the var sits at a bound of the prior's range |
-//! | `covariance` | N(N+1)/2 f32 | 1, of the vars |
-//! | `reading` | B u32 | 0 did not report, 1 used, 2 rejected |
-//! | `monitor_state` | B u32 | 0 ok, 1 noisy, 2 jumps, 3 dead |
-//! | `monitor_sigma` | B f32 | m, noise of one reading |
-//! | `monitor_rejected` | B u32 | readings not used so far |
-//! | text | `text_bytes`, padded with zeros to a word | UTF-8 |
-//!
-//! The covariance is its lower triangle row by row, `(0,0) (1,0) (1,1) (2,0) ..`: entry `(i, j)` with `j <= i` stands at
-//! `i (i + 1) / 2 + j`. The text is the publisher's name, the machine's, then those of the vars and of the monitors, each
-//! ended by a line feed. The Booster's record has 48 vars and 33 monitors, 6.5 kB in all.
+#![doc = include_str!("../../../../docs/shared-memory.md")]
 
 use std::sync::Arc;
 
@@ -59,6 +25,8 @@ pub struct Header {
     pub mismatch: u32,
     pub nis: f32,
     pub log_evidence: f32,
+    /// Not a number where there is none.
+    pub tune_innovation: [f32; 2],
     pub vars: u32,
     pub monitors: u32,
     pub text_bytes: u32,
@@ -142,6 +110,7 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         mismatch: record.mismatch.map_or(2, u32::from),
         nis: record.nis,
         log_evidence: record.log_evidence,
+        tune_innovation: record.tune_innovation.map(|tune| tune.unwrap_or(f32::NAN)),
         vars: record.mean.len() as u32,
         monitors: record.reading.len() as u32,
         text_bytes: text.len() as u32,
@@ -197,6 +166,7 @@ pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp
         linearised: header.linearised != 0,
         mismatch: [Some(false), Some(true)].get(header.mismatch as usize).copied().flatten(),
         nis: header.nis,
+        tune_innovation: header.tune_innovation.map(|tune| Some(tune).filter(|tune| !tune.is_nan())),
         log_evidence: header.log_evidence,
         mean,
         sigma,
@@ -268,7 +238,7 @@ mod tests {
 
     #[test]
     fn the_header_is_the_documented_one() {
-        assert_eq!((size_of::<Header>(), align_of::<Header>()), (64, 8));
+        assert_eq!((size_of::<Header>(), align_of::<Header>()), (72, 8));
         macro_rules! stands_at {
             ($($field:ident $offset:literal)*) => {
                 $(assert_eq!(offset_of!(Header, $field), $offset, stringify!($field));)*
@@ -276,7 +246,7 @@ mod tests {
         }
         stands_at! {
             time_us 0 started_ns 8 published_ns 16 sequence 24 frames 28 rejected_frames 32 linearised 36
-            mismatch 40 nis 44 log_evidence 48 vars 52 monitors 56 text_bytes 60
+            mismatch 40 nis 44 log_evidence 48 tune_innovation 52 vars 60 monitors 64 text_bytes 68
         }
     }
 
@@ -315,6 +285,7 @@ mod tests {
         for (vars, monitors) in [(0, 0), (1, 2), (20, 20), (48, 33), (260, 500)] {
             let mut record = record(vars, monitors);
             (record.mismatch, record.linearised, record.nis, record.time_us) = (None, true, 2.5, 1 << 40);
+            record.tune_innovation = [None, Some(-1e-3)];
             let (header, payload) = encode(&record, &stamp());
             assert_eq!(payload.len(), words_of(&stamp().publisher, &record.names));
             assert_eq!(decode(&header, &payload).unwrap(), (record, stamp()));
@@ -332,6 +303,6 @@ mod tests {
         assert_eq!(refused(&header, &other), "a monitor's state has no code 9");
         let mut other = payload.clone();
         *other.last_mut().unwrap() = u32::from_le_bytes(*b"\n\n\n\n");
-        assert_eq!(refused(&header, &other), "expected 5 names in UTF-8, found 8");
+        assert_eq!(refused(&header, &other), "expected 5 names in UTF-8, found 7");
     }
 }

@@ -3,21 +3,29 @@
 //!
 //! COBS gives boundaries, not integrity: without the CRC a flipped bit decodes as a good body.
 
-use cobs::{DecodeResult, DecoderState};
+use cobs::{DecodeResult, DecoderState, EncoderState, PushResult};
 use serde::{Deserialize, Serialize};
 
-use crate::frame::FrameError;
+use super::FrameError;
 
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// Bytes in front of the body: kind and length.
-pub(crate) const HEADER: usize = 3;
+const HEADER: usize = 3;
 /// Bytes of the CRC.
-pub(crate) const TRAILER: usize = 4;
-/// Largest packet before COBS.
-pub const MAX_BYTES: usize = 1536;
-/// A buffer of this many bytes holds any packet.
-pub const MAX_WIRE_BYTES: usize = cobs::max_encoding_length(MAX_BYTES) + 1;
+const TRAILER: usize = 4;
+
+/// Bytes that hold any packet whose body has at most so many.
+pub const fn wire_bytes(body: usize) -> usize {
+    cobs::max_encoding_length(HEADER + body + TRAILER) + 1
+}
+
+/// Most bytes of a varint of 16, 32 and 64 bits in postcard.
+pub(crate) const VARINT_16: usize = 3;
+pub(crate) const VARINT_32: usize = 5;
+pub(crate) const VARINT_64: usize = 10;
+/// Most bytes of the length of a list; none has more than 16,383 entries.
+pub(crate) const LENGTH: usize = 2;
 
 /// The kind of a packet, read off its encoded bytes: COBS leaves the first byte where it is, behind its own, unless it is 0.
 pub fn kind(encoded: &[u8]) -> Option<u8> {
@@ -27,23 +35,45 @@ pub fn kind(encoded: &[u8]) -> Option<u8> {
 /// Write a packet to `out`, terminator included; returns the number of bytes.
 ///
 /// # Errors
-/// [`FrameError::Space`] if `out` is too small, or the body larger than any packet.
+/// [`FrameError::Space`] if `out` is too small; [`wire_bytes`] of the largest body always suffice.
 pub fn seal(kind: u8, body: &impl Serialize, out: &mut [u8]) -> Result<usize, FrameError> {
     let space = FrameError::Space { got: out.len() };
-    let mut plain = [0u8; MAX_BYTES];
-    let (header, rest) = plain.split_at_mut(HEADER);
+    // COBS adds a byte to every 254: with a gap of as many in front, what is written never overtakes what is still to be read
+    let gap = 1 + out.len().saturating_sub(1) / 255;
+    let plain = out.get_mut(gap..).ok_or(space)?;
+    let (header, rest) = plain.split_first_chunk_mut::<HEADER>().ok_or(space)?;
     let length = postcard::to_slice(body, rest).map_err(|_| space)?.len();
-    header.copy_from_slice(&[kind, length as u8, (length >> 8) as u8]);
+    *header = [kind, length as u8, (length >> 8) as u8];
     let covered = HEADER + length;
     let crc = CRC.checksum(plain.get(..covered).ok_or(space)?);
     plain.get_mut(covered..covered + TRAILER).ok_or(space)?.copy_from_slice(&crc.to_le_bytes());
-    let plain = plain.get(..covered + TRAILER).ok_or(space)?;
-    if out.len() <= cobs::max_encoding_length(plain.len()) {
-        return Err(space);
+    stuff(out, gap, covered + TRAILER).ok_or(space)
+}
+
+/// Encode COBS in place: `length` plain bytes that stand `gap` from the front, the terminator added. Returns the number of
+/// encoded bytes.
+fn stuff(bytes: &mut [u8], gap: usize, length: usize) -> Option<usize> {
+    let (mut state, mut end, mut code_is_due) = (EncoderState::default(), 1, true);
+    for at in gap..gap + length {
+        // after a full block of 254 the next one's code has no place yet: there may be none
+        end += usize::from(!core::mem::replace(&mut code_is_due, true));
+        match state.push(*bytes.get(at)?) {
+            PushResult::AddSingle(byte) => *bytes.get_mut(end)? = byte,
+            PushResult::ModifyFromStartAndSkip((code, value)) => *bytes.get_mut(code)? = value,
+            PushResult::ModifyFromStartAndPushAndSkip((code, value, byte)) => {
+                *bytes.get_mut(code)? = value;
+                *bytes.get_mut(end)? = byte;
+                code_is_due = false;
+            }
+        }
+        end += 1;
     }
-    let written = cobs::encode(plain, out);
-    *out.get_mut(written).ok_or(space)? = 0;
-    Ok(written + 1)
+    if code_is_due {
+        let (code, value) = state.finalize();
+        *bytes.get_mut(code)? = value;
+    }
+    *bytes.get_mut(end)? = 0;
+    Some(end + 1)
 }
 
 /// The bytes of a packet's body, its length, CRC and kind checked; `bytes` (with or without the terminating zero) is used
@@ -82,12 +112,12 @@ fn unstuff(bytes: &mut [u8]) -> Option<usize> {
     matches!(state.feed(0), Ok(DecodeResult::DataComplete)).then_some(length)
 }
 
-/// A packet's body.
+/// A packet's body; the packet has at most `limit` bytes.
 ///
 /// # Errors
 /// [`FrameError`]; [`FrameError::Malformed`] if the body is sound but not of this type.
-pub fn unseal<'b, T: Deserialize<'b>>(kind: u8, bytes: &'b mut [u8]) -> Result<T, FrameError> {
-    match postcard::take_from_bytes(open(kind, MAX_WIRE_BYTES, bytes)?) {
+pub fn unseal<'b, T: Deserialize<'b>>(kind: u8, limit: usize, bytes: &'b mut [u8]) -> Result<T, FrameError> {
+    match postcard::take_from_bytes(open(kind, limit, bytes)?) {
         Ok((body, [])) => Ok(body),
         _ => Err(FrameError::Malformed),
     }
@@ -122,22 +152,55 @@ fn checked(plain: &[u8], expected: u8) -> Result<&[u8], FrameError> {
 
 #[cfg(test)]
 mod tests {
+    extern crate std;
+
     use super::*;
+
+    const MOST: usize = wire_bytes(64);
 
     #[test]
     fn a_body_survives_and_its_kind_shows() {
-        let mut out = [0; MAX_WIRE_BYTES];
+        let mut out = [0; MOST];
         let body = [7_u32, 0, 300];
         let n = seal(0x11, &body, &mut out).unwrap();
         assert_eq!(kind(&out[..n]), Some(0x11));
-        assert_eq!(unseal(0x11, &mut { out }[..n]), Ok(body));
-        assert_eq!(unseal::<[u32; 3]>(1, &mut { out }[..n]), Err(FrameError::Version { supported: 1, got: 0x11 }));
-        assert_eq!(unseal::<[u32; 2]>(0x11, &mut out[..n]), Err(FrameError::Malformed));
+        assert_eq!(unseal(0x11, MOST, &mut { out }[..n]), Ok(body));
+        let other = FrameError::Version { supported: 1, got: 0x11 };
+        assert_eq!(unseal::<[u32; 3]>(1, MOST, &mut { out }[..n]), Err(other));
+        assert_eq!(unseal::<[u32; 2]>(0x11, MOST, &mut out[..n]), Err(FrameError::Malformed));
     }
 
     #[test]
     fn what_does_not_fit_is_refused() {
         assert_eq!(seal(1, &[[1_u8; 32]; 32], &mut [0; 100]), Err(FrameError::Space { got: 100 }));
+        assert_eq!(seal(1, &1_u8, &mut []), Err(FrameError::Space { got: 0 }));
         assert_eq!(kind(&[]), None);
+    }
+
+    /// In place, from the smallest buffer that is promised to suffice, for lengths about those of COBS's blocks.
+    #[test]
+    fn bodies_of_every_length_survive_in_the_smallest_buffer() {
+        for length in (0..1100).chain(65_000..65_010) {
+            for zeros in [usize::MAX, 1, 7] {
+                let body: std::vec::Vec<u8> = (0..length).map(|i| u8::from((i + 1) % zeros != 0)).collect();
+                let raw = Raw(&body);
+                let mut out = std::vec![9; wire_bytes(length)];
+                let n = seal(3, &raw, &mut out).unwrap();
+                assert!(out[..n - 1].iter().all(|byte| *byte != 0) && out[n - 1] == 0, "{length}");
+                assert_eq!(open(3, n, &mut out[..n]), Ok(body.as_slice()), "{length}");
+            }
+        }
+    }
+
+    /// Bytes as they are.
+    struct Raw<'b>(&'b [u8]);
+
+    impl Serialize for Raw<'_> {
+        fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+            use serde::ser::SerializeTuple as _;
+            let mut tuple = serializer.serialize_tuple(self.0.len())?;
+            self.0.iter().try_for_each(|byte| tuple.serialize_element(byte))?;
+            tuple.end()
+        }
     }
 }

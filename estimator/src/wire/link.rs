@@ -1,27 +1,31 @@
 //! What host and device say to each other besides frames: requests in, replies out, each a packet of its own kind. See
 //! `docs/device.md`.
 
-use estimator::booster::Estimate;
-use estimator::surrogate::{Parcel, ParcelError};
-use estimator::{FrameError, Health, IngestError, MonitorState, Setup, packet};
 use heapless::Vec;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// First byte of a request: kind 1 of version 1.
-pub const REQUEST: u8 = 0x11;
-/// First byte of a reply.
-pub const REPLY: u8 = 0x21;
-/// Entries of a covariance in one piece: 21 pieces make the triangle of 48.
-pub const PIECE: usize = 56;
-/// Entries of the covariance's lower triangle.
-pub const TRIANGLE: usize = 48 * 49 / 2;
+use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
+use super::{FrameError, ParcelError};
+use crate::estimate::{Estimate, Health, MonitorState};
+use crate::estimator::{GROUPS, IngestError, Setup};
+use crate::mask::Mask;
 
-/// What a host asks of a device.
+/// First byte of a request: kind 1 of version 2.
+pub const REQUEST: u8 = 0x12;
+/// First byte of a reply.
+pub const REPLY: u8 = 0x22;
+/// Most entries of a covariance in one piece.
+pub const PIECE: usize = 56;
+/// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
+pub const OTHER_BYTES: usize = 1 + VARINT_32 + 3 + LENGTH + 4 * PIECE;
+
+/// What a host asks of a device: `S` is the setup of its core, `P` a parcel of its tables.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
-pub enum Request {
+pub enum Request<S, P> {
     /// Forget all frames and begin at the prior.
-    Restart(Setup),
+    Restart(S),
     /// Take the next frame whatever its number: the front end counts anew.
     ForgetSequence,
     /// Send the covariance after the next estimate.
@@ -29,17 +33,17 @@ pub enum Request {
     /// Say how the device is.
     Status,
     /// A part of new tables. The last one puts them in use, if they are whole.
-    Model(Parcel),
+    Model(P),
     /// Use the tables in flash again, which frees the slot.
     BuiltIn,
 }
 
-/// What a device says.
+/// What a device says: `A` is the answer of its core.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
-pub enum Reply {
+pub enum Reply<A> {
     /// The answer to a frame.
-    Estimate(Answer),
+    Estimate(A),
     /// A part of the covariance of `theta = ln var`, lower triangle row by row.
     Covariance {
         /// The frame after which it was taken.
@@ -150,44 +154,46 @@ pub struct Status {
     pub refused: u32,
     /// What the board says of itself.
     pub vitals: Vitals,
-    /// CRC of the tables in use, see [`estimator::surrogate::Green::digest`].
+    /// CRC of the tables in use, see [`crate::Tables::digest`].
     pub tables: u32,
     /// The tables in use came over the wire.
     pub loaded: bool,
-    /// See [`estimator::FitQuality`].
+    /// See [`crate::FitQuality`].
     pub chi_square: f32,
     /// Degrees of freedom of that.
     pub degrees_of_freedom: f32,
 }
 
-/// An [`Estimate`] on the wire: the same fields in the same order, lists with their length.
+/// An [`Estimate`] on the wire: the same fields in the same order, lists with their length, masks as lists of words.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(missing_docs)] // those of `Estimate`
-pub struct Answer {
+pub struct Answer<const B: usize, const N: usize, const W: usize> {
     pub sequence: u32,
     pub time_us: u64,
     pub frames: u32,
     pub rejected_frames: u32,
-    pub mean: Vec<f32, 48>,
-    pub sigma: Vec<f32, 48>,
-    pub map_params: Vec<f32, 48>,
-    pub centre: Vec<f32, 48>,
-    pub params_sigma: Vec<f32, 48>,
-    pub clipped: u64,
+    pub mean: Vec<f32, N>,
+    pub sigma: Vec<f32, N>,
+    pub map_params: Vec<f32, N>,
+    pub centre: Vec<f32, N>,
+    pub params_sigma: Vec<f32, N>,
+    pub clipped: Vec<u32, W>,
     pub nis: f32,
-    pub accepted: u64,
-    pub rejected: u64,
-    pub confirmed: u64,
-    pub restarted: u64,
+    pub accepted: Vec<u32, W>,
+    pub rejected: Vec<u32, W>,
+    pub confirmed: Vec<u32, W>,
+    pub restarted: Vec<u32, W>,
+    pub tune_innovation: [Option<f32>; 2],
     pub setting: Option<u16>,
     pub log_evidence: f32,
     pub linearised: bool,
-    pub health: Vec<(u8, f32, f32, u32), 33>,
+    pub health: Vec<(u8, f32, f32, u32), B>,
 }
 
-impl From<&Estimate> for Answer {
-    fn from(e: &Estimate) -> Self {
-        let list = |values: &[f32; 48]| values.iter().copied().collect();
+impl<const B: usize, const N: usize, const W: usize> From<&Estimate<B, N, W>> for Answer<B, N, W> {
+    fn from(e: &Estimate<B, N, W>) -> Self {
+        let list = |values: &[f32; N]| values.iter().copied().collect();
+        let mask = |mask: &Mask<W>, bits| mask.as_words().iter().take(crate::mask::words(bits)).copied().collect();
         Self {
             sequence: e.sequence,
             time_us: e.time_us,
@@ -198,12 +204,13 @@ impl From<&Estimate> for Answer {
             map_params: list(&e.map_params),
             centre: list(&e.centre),
             params_sigma: list(&e.params_sigma),
-            clipped: e.clipped,
+            clipped: mask(&e.clipped, N),
             nis: e.nis,
-            accepted: e.accepted,
-            rejected: e.rejected,
-            confirmed: e.confirmed,
-            restarted: e.restarted,
+            accepted: mask(&e.accepted, B),
+            rejected: mask(&e.rejected, B),
+            confirmed: mask(&e.confirmed, B),
+            restarted: mask(&e.restarted, B),
+            tune_innovation: e.tune_innovation,
             setting: e.setting,
             log_evidence: e.log_evidence,
             linearised: e.linearised,
@@ -212,11 +219,18 @@ impl From<&Estimate> for Answer {
     }
 }
 
-impl Answer {
+impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
+    /// Largest body of a reply that holds one.
+    pub const MAX_BYTES: usize = 1 + 5 * (LENGTH + 4 * N) // mean .. params_sigma
+        + 5 * (LENGTH + VARINT_32 * W) // masks
+        + LENGTH + B * (1 + 8 + VARINT_32) // health
+        + 3 * VARINT_32 + VARINT_64 // the frame, and how many
+        + 2 * 4 + 2 * 5 + 4 + 1; // nis, log_evidence, tunes, setting, linearised
+
     /// The estimate, if every list is whole.
-    pub fn estimate(&self) -> Option<Estimate> {
-        let list = |values: &Vec<f32, 48>| <[f32; 48]>::try_from(values.as_slice()).ok();
-        let mut health = [Health::default(); 33];
+    pub fn estimate(&self) -> Option<Estimate<B, N, W>> {
+        let list = |values: &Vec<f32, N>| <[f32; N]>::try_from(values.as_slice()).ok();
+        let mut health = [Health::default(); B];
         if self.health.len() != health.len() {
             return None;
         }
@@ -233,12 +247,13 @@ impl Answer {
             map_params: list(&self.map_params)?,
             centre: list(&self.centre)?,
             params_sigma: list(&self.params_sigma)?,
-            clipped: self.clipped,
+            clipped: Mask::from_words(&self.clipped),
             nis: self.nis,
-            accepted: self.accepted,
-            rejected: self.rejected,
-            confirmed: self.confirmed,
-            restarted: self.restarted,
+            accepted: Mask::from_words(&self.accepted),
+            rejected: Mask::from_words(&self.rejected),
+            confirmed: Mask::from_words(&self.confirmed),
+            restarted: Mask::from_words(&self.restarted),
+            tune_innovation: self.tune_innovation,
             setting: self.setting,
             log_evidence: self.log_evidence,
             linearised: self.linearised,
@@ -247,31 +262,51 @@ impl Answer {
     }
 }
 
-impl Request {
+impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
+    /// Largest body of a request that holds one.
+    pub const MAX_BYTES: usize = 1 + 16 * GROUPS // priors
+        + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
+        + 5 + LENGTH + 28 * F // dipole, supplies
+        + 3 * 4 + 5; // powered, gate, process noise, tunes
+}
+
+impl<S: Serialize, P: Serialize> Request<S, P> {
     /// Write the request as a packet; returns its bytes.
     ///
     /// # Errors
-    /// [`FrameError::Space`]; [`packet::MAX_WIRE_BYTES`] always suffice.
+    /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
         packet::seal(REQUEST, self, out)
     }
 }
 
-impl Reply {
+impl<S: DeserializeOwned, P: DeserializeOwned> Request<S, P> {
+    /// Read a request; `bytes` is used as work space.
+    ///
+    /// # Errors
+    /// [`FrameError`].
+    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
+        packet::unseal(REQUEST, bytes.len(), bytes)
+    }
+}
+
+impl<A: Serialize> Reply<A> {
     /// Write the reply as a packet; returns its bytes.
     ///
     /// # Errors
-    /// [`FrameError::Space`]; [`packet::MAX_WIRE_BYTES`] always suffice.
+    /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
     #[inline(never)] // so that a count of instructions leaves out the waiting for the line
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
         packet::seal(REPLY, self, out)
     }
+}
 
+impl<A: DeserializeOwned> Reply<A> {
     /// Read a reply; `bytes` is used as work space.
     ///
     /// # Errors
     /// [`FrameError`].
     pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
-        packet::unseal(REPLY, bytes)
+        packet::unseal(REPLY, bytes.len(), bytes)
     }
 }

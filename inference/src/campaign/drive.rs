@@ -1,0 +1,68 @@
+//! What supplies and correctors do to the beam in one frame.
+
+use nalgebra::DVector;
+
+use crate::recording::{Header, Row};
+
+/// What drives the beam in one frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Drive {
+    /// Kick of each corrector [C] [rad].
+    pub kick: DVector<f64>,
+    /// `ln` of each supply's factor on its gradients [F].
+    pub strength: DVector<f64>,
+    /// Relative RF offset [1].
+    pub rf_offset: f64,
+}
+
+impl Drive {
+    /// The header's formulas: `k1 = var k1_design p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`; what is in series with the dipoles
+    /// keeps its strength, and a kick falls with the dipoles' current.
+    pub fn of(header: &Header, row: &Row) -> Self {
+        let rigidity = match (row.dipole, header.nominal_dipole) {
+            (Some(current), Some(nominal)) => current / nominal,
+            _ => 1.0,
+        };
+        let strength = |f: usize| {
+            let transfer = |r: f64| header.transfer[f].iter().rev().fold(0.0, |sum, c| sum * r + c);
+            (transfer(row.supply[f] / header.nominal[f]) / transfer(1.0) / rigidity).ln()
+        };
+        let kick = row.corrector_current.iter().zip(&header.kick_per_ampere).map(|(current, k)| current * k / rigidity);
+        Self {
+            kick: DVector::from_iterator(row.corrector_current.len(), kick),
+            strength: DVector::from_fn(row.supply.len(), |f, _| strength(f)),
+            rf_offset: row.rf_offset,
+        }
+    }
+}
+
+/// Mean `ln` of each supply's factor over all frames [F]; none without frames.
+pub(crate) fn mean_supplies(drives: &[Drive]) -> Vec<f64> {
+    let supplies = drives.first().map_or(0, |drive| drive.strength.len());
+    let mean = |f: usize| drives.iter().map(|drive| drive.strength[f]).sum::<f64>() / drives.len() as f64;
+    (0..supplies).map(mean).collect()
+}
+
+/// Mean of some drives.
+///
+/// # Panics
+/// Without any.
+pub(crate) fn mean(drives: &[&Drive]) -> Drive {
+    let share = 1.0 / drives.len() as f64;
+    let mut mean = Drive {
+        kick: drives[0].kick.map(|_| 0.0),
+        strength: drives[0].strength.map(|_| 0.0),
+        rf_offset: drives[0].rf_offset,
+    };
+    for drive in drives {
+        mean.kick.axpy(share, &drive.kick, 1.0);
+        mean.strength.axpy(share, &drive.strength, 1.0);
+    }
+    mean
+}
+
+/// Number of frames with each frame's RF offset.
+pub(crate) fn sharing(drives: &[Drive]) -> Vec<f64> {
+    let alike = |drive: &Drive| drives.iter().filter(|other| other.rf_offset == drive.rf_offset).count() as f64;
+    drives.iter().map(alike).collect()
+}

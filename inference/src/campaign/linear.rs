@@ -1,0 +1,165 @@
+//! The exact ring at given params and mean supplies, and to first order about them: what predictions of frames are made of.
+
+use nalgebra::{DMatrix, DVector, DVectorView};
+use twin::{ClosedOrbit, Hold, Optics, OrbitError, Plane, Ring, Tunes};
+
+use super::drive::Drive;
+
+/// The ring at given params.
+#[derive(Debug, Clone)]
+pub(crate) struct Linearised {
+    /// Response of the read monitors to the correctors [B][C] [m/rad].
+    response: DMatrix<f64>,
+    /// Its derivative with respect to each param, of each monitor [N][C].
+    slopes: Vec<DMatrix<f64>>,
+    /// The same with respect to `ln` of each supply's strength [F][C].
+    supply_slopes: Vec<DMatrix<f64>>,
+    rf: Vec<RfOrbit>,
+    /// Tunes.
+    pub tunes: Tunes,
+    /// Derivative of both tunes with respect to each param [2][N].
+    pub tune_slopes: DMatrix<f64>,
+    /// The same with respect to `ln` of each supply's strength [2][F].
+    pub tune_supply_slopes: DMatrix<f64>,
+    /// Supplies about which it is linearised [F].
+    supplies: DVector<f64>,
+}
+
+/// Orbit that an RF offset makes, exactly, and its derivatives.
+#[derive(Debug, Clone)]
+struct RfOrbit {
+    offset: f64,
+    /// [B] [m].
+    orbit: DVector<f64>,
+    /// [N][B] and [F][B].
+    slopes: DMatrix<f64>,
+    supply_slopes: DMatrix<f64>,
+}
+
+impl Linearised {
+    /// About params and supplies, for the RF offsets of some frames.
+    pub fn of(ring: &Ring, params: &DVector<f64>, supplies: &[f64], drives: &[Drive]) -> Result<Self, OrbitError> {
+        let ring = &ring.with_strengths(&ring.strengths(params.as_slice(), supplies));
+        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+        let (observers, sources, gradients) = (optics.read_monitors(), optics.correctors(), optics.quadrupoles());
+        let k1 = ring.gradients();
+        let by_param = |m: usize| ring.quadrupoles[m].parameter;
+        let by_supply = |m: usize| ring.quadrupoles[m].supply;
+        let (params, supply_count) = (ring.parameters.len(), ring.supplies.len());
+        let (monitors, correctors) = (observers.len(), sources.len());
+        let mut slopes = vec![DMatrix::zeros(params, correctors); monitors];
+        let mut supply_slopes = vec![DMatrix::zeros(supply_count, correctors); monitors];
+        // d/d ln k = k1 d/dk1
+        for (m, slope) in optics.response_jacobian(&observers, &sources, &gradients).iter().enumerate() {
+            for (to, index) in [(&mut slopes, by_param(m)), (&mut supply_slopes, by_supply(m))] {
+                let Some(index) = index else { continue };
+                for (b, to) in to.iter_mut().enumerate() {
+                    let mut row = to.row_mut(index);
+                    row += slope.row(b) * k1[m];
+                }
+            }
+        }
+        let rf_slope = optics.rf_jacobian(&observers, &gradients);
+        let tune_slope: Vec<[f64; 2]> = gradients.iter().map(|gradient| optics.tune_slope(gradient)).collect();
+        let tune_slope = DMatrix::from_fn(2, gradients.len(), |plane, m| tune_slope[m][plane]);
+        let summed = |slope: &DMatrix<f64>, count: usize, index: &dyn Fn(usize) -> Option<usize>| {
+            let mut sum = DMatrix::zeros(slope.nrows(), count);
+            for (m, column) in slope.column_iter().enumerate() {
+                if let Some(index) = index(m) {
+                    sum.column_mut(index).axpy(k1[m], &column, 1.0);
+                }
+            }
+            sum
+        };
+        let (rf_params, rf_supplies) =
+            (summed(&rf_slope, params, &by_param), summed(&rf_slope, supply_count, &by_supply));
+        let rf = |offset: f64| {
+            let orbit = rf_orbit(ring, offset)?;
+            Ok(RfOrbit {
+                offset,
+                orbit,
+                slopes: rf_params.transpose() * offset,
+                supply_slopes: rf_supplies.transpose() * offset,
+            })
+        };
+        Ok(Self {
+            response: optics.response(&observers, &sources),
+            slopes,
+            supply_slopes,
+            rf: offsets(drives).into_iter().map(rf).collect::<Result<_, OrbitError>>()?,
+            tunes: optics.tunes()?,
+            tune_slopes: summed(&tune_slope, params, &by_param),
+            tune_supply_slopes: summed(&tune_slope, supply_count, &by_supply),
+            supplies: DVector::from_column_slice(supplies),
+        })
+    }
+
+    /// Orbits of frames without baselines, the supplies off their mean to first order: rows frames, columns monitors [m].
+    pub fn orbits(&self, drives: &[Drive]) -> DMatrix<f64> {
+        let kicks = self.kicks(drives);
+        let off = columns(self.supplies.len(), drives, |drive| &drive.strength - &self.supplies);
+        let mut orbits = (&self.response * &kicks).transpose();
+        for (b, mut orbit) in orbits.column_iter_mut().enumerate() {
+            let by_supply = self.along(&self.supply_slopes[b], &kicks, drives, |rf| rf.supply_slopes.column(b));
+            for (i, (orbit, drive)) in orbit.iter_mut().zip(drives).enumerate() {
+                *orbit += self.rf(drive).map_or(0.0, |rf| rf.orbit[b]) + by_supply.column(i).dot(&off.column(i));
+            }
+        }
+        orbits
+    }
+
+    /// Derivative of the orbits with respect to the params, of each monitor: rows params, columns frames.
+    pub fn slopes(&self, drives: &[Drive]) -> Vec<DMatrix<f64>> {
+        let kicks = self.kicks(drives);
+        let slopes = self.slopes.iter().enumerate();
+        slopes.map(|(b, slope)| self.along(slope, &kicks, drives, |rf| rf.slopes.column(b))).collect()
+    }
+
+    /// A derivative of one monitor's response, times the drives of all frames.
+    fn along<'l>(
+        &'l self,
+        slope: &DMatrix<f64>,
+        kicks: &DMatrix<f64>,
+        drives: &[Drive],
+        of_rf: impl Fn(&'l RfOrbit) -> DVectorView<'l, f64>,
+    ) -> DMatrix<f64> {
+        let mut along = slope * kicks;
+        for (mut column, drive) in along.column_iter_mut().zip(drives) {
+            self.rf(drive).into_iter().for_each(|rf| column += of_rf(rf));
+        }
+        along
+    }
+
+    fn rf(&self, drive: &Drive) -> Option<&RfOrbit> {
+        self.rf.iter().find(|rf| rf.offset == drive.rf_offset)
+    }
+
+    fn kicks(&self, drives: &[Drive]) -> DMatrix<f64> {
+        columns(self.response.ncols(), drives, |drive| drive.kick.clone())
+    }
+}
+
+/// Columns of all frames.
+fn columns(rows: usize, drives: &[Drive], of: impl Fn(&Drive) -> DVector<f64>) -> DMatrix<f64> {
+    let mut columns = DMatrix::zeros(rows, drives.len());
+    drives.iter().enumerate().for_each(|(i, drive)| columns.set_column(i, &of(drive)));
+    columns
+}
+
+/// RF offsets other than 0, each once.
+fn offsets(drives: &[Drive]) -> Vec<f64> {
+    let mut offsets: Vec<f64> = drives.iter().map(|d| d.rf_offset).filter(|&offset| offset != 0.0).collect();
+    offsets.sort_by(f64::total_cmp);
+    offsets.dedup();
+    offsets
+}
+
+/// Orbit that an RF offset makes at the read monitors, exactly [m].
+///
+/// # Errors
+/// [`OrbitError`] if there is none.
+pub fn rf_orbit(ring: &Ring, offset: f64) -> Result<DVector<f64>, OrbitError> {
+    let orbit = ClosedOrbit::find(ring, Hold::Frequency { offset })?;
+    let seen = ring.monitors_read().map(|m| orbit.at[m.element][if m.plane == Plane::Y { 2 } else { 0 }]);
+    Ok(DVector::from_iterator(ring.read_monitors.len(), seen))
+}

@@ -1,0 +1,197 @@
+//! One recording of one ring, assembled once: what drove the beam, which readings count, what the tune meter says.
+//!
+//! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
+
+mod drive;
+mod linear;
+mod meter;
+mod normal;
+mod screen;
+mod setting;
+
+use estimator::MonitorState;
+use nalgebra::{DMatrix, DVector};
+use twin::{OrbitError, Ring, spurious_dispersion};
+
+use crate::prior::Prior;
+use crate::recording::Recording;
+
+pub use drive::Drive;
+pub(crate) use linear::Linearised;
+pub use linear::rf_orbit;
+pub use meter::{Meter, TUNE_CALIBRATION};
+pub(crate) use normal::{Normal, Weighed};
+pub use screen::Screened;
+use screen::{Groups, Screener, Seen};
+pub use setting::Settings;
+
+/// A recording and what follows from it before any fit.
+#[derive(Debug, Clone)]
+pub struct Campaign {
+    /// The ring as designed, powered as the recording has it.
+    pub ring: Ring,
+    /// The recording.
+    pub recording: Recording,
+    /// What is known of the params beforehand.
+    pub prior: Prior,
+    /// What drove the beam in each frame.
+    pub drives: Vec<Drive>,
+    /// Time of each frame, from -1 to 1.
+    pub time: Vec<f64>,
+    /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
+    sharing: Vec<f64>,
+    /// Mean `ln` of each supply's factor [F].
+    pub supplies: Vec<f64>,
+    /// Frames that ask the same of the machine.
+    pub settings: Settings,
+    /// Readings as recorded, rows frames, columns monitors; not a number where a monitor did not report [m].
+    pub readings: DMatrix<f64>,
+    /// Fractional tunes as recorded, rows frames, columns x and y; not a number where the meter did not report [1].
+    pub tunes: DMatrix<f64>,
+    /// What the tune meter says, at the mean supply currents and without an RF offset.
+    pub meters: [Option<Meter>; 2],
+    /// Which readings count, and the state of the monitors.
+    pub screened: Screened,
+    /// The params that the screening ends with: a first guess.
+    pub params: DVector<f64>,
+    /// Each monitor's baseline at these [B] [m]; none without readings.
+    pub baselines: Vec<Option<f64>>,
+    /// Rms of these in x and y [m].
+    pub orbit: [f64; 2],
+    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y.
+    pub spurious: [f64; 2],
+}
+
+impl Campaign {
+    /// Assemble and screen a recording of a ring, with the priors of its params.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring as designed, or displaced by a fraction of a millimetre, has no stable orbit.
+    pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
+        let ring = recording.powered(ring).into_owned();
+        let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+        let supplies = drive::mean_supplies(&drives);
+        let settings = Settings::of(&drives, recording.nominal_kick());
+        let (readings, tunes) = (readings(recording), tunes(recording));
+        let (prior, spurious) = (Prior::of(&ring), spurious_dispersion(&ring)?);
+        let screener = Screener {
+            ring: &ring,
+            prior: &prior,
+            drives: &drives,
+            supplies: &supplies,
+            settings: &settings,
+            groups: Groups::of(&drives, &settings),
+            readings: &readings,
+            noise: &recording.header.noise,
+            sharing: &drive::sharing(&drives),
+            spurious,
+        };
+        let Seen { screened, params, baselines } = screener.run()?;
+        let linearised = Linearised::of(&ring, &params, &supplies, &drives)?;
+        let mut campaign = Self {
+            meters: [None, None],
+            orbit: rms_by_plane(&ring, &baselines),
+            sharing: drive::sharing(&drives),
+            time: recording.times(),
+            recording: recording.clone(),
+            ring,
+            prior,
+            drives,
+            supplies,
+            settings,
+            readings,
+            tunes,
+            screened,
+            params,
+            baselines,
+            spurious,
+        };
+        campaign.meters = campaign.read_meters(&linearised);
+        Ok(campaign)
+    }
+
+    /// Number of frames.
+    pub fn frames(&self) -> usize {
+        self.drives.len()
+    }
+
+    /// Number of monitors.
+    pub fn monitors(&self) -> usize {
+        self.readings.ncols()
+    }
+
+    /// True if a reading counts.
+    pub fn counts(&self, frame: usize, b: usize) -> bool {
+        self.screened.accepted[(frame, b)]
+    }
+
+    /// Noise as which a reading of a monitor is weighted [m].
+    pub fn noise(&self, b: usize) -> f64 {
+        f64::from(self.screened.health[b].weighted_as)
+    }
+
+    /// True for a monitor in state ok.
+    pub fn is_ok(&self, b: usize) -> bool {
+        self.screened.health[b].state == MonitorState::Ok
+    }
+
+    /// 0 for a monitor that reads x, 1 for one that reads y.
+    pub fn plane(&self, b: usize) -> usize {
+        usize::from(b >= self.ring.horizontal_monitors())
+    }
+
+    /// Error that all readings of a monitor at an RF offset share: the dispersion of unknown misalignments [m].
+    pub fn shared_error(&self, b: usize, rf_offset: f64) -> f64 {
+        self.spurious[self.plane(b)] * self.orbit[self.plane(b)] * rf_offset
+    }
+
+    /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
+    pub fn variance(&self, frame: usize, b: usize) -> f64 {
+        let shared = self.shared_error(b, self.drives[frame].rf_offset);
+        self.noise(b).powi(2) + self.sharing[frame] * shared * shared
+    }
+
+    /// Rms of the baselines that are known, in x and y [m].
+    pub(crate) fn rms_by_plane(&self, baselines: &[Option<f64>]) -> [f64; 2] {
+        rms_by_plane(&self.ring, baselines)
+    }
+
+    /// True if any reading counts.
+    pub fn has_readings(&self) -> bool {
+        self.screened.accepted.iter().any(|counts| *counts)
+    }
+
+    /// What the meter says of frames without an RF offset, the supplies' fluctuations taken out to first order.
+    fn read_meters(&self, linearised: &Linearised) -> [Option<Meter>; 2] {
+        let at_mean = |plane: usize| -> Vec<f64> {
+            let slopes = linearised.tune_supply_slopes.row(plane).transpose();
+            let supplies = DVector::from_column_slice(&self.supplies);
+            let frame = |(i, drive): (usize, &Drive)| {
+                let moved = slopes.dot(&(&drive.strength - &supplies));
+                if drive.rf_offset == 0.0 { self.tunes[(i, plane)] - moved } else { f64::NAN }
+            };
+            self.drives.iter().enumerate().map(frame).collect()
+        };
+        [0, 1].map(|plane| Meter::of(at_mean(plane).iter().zip(&self.time)))
+    }
+}
+
+fn readings(recording: &Recording) -> DMatrix<f64> {
+    let rows = &recording.rows;
+    let monitors = rows.first().map_or(0, |row| row.reading.len());
+    DMatrix::from_fn(rows.len(), monitors, |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
+}
+
+fn tunes(recording: &Recording) -> DMatrix<f64> {
+    let rows = &recording.rows;
+    DMatrix::from_fn(rows.len(), 2, |i, plane| rows[i].tune[plane].unwrap_or(f64::NAN))
+}
+
+/// Rms of the baselines that are known, in x and y [m].
+fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
+    let (x, y) = baselines.split_at(ring.horizontal_monitors());
+    [x, y].map(|baselines| {
+        let squares: Vec<f64> = baselines.iter().flatten().map(|x| x * x).collect();
+        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+    })
+}

@@ -1,0 +1,397 @@
+//! Which readings count, and how well each monitor is doing: the rules of the core (`estimator::Monitor`, `estimator::Cell`), in f64 and
+//! for a ring of any size.
+//!
+//! Frames are taken in the order of time. A reading is judged by the repeats of its setting; the first one by the model with all
+//! that is known of the params so far, in normal equations that are linearised anew when the params have moved.
+
+use std::collections::BTreeMap;
+
+use estimator::{Gate, Health, Monitor, PositionCode, Verdict};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use twin::{OrbitError, Ring};
+
+use super::drive::{self, Drive};
+use super::linear::Linearised;
+use super::normal::{Normal, Weighed};
+use super::rms_by_plane;
+use super::setting::Settings;
+use crate::prior::Prior;
+
+/// What is known of the instruments.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Screened {
+    /// Which readings count, rows frames, columns monitors.
+    pub accepted: DMatrix<bool>,
+    /// State and noise of each monitor.
+    pub health: Vec<Health>,
+}
+
+/// What a campaign is screened by.
+pub(super) struct Screener<'c> {
+    pub ring: &'c Ring,
+    pub prior: &'c Prior,
+    pub drives: &'c [Drive],
+    pub supplies: &'c [f64],
+    pub settings: &'c Settings,
+    pub groups: Groups,
+    /// Rows frames, columns monitors, not a number where a monitor did not report [m].
+    pub readings: &'c DMatrix<f64>,
+    /// Expected noise of each monitor [m].
+    pub noise: &'c [f64],
+    /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
+    pub sharing: &'c [f64],
+    /// Change of a misaligned ring's orbit per RF offset and rms orbit, in x and y.
+    pub spurious: [f64; 2],
+}
+
+/// Frames that share a derivative: those of a setting, or one by itself.
+pub(super) struct Groups {
+    of_frame: Vec<usize>,
+    /// Mean drive of each.
+    drives: Vec<Drive>,
+}
+
+/// What remains when all frames have been taken.
+pub(super) struct Seen {
+    pub screened: Screened,
+    /// The best params.
+    pub params: DVector<f64>,
+    /// Baselines [B] [m].
+    pub baselines: Vec<Option<f64>>,
+}
+
+/// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
+const BASELINE: f64 = 0.02;
+/// A param that has moved by this many error bars calls for a new linearisation.
+const MOVED: f64 = 1.0;
+/// Growth of chi-square that counts as uphill.
+const UPHILL: f64 = 1.0;
+/// Halvings of a step that leads uphill or to an unstable ring.
+const HALVINGS: i32 = 4;
+/// Share of a prediction's variance by the params that their linearisation adds.
+const UNDERWEIGHT: f64 = 0.2;
+/// Frames without a setting in a row in which most readings have to surprise before the model is at fault, and not the beam.
+const CONVINCED: usize = 3;
+/// One in this many readings of a frame may surprise before the frame does.
+const MOST: usize = 8;
+
+/// The repeats of one monitor in one setting.
+#[derive(Debug, Clone, Default)]
+struct Repeats {
+    /// Frames whose reading counts.
+    frames: Vec<usize>,
+    /// The last frame with a reading, and whether that waits for one that confirms it.
+    last: Option<usize>,
+    waiting: bool,
+}
+
+/// The screening after some frames.
+struct Screening<'c> {
+    of: &'c Screener<'c>,
+    gate: Gate,
+    monitors: Vec<Monitor>,
+    /// By setting and monitor.
+    repeats: Vec<Vec<Repeats>>,
+    accepted: DMatrix<bool>,
+    model: Model,
+    normal: Normal,
+    best: Best,
+    /// Accepted readings have to be weighted anew.
+    stale: bool,
+    /// Frames without a setting in a row of which most readings surprised.
+    surprises: usize,
+}
+
+/// The ring linearised at some params.
+///
+/// Frames of a setting differ by the scatter of idle correctors, a thousandth of its kick: their own orbits count, and the derivative of
+/// their mean drive serves them all.
+struct Model {
+    params: DVector<f64>,
+    /// Orbits of the frames, rows frames, columns monitors [m].
+    orbit: DMatrix<f64>,
+    /// Derivative of each monitor's orbit with respect to the params, columns groups of frames.
+    slope: Vec<DMatrix<f64>>,
+    /// What the mean drive of each frame's setting adds to the orbit of its own [frame][monitor] [m].
+    to_mean_drive: DMatrix<f64>,
+}
+
+/// The best params of the normal equations.
+struct Best {
+    step: DVector<f64>,
+    factor: Cholesky<f64, Dyn>,
+    /// Rms of the baselines in x and y [m].
+    orbit: [f64; 2],
+    cost: f64,
+}
+
+impl Groups {
+    pub fn of(drives: &[Drive], settings: &Settings) -> Self {
+        let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
+        let mut group = |(frame, drive): (usize, _)| {
+            let key = settings.of_frame[frame].ok_or(frame);
+            let group = *known.entry(key).or_insert(members.len());
+            members.resize(members.len().max(group + 1), Vec::new());
+            members[group].push(drive);
+            group
+        };
+        let of_frame = drives.iter().enumerate().map(&mut group).collect();
+        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect() }
+    }
+}
+
+impl Screener<'_> {
+    /// Take all frames.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring as designed has no stable orbit.
+    pub fn run(&self) -> Result<Seen, OrbitError> {
+        let mut screening = Screening::new(self)?;
+        for frame in 0..self.drives.len() {
+            screening.linearise_if_due(frame);
+            screening.take(frame);
+        }
+        let Screening { accepted, monitors, model, best, normal, .. } = screening;
+        let baselines = (0..monitors.len()).map(|b| normal.baseline(b, &best.step)).collect();
+        let health = monitors.iter().map(Monitor::health).collect();
+        Ok(Seen { screened: Screened { accepted, health }, params: model.params + best.step, baselines })
+    }
+
+    fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
+        let linearised = Linearised::of(self.ring, &params, self.supplies, self.drives)?;
+        let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
+        let to_mean_drive = self.to_mean_drive(&orbit);
+        Ok(Model { params, orbit, slope, to_mean_drive })
+    }
+
+    fn to_mean_drive(&self, orbit: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut sum = DMatrix::<f64>::zeros(self.settings.count, orbit.ncols());
+        let mut frames = vec![0.0; self.settings.count];
+        let settings = || self.settings.of_frame.iter().enumerate().filter_map(|(i, setting)| Some((i, (*setting)?)));
+        for (i, setting) in settings() {
+            frames[setting] += 1.0;
+            let mut row = sum.row_mut(setting);
+            row += orbit.row(i);
+        }
+        let mut shift = DMatrix::zeros(orbit.nrows(), orbit.ncols());
+        settings().for_each(|(i, setting)| shift.set_row(i, &(sum.row(setting) / frames[setting] - orbit.row(i))));
+        shift
+    }
+}
+
+impl<'c> Screening<'c> {
+    fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
+        let (frames, monitors) = (of.drives.len(), of.noise.len());
+        let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
+        let normal = Normal::new(of.prior, &model.params, monitors, BASELINE.powi(-2));
+        let expecting = |sigma: &f64| {
+            let mut monitor = Monitor::BLANK;
+            monitor.expect(*sigma as f32);
+            monitor
+        };
+        Ok(Self {
+            gate: Gate::default(),
+            monitors: of.noise.iter().map(expecting).collect(),
+            repeats: vec![vec![Repeats::default(); monitors]; of.settings.count],
+            accepted: DMatrix::from_element(frames, monitors, false),
+            best: Best::of(of, &model, &normal),
+            model,
+            normal,
+            stale: false,
+            surprises: 0,
+            of,
+        })
+    }
+
+    /// Take one frame: judge its readings, then learn from those that pass.
+    fn take(&mut self, frame: usize) {
+        let setting = self.of.settings.of_frame[frame];
+        let mut rejected = Vec::new();
+        for b in 0..self.monitors.len() {
+            let reading = self.of.readings[(frame, b)];
+            if self.monitors[b].hear(code(reading)) {
+                match setting {
+                    Some(setting) => self.judge_repeat(frame, b, setting),
+                    None if self.is_expected(frame, b) => self.accepted[(frame, b)] = true,
+                    None => {
+                        self.monitors[b].reject();
+                        rejected.push(b);
+                    }
+                }
+            }
+            self.stale |= self.monitors[b].judge();
+        }
+        if setting.is_none() {
+            self.pardon(frame, &rejected);
+        }
+        self.learn(frame);
+        self.best = Best::of(self.of, &self.model, &self.normal);
+    }
+
+    /// Add the readings of a frame that count to the normal equations.
+    fn learn(&mut self, frame: usize) {
+        let group = self.of.groups.of_frame[frame];
+        let counting = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]);
+        let readings: Vec<(usize, Weighed)> = counting.map(|b| (b, self.weighed(frame, b))).collect();
+        let mut slopes = DMatrix::zeros(self.model.params.len(), readings.len());
+        for (mut to, (b, _)) in slopes.column_iter_mut().zip(&readings) {
+            to.copy_from(&self.model.slope[*b].column(group));
+        }
+        self.normal.add(&slopes, &readings);
+    }
+
+    /// A reading in a setting is judged by its repeats, the first one by the model.
+    fn judge_repeat(&mut self, frame: usize, b: usize, setting: usize) {
+        let expected = self.is_expected(frame, b);
+        let repeats = &self.repeats[setting][b];
+        let moved = |i: usize| self.of.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
+        let (here, last) = (moved(frame), repeats.last);
+        if let Some(last) = last {
+            self.monitors[b].noise.learn((here - moved(last)) as f32);
+        }
+        let mean = repeats.frames.iter().map(|&i| moved(i)).sum::<f64>() / repeats.frames.len() as f64;
+        let sigma = self.monitors[b].noise.sigma();
+        let agrees = |other: f64| self.gate.agree((here - other) as f32, 0.0, sigma);
+        let agrees_with_last = last.is_some_and(|last| agrees(moved(last)));
+        let verdict = repeats.judge(agrees(mean), agrees_with_last, expected);
+        self.note(frame, b, setting, verdict);
+    }
+
+    fn note(&mut self, frame: usize, b: usize, setting: usize, verdict: Verdict) {
+        let repeats = &mut self.repeats[setting][b];
+        match verdict {
+            Verdict::Accepted => {}
+            Verdict::Held => self.monitors[b].reject(),
+            Verdict::Confirms { outvotes } => {
+                self.monitors[b].pardon();
+                self.stale = true;
+                if outvotes {
+                    repeats.frames.drain(..).for_each(|i| self.accepted[(i, b)] = false);
+                }
+                repeats.frames.extend(repeats.last);
+                repeats.last.into_iter().for_each(|last| self.accepted[(last, b)] = true);
+            }
+        }
+        repeats.waiting = verdict == Verdict::Held;
+        repeats.last = Some(frame);
+        if !repeats.waiting {
+            repeats.frames.push(frame);
+            self.accepted[(frame, b)] = true;
+        }
+    }
+
+    /// Monitors fail one at a time: when most readings of a frame without a setting surprise, the beam was lost or the model is
+    /// at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before are not.
+    fn pardon(&mut self, frame: usize, rejected: &[usize]) {
+        let accepted = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).count();
+        if MOST * rejected.len() <= accepted + rejected.len() {
+            self.surprises = 0;
+            return;
+        }
+        self.surprises += 1;
+        let convinced = self.surprises >= CONVINCED;
+        for &b in rejected {
+            self.monitors[b].pardon();
+            self.accepted[(frame, b)] = true;
+        }
+        let mut row = self.accepted.row_mut(frame);
+        row.iter_mut().for_each(|accepted| *accepted &= convinced);
+    }
+
+    /// True if the model, with all its uncertainty, expects a reading.
+    fn is_expected(&self, frame: usize, b: usize) -> bool {
+        let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
+        let (expected, of_baseline, of_params) = self.normal.expect(b, slope, &self.best.step, &self.best.factor);
+        let surprise = (self.residual(frame, b) - expected) as f32;
+        let certain = self.variance(frame, b) + of_baseline;
+        // the uncertainty of the params is only worked out for readings that need it
+        self.gate.expects(surprise, certain as f32)
+            || self.gate.expects(surprise, (certain + (1.0 + UNDERWEIGHT) * of_params()) as f32)
+    }
+
+    fn residual(&self, frame: usize, b: usize) -> f64 {
+        self.of.readings[(frame, b)] - self.model.orbit[(frame, b)]
+    }
+
+    /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
+    fn variance(&self, frame: usize, b: usize) -> f64 {
+        let plane = usize::from(b >= self.of.ring.horizontal_monitors());
+        let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
+        f64::from(self.monitors[b].variance()) + self.of.sharing[frame] * shared * shared
+    }
+
+    fn weighed(&self, frame: usize, b: usize) -> Weighed {
+        Weighed::one(self.residual(frame, b), 1.0 / self.variance(frame, b))
+    }
+
+    /// Linearise at the best params if they have left those of the model, or if readings have to be weighted anew.
+    fn linearise_if_due(&mut self, frames: usize) {
+        let covariance = self.best.factor.inverse();
+        let moved = |i: usize| self.best.step[i].abs() > MOVED * covariance[(i, i)].sqrt();
+        if !self.stale && !(0..self.best.step.len()).any(moved) {
+            return;
+        }
+        // readings that are weighted anew have another chi-square; the step is then judged with the next one
+        let highest = if self.stale { f64::INFINITY } else { self.best.cost + UPHILL };
+        self.stale = false;
+        let (from, step) = (self.model.params.clone(), self.best.step.clone());
+        for halvings in 0..HALVINGS {
+            let Ok(model) = self.of.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
+            self.model = model;
+            self.rebuild(frames);
+            if self.best.cost <= highest {
+                return;
+            }
+        }
+        if let Ok(model) = self.of.model(from) {
+            self.model = model;
+            self.rebuild(frames);
+        }
+    }
+
+    /// The normal equations of the accepted readings of the first frames.
+    fn rebuild(&mut self, frames: usize) {
+        let monitors = self.monitors.len();
+        self.normal = Normal::new(self.of.prior, &self.model.params, monitors, BASELINE.powi(-2));
+        for b in 0..monitors {
+            let mut sums = vec![(b, Weighed::default()); self.of.groups.drives.len()];
+            for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
+                sums[self.of.groups.of_frame[frame]].1 += self.weighed(frame, b);
+            }
+            self.normal.add(&self.model.slope[b], &sums);
+        }
+        self.best = Best::of(self.of, &self.model, &self.normal);
+    }
+}
+
+impl Repeats {
+    /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects it. A
+    /// surprising one waits. Two that agree outvote the model, and whatever came before.
+    fn judge(&self, agrees_with_mean: bool, agrees_with_last: bool, expected: bool) -> Verdict {
+        let any = !self.frames.is_empty();
+        if (any && agrees_with_mean) || (agrees_with_last && !self.waiting) {
+            Verdict::Accepted
+        } else if agrees_with_last {
+            Verdict::Confirms { outvotes: any }
+        } else if !any && expected {
+            Verdict::Accepted
+        } else {
+            Verdict::Held
+        }
+    }
+}
+
+impl Best {
+    fn of(of: &Screener, model: &Model, normal: &Normal) -> Self {
+        let (cost, quadratic) = normal.eliminated();
+        let factor = quadratic.factor().expect("a prior's precision is positive");
+        let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
+        let baselines: Vec<Option<f64>> = (0..of.noise.len()).map(|b| normal.baseline(b, &step)).collect();
+        Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost }
+    }
+}
+
+/// A reading as the wire has it; none where it is missing.
+fn code(reading: f64) -> Option<i32> {
+    PositionCode::nearest(reading).map(PositionCode::steps)
+}

@@ -1,0 +1,259 @@
+//! The batch fit: all frames at once in f64, predicted by the twin itself; the maximum a posteriori (MAP) of the params.
+//!
+//! Exact optics at every step, each frame with its own read-backs, baselines eliminated by the normal equations, measured tunes as
+//! readings:
+//!
+//! `chi2 = sum of (reading - baseline_b - predicted)^2/variance + sum of (tune - predicted)^2/variance + sum of (theta - prior)^2/sigma^2`,
+//!
+//! minimised by damped Gauss-Newton within the range of the params.
+
+use core::fmt;
+
+use estimator::Marginal;
+use nalgebra::{DMatrix, DVector, Vector2};
+use twin::{OrbitError, Tunes};
+
+use crate::campaign::{Campaign, Linearised, Normal, Weighed};
+use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
+
+/// The batch result for one campaign.
+#[derive(Debug, Clone)]
+pub struct BatchFit {
+    /// MAP of each `theta = ln var`, within the prior's range.
+    pub map_params: Vec<f64>,
+    /// Covariance of theta.
+    pub covariance: DMatrix<f64>,
+    /// Marginal of each theta.
+    pub marginals: Vec<Marginal>,
+    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines less
+    /// params); not a number without any.
+    pub chi2_per_dof: f64,
+    /// Tunes x and y at the MAP, and as measured.
+    pub tunes: [FittedTune; 2],
+    /// What the orbits lack to say anything: the result is then the prior, but for measured tunes.
+    pub lack: Option<Lack>,
+    /// Rms of the baselines in x and y [m].
+    pub orbit: [f64; 2],
+    /// Gauss-Newton steps taken.
+    pub steps: usize,
+}
+
+/// One tune of a fit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FittedTune {
+    /// Of the ring at the MAP.
+    pub model: f64,
+    /// Mean of what was measured, with the model's integer part, and its standard deviation, the meter's calibration included.
+    pub measured: Option<(f64, f64)>,
+}
+
+impl FittedTune {
+    /// Measured less the model's, in standard deviations of the measured one.
+    pub fn pull(&self) -> Option<f64> {
+        self.measured.map(|(tune, sigma)| (tune - self.model) / sigma)
+    }
+}
+
+/// What a campaign lacks to say anything of the params by orbits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lack {
+    /// No monitor has a reading that counts.
+    Readings,
+    /// No kick and no RF offset moved the beam.
+    Kick,
+}
+
+impl fmt::Display for Lack {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Readings => "no monitor has a reading that counts",
+            Self::Kick => "no corrector and no RF offset moved the beam",
+        })
+    }
+}
+
+/// What counts as a reading beside the monitors.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TuneUse {
+    /// Measured tunes are readings.
+    #[default]
+    Readings,
+    /// They are left out, and only stand beside the model's.
+    LeftOut,
+}
+
+/// Why there is no batch result.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum BatchError {
+    /// The campaign cannot be assembled, or there is no stable ring where the fit begins.
+    #[error("no stable ring: {0}")]
+    Orbit(#[from] OrbitError),
+    /// The steps did not settle.
+    #[error("no minimum after {steps} steps; the last one moved the vars by {moved:.2e} standard deviations")]
+    NotConverged {
+        /// Steps taken.
+        steps: usize,
+        /// Length of the last step, in standard deviations.
+        moved: f64,
+    },
+    /// The normal matrix is not positive.
+    #[error("the readings and the prior do not determine the vars")]
+    Degenerate,
+}
+
+impl From<OptimiseError<OrbitError>> for BatchError {
+    fn from(error: OptimiseError<OrbitError>) -> Self {
+        match error {
+            OptimiseError::Start(error) => Self::Orbit(error),
+            OptimiseError::Degenerate => Self::Degenerate,
+        }
+    }
+}
+
+const LIMITS: Limits = Limits { settled: 1e-6, steps: 30, halvings: 8 };
+/// Share of a param's prior standard deviation that orbits have to take away from one of them, to say anything.
+const LEARNT: f64 = 0.01;
+
+impl BatchFit {
+    /// Fit a campaign; `progress` hears of each step.
+    ///
+    /// # Errors
+    /// [`BatchError`].
+    pub fn of(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
+        let problem = Problem { campaign, tunes };
+        let watch = |steps, _| {
+            progress(steps);
+            true
+        };
+        let found = minimise(&problem, &campaign.params, &campaign.prior.range, &LIMITS, watch)?;
+        if found.end == End::Exhausted {
+            return Err(BatchError::NotConverged { steps: found.steps, moved: found.expected.max(0.0).sqrt() });
+        }
+        problem.result(&found)
+    }
+}
+
+/// One campaign and how it is to be read.
+struct Problem<'c> {
+    campaign: &'c Campaign,
+    tunes: TuneUse,
+}
+
+/// What a fit knows at given params.
+struct Point {
+    quadratic: Quadratic,
+    /// Half the second derivative without the tunes.
+    of_orbits: DMatrix<f64>,
+    /// Chi-square of the monitors in state ok by their expected noise, and its degrees of freedom.
+    chi2: (f64, f64),
+    /// Rms of the baselines in x and y [m].
+    orbit: [f64; 2],
+    tunes: Tunes,
+}
+
+impl Objective for Problem<'_> {
+    type Point = Point;
+    type Slopes = ();
+    type Error = OrbitError;
+
+    fn evaluate(&self, params: &DVector<f64>) -> Result<(f64, Point), OrbitError> {
+        let Campaign { ring, supplies, drives, prior, .. } = self.campaign;
+        let linearised = Linearised::of(ring, params, supplies, drives)?;
+        let (mut normal, chi2) = self.orbits(params, &linearised);
+        let (_, of_orbits) = normal.eliminated();
+        if self.tunes == TuneUse::Readings {
+            self.add_tunes(&mut normal, &linearised);
+        }
+        let (cost, quadratic) = normal.eliminated();
+        let here = DVector::zeros(prior.len());
+        let baselines: Vec<Option<f64>> = (0..self.campaign.monitors()).map(|b| normal.baseline(b, &here)).collect();
+        let orbit = self.campaign.rms_by_plane(&baselines);
+        Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.tunes }))
+    }
+
+    fn linearise(&self, _: &DVector<f64>, point: &Point) -> Result<(Quadratic, ()), OrbitError> {
+        Ok((point.quadratic.clone(), ()))
+    }
+}
+
+impl Problem<'_> {
+    /// Add up all readings that count.
+    fn orbits(&self, params: &DVector<f64>, linearised: &Linearised) -> (Normal, (f64, f64)) {
+        let campaign = self.campaign;
+        let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
+        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), 0.0);
+        let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
+        for b in 0..campaign.monitors() {
+            let (mut residuals, mut readings) = (Vec::new(), vec![(b, Weighed::default()); campaign.frames()]);
+            for i in (0..campaign.frames()).filter(|&i| campaign.counts(i, b)) {
+                let residual = campaign.readings[(i, b)] - orbits[(i, b)];
+                readings[i].1 = Weighed::one(residual, 1.0 / campaign.variance(i, b));
+                residuals.push(residual);
+            }
+            normal.add(&slopes[b], &readings);
+            if campaign.is_ok(b) && !residuals.is_empty() {
+                chi2 += about_mean(&residuals) / campaign.recording.header.noise[b].powi(2);
+                freedom += residuals.len() as f64 - 1.0;
+            }
+        }
+        (normal, (chi2, freedom))
+    }
+
+    /// The two whitened numbers of each meter: the tune and its change, which no constant ring has.
+    fn add_tunes(&self, normal: &mut Normal, linearised: &Linearised) {
+        let tunes = [linearised.tunes.x, linearised.tunes.y];
+        for (plane, meter) in self.campaign.meters.iter().enumerate() {
+            let Some(meter) = meter else { continue };
+            let miss = meter.miss(Vector2::new(tunes[plane], 0.0));
+            let slope = linearised.tune_slopes.row(plane).transpose();
+            for number in 0..2 {
+                let slope = &slope * meter.whiten[(number, 0)];
+                normal.add_plain(&slope, miss[number]);
+            }
+        }
+    }
+
+    fn result(&self, found: &Optimum<Self>) -> Result<BatchFit, BatchError> {
+        let (prior, point) = (&self.campaign.prior, &found.point);
+        let factor = point.quadratic.factor().ok_or(BatchError::Degenerate)?;
+        let covariance = factor.inverse();
+        let unbounded = &found.x + factor.solve(&point.quadratic.slope);
+        let marginal = |i: usize| {
+            let [lower, upper] = prior.range[i];
+            let inside = found.x[i] > lower && found.x[i] < upper;
+            prior.marginal(i, if inside { found.x[i] } else { unbounded[i] }, covariance[(i, i)].sqrt())
+        };
+        let tune = |plane: usize, model: f64| {
+            let meter = self.campaign.meters[plane].as_ref();
+            FittedTune { model, measured: meter.map(|meter| (meter.near(model), meter.sigma)) }
+        };
+        Ok(BatchFit {
+            marginals: (0..prior.len()).map(marginal).collect(),
+            map_params: found.x.iter().copied().collect(),
+            covariance,
+            chi2_per_dof: if point.chi2.1 > 0.0 { point.chi2.0 / point.chi2.1 } else { f64::NAN },
+            tunes: [tune(0, point.tunes.x), tune(1, point.tunes.y)],
+            lack: self.lack(&point.of_orbits),
+            orbit: point.orbit,
+            steps: found.steps,
+        })
+    }
+
+    /// What the orbits lack, by what they leave of the prior.
+    fn lack(&self, of_orbits: &DMatrix<f64>) -> Option<Lack> {
+        if !self.campaign.has_readings() {
+            return Some(Lack::Readings);
+        }
+        let left = of_orbits.clone().cholesky()?.inverse();
+        let precision = &self.campaign.prior.precision;
+        let learnt = |i: usize| (left[(i, i)] * precision[i]).sqrt() < 1.0 - LEARNT;
+        (!precision.is_empty() && !(0..precision.len()).any(learnt)).then_some(Lack::Kick)
+    }
+}
+
+/// Sum of squares about the mean.
+fn about_mean(values: &[f64]) -> f64 {
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    values.iter().map(|value| (value - mean).powi(2)).sum()
+}

@@ -1,0 +1,508 @@
+//! `header.toml`: what holds for every frame.
+//!
+//! The file is read strictly by its format, checked against the ring, and resolved: what it says by name becomes one number
+//! for each instrument and supply of the ring.
+
+use core::fmt;
+use core::ops::Range;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
+use twin::Ring;
+
+use super::error::{Part, Place, RecordingError};
+use super::limit::{POSITIVE, from_milli, in_milli};
+use super::names::{Names, feeds};
+
+/// What `header.toml` says about the whole campaign.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Header {
+    /// How the files are written.
+    pub format: Format,
+    /// The machine's name.
+    pub machine: String,
+    /// File name of the machine's lattice.
+    pub lattice: String,
+    /// The front end or code that wrote the frames.
+    pub recorded_with: String,
+    /// Particle species.
+    pub particle: String,
+    /// Kinetic energy when the orbit is read [GeV].
+    pub kinetic_energy: f64,
+    /// Expected sigma of one reading of each monitor [B] [m].
+    pub noise: Vec<f64>,
+    /// Kick per current of each corrector [C] [rad/A].
+    pub kick_per_ampere: Vec<f64>,
+    /// How settings follow each other, in words.
+    pub kick_convention: String,
+    /// What the operators believe held the beam.
+    pub believed_rf: BelievedRf,
+    /// Dipole current at which the lattice has its design momentum [A]; none if it is not recorded.
+    pub nominal_dipole: Option<f64>,
+    /// Supply currents at which the lattice has its design strengths [F] [A].
+    pub nominal: Vec<f64>,
+    /// Coefficients `c_n` of each supply's transfer function `p(r) = sum of c_n r^n`, from `n = 0`, `p(1) != 0` [F] [1].
+    ///
+    /// `k1 = var k1_design p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`
+    pub transfer: Vec<Vec<f64>>,
+    /// The two monitors whose mean a radial loop holds; always present where one is believed on.
+    pub radial_loop_monitors: Option<[String; 2]>,
+    /// Remarks.
+    pub note: String,
+}
+
+/// How a recording's files are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// One supply of all focusing and one of all other quadrupoles, one constant for all correctors and one for all
+    /// monitors, all columns in their order.
+    One,
+    /// Supplies, correctors and monitors by name, columns in any order.
+    Two,
+}
+
+/// What is believed to stay constant while the correctors move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BelievedRf {
+    /// The momentum.
+    FixedMomentum,
+    /// The RF frequency, hence the path length.
+    FixedFrequency,
+    /// The mean of two horizontal monitors.
+    RadialLoop,
+}
+
+/// The file, whose nominal currents, transfer functions and numbers of single instruments differ from format to format.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct HeaderFile<N, T, P> {
+    #[serde(default)]
+    format: Option<i64>,
+    machine: String,
+    lattice: String,
+    recorded_with: String,
+    particle: String,
+    #[serde(rename = "kinetic_energy_GeV")]
+    kinetic_energy: Positive,
+    #[serde(rename = "bpm_sigma_mm")]
+    noise: P,
+    #[serde(rename = "kick_mrad_per_A")]
+    kick_per_ampere: P,
+    kick_convention: String,
+    believed_rf: BelievedRf,
+    #[serde(rename = "nominal_A")]
+    nominal: N,
+    quad_transfer: T,
+    #[serde(default, deserialize_with = "pair", skip_serializing_if = "Option::is_none")]
+    radial_loop_monitors: Option<[String; 2]>,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    note: String,
+}
+
+type First = HeaderFile<TwoSupplies, Transfer, Positive>;
+type Second = HeaderFile<BTreeMap<String, Positive>, Transfers, PerName>;
+
+/// Nominal currents of format 1.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TwoSupplies {
+    dipole: Positive,
+    qh: Positive,
+    qv: Positive,
+}
+
+/// A positive finite number.
+#[derive(Clone, Copy, Serialize)]
+struct Positive(f64);
+
+/// Coefficients with a sum that is not 0.
+#[derive(Clone, Serialize)]
+struct Transfer(Vec<f64>);
+
+/// One transfer function for all supplies, or one for each.
+enum Transfers {
+    All(Transfer),
+    Each(BTreeMap<String, Transfer>),
+}
+
+/// One number for all instruments, or some by name and a default.
+enum PerName {
+    All(Positive),
+    Each(BTreeMap<String, Positive>),
+}
+
+/// The key of the number that holds for all instruments that are not named.
+const DEFAULT: &str = "default";
+
+impl Header {
+    pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
+        let text = Text { file, text };
+        let header = match text.format()? {
+            Format::One => text.first(ring)?,
+            Format::Two => text.second(names)?,
+        };
+        if header.believed_rf == BelievedRf::RadialLoop && header.radial_loop_monitors.is_none() {
+            return Err(text.refuse(0..0, "missing field `radial_loop_monitors`, needed as believed_rf is radial_loop"));
+        }
+        text.check_machine(&header, ring)?;
+        Ok(header)
+    }
+
+    /// The file's text, in format 2.
+    pub(super) fn text(&self, names: &Names) -> String {
+        let by_name = |names: &[String], values: &[f64], scale: fn(f64) -> f64| {
+            let default = values.first().copied().unwrap_or(1.0);
+            let others = names.iter().zip(values).filter(|(_, value)| **value != default);
+            let mut each: BTreeMap<String, Positive> =
+                others.map(|(name, value)| (name.clone(), Positive(scale(*value)))).collect();
+            if each.is_empty() {
+                return PerName::All(Positive(scale(default)));
+            }
+            each.insert(DEFAULT.into(), Positive(scale(default)));
+            PerName::Each(each)
+        };
+        let supplies = names.supplies.iter().zip(&self.nominal).map(|(name, nominal)| (name.clone(), *nominal));
+        let dipole = self.nominal_dipole.map(|nominal| ("dipole".to_owned(), nominal));
+        let transfer = |(name, transfer): (&String, &Vec<f64>)| (name.clone(), Transfer(transfer.clone()));
+        let alike = self.transfer.windows(2).all(|pair| pair[0] == pair[1]);
+        let file: Second = HeaderFile {
+            format: Some(2),
+            machine: self.machine.clone(),
+            lattice: self.lattice.clone(),
+            recorded_with: self.recorded_with.clone(),
+            particle: self.particle.clone(),
+            kinetic_energy: Positive(self.kinetic_energy),
+            noise: by_name(&names.monitors, &self.noise, in_milli),
+            kick_per_ampere: by_name(&names.correctors, &self.kick_per_ampere, in_milli),
+            kick_convention: self.kick_convention.clone(),
+            believed_rf: self.believed_rf,
+            nominal: dipole.into_iter().chain(supplies).map(|(name, nominal)| (name, Positive(nominal))).collect(),
+            quad_transfer: match self.transfer.first() {
+                Some(first) if alike => Transfers::All(Transfer(first.clone())),
+                _ => Transfers::Each(names.supplies.iter().zip(&self.transfer).map(transfer).collect()),
+            },
+            radial_loop_monitors: self.radial_loop_monitors.clone(),
+            note: self.note.clone(),
+        };
+        toml::to_string(&file).expect("texts, numbers and tables of them are TOML")
+    }
+}
+
+/// How a recording is written, by its header.
+pub(super) fn format(file: &Path, text: &str) -> Result<Format, RecordingError> {
+    Text { file, text }.format()
+}
+
+/// A header as text, and where it comes from.
+struct Text<'a> {
+    file: &'a Path,
+    text: &'a str,
+}
+
+impl Text<'_> {
+    fn format(&self) -> Result<Format, RecordingError> {
+        #[derive(Deserialize)]
+        struct Probe {
+            format: Option<toml::Spanned<toml::Value>>,
+        }
+        // what is wrong elsewhere is found by the strict reading
+        let Ok(Probe { format: Some(format) }) = toml::from_str(self.text) else { return Ok(Format::One) };
+        match format.get_ref().as_integer() {
+            Some(1) => Ok(Format::One),
+            Some(2) => Ok(Format::Two),
+            _ => Err(self.refuse(format.span(), &format!("expected 1 or 2, found {}", format.get_ref()))),
+        }
+    }
+
+    fn first(&self, ring: &Ring) -> Result<Header, RecordingError> {
+        let file: First = self.strict()?;
+        let nominal = [file.nominal.qh, file.nominal.qv];
+        Ok(Header {
+            format: Format::One,
+            machine: file.machine,
+            lattice: file.lattice,
+            recorded_with: file.recorded_with,
+            particle: file.particle,
+            kinetic_energy: file.kinetic_energy.0,
+            noise: vec![from_milli(file.noise.0); ring.read_monitors.len()],
+            kick_per_ampere: vec![from_milli(file.kick_per_ampere.0); ring.correctors.len()],
+            kick_convention: file.kick_convention,
+            believed_rf: file.believed_rf,
+            nominal_dipole: Some(file.nominal.dipole.0),
+            nominal: feeds(ring).into_iter().map(|feed| nominal[feed].0).collect(),
+            transfer: vec![file.quad_transfer.0; ring.supplies.len()],
+            radial_loop_monitors: file.radial_loop_monitors,
+            note: file.note,
+        })
+    }
+
+    fn second(&self, names: &Names) -> Result<Header, RecordingError> {
+        let file: Second = self.strict()?;
+        let per_monitor = |name: &str| names.monitor(name);
+        let per_corrector = |name: &str| names.corrector(name);
+        let (monitors, correctors) = (names.monitors.len(), names.correctors.len());
+        let mut nominal = file.nominal;
+        let nominal_dipole = nominal.remove("dipole").map(|nominal| nominal.0);
+        let nominal = self.by_supply("nominal_A", &names.supplies, nominal)?.into_iter().map(|Positive(a)| a).collect();
+        let transfer = match file.quad_transfer {
+            Transfers::All(transfer) => vec![transfer; names.supplies.len()],
+            Transfers::Each(each) => self.by_supply("quad_transfer", &names.supplies, each)?,
+        };
+        Ok(Header {
+            format: Format::Two,
+            machine: file.machine,
+            lattice: file.lattice,
+            recorded_with: file.recorded_with,
+            particle: file.particle,
+            kinetic_energy: file.kinetic_energy.0,
+            noise: self.by_name("bpm_sigma_mm", file.noise, monitors, per_monitor)?,
+            kick_per_ampere: self.by_name("kick_mrad_per_A", file.kick_per_ampere, correctors, per_corrector)?,
+            kick_convention: file.kick_convention,
+            believed_rf: file.believed_rf,
+            nominal_dipole,
+            nominal,
+            transfer: transfer.into_iter().map(|Transfer(c)| c).collect(),
+            radial_loop_monitors: file.radial_loop_monitors,
+            note: file.note,
+        })
+    }
+
+    fn strict<'de, T: Deserialize<'de>>(&'de self) -> Result<T, RecordingError> {
+        toml::from_str(self.text).map_err(|error| self.refuse(error.span().unwrap_or_default(), error.message()))
+    }
+
+    /// A value of every supply.
+    fn by_supply<T>(
+        &self,
+        key: &str,
+        supplies: &[String],
+        mut each: BTreeMap<String, T>,
+    ) -> Result<Vec<T>, RecordingError> {
+        let take = |supply: &String| {
+            each.remove(supply)
+                .ok_or_else(|| self.refuse_key(key, &format!("missing field `{supply}`, a supply of the machine")))
+        };
+        let values = supplies.iter().map(take).collect::<Result<Vec<T>, _>>()?;
+        match each.keys().next() {
+            Some(unknown) => {
+                Err(self.refuse_key(key, &format!("unknown field `{unknown}`, the machine has no such supply")))
+            }
+            None => Ok(values),
+        }
+    }
+
+    /// A number for every instrument, in SI units.
+    fn by_name(
+        &self,
+        key: &str,
+        per_name: PerName,
+        instruments: usize,
+        index: impl Fn(&str) -> Option<usize>,
+    ) -> Result<Vec<f64>, RecordingError> {
+        let mut each = match per_name {
+            PerName::All(Positive(value)) => return Ok(vec![from_milli(value); instruments]),
+            PerName::Each(each) => each,
+        };
+        let mut values = vec![each.remove(DEFAULT).map(|Positive(value)| from_milli(value)); instruments];
+        for (name, Positive(value)) in &each {
+            let at = index(name);
+            let unknown =
+                || self.refuse_key(key, &format!("unknown field `{name}`, the machine has no such instrument"));
+            values[at.ok_or_else(unknown)?] = Some(from_milli(*value));
+        }
+        let missing = || self.refuse_key(key, "missing field `default`, as not every instrument is named");
+        values.into_iter().collect::<Option<_>>().ok_or_else(missing)
+    }
+
+    /// Machine, lattice, particle and energy have to be the ring's.
+    fn check_machine(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
+        let refuse = |key, expected: &dyn fmt::Display, found: &dyn fmt::Display| {
+            Err(RecordingError::Machine(self.key(key).mismatch(expected, found)))
+        };
+        if !begins(&ring.name, &header.machine) {
+            return refuse("machine", &format!("{:?}", ring.name), &format!("{:?}", header.machine));
+        }
+        if header.lattice != ring.file {
+            return refuse("lattice", &format!("{:?}", ring.file), &format!("{:?}", header.lattice));
+        }
+        if header.particle != ring.particle.name() {
+            return refuse("particle", &format!("{:?}", ring.particle.name()), &format!("{:?}", header.particle));
+        }
+        let (expected, found) = (ring.particle.kinetic_energy, header.kinetic_energy);
+        if (found / expected - 1.0).abs() > SAME_ENERGY {
+            return refuse("kinetic_energy_GeV", &expected, &found);
+        }
+        Ok(())
+    }
+
+    fn refuse(&self, span: Range<usize>, message: &str) -> RecordingError {
+        let message = message.replace(['\n', '\r'], " "); // a quoted key may hold a line break
+        RecordingError::Header(header_place(self.file, self.text, span), message)
+    }
+
+    fn refuse_key(&self, key: &str, message: &str) -> RecordingError {
+        RecordingError::Header(self.key(key), message.to_owned())
+    }
+
+    /// Where a key of the top level stands.
+    fn key(&self, key: &str) -> Place {
+        let is =
+            |line: &str| line.trim_start().strip_prefix(key).is_some_and(|rest| rest.trim_start().starts_with('='));
+        let line = self.text.lines().position(is).unwrap_or(0);
+        Place::new(self.file, line + 1, Part::Key(key.into()))
+    }
+}
+
+/// Relative difference of energies that counts as rounding.
+const SAME_ENERGY: f64 = 1e-6;
+
+/// True if a name's words, letter case aside, are the first of the other's: `ags-booster` of `AGS Booster (BNL)`.
+fn begins(whole: &str, name: &str) -> bool {
+    let words = |text: &str| -> Vec<String> {
+        let parts = text.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty());
+        parts.map(str::to_lowercase).collect()
+    };
+    let name = words(name);
+    !name.is_empty() && words(whole).starts_with(&name)
+}
+
+/// Line of a span of the header, and the key that the span is or is the value of.
+fn header_place(file: &Path, text: &str, span: Range<usize>) -> Place {
+    let is_key = text[span.end..].trim_start().starts_with('=');
+    let before = &text[..if is_key { span.end } else { span.start }];
+    let line = before.rsplit('\n').next().unwrap_or_default();
+    let left = if is_key { Some(line) } else { line.rsplit_once('=').map(|(left, _)| left) };
+    let part = left.and_then(last_word).map_or(Part::Whole, |key| Part::Key(key.into()));
+    Place::new(file, 1 + before.matches('\n').count(), part)
+}
+
+fn last_word(text: &str) -> Option<&str> {
+    let in_key = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
+    text.trim_end().rsplit(|c| !in_key(c)).next().filter(|word| !word.is_empty())
+}
+
+impl<'de> Deserialize<'de> for Positive {
+    fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
+        Self::checked(f64::deserialize(value)?)
+    }
+}
+
+impl Positive {
+    fn checked<E: serde::de::Error>(value: f64) -> Result<Self, E> {
+        let refuse = || E::invalid_value(Unexpected::Float(value), &POSITIVE.words);
+        POSITIVE.check(value).map(Self).ok_or_else(refuse)
+    }
+}
+
+impl<'de> Deserialize<'de> for Transfer {
+    fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
+        Self::checked(Vec::<f64>::deserialize(value)?)
+    }
+}
+
+impl Transfer {
+    fn checked<E: serde::de::Error>(coefficients: Vec<f64>) -> Result<Self, E> {
+        let nominal = 0.0 + coefficients.iter().sum::<f64>(); // p(1); an empty list sums to -0, which would puzzle a reader
+        if nominal == 0.0 || !nominal.is_finite() {
+            let words = &"finite coefficients with a sum p(1) that is not 0";
+            return Err(E::invalid_value(Unexpected::Other(&format!("p(1) = {nominal}")), words));
+        }
+        Ok(Self(coefficients))
+    }
+}
+
+impl Serialize for Transfers {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::All(transfer) => transfer.serialize(serializer),
+            Self::Each(each) => each.serialize(serializer),
+        }
+    }
+}
+
+/// Serde's untagged enums would say neither what was expected nor where.
+impl<'de> Deserialize<'de> for Transfers {
+    fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = Transfers;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a list of coefficients, or a table of lists by supply")
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Transfers, A::Error> {
+                let mut coefficients = Vec::new();
+                while let Some(coefficient) = list.next_element()? {
+                    coefficients.push(coefficient);
+                }
+                Transfer::checked(coefficients).map(Transfers::All)
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<Transfers, A::Error> {
+                BTreeMap::deserialize(serde::de::value::MapAccessDeserializer::new(table)).map(Transfers::Each)
+            }
+        }
+        value.deserialize_any(Either)
+    }
+}
+
+impl Serialize for PerName {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::All(value) => value.serialize(serializer),
+            Self::Each(each) => each.serialize(serializer),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for PerName {
+    fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = PerName;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a number, or a table of numbers by name")
+            }
+
+            fn visit_f64<E: serde::de::Error>(self, value: f64) -> Result<PerName, E> {
+                Positive::checked(value).map(PerName::All)
+            }
+
+            fn visit_i64<E: serde::de::Error>(self, value: i64) -> Result<PerName, E> {
+                self.visit_f64(value as f64)
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<PerName, A::Error> {
+                BTreeMap::deserialize(serde::de::value::MapAccessDeserializer::new(table)).map(PerName::Each)
+            }
+        }
+        value.deserialize_any(Either)
+    }
+}
+
+/// Exactly two names: serde's own `[String; 2]` would let the header's reader drop a third in silence.
+fn pair<'de, D: Deserializer<'de>>(value: D) -> Result<Option<[String; 2]>, D::Error> {
+    let names = Vec::<String>::deserialize(value)?;
+    let refuse = |names: Vec<String>| D::Error::invalid_length(names.len(), &"two monitors");
+    names.try_into().map(Some).map_err(refuse)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_machine_is_known_by_the_first_words_of_its_name() {
+        let booster = "AGS Booster (BNL), design model";
+        for (name, known) in
+            [("ags-booster", true), ("AGS", true), ("ags boost", false), ("", false), ("booster", false)]
+        {
+            assert_eq!(begins(booster, name), known, "{name}");
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! Campaigns on disk: `header.toml` and `frames.csv` become SI values, or one line that says what is wrong.
+//!
+//! The format, with worked examples, is `docs/recording.md`. Nothing is repaired or guessed: past [`Recording::read`] every
+//! number is finite, in its range and in its place, and the recording is of the ring.
+
+mod columns;
+mod error;
+mod frames;
+mod header;
+mod limit;
+mod names;
+mod write;
+
+use std::borrow::Cow;
+use std::fs;
+use std::path::Path;
+
+use twin::Ring;
+
+pub use error::{Mismatch, Part, Place, RecordingError};
+pub use frames::Row;
+pub use header::{BelievedRf, Format, Header};
+use names::Names;
+
+/// One campaign: what it was taken with, and one row a machine cycle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recording {
+    /// Name of the folder.
+    pub name: String,
+    /// What holds for every row.
+    pub header: Header,
+    /// Columns of currents that the model has no use for, `i_sh_A`.
+    pub other: Vec<String>,
+    /// Machine cycles in the order of time; at least one.
+    pub rows: Vec<Row>,
+}
+
+impl Recording {
+    /// Read `header.toml` and `frames.csv` of a campaign's folder.
+    ///
+    /// # Errors
+    /// The first fault met, the header's before the frames'.
+    pub fn read(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
+        let [file, frames_file] = ["header.toml", "frames.csv"].map(|file| folder.join(file));
+        let header_text = text(&file)?;
+        let ring = powered(ring, header::format(&file, &header_text)?);
+        let names = Names::of(&ring);
+        let header = Header::parse(&file, &header_text, &ring, &names)?;
+        let (rows, other) = frames::parse(&frames_file, &text(&frames_file)?, &header, &ring, &names)?;
+        Ok(Self { name: name(folder), header, other, rows })
+    }
+
+    /// The ring as the recording's supplies power it: its own in format 2; in format 1 one for the focusing quadrupoles and
+    /// one for all others, where the ring's own cannot be fed by these.
+    pub fn powered<'r>(&self, ring: &'r Ring) -> Cow<'r, Ring> {
+        powered(ring, self.header.format)
+    }
+
+    /// Time of each frame within the campaign, from -1 for the first to 1 for the last.
+    pub fn times(&self) -> Vec<f64> {
+        let (start, end) = (self.rows.first().map_or(0.0, |r| r.time), self.rows.last().map_or(0.0, |r| r.time));
+        let within = |row: &Row| if end > start { 2.0 * (row.time - start) / (end - start) - 1.0 } else { 0.0 };
+        self.rows.iter().map(within).collect()
+    }
+
+    /// A current that the model has no use for, by its column [A].
+    pub fn other(&self, row: &Row, column: &str) -> Option<f64> {
+        self.other.iter().position(|name| name == column).map(|at| row.other[at])
+    }
+
+    /// Largest kick that a corrector was set to, by read-back where settings are not recorded [rad]; 1 where none was.
+    pub fn nominal_kick(&self) -> f64 {
+        let kick = |(c, current): (usize, f64)| (current * self.header.kick_per_ampere[c]).abs();
+        let set = self.rows.iter().flat_map(|row| row.correctors.iter().copied()).map(kick).fold(0.0, f64::max);
+        let read_back = || {
+            let currents = self.rows.iter().flat_map(|row| row.corrector_current.iter().copied().enumerate());
+            currents.map(kick).fold(0.0, f64::max)
+        };
+        let largest = if self.rows.iter().any(|row| !row.correctors.is_empty()) { set } else { read_back() };
+        if largest > IDLE { largest } else { 1.0 }
+    }
+}
+
+/// Kick below which a corrector is idle [rad]: the scatter of its read-back.
+const IDLE: f64 = 1e-6;
+
+fn powered(ring: &Ring, format: Format) -> Cow<'_, Ring> {
+    match format {
+        Format::One => names::by_focusing(ring),
+        Format::Two => Cow::Borrowed(ring),
+    }
+}
+
+/// The folder's own name, also where it was given as `.` or `..`.
+fn name(folder: &Path) -> String {
+    let full = folder.canonicalize().unwrap_or_else(|_| folder.into());
+    full.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The file's text without the byte order mark that some spreadsheets put before it.
+fn text(file: &Path) -> Result<String, RecordingError> {
+    let text = fs::read_to_string(file).map_err(|error| RecordingError::reading(file, &error))?;
+    Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
+}
+
+#[cfg(test)]
+mod tests;

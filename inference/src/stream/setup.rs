@@ -1,0 +1,117 @@
+//! What is known beforehand, besides the tables, for a ring of any size.
+
+use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, SupplyCalibration};
+use training::rooms::large;
+use twin::Ring;
+
+use super::StreamError;
+use crate::recording::Recording;
+
+/// Read-back above which a corrector counts as powered [A]: 50 times its scatter, a twentieth of its setting.
+const POWERED: f32 = 1.0;
+/// Calibration error of a tune meter [1], of the order of its resolution.
+pub const TUNE_CALIBRATION: f32 = 3e-4;
+
+/// What is known beforehand: [`estimator::Setup`] for a ring of any size.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Setup {
+    /// Priors of `theta = ln var`; which of them a param has stands in the tables. From 1 to [`GROUPS`].
+    pub priors: Vec<Prior>,
+    /// Kick of each corrector at nominal momentum [rad/A] [C].
+    pub kick_per_ampere: Vec<f32>,
+    /// Nominal current of the dipoles [A]; without one their read-back does not count.
+    pub dipole: Option<f32>,
+    /// The supplies of quadrupoles [F].
+    pub supplies: Vec<SupplyCalibration>,
+    /// Read-back above which a corrector counts as powered [A].
+    pub powered: f32,
+    /// Expected noise of a reading of each monitor [m] [B].
+    pub noise: Vec<f32>,
+    /// When readings agree.
+    pub gate: Gate,
+    /// Random walk of each theta, standard deviation per `sqrt(frame)`; 0 for constant vars.
+    pub process_noise: f32,
+    /// Calibration error of the tune meter [1]; none, and tunes do not count.
+    pub tune_calibration: Option<f32>,
+}
+
+/// What is known beforehand of a recording of a ring, from its header.
+///
+/// # Errors
+/// [`StreamError::Transfer`], or [`StreamError::Training`] for more priors than a core tells apart.
+pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Setup, StreamError> {
+    let header = &recording.header;
+    let single = |values: &[f64]| values.iter().map(|v| *v as f32).collect();
+    let supply = |(nominal, coefficients): (&f64, &Vec<f64>)| {
+        let mut transfer = [0.0; 6];
+        if coefficients.len() > transfer.len() {
+            return Err(StreamError::Transfer { recording: recording.name.clone(), found: coefficients.len() });
+        }
+        transfer.iter_mut().zip(coefficients).for_each(|(to, from)| *to = *from as f32);
+        Ok(SupplyCalibration { nominal: *nominal as f32, transfer })
+    };
+    let (priors, _) = training::green::prior_groups(ring)?;
+    let prior = |prior: &twin::ParameterPrior| Prior::lognormal(prior.width as f32, prior.range.map(|v| v as f32));
+    Ok(Setup {
+        priors: priors.iter().map(prior).collect(),
+        kick_per_ampere: single(&header.kick_per_ampere),
+        dipole: header.nominal_dipole.map(|a| a as f32),
+        supplies: header.nominal.iter().zip(&header.transfer).map(supply).collect::<Result<_, _>>()?,
+        powered: POWERED,
+        noise: single(&header.noise),
+        gate: Gate::default(),
+        process_noise,
+        tune_calibration: Some(TUNE_CALIBRATION),
+    })
+}
+
+impl Setup {
+    /// As it travels to a device of exactly the ring's sizes.
+    pub fn on_wire(&self) -> large::Setup {
+        let mut setup = self.sized(|b| b, |c| c);
+        setup.calibration.supplies.truncate(self.supplies.len());
+        setup.noise.own.truncate(self.noise.len());
+        setup.calibration.kick_per_ampere.own.truncate(self.kick_per_ampere.len());
+        setup
+    }
+
+    /// For a core that has room for the ring.
+    pub(super) fn in_room<const B: usize, const C: usize, const F: usize>(
+        &self,
+        layout: &Layout,
+    ) -> estimator::Setup<B, C, F> {
+        self.sized(|b| layout.monitor(b), |c| layout.corrector(c))
+    }
+
+    fn sized<const B: usize, const C: usize, const F: usize>(
+        &self,
+        monitor: impl Fn(usize) -> usize,
+        corrector: impl Fn(usize) -> usize,
+    ) -> estimator::Setup<B, C, F> {
+        let supplies = self.supplies.iter().copied().chain(core::iter::repeat(SupplyCalibration::IDLE));
+        estimator::Setup {
+            prior: core::array::from_fn::<_, GROUPS, _>(|group| *self.priors.get(group).unwrap_or(&self.priors[0])),
+            calibration: Calibration {
+                kick_per_ampere: each(&self.kick_per_ampere, corrector),
+                dipole: self.dipole,
+                supplies: supplies.take(F).collect(),
+                powered: self.powered,
+            },
+            noise: each(&self.noise, monitor),
+            gate: self.gate,
+            process_noise: self.process_noise,
+            tune_calibration: self.tune_calibration,
+        }
+    }
+}
+
+/// One number if all are the same, else each in its slot, a spare slot with the first.
+fn each<const L: usize>(values: &[f32], slot: impl Fn(usize) -> usize) -> Each<L> {
+    let first = values.first().copied().unwrap_or(1.0);
+    let mut each = Each::same(first);
+    if values.iter().any(|v| *v != first) {
+        each.own.resize(L, first).expect("as many as there is room for");
+        values.iter().enumerate().for_each(|(i, v)| each.own[slot(i)] = *v);
+    }
+    each
+}
