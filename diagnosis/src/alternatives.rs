@@ -55,6 +55,16 @@ pub struct Slot {
     pub without: Fitted,
 }
 
+impl Cause {
+    /// The effect of the library that it is, if any.
+    pub fn term(&self) -> Option<&Term> {
+        match self {
+            Self::Effect(term) => Some(term),
+            Self::Unknown(_) => None,
+        }
+    }
+}
+
 impl Alternative {
     /// A candidate, to first order.
     pub(super) fn of(candidate: &Candidate) -> Self {
@@ -62,7 +72,7 @@ impl Alternative {
         let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
         Self {
             amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
-            cause: Cause::Effect(candidate.term.clone()),
+            cause: Cause::Effect(candidate.term),
             log_gain: candidate.log_bayes,
             probability: 0.0,
             adapting: &candidate.adapting * candidate.amplitude,
@@ -73,7 +83,7 @@ impl Alternative {
     /// One of the terms of a fit, beside the fit without it.
     pub(super) fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
         Self {
-            cause: Cause::Effect(fitted.hypothesis.terms[term].clone()),
+            cause: Cause::Effect(fitted.hypothesis.terms[term]),
             log_gain: fitted.log_evidence - without.log_evidence,
             probability: 0.0,
             amplitude: fitted.amplitude(data, term),
@@ -96,10 +106,7 @@ impl Alternative {
 
     /// The effect of the library that it is, if any.
     pub fn term(&self) -> Option<&Term> {
-        match &self.cause {
-            Cause::Effect(term) => Some(term),
-            Cause::Unknown(_) => None,
-        }
+        self.cause.term()
     }
 
     /// True for an effect of the library.

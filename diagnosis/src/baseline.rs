@@ -40,7 +40,7 @@ impl Baseline {
         per_rms: [f64; 2],
     ) -> Result<(Vec<[f64; 2]>, Self), OrbitError> {
         let baselines = means(readings, screened);
-        let split = ring.read_places().iter().filter(|(plane, _)| *plane == Plane::X).count();
+        let split = ring.horizontal_monitors();
         let rms = [rms(&baselines[..split]), rms(&baselines[split..])];
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
@@ -97,12 +97,13 @@ type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
 fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let (mut orbit, mut sigma) = (vec![[0.0; 2]; ring.elements.len()], vec![[0.0; 2]; ring.elements.len()]);
-    let places = ring.read_places();
+    let monitors: Vec<_> = ring.monitors_read().collect();
     for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
         let direction = [[1.0, 0.0], [0.0, 1.0]][index];
-        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
-        let read: Vec<usize> = (0..places.len()).filter(|&b| places[b].0 == plane && baselines[b].is_some()).collect();
-        let seen: Vec<_> = read.iter().map(|&b| optics.observe(ring.monitors[places[b].1], plane)).collect();
+        let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(q.element, direction)).collect();
+        let read: Vec<usize> =
+            (0..monitors.len()).filter(|&b| monitors[b].plane == plane && baselines[b].is_some()).collect();
+        let seen: Vec<_> = read.iter().map(|&b| optics.observe(monitors[b].element, plane)).collect();
         let everywhere: Vec<_> = (0..ring.elements.len()).map(|i| optics.observe(i, plane)).collect();
         let (at, all) = (optics.response(&seen, &sources), optics.response(&everywhere, &sources));
         let mean_square = at.norm_squared() / (read.len().max(1)) as f64;

@@ -14,8 +14,8 @@ use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
 use training::BoosterGreen;
 use twin::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Plane, Rf, Ring, Signature, Signatures,
-    Tracked, Tunes,
+    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
+    Tunes,
 };
 
 use super::baseline::Baseline;
@@ -136,7 +136,8 @@ impl Data {
             DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
         });
         let mut drives = drives_of(recording, &driven, ring);
-        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed(recording))?;
+        let believed = believed(recording, ring)?;
+        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed)?;
         let recorded = raw(recording, ring);
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
             recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
@@ -147,7 +148,7 @@ impl Data {
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, &screened, &recorded_tunes, per_rms)?;
         drives.orbit = orbit;
         let shared = |b: usize| {
-            let supply = baseline.per_gradient(usize::from(ring.read_places()[b].0 == Plane::Y));
+            let supply = baseline.per_gradient(usize::from(b >= ring.horizontal_monitors()));
             DMatrix::from_columns(&[
                 DVector::from_element(driven.len(), BASELINE),
                 &fluctuation[0] * supply,
@@ -168,7 +169,7 @@ impl Data {
             meter: [None, None],
             tunes: recorded_tunes.clone(),
             recorded_tunes,
-            believed: believed(recording),
+            believed,
             drift: 0.0,
             drives,
         };
@@ -285,7 +286,7 @@ impl Data {
 
     /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
-        let plane = usize::from(self.ring.read_places()[b].0 == Plane::Y);
+        let plane = usize::from(b >= self.ring.horizontal_monitors());
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();
@@ -506,14 +507,14 @@ impl Meter {
 }
 
 /// What the recording's header says was held, as an effect.
-fn believed(recording: &Recording) -> Vec<Effect> {
+fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
     let pair = recording.header.radial_loop_monitors.as_ref();
-    let one = |kind, place: String| vec![Effect { kind, place, amplitude: 1.0 }];
-    match recording.header.believed_rf {
-        BelievedRf::FixedMomentum => Vec::new(),
-        BelievedRf::FixedFrequency => one(EffectKind::FixedRfFrequency, String::new()),
-        BelievedRf::RadialLoop => pair.map_or_else(Vec::new, |pair| one(EffectKind::RadialLoop, pair.join(","))),
-    }
+    let held = match recording.header.believed_rf {
+        BelievedRf::FixedMomentum => None,
+        BelievedRf::FixedFrequency => Some((EffectKind::FixedRfFrequency, String::new())),
+        BelievedRf::RadialLoop => pair.map(|pair| (EffectKind::RadialLoop, pair.join(","))),
+    };
+    held.into_iter().map(|(kind, place)| Effect::at(kind, &place, 1.0, ring)).collect()
 }
 
 fn exp(ln: &[f64]) -> Vec<f64> {

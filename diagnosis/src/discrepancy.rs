@@ -241,7 +241,7 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
     let observers = optics.read_monitors();
     let of_plane = |plane: Plane| {
         let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
-        let sources: Vec<_> = ring.quadrupoles.iter().map(|&q| optics.kick(q, direction)).collect();
+        let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(q.element, direction)).collect();
         let response = optics.response(&observers, &sources);
         (0..sources.len()).map(move |q| {
             let column = response.column(q).into_owned();

@@ -4,7 +4,7 @@
 //! new campaign below each other, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine, Signatures};
+use twin::{Drives, EffectError, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
 use super::evidence::prior;
@@ -53,7 +53,7 @@ impl Menu {
         let (machine, drives) = fitted.machine(data)?;
         let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
-        let free = [Some(one.0), other].map(|term| term.is_some_and(|term| term.kind.prior_scale().is_some()));
+        let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is no proposal
@@ -80,35 +80,28 @@ impl Campaign {
         let (_, sigma) = prior();
         let columns: Vec<_> = signatures.of_vars().iter().map(|s| data.signature(s) * sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
-            let weight = if is_stray(term.kind) { weight } else { 1.0 };
+            let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
-            Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?) * scale)
+            Ok(data.signature(&signatures.of_effect(term.kind, term.site)?) * scale)
         };
         Ok(Self { jacobian: DMatrix::from_columns(&columns), one: of(one)?, other: other.map(of).transpose()? })
     }
 }
 
-/// A field of its own, which does not grow with the magnets.
-fn is_stray(kind: EffectKind) -> bool {
-    matches!(kind, EffectKind::StrayGradient | EffectKind::StraySkewGradient)
-}
-
 /// What could be done: words, machine, drives, and the weight of stray fields.
 fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<(String, Machine, Drives, f64)> {
     let ring = machine.ring();
-    let retuned = |first: bool, factor: f64| {
-        let families = inference::map::first_family(ring);
-        let vars: Vec<f64> =
-            (0..ring.quadrupoles.len()).map(|q| if (q < families) == first { factor } else { 1.0 }).collect();
-        machine.with_vars(&vars)
+    let retuned = |supply: usize, factor: f64| {
+        let of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
+        machine.with_strengths(&ring.quadrupoles.iter().map(of).collect::<Vec<_>>())
     };
     let mut all = vec![("with the same settings".to_owned(), machine.clone(), drives.clone(), 1.0)];
     let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };
     all.push(("with twice the corrector settings".into(), machine.clone(), doubled, 1.0));
-    for (family, first) in [("QH", true), ("QV", false)] {
+    for (supply, family) in ring.supplies.iter().enumerate() {
         for (word, factor) in [("raised", 1.0 + RETUNE), ("lowered", 1.0 - RETUNE)] {
-            let what = format!("with {family} {word} by {:.0} %", RETUNE * 100.0);
-            all.push((what, retuned(first, factor), drives.clone(), 1.0));
+            let what = format!("with {} {word} by {:.0} %", family.name, RETUNE * 100.0);
+            all.push((what, retuned(supply, factor), drives.clone(), 1.0));
         }
     }
     let alternating = DVector::from_fn(drives.rf_offset.len(), |i, _| if i % 2 == 0 { RF_STEP } else { -RF_STEP });
@@ -122,7 +115,7 @@ fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec
     if let Some(others) = other_correctors(data, drives) {
         all.push(("with the correctors that were not used".into(), machine.clone(), others, 1.0));
     }
-    if is_stray(one.kind) {
+    if one.kind.is_stray() {
         let stronger = Drives { kick: &drives.kick / EARLIER, ..drives.clone() };
         let what = "earlier in the cycle, at half the momentum, where a stray field weighs twice as much".to_owned();
         all.push((what, machine.clone(), stronger, 1.0 / EARLIER));

@@ -9,7 +9,7 @@
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
+use twin::{Drives, EffectError, Machine, Signature, Signatures};
 
 use super::data::Data;
 use super::evidence::{Within, bounded, prior};
@@ -80,13 +80,13 @@ impl Fitted {
         guess: &DVector<f64>,
         rival: f64,
     ) -> Result<Self, EffectError> {
-        if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind == EffectKind::QuadDrift) {
+        if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind.moves_baselines()) {
             let drifting = data.drifting(given.amplitude.abs());
             let fitted = Self::minimise(&drifting, hypothesis, guess, rival)?;
             return Ok(Self { drifting: Some(Box::new(drifting)), ..fitted });
         }
         let fitted = Self::minimise(data, hypothesis, guess, rival)?;
-        let Some(term) = hypothesis.terms.iter().position(|term| term.kind == EffectKind::QuadDrift) else {
+        let Some(term) = hypothesis.terms.iter().position(|term| term.kind.moves_baselines()) else {
             return Ok(fitted);
         };
         // the drift of the baselines is as large as that of the quadrupoles
@@ -230,7 +230,7 @@ impl Fitted {
         let mut slopes: Vec<DMatrix<f64>> = of_vars.collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Member(term, width) => by_frame(signatures.of_effect(term.kind, &term.place)?, *width),
+                Unknown::Member(term, width) => by_frame(signatures.of_effect(term.kind, term.site)?, *width),
                 _ => {
                     let at = |step: f64| {
                         let mut u = self.u.clone();
@@ -358,7 +358,7 @@ fn differentiate(
     }
     for (i, unknown) in unknowns.iter().enumerate() {
         let column = match unknown {
-            Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, &term.place)?) * *width,
+            Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, term.site)?) * *width,
             _ => {
                 let at = |step: f64| {
                     let mut u = here.u.clone();

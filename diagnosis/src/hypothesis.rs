@@ -1,30 +1,25 @@
 //! What may be true of a machine: some effects, and what is then unknown beside the vars.
 
-use serde::Serialize;
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Rf};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Rf, Ring, Site};
 
 use super::data::Data;
 
 /// One effect that a hypothesis holds, its amplitude unknown.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Term {
     /// What happens.
-    #[serde(serialize_with = "word")]
     pub kind: EffectKind,
     /// Where.
-    pub place: String,
-}
-
-fn word<S: serde::Serializer>(kind: &EffectKind, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(kind.word())
+    pub site: Site,
 }
 
 /// Instruments or magnets that all scatter a little: ordinary, and no discovery.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scatter {
     /// What of them scatters.
-    #[serde(serialize_with = "word")]
     pub kind: EffectKind,
+    /// All of them together, in words.
+    pub name: &'static str,
     /// Standard deviation, in the unit of the kind.
     pub width: f64,
 }
@@ -45,54 +40,41 @@ pub struct Hypothesis {
 pub enum Unknown {
     /// The amplitude of a term.
     Amplitude(usize, f64),
-    /// The orbit at the element of a term, in x or y [m].
+    /// The orbit at an element, in x or y [m].
     Orbit(usize, Plane, f64),
     /// One member of a scatter.
     Member(Term, f64),
 }
 
 impl Term {
-    /// An effect at a place.
-    pub fn new(kind: EffectKind, place: &str) -> Self {
-        Self { kind, place: place.into() }
+    /// An effect at a place that is named.
+    ///
+    /// # Errors
+    /// [`EffectError::Place`].
+    pub fn at(kind: EffectKind, place: &str, ring: &Ring) -> Result<Self, EffectError> {
+        Effect::at(kind, place, 1.0, ring).map(Self::from)
+    }
+
+    /// The effect, of an amplitude.
+    pub fn effect(self, amplitude: f64) -> Effect {
+        Effect { kind: self.kind, site: self.site, amplitude }
     }
 
     /// `kind@place`.
-    pub fn label(&self) -> String {
-        if self.place.is_empty() { self.kind.word().into() } else { format!("{}@{}", self.kind.word(), self.place) }
+    pub fn label(self, ring: &Ring) -> String {
+        let place = self.site.name(ring);
+        if place.is_empty() { self.kind.word().into() } else { format!("{}@{place}", self.kind) }
     }
 
-    /// Where it sits along the beam [m], if it is at one place.
-    pub fn position(&self, data: &Data) -> Option<f64> {
-        self.element(data).map(|at| data.ring.elements[at].s + 0.5 * data.ring.elements[at].length)
+    /// Where it sits along the beam [m], the first of two places; none of the whole ring.
+    pub fn position(self, ring: &Ring) -> Option<f64> {
+        self.site.positions(ring).first().copied()
     }
+}
 
-    /// The element it sits at.
-    pub fn element(&self, data: &Data) -> Option<usize> {
-        let ring = &data.ring;
-        let first = self.place.split(',').next().filter(|place| !place.is_empty())?;
-        let (prefix, cell) = first.split_once('_').unwrap_or(("", first));
-        match prefix {
-            "x" => ring.monitor(Plane::X, cell).ok(),
-            "y" => ring.monitor(Plane::Y, cell).ok(),
-            "H" => ring.corrector(Plane::X, cell).ok(),
-            "V" => ring.corrector(Plane::Y, cell).ok(),
-            "SX" => {
-                ring.elements.iter().position(|e| matches!(e.kind, twin::Kind::Sextupole { .. }) && e.cell() == cell)
-            }
-            "" => ring.quadrupole(cell).ok(),
-            _ => ring.element(first).ok(),
-        }
-    }
-
-    /// What a monitor with this plane of the orbit sees, for a term whose size depends on the orbit.
-    fn orbits(&self) -> &'static [Plane] {
-        match self.kind {
-            EffectKind::BpmCubic if self.place.starts_with("y_") => &[Plane::Y],
-            EffectKind::BpmCubic => &[Plane::X],
-            EffectKind::SextupoleError => &[Plane::X, Plane::Y],
-            _ => &[],
-        }
+impl From<Effect> for Term {
+    fn from(effect: Effect) -> Self {
+        Self { kind: effect.kind, site: effect.site }
     }
 }
 
@@ -115,14 +97,14 @@ impl Hypothesis {
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {
             let amplitude = term.kind.prior_scale().map(|scale| Unknown::Amplitude(i, scale));
-            let orbit = term.orbits().iter().filter_map(move |&plane| {
-                let sigma = data.baseline.sigma[term.element(data)?][usize::from(plane == Plane::Y)];
-                Some(Unknown::Orbit(i, plane, sigma))
-            });
-            amplitude.into_iter().chain(orbit.collect::<Vec<_>>()).collect::<Vec<_>>()
+            let orbit =
+                term.kind.orbit(&data.ring, term.site).into_iter().map(|(element, plane)| {
+                    Unknown::Orbit(element, plane, data.baseline.sigma[element][plane.index()])
+                });
+            amplitude.into_iter().chain(orbit).collect::<Vec<_>>()
         };
         let of_scatter = |scatter: &Scatter| {
-            let Scatter { kind, width } = *scatter;
+            let Scatter { kind, width, .. } = *scatter;
             members(kind, data).into_iter().map(move |term| Unknown::Member(term, width)).collect::<Vec<_>>()
         };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
@@ -141,29 +123,22 @@ impl Hypothesis {
     pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
         let strength: Vec<f64> =
             params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
-        let mut effects: Vec<Effect> =
-            self.terms.iter().map(|t| Effect { kind: t.kind, place: t.place.clone(), amplitude: 1.0 }).collect();
-        effects.extend(self.given.iter().chain(&data.believed).cloned());
+        let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
+        effects.extend(self.given.iter().chain(&data.believed));
         let mut drives = data.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
                 Unknown::Amplitude(i, sigma) => effects[*i].amplitude = u * sigma,
-                Unknown::Orbit(i, plane, sigma) => {
-                    if let Some(at) = self.terms[*i].element(data) {
-                        drives.orbit[at][usize::from(*plane == Plane::Y)] += u * sigma;
-                    }
-                }
-                Unknown::Member(term, sigma) => {
-                    effects.push(Effect { kind: term.kind, place: term.place.clone(), amplitude: u * sigma });
-                }
+                Unknown::Orbit(element, plane, sigma) => drives.orbit[*element][plane.index()] += u * sigma,
+                Unknown::Member(term, sigma) => effects.push(term.effect(u * sigma)),
             }
         }
         Ok((Machine::new(data.ring.with_vars(&strength), Rf::FixedMomentum, &effects)?, drives))
     }
 
     /// `kind@place + kind@place`, or `nothing`.
-    pub fn label(&self) -> String {
-        let terms: Vec<String> = self.terms.iter().map(Term::label).collect();
+    pub fn label(&self, ring: &Ring) -> String {
+        let terms: Vec<String> = self.terms.iter().map(|term| term.label(ring)).collect();
         if terms.is_empty() { "nothing".into() } else { terms.join(" + ") }
     }
 }
@@ -171,20 +146,12 @@ impl Hypothesis {
 /// The members of a family that the data can say anything about.
 pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
     let driven = data.driven_correctors();
-    let speaking = data.speaking_monitors();
-    let sites = kind.sites(&data.ring);
-    let of = |indices: &[usize]| indices.iter().map(|&i| Term::new(kind, &sites[i])).collect();
-    match kind {
-        EffectKind::BpmGain | EffectKind::BpmRoll | EffectKind::BpmCubic => of(&speaking),
-        EffectKind::CorrectorGain
-        | EffectKind::CorrectorRoll
-        | EffectKind::CorrectorPolarity
-        | EffectKind::CorrectorEven => of(&driven),
-        EffectKind::BpmSwap => {
-            let names = data.ring.monitor_names();
-            let silent = |name: &str| !speaking.iter().any(|&b| names[b] == name);
-            sites.iter().filter(|pair| !pair.split(',').any(silent)).map(|pair| Term::new(kind, pair)).collect()
-        }
-        _ => sites.iter().map(|site| Term::new(kind, site)).collect(),
-    }
+    let speaking: Vec<usize> = data.speaking_monitors().into_iter().map(|b| data.ring.read_monitors[b]).collect();
+    let tells = |site: &Site| match site {
+        Site::Monitor(at) => speaking.contains(at),
+        Site::MonitorPair(one, other) => speaking.contains(one) && speaking.contains(other),
+        Site::Corrector(at) => driven.contains(at),
+        Site::Ring | Site::Quadrupole(_) | Site::Element(_) => true,
+    };
+    kind.sites(&data.ring).into_iter().filter(tells).map(|site| Term { kind, site }).collect()
 }

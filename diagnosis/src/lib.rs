@@ -112,10 +112,7 @@ impl Diagnosis {
     /// The effects that were taken up, at their most likely amplitudes.
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
-        let of = |(i, term): (usize, &Term)| {
-            let amplitude = best.amplitude(&self.found.data, i).0;
-            Effect { kind: term.kind, place: term.place.clone(), amplitude }
-        };
+        let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
         best.hypothesis.terms.iter().enumerate().map(of).collect()
     }
 

@@ -104,9 +104,9 @@ impl Location {
             | Self::MonitorInTime(b)
             | Self::GainInTime(b)
             | Self::MonitorElsewhere(b)
-            | Self::MonitorCurve(b) => ring.read_monitors[b],
-            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c],
-            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q],
+            | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
+            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q].element,
             Self::Time | Self::Tunes | Self::Everywhere => return None,
         };
         Some(ring.elements[at].s)

@@ -5,8 +5,8 @@
 //! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
 
 use nalgebra::{DMatrix, DVector};
-use twin::response::Place;
-use twin::{EffectError, EffectKind, Signatures};
+use twin::Place;
+use twin::{EffectError, Signatures, Thin};
 
 use super::data::Data;
 use super::fit::Fitted;
@@ -43,7 +43,7 @@ pub struct Interval {
 #[derive(Debug, Clone)]
 pub struct PlaceScan {
     /// Normal or skew.
-    pub kind: EffectKind,
+    pub kind: Thin,
     /// Where, along the beam.
     pub cells: Vec<Cell>,
     /// `ln` Bayes factor over none, at each.
@@ -52,27 +52,18 @@ pub struct PlaceScan {
     pub amplitude: Vec<f64>,
 }
 
-/// The thin gradient that acts on the beam as a kind of effect does, if any.
-pub fn thin(kind: EffectKind) -> Option<EffectKind> {
-    match kind {
-        EffectKind::StrayGradient | EffectKind::DipoleGradient => Some(EffectKind::StrayGradient),
-        EffectKind::StraySkewGradient | EffectKind::QuadRoll => Some(EffectKind::StraySkewGradient),
-        _ => None,
-    }
-}
-
 impl PlaceScan {
     /// Scan the ring about a fit, one of its effects left out if the scan stands in for it.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: EffectKind) -> Result<Self, EffectError> {
+    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, EffectError> {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
         let bench = unknown.map_or_else(|| Projection::of(fitted), |at| Projection::without(fitted, at));
         let data = fitted.data(data);
         let (machine, drives) = fitted.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;
-        let scale = kind.prior_scale().unwrap_or(1.0);
+        let scale = kind.kind().prior_scale().unwrap_or(1.0);
         let judge = |cells: Vec<Cell>| -> Self {
             let column = |cell: &Cell| data.signature(&signatures.of_thin(cell.place, kind)) * scale;
             let of_batch = |batch: &[Cell]| {
@@ -182,7 +173,7 @@ fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Cell> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hypothesis::{Hypothesis, Term};
+    use crate::hypothesis::Hypothesis;
     use crate::testing::template;
     use inference::simulate::{Hardware, Truth, campaign};
     use twin::Effect;
@@ -192,19 +183,18 @@ mod tests {
         let (ring, recording) = template();
         let hardware = Hardware::shipped(&ring, &recording);
         // a normal gradient hides behind the vars of its neighbours: it has to be larger, and is placed less well
-        let cases =
-            [(EffectKind::StrayGradient, "SLOT_C6", 0.08, 12.0), (EffectKind::StraySkewGradient, "SLOT_E3", 0.01, 4.0)];
-        for (kind, place, amplitude, widest) in cases {
-            let effect = Effect { kind, place: place.into(), amplitude };
+        let cases = [(Thin::Normal, "SLOT_C6", 0.08, 12.0), (Thin::Skew, "SLOT_E3", 0.01, 4.0)];
+        for (thin, place, amplitude, widest) in cases {
+            let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
             let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
             let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
             let mut data = Data::of(&ring, &made).unwrap();
-            let hypothesis = Hypothesis { terms: vec![Term::new(kind, place)], ..Hypothesis::default() };
+            let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;
             data.straighten(&machine).unwrap();
             let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
-            let along = PlaceScan::of(&data, &fitted, Some(0), kind).unwrap();
+            let along = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
             let peak = along.peak();
             let credible = along.credible(0.95);
@@ -227,7 +217,7 @@ mod tests {
         let place = Place { element: 0, depth: 0.0 };
         let cells: Vec<Cell> = (0..10).map(|i| Cell { s: i as f64 + 0.5, length: 1.0, place }).collect();
         let log_bayes = (0..10).map(|i| if [0, 1, 9].contains(&i) { 0.0 } else { -50.0 }).collect();
-        let along = PlaceScan { kind: EffectKind::StrayGradient, cells, log_bayes, amplitude: vec![0.0; 10] };
+        let along = PlaceScan { kind: Thin::Normal, cells, log_bayes, amplitude: vec![0.0; 10] };
         assert_eq!(along.credible(0.95), [Interval { from_m: 9.0, to_m: 2.0 }]);
     }
 }

@@ -8,7 +8,7 @@
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{EffectError, EffectKind, Signatures};
+use twin::{EffectError, EffectKind, Signatures, Site};
 
 use super::data::Data;
 use super::fit::Fitted;
@@ -120,9 +120,12 @@ impl Score {
 /// All candidates that the data can say anything about.
 pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
     let of_kind = |&kind: &EffectKind| members(kind, data);
-    let read = data.ring.monitor_names();
-    let is_read = |pair: &&[String; 2]| pair.iter().all(|name| name.starts_with("x_") && read.contains(name));
-    let radial = radial_loop.filter(is_read).map(|pair| Term::new(EffectKind::RadialLoop, &pair.join(",")));
+    let held = |pair: &[String; 2]| Term::at(EffectKind::RadialLoop, &pair.join(","), &data.ring).ok();
+    let is_read = |term: &Term| match term.site {
+        Site::MonitorPair(one, other) => [one, other].iter().all(|at| data.ring.read_monitors.contains(at)),
+        _ => false,
+    };
+    let radial = radial_loop.and_then(held).filter(is_read);
     let is_believed = |term: &Term| data.believed.iter().any(|effect| effect.kind == term.kind);
     EffectKind::ALL.iter().flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
 }
@@ -140,10 +143,9 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
         let columns: Vec<DVector<f64>> = batch.iter().map(|term| whitened(data, &signatures, term)).collect();
         let scored = bench.score(DMatrix::from_columns(&columns));
         for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
-            let free = term.kind.prior_scale().is_some();
-            let (amplitude, log_bayes) = if free { score.of_amplitude() } else { score.of_switch() };
+            let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
             let adapting = -scored.taken.column(i);
-            all.push(Candidate { term: term.clone(), amplitude, log_bayes, power: score.power, adapting });
+            all.push(Candidate { term: *term, amplitude, log_bayes, power: score.power, adapting });
         }
     }
     Ok(all)
@@ -196,7 +198,7 @@ pub fn separations(
     let gram = Projection::of(fitted).gram(&DMatrix::from_columns(&columns));
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let of = |(i, other): (usize, &&Term)| {
-        let free = [term, other].map(|term| term.kind.prior_scale().is_some());
+        let free = [term, other].map(|term| !term.kind.is_switch());
         let (power, rival, both) = (gram[(0, 0)], gram[(i + 1, i + 1)], gram[(0, i + 1)]);
         Rivals { power, rival, both, free }.expected(amplitude)
     };
@@ -206,7 +208,7 @@ pub fn separations(
 /// The whitened signature of a term, per prior standard deviation; what leads to no stable machine has nothing to say.
 fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
     let scale = term.kind.prior_scale().unwrap_or(1.0);
-    let signature = signatures.of_effect(term.kind, &term.place);
+    let signature = signatures.of_effect(term.kind, term.site);
     signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
 }
 
@@ -219,7 +221,7 @@ pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) ->
     let signatures = Signatures::of(&machine, &drives)?;
     let columns: Vec<DVector<f64>> = members
         .iter()
-        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, &term.place)?)))
+        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, term.site)?)))
         .collect::<Result<_, EffectError>>()?;
     let columns = DMatrix::from_columns(&columns);
     let bench = Projection::of(fitted);

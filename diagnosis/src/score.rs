@@ -5,37 +5,68 @@ use std::path::Path;
 
 use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
+use twin::{EffectError, EffectKind, Ring};
 
 use crate::alternatives::DECISIVE;
 use crate::average::Vars;
+use crate::hypothesis::Term;
 use crate::{Diagnosis, Finding, Verdict};
 
 /// What a recording was made with.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone)]
 pub struct Truth {
     /// The effects, none for an empty campaign.
     pub effects: Vec<TrueEffect>,
     /// The vars by name.
     pub vars: BTreeMap<String, f64>,
     /// Gain in `ln` posterior when kind, place and size are given.
-    #[serde(default)]
     pub oracle_gain: Option<f64>,
 }
 
 /// One effect.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TrueEffect {
-    /// Kind, in the words of the command line, or `unknown`.
-    pub kind: String,
-    /// Place.
-    #[serde(default)]
-    pub at: String,
-    /// Amplitude, if the kind has one.
-    #[serde(default)]
+    /// What it is, and where.
+    pub cause: TrueCause,
+    /// Amplitude, if it has one.
     pub amplitude: Option<f64>,
-    /// What it is, where it is unknown to the library.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub what: Option<String>,
+}
+
+/// What an effect is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TrueCause {
+    /// One of the library.
+    Effect(Term),
+    /// One of the library that needs a place which the key leaves to the recording's header, as for a radial loop.
+    Kind(EffectKind),
+    /// Something that the library does not hold.
+    Unknown {
+        /// What it is.
+        what: String,
+        /// The name of its place.
+        at: String,
+    },
+}
+
+/// The file.
+#[derive(Deserialize)]
+struct Key {
+    effects: Vec<Entry>,
+    vars: BTreeMap<String, f64>,
+    #[serde(default)]
+    oracle_gain: Option<f64>,
+}
+
+/// One effect in the file: a kind of the library in the words of the command line, or any other word.
+#[derive(Deserialize)]
+struct Entry {
+    kind: String,
+    #[serde(default)]
+    at: String,
+    #[serde(default)]
+    amplitude: Option<f64>,
+    #[serde(default)]
+    what: Option<String>,
 }
 
 /// How right a verdict is.
@@ -83,11 +114,14 @@ impl Truth {
     ///
     /// # Errors
     /// [`TruthError`].
-    pub fn read(folder: &Path) -> Result<Self, TruthError> {
+    pub fn read(folder: &Path, ring: &Ring) -> Result<Self, TruthError> {
         let path = folder.join("truth.json");
         let wrong = |what: String| TruthError { path: path.display().to_string(), what };
         let text = std::fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
-        serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
+        let Key { effects, vars, oracle_gain } =
+            serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        let effects = effects.into_iter().map(|entry| entry.resolve(ring)).collect::<Result<_, _>>();
+        Ok(Self { effects: effects.map_err(|error| wrong(error.to_string()))?, vars, oracle_gain })
     }
 
     /// Grade a diagnosis.
@@ -97,7 +131,7 @@ impl Truth {
         let listed = |truth: &TrueEffect| {
             effects.iter().any(|f| truth.is(f) || f.alternatives.iter().any(|other| truth.is(other)))
         };
-        let library = self.effects.iter().all(|effect| effect.kind != "unknown");
+        let library = self.effects.iter().all(|effect| !effect.is_unknown());
         match diagnosis.verdict {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
             Verdict::Consistent => Grade::Missed,
@@ -157,37 +191,79 @@ impl Truth {
     }
 }
 
-impl TrueEffect {
-    /// True if a finding names this effect at its place.
-    pub fn is(&self, finding: &Finding) -> bool {
-        self.kind == finding.kind && same_place(&self.at, &finding.at)
-    }
-
-    /// `kind@place=amplitude`.
-    pub fn label(&self) -> String {
-        let at = if self.at.is_empty() { String::new() } else { format!("@{}", self.at) };
-        let amplitude = self.amplitude.map_or(String::new(), |a| format!("={a:.4}"));
-        format!("{}{at}{amplitude}", self.what.as_ref().unwrap_or(&self.kind))
+impl Entry {
+    fn resolve(self, ring: &Ring) -> Result<TrueEffect, EffectError> {
+        let Self { kind, at, amplitude, what } = self;
+        let cause = match kind.parse::<EffectKind>() {
+            Err(_) => TrueCause::Unknown { what: what.unwrap_or(kind), at },
+            Ok(kind) => match Term::at(kind, &at, ring) {
+                Ok(term) => TrueCause::Effect(term),
+                Err(_) if at.is_empty() => TrueCause::Kind(kind),
+                Err(error) => return Err(error),
+            },
+        };
+        Ok(TrueEffect { cause, amplitude })
     }
 }
 
-/// Two names of one place: pairs in either order, and the whole ring without a name.
-fn same_place(one: &str, other: &str) -> bool {
-    let parts = |text: &str| {
-        let mut parts: Vec<String> = text.split(',').map(|part| part.trim().to_owned()).collect();
-        parts.sort();
-        parts
-    };
-    parts(one) == parts(other)
+impl TrueEffect {
+    /// True if a finding names this effect at its place.
+    pub fn is(&self, finding: &Finding) -> bool {
+        match (&self.cause, finding.term()) {
+            (TrueCause::Effect(term), Some(found)) => term == found,
+            (TrueCause::Kind(kind), Some(found)) => *kind == found.kind,
+            (TrueCause::Unknown { at, .. }, None) => *at == finding.at,
+            (TrueCause::Effect(_) | TrueCause::Kind(_), None) | (TrueCause::Unknown { .. }, Some(_)) => false,
+        }
+    }
+
+    /// True for something that the library does not hold.
+    pub fn is_unknown(&self) -> bool {
+        matches!(self.cause, TrueCause::Unknown { .. })
+    }
+
+    /// Its kind in the library.
+    pub fn kind(&self) -> Option<EffectKind> {
+        match self.cause {
+            TrueCause::Effect(term) => Some(term.kind),
+            TrueCause::Kind(kind) => Some(kind),
+            TrueCause::Unknown { .. } => None,
+        }
+    }
+
+    /// `kind@place=amplitude`.
+    pub fn label(&self, ring: &Ring) -> String {
+        let what = match &self.cause {
+            TrueCause::Effect(term) => term.label(ring),
+            TrueCause::Kind(kind) => kind.word().into(),
+            TrueCause::Unknown { what, at } if at.is_empty() => what.clone(),
+            TrueCause::Unknown { what, at } => format!("{what}@{at}"),
+        };
+        format!("{what}{}", self.amplitude.map_or(String::new(), |a| format!("={a:.4}")))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn resolved(entry: &str) -> Result<TrueEffect, EffectError> {
+        serde_json::from_str::<Entry>(entry).unwrap().resolve(&Ring::booster())
+    }
+
     #[test]
-    fn pairs_are_the_same_in_either_order() {
-        assert!(same_place("x_E4,x_E6", "x_E6, x_E4") && same_place("", ""));
-        assert!(!same_place("x_E4", "x_E6") && !same_place("x_E4", ""));
+    fn a_key_names_effects_and_what_is_none() {
+        let of = |entry: &str| resolved(entry).unwrap();
+        let pair = |at: &str| of(&format!(r#"{{"kind":"bpm_swap","at":"{at}"}}"#));
+        assert_eq!(pair("x_E4,x_E6"), pair("x_E6, x_E4"));
+        assert_ne!(pair("x_E4,x_E6"), pair("x_E4,x_E8"));
+        assert_eq!(of(r#"{"kind":"radial_loop","amplitude":0.8}"#).cause, TrueCause::Kind(EffectKind::RadialLoop));
+        let crosstalk = of(r#"{"kind":"unknown","at":"x_D2","amplitude":0.1,"what":"bpm_crosstalk"}"#);
+        assert_eq!(
+            (crosstalk.is_unknown(), crosstalk.label(&Ring::booster()).as_str()),
+            (true, "bpm_crosstalk@x_D2=0.1000")
+        );
+        assert!(of(r#"{"kind":"var_step","at":"C3"}"#).is_unknown());
+        assert!(resolved(r#"{"kind":"bpm_gain","at":"x_E99"}"#).is_err());
     }
 }

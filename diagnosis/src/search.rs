@@ -73,10 +73,10 @@ fn odds(effects: usize) -> f64 {
 
 /// `ln` prior of each candidate, given that the library holds the effect.
 fn log_prior(terms: &[Term]) -> Vec<f64> {
-    let mut count: BTreeMap<&str, usize> = BTreeMap::new();
-    terms.iter().for_each(|term| *count.entry(term.kind.word()).or_default() += 1);
+    let mut count: BTreeMap<EffectKind, usize> = BTreeMap::new();
+    terms.iter().for_each(|term| *count.entry(term.kind).or_default() += 1);
     let kinds = count.len() as f64;
-    terms.iter().map(|term| -(kinds * count[term.kind.word()] as f64).ln()).collect()
+    terms.iter().map(|term| -(kinds * count[&term.kind] as f64).ln()).collect()
 }
 
 /// The price of a first search: what a `ln` Bayes factor has to exceed for even odds, of each candidate.
@@ -243,7 +243,7 @@ impl Search {
             };
             let alternative = known.filter(|known| known.log_gain > alternative.log_gain).unwrap_or(alternative);
             // the costs of drifting baselines are of other numbers
-            if let Some(fitted) = alternative.fitted.as_ref().filter(|_| candidate.term.kind != EffectKind::QuadDrift) {
+            if let Some(fitted) = alternative.fitted.as_ref().filter(|_| !candidate.term.kind.moves_baselines()) {
                 least = least.min(fitted.cost);
             }
             let weight = alternative.log_gain + prior_of(i);
@@ -302,7 +302,7 @@ fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) ->
 
 /// The exact fit with a candidate, given up where it stays far behind the least cost of its rivals.
 fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alternative {
-    let hypothesis = fitted.hypothesis.with(candidate.term.clone());
+    let hypothesis = fitted.hypothesis.with(candidate.term);
     let vars = fitted.params.len();
     // the new unknowns of a term stand before those of scatter
     let at = vars + fitted.hypothesis.unknowns(data).len() - fitted.hypothesis.members(data);
@@ -327,12 +327,12 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
 fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
     let single = next.log_odds;
     let mut best: Option<(Scatter, f64)> = None;
-    for &(kind, widths) in &FAMILIES {
+    for &(kind, name, widths) in &FAMILIES {
         let terms = members(kind, data);
         let logs = super::scan::family(data, fitted, &terms, widths)?;
         for (&width, log_bayes) in widths.iter().zip(logs) {
             if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
-                best = Some((Scatter { kind, width }, log_bayes));
+                best = Some((Scatter { kind, name, width }, log_bayes));
             }
         }
     }
@@ -348,10 +348,10 @@ const CLEARLY: f64 = 6.0;
 /// Families whose members all scatter a little, and the widths tried, in the unit of the kind.
 ///
 /// Source: alignment and calibration tolerances, from good to poor (1 to 5 % of gain, 5 to 30 mrad; 1 to 5 mrad of a quadrupole).
-const FAMILIES: [(EffectKind, &[f64]); 5] = [
-    (EffectKind::BpmGain, &[0.01, 0.02, 0.04]),
-    (EffectKind::CorrectorGain, &[0.01, 0.02, 0.04]),
-    (EffectKind::BpmRoll, &[0.01, 0.02, 0.04]),
-    (EffectKind::CorrectorRoll, &[0.01, 0.02, 0.04]),
-    (EffectKind::QuadRoll, &[0.001, 0.002, 0.004]),
+const FAMILIES: [(EffectKind, &str, &[f64]); 5] = [
+    (EffectKind::BpmGain, "BPM gains", &[0.01, 0.02, 0.04]),
+    (EffectKind::CorrectorGain, "corrector gains", &[0.01, 0.02, 0.04]),
+    (EffectKind::BpmRoll, "BPM rolls", &[0.01, 0.02, 0.04]),
+    (EffectKind::CorrectorRoll, "corrector rolls", &[0.01, 0.02, 0.04]),
+    (EffectKind::QuadRoll, "quadrupole rolls", &[0.001, 0.002, 0.004]),
 ];

@@ -1,18 +1,20 @@
 //! The verdict, in one word and in one sentence.
 
-use twin::EffectError;
+use serde::{Deserialize, Serialize};
+use twin::{EffectError, EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Slot};
 use super::data::Data;
 use super::experiment::Menu;
 use super::heldout::{Fold, PROVEN, Score};
-use super::hypothesis::Term;
-use super::place_scan::{Interval, PlaceScan, thin};
+use super::hypothesis::{Scatter, Term};
+use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
 use super::search::Found;
 
 /// What the recording says about the model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Verdict {
     /// Nothing is missing at the noise level.
     Consistent,
@@ -24,6 +26,8 @@ pub enum Verdict {
     Unexplained,
 }
 
+/// Unit of something without a class [m], read in mm.
+const UNKNOWN: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 /// Alternatives that the sentence names.
@@ -72,18 +76,16 @@ impl Verdict {
 /// One cause, with what competes with it.
 #[derive(Debug, Clone)]
 pub struct Finding {
-    /// Kind, or `unknown`.
-    pub kind: &'static str,
-    /// Place.
+    /// The cause.
+    pub cause: Cause,
+    /// Name of its place, empty for the whole ring.
     pub at: String,
     /// Position along the beam [m].
     pub s: Option<f64>,
     /// Shortest stretches of the ring that hold 95 % of the posterior of its place, for a gradient.
     pub interval: Vec<Interval>,
-    /// Amplitude and its standard deviation, in `unit`.
+    /// Amplitude and its standard deviation, in the unit of the cause.
     pub amplitude: (f64, f64),
-    /// Unit of the amplitude.
-    pub unit: &'static str,
     /// In words.
     pub phrase: String,
     /// `ln` evidence over the fit without it.
@@ -101,23 +103,21 @@ pub struct Finding {
 impl Finding {
     fn of(data: &Data, alternative: &Alternative) -> Self {
         let (amplitude, sigma) = alternative.amplitude;
-        let (kind, at, s, unit, phrase) = match &alternative.cause {
+        let ring = &data.ring;
+        let (at, s, phrase) = match &alternative.cause {
             Cause::Effect(term) => (
-                term.kind.word(),
-                term.place.clone(),
-                term.position(data),
-                term.kind.unit(),
-                term.kind.phrase(&term.place, amplitude, sigma),
+                term.site.name(ring),
+                term.position(ring),
+                term.kind.phrase(ring, term.site, Measured { value: amplitude, sigma }),
             ),
-            Cause::Unknown(one) => ("unknown", one.at.label(data), one.at.position(data), "m", one.at.phrase(data)),
+            Cause::Unknown(one) => (one.at.label(data), one.at.position(data), one.at.phrase(data)),
         };
         Self {
-            kind,
+            cause: alternative.cause.clone(),
             at,
             s,
             interval: Vec::new(),
             amplitude: alternative.amplitude,
-            unit,
             phrase,
             log_evidence_gain: alternative.log_gain,
             probability: alternative.probability,
@@ -143,6 +143,26 @@ impl Finding {
             }
         }
         Ok(Self { alternatives, ..finding })
+    }
+
+    /// The effect of the library that it is, if any.
+    pub fn term(&self) -> Option<&Term> {
+        self.cause.term()
+    }
+
+    /// The word for its kind, or `unknown`.
+    pub fn word(&self) -> &'static str {
+        self.term().map_or("unknown", |term| term.kind.word())
+    }
+
+    /// `kind@place`.
+    pub fn label(&self) -> String {
+        format!("{}@{}", self.word(), self.at)
+    }
+
+    /// Unit of the amplitude; of something unknown, the rms of what it does to the readings.
+    pub fn unit(&self) -> Unit {
+        self.term().map_or(UNKNOWN, |term| term.kind.unit())
     }
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
@@ -187,7 +207,7 @@ pub fn findings(
     for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
         let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
-        let interval = match thin(term.kind) {
+        let interval = match term.kind.thin() {
             Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)?.credible(CREDIBLE),
             None => Vec::new(),
         };
@@ -231,12 +251,8 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         }
     };
     let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
-        format!(
-            "; all {} scatter by {} {}, which is ordinary",
-            family(scatter.kind),
-            scatter.width,
-            scatter.kind.unit()
-        )
+        let Scatter { kind, name, width } = scatter;
+        format!("; all {name} scatter by {} {}, which is ordinary", width * kind.unit().factor, kind.unit().shown)
     });
     let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
@@ -244,10 +260,6 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         .collect();
     let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
     capitalised(&format!("{text}{}{faulty}", scatter.unwrap_or_default()))
-}
-
-fn family(kind: twin::EffectKind) -> String {
-    kind.word().replace("bpm", "BPM").replace("quad", "quadrupole").replace('_', " ") + "s"
 }
 
 /// The alternatives that share most of the probability.
@@ -272,21 +284,15 @@ fn ambiguous(findings: &[Finding]) -> String {
 /// The amplitudes that would have been seen: `ln` Bayes factor of 12 at half of the places.
 fn power(found: &Found) -> String {
     const SEEN: f64 = 12.0;
-    let shown = [
-        twin::EffectKind::BpmGain,
-        twin::EffectKind::CorrectorGain,
-        twin::EffectKind::QuadRoll,
-        twin::EffectKind::StrayGradient,
-    ];
-    let of_kind = |kind: twin::EffectKind| {
+    let shown = [EffectKind::BpmGain, EffectKind::CorrectorGain, EffectKind::QuadRoll, EffectKind::StrayGradient];
+    let of_kind = |kind: EffectKind| {
         let mut powers: Vec<f64> = found.next.scanned.iter().filter(|c| c.term.kind == kind).map(|c| c.power).collect();
         powers.sort_by(f64::total_cmp);
         let median = powers.get(powers.len() / 2).copied()?;
         let amplitude = kind.prior_scale()? * (2.0 * SEEN / median.max(f64::MIN_POSITIVE)).sqrt();
-        Some(format!("{} {amplitude:.1$} {2}", kind.word(), if amplitude < 0.1 { 3 } else { 2 }, kind.unit()))
+        Some(format!("{kind} {}", kind.unit().rounded(amplitude)))
     };
-    let list: Vec<String> =
-        shown.into_iter().filter_map(of_kind).map(|one| one.trim_end_matches(" 1").to_owned()).collect();
+    let list: Vec<String> = shown.into_iter().filter_map(of_kind).collect();
     format!("what would have been seen at half of the places: {}", list.join(", "))
 }
 
@@ -311,8 +317,8 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);
     let menu = Menu::of(data, &slot.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
-    let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label());
-    Ok(Some((menu, [one.label(), against])))
+    let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label(&data.ring));
+    Ok(Some((menu, [one.label(&data.ring), against])))
 }
 
 /// The measurement that would take the two most likely causes furthest apart, for what is not settled.

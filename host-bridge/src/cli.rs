@@ -1,15 +1,15 @@
 //! The command line.
 
-use core::str::FromStr;
 use core::time::Duration;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use inference::nuts::NutsSettings;
-use twin::Effect;
+use twin::EffectText;
 
-use crate::link::Source;
-use crate::publish::SERVICE;
+use crate::sink::shared_memory::{PUBLISHER, SERVICE};
+use crate::source::Rate;
+use crate::source::link::Address;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
 #[derive(Debug, Parser)]
@@ -35,6 +35,8 @@ pub enum Command {
     Study(Study),
     /// What is missing in the model of a recording, in a sentence, with proof on held-out frames
     Diagnose(Diagnose),
+    /// The calibrated ring as a lattice file of another code
+    Export(Export),
     /// Diagnose every recording below a folder and score it against the truth.json beside it
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns and count how often it is right
@@ -48,7 +50,7 @@ pub enum Command {
 /// Options that every command has.
 #[derive(Debug, Args)]
 pub struct Common {
-    /// Write the answer as JSON to FILE, `-` for stdout
+    /// Write the result as JSON to FILE, `-` for stdout
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
     /// Machine file; the built-in AGS Booster without it
@@ -57,6 +59,27 @@ pub struct Common {
     /// Print nothing but errors
     #[arg(long)]
     pub quiet: bool,
+}
+
+impl Common {
+    /// Whether a person wants to read the result on stdout.
+    pub fn speaks(&self) -> bool {
+        !self.quiet && self.json.as_deref() != Some("-".as_ref())
+    }
+}
+
+/// How estimates are published.
+#[derive(Debug, Args)]
+pub struct Publishing {
+    /// Name of the shared-memory service
+    #[arg(long, value_name = "SERVICE", default_value = SERVICE)]
+    pub service: String,
+    /// Name of this publisher, which `orbitcal watch` shows
+    #[arg(long, value_name = "NAME", default_value = PUBLISHER)]
+    pub name: String,
+    /// Publish nothing
+    #[arg(long)]
+    pub no_publish: bool,
 }
 
 /// `orbitcal replay`.
@@ -82,9 +105,9 @@ pub struct Replay {
     /// Tables of a machine with the physics that a diagnosis found, instead of the design's
     #[arg(long, value_name = "FILE")]
     pub model_file: Option<PathBuf>,
-    /// Name of the shared-memory service
-    #[arg(long, default_value = SERVICE)]
-    pub service: String,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub publishing: Publishing,
 }
 
 /// `orbitcal serve`.
@@ -92,7 +115,7 @@ pub struct Replay {
 pub struct Serve {
     /// Where the device is: tcp://HOST:PORT, unix:PATH or serial:PATH[@BAUD]
     #[arg(long)]
-    pub source: Source,
+    pub source: Address,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
@@ -120,20 +143,17 @@ pub struct Serve {
     /// Tables of a machine with the physics that a diagnosis found, instead of the design's
     #[arg(long, value_name = "FILE", requires = "feed")]
     pub model_file: Option<PathBuf>,
-    /// Name of the shared-memory service
-    #[arg(long, default_value = SERVICE)]
-    pub service: String,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub publishing: Publishing,
 }
 
 /// `orbitcal watch`.
 #[derive(Debug, Args)]
 pub struct Watch {
     /// Name of the shared-memory service
-    #[arg(long, default_value = SERVICE)]
+    #[arg(long, value_name = "SERVICE", default_value = SERVICE)]
     pub service: String,
-    /// Machine file, for the names of vars and monitors
-    #[arg(long, value_name = "FILE")]
-    pub machine: Option<PathBuf>,
     /// One CSV row an estimate
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,
@@ -159,7 +179,7 @@ pub struct Response {
     pub vars: Option<PathBuf>,
     /// KIND[@PLACE][=AMPLITUDE], repeatable, such as quad_roll@D8=0.01
     #[arg(long = "effect", value_name = "EFFECT")]
-    pub effects: Vec<Effect>,
+    pub effects: Vec<EffectText>,
     /// What the machine holds
     #[arg(long, value_enum, default_value_t = Rf::FixedMomentum)]
     pub rf: Rf,
@@ -217,6 +237,41 @@ pub struct Diagnose {
     /// The model with what was identified, for `orbitcal replay --model-file` and for a device
     #[arg(long, value_name = "FILE")]
     pub model_out: Option<PathBuf>,
+}
+
+/// `orbitcal export`.
+#[derive(Debug, Args)]
+pub struct Export {
+    /// JSON of fit, replay or diagnose
+    #[arg(value_name = "FIT.json")]
+    pub result: PathBuf,
+    /// Which format
+    #[arg(long = "as", value_enum)]
+    pub format: Format,
+    /// The file, `-` for stdout
+    #[arg(long, value_name = "FILE", default_value = "-")]
+    pub out: PathBuf,
+    /// Machine file; the built-in AGS Booster without it
+    #[arg(long, value_name = "FILE")]
+    pub machine: Option<PathBuf>,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
+}
+
+/// Lattice formats.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// A sequence for MAD-X
+    Madx,
+    /// A lattice for Bmad and Tao
+    Bmad,
+    /// JSON for pyAT
+    At,
+    /// JSON for Xsuite
+    Xsuite,
+    /// JSON in the Particle Accelerator Lattice Standard
+    Pals,
 }
 
 /// `orbitcal challenge`.
@@ -359,26 +414,6 @@ impl From<Rf> for twin::Rf {
     }
 }
 
-/// Frames a second.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Rate {
-    /// As fast as possible.
-    Max,
-    /// This many a second [Hz].
-    Hertz(f64),
-}
-
-impl FromStr for Rate {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        if text == "max" {
-            return Ok(Self::Max);
-        }
-        positive(text).map(Self::Hertz)
-    }
-}
-
 fn seconds(text: &str) -> Result<Duration, String> {
     positive(text).map(Duration::from_secs_f64)
 }
@@ -401,14 +436,5 @@ mod tests {
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
         Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn rates_are_numbers_or_max() {
-        assert_eq!("max".parse(), Ok(Rate::Max));
-        assert_eq!("1000".parse(), Ok(Rate::Hertz(1000.0)));
-        for wrong in ["0", "-1", "nan", "inf", "fast"] {
-            assert!(wrong.parse::<Rate>().is_err(), "{wrong}");
-        }
     }
 }

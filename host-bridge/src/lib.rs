@@ -1,12 +1,20 @@
-//! The host's side of orbitcal: recordings in, shared memory, tables and files out. `main.rs` joins these parts.
+//! The host's side of orbitcal. Estimates come from a [`source`] (the core fed by a recording, a device), pass the loop
+//! [`serve`], and go to every [`sink`] (shared memory, trace); a [`result`] is what a command prints. `main.rs` joins these parts.
 
-pub mod answer;
 pub mod cli;
 pub mod command;
-pub mod link;
+pub mod export;
 pub mod model_file;
 pub mod output;
-pub mod publish;
 pub mod record;
-pub mod trace;
+pub mod result;
+pub mod serve;
+pub mod sink;
+pub mod source;
+pub mod stop;
 pub mod watch;
+
+/// The worked examples of `docs/extending.md`, compiled and run as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/extending.md")]
+mod extending {}

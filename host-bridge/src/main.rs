@@ -1,21 +1,26 @@
 //! `orbitcal`: read the arguments, run the command, report what went wrong in one line.
 
+use std::io::Write;
 use std::process::ExitCode;
 
 use clap::Parser;
+use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, diagnose, fit, prove, replay, response, serve, study, surrogate, watch,
+    CommandError, challenge, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
 };
+use host_bridge::output::{self, OutputError};
 
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) if error.use_stderr() => return refuse(&first_line(&error)),
-        Err(help) => {
-            print!("{help}");
-            return ExitCode::SUCCESS;
+        // a bare `orbitcal` asks what it can do
+        Err(help) if help.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            let _ = write!(std::io::stderr(), "{help}");
+            return ExitCode::from(2);
         }
+        Err(error) if error.use_stderr() => return refuse(&first_line(&error)),
+        Err(help) => return said(output::say(help.to_string().trim_end())),
     };
     let done = match &cli.command {
         Command::Replay(options) => replay::run(options),
@@ -25,6 +30,7 @@ fn main() -> ExitCode {
         Command::Study(options) => study::run(options),
         Command::Diagnose(options) => diagnose::run(options),
         Command::Challenge(options) => challenge::run(options),
+        Command::Export(options) => export::run(options),
         Command::Prove(options) => prove::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Surrogate(options) => surrogate::run(options),
@@ -32,16 +38,22 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(CommandError::Input(message)) => refuse(&message),
-        Err(CommandError::Other(message)) => {
-            eprintln!("orbitcal: {message}");
-            ExitCode::from(1)
-        }
+        Err(CommandError::Other(message)) => fail(&message),
     }
 }
 
+fn said(said: Result<(), OutputError>) -> ExitCode {
+    said.map_or_else(|error| fail(&error.to_string()), |()| ExitCode::SUCCESS)
+}
+
 fn refuse(message: &str) -> ExitCode {
-    eprintln!("orbitcal: {message}");
+    output::warn(message);
     ExitCode::from(2)
+}
+
+fn fail(message: &str) -> ExitCode {
+    output::warn(message);
+    ExitCode::from(1)
 }
 
 /// What clap complains about, without its usage lines.

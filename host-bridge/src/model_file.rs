@@ -1,14 +1,13 @@
-//! A model on disk: the core's tables as the packets that a device takes.
+//! A model on disk: a line that names its machine, then the core's tables as the packets that a device takes.
 //!
-//! The bytes are those of `orbitcal serve --load`, requests `Model` with one parcel each, head first and seal last
+//! After that line the bytes are those of `orbitcal serve --load`, requests `Model` with one parcel each, head first and seal last
 //! (`docs/device.md`), so that a file tells a device what it tells the core in process.
 
 use std::path::Path;
 
-use estimator::surrogate::{Parcel, ParcelError};
-use estimator::{FrameError, packet};
-use firmware_sim::link::{REQUEST, Request};
-use training::BoosterGreen;
+use estimator::{FrameError, Parcel, ParcelError, Tables as _};
+use training::rooms::large::{PACKET, Request};
+use training::{AnyParcel, LINE, Tables};
 
 use crate::output::{self, OutputError};
 
@@ -17,12 +16,28 @@ use crate::output::{self, OutputError};
 #[non_exhaustive]
 pub enum ModelFileError {
     /// The system cannot read it.
-    #[error("{path}: {source}")]
+    #[error("{path}: {}", output::unreadable(.source))]
     Read {
         /// The file.
         path: String,
         /// Why.
         source: std::io::Error,
+    },
+    /// It does not begin as a model file does.
+    #[error("{path}: expected a model file, which begins with the line {FIRST:?} and its machine")]
+    Kind {
+        /// The file.
+        path: String,
+    },
+    /// It is of another machine.
+    #[error("{path}: a model of {found:?}, this machine is {machine:?}")]
+    Machine {
+        /// The file.
+        path: String,
+        /// The machine of the file.
+        found: String,
+        /// The machine at hand.
+        machine: String,
     },
     /// One of its packets is not what it should be.
     #[error("{path}, packet {packet}: {fault}")]
@@ -56,40 +71,61 @@ pub enum Fault {
     },
 }
 
-/// Write the tables to a file.
+/// How the first line of a file begins; the machine's name follows.
+const FIRST: &str = "orbitcal model of ";
+
+/// Write the tables of a machine to a file.
 ///
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
-pub fn write(path: &Path, tables: &BoosterGreen) -> Result<(), OutputError> {
-    output::bytes(path, &tables.parcels().flat_map(wire).collect::<Vec<u8>>())
+pub fn write(path: &Path, machine: &str, tables: &Tables) -> Result<(), OutputError> {
+    let first = format!("{FIRST}{}\n", line(machine));
+    output::bytes(
+        path,
+        &first.into_bytes().into_iter().chain(tables.parcels::<LINE>().flat_map(wire)).collect::<Vec<u8>>(),
+    )
 }
 
-fn wire(parcel: Parcel) -> Vec<u8> {
-    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+/// A name as it stands in a line.
+fn line(name: &str) -> String {
+    name.replace('\n', " ")
+}
+
+fn wire(parcel: AnyParcel) -> Vec<u8> {
+    let mut bytes = vec![0; PACKET];
     let length = Request::Model(parcel).encode(&mut bytes).expect("a parcel fits a packet");
     bytes.truncate(length);
     bytes
 }
 
-/// The tables of a file.
+/// The tables of a file, which has to be of this machine.
 ///
 /// # Errors
 /// [`ModelFileError`].
-pub fn read(path: &Path) -> Result<Box<BoosterGreen>, ModelFileError> {
+pub fn read(path: &Path, machine: &str) -> Result<Tables, ModelFileError> {
     let name = || path.display().to_string();
     let mut bytes = std::fs::read(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
-    let mut tables = Box::new(BoosterGreen::BLANK);
+    let end = bytes.iter().position(|byte| *byte == b'\n').ok_or_else(|| ModelFileError::Kind { path: name() })?;
+    let first = String::from_utf8_lossy(&bytes[..end]).into_owned();
+    let found = first.strip_prefix(FIRST).ok_or_else(|| ModelFileError::Kind { path: name() })?;
+    if found != line(machine) {
+        return Err(ModelFileError::Machine { path: name(), found: found.into(), machine: machine.into() });
+    }
+    tables(&mut bytes[end + 1..]).map_err(|(packet, fault)| ModelFileError::Packet { path: name(), packet, fault })
+}
+
+/// The tables of packets; or which of them, from 1, is wrong.
+fn tables(bytes: &mut [u8]) -> Result<Tables, (usize, Fault)> {
+    let mut tables = Tables::BLANK;
     let (mut due, mut packet) = (Due::Head, 0);
     for wire in bytes.split_inclusive_mut(|byte| *byte == 0) {
         packet += 1;
-        due = take(&mut tables, due, wire).map_err(|fault| ModelFileError::Packet { path: name(), packet, fault })?;
+        due = take(&mut tables, due, wire).map_err(|fault| (packet, fault))?;
     }
-    let early = Fault::Order { expected: due.words(), found: "the end of the file" };
     if due == Due::End {
-        Ok(tables)
-    } else {
-        Err(ModelFileError::Packet { path: name(), packet: packet + 1, fault: early })
+        return Ok(tables);
     }
+    Err((packet + 1, Fault::Order { expected: due.words(), found: "the end of the file" }))
 }
 
 /// What comes next in a file.
@@ -111,14 +147,14 @@ impl Due {
 }
 
 /// Take one packet in; returns what is due then.
-fn take(tables: &mut BoosterGreen, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
+fn take(tables: &mut Tables, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
     let found = |found| Fault::Order { expected: due.words(), found };
-    let Request::Model(parcel) = packet::unseal(REQUEST, wire)? else { return Err(found("another request")) };
+    let Request::Model(parcel) = Request::decode(wire)? else { return Err(found("another request")) };
     let next = match (due, &parcel) {
-        (Due::Head, Parcel::Head(_)) => Due::Rest,
+        (Due::Head, Parcel::Head { .. }) => Due::Rest,
         (Due::Rest, Parcel::Codes { .. } | Parcel::Values { .. }) => Due::Rest,
         (Due::Rest, Parcel::Seal { .. }) => Due::End,
-        (_, Parcel::Head(_)) => return Err(found("a head")),
+        (_, Parcel::Head { .. }) => return Err(found("a head")),
         _ => return Err(found("a part of tables")),
     };
     tables.take(&parcel)?;
@@ -128,32 +164,51 @@ fn take(tables: &mut BoosterGreen, due: Due, wire: &mut [u8]) -> Result<Due, Fau
 #[cfg(test)]
 mod tests {
     use estimator::surrogate::Head;
-    use twin::Ring;
+    use twin::{Effect, Ring};
 
     use super::*;
 
-    fn extended() -> Box<BoosterGreen> {
-        let effects = ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|e| e.parse().unwrap());
+    fn extended() -> Tables {
+        let effects =
+            ["quad_roll@F2=-0.018", "bpm_gain@x_E6=-0.08"].map(|text| Effect::parse(text, &Ring::booster()).unwrap());
         training::extended::tables(&Ring::booster(), &effects, &[1.0; 48]).unwrap().tables
     }
 
+    const MACHINE: &str = "a machine";
+
     /// What is said of a file with these bytes, without its path.
-    fn refused(bytes: &[u8]) -> String {
+    fn refused_whole(bytes: &[u8]) -> String {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model");
         std::fs::write(&path, bytes).unwrap();
-        let error = read(&path).unwrap_err().to_string();
+        let error = read(&path, MACHINE).unwrap_err().to_string();
         error.strip_prefix(&path.display().to_string()).unwrap().to_owned()
+    }
+
+    /// The same of these packets.
+    fn refused(packets: &[u8]) -> String {
+        refused_whole(&[b"orbitcal model of a machine\n", packets].concat())
     }
 
     #[test]
     fn tables_survive_their_file() {
         let (folder, tables) = (tempfile::tempdir().unwrap(), extended());
         let path = folder.path().join("model");
-        write(&path, &tables).unwrap();
-        assert_eq!(read(&path).unwrap(), tables);
+        write(&path, MACHINE, &tables).unwrap();
+        assert_eq!(read(&path, MACHINE).unwrap(), tables);
         // 328 parcels of every ring, four of each of two terms, and two lists of them
         assert_eq!(std::fs::read(&path).unwrap().split_inclusive(|byte| *byte == 0).count(), 328 + 4 * 2 + 2);
+    }
+
+    #[test]
+    fn a_file_is_for_its_machine_alone() {
+        let other = refused_whole(b"orbitcal model of ten cells\n");
+        assert_eq!(other, ": a model of \"ten cells\", this machine is \"a machine\"");
+        let expected = ": expected a model file, which begins with the line \"orbitcal model of \" and its machine";
+        for bytes in [&b""[..], b"{}", b"{}\n", &wire(extended().parcels().next().unwrap())] {
+            assert_eq!(refused_whole(bytes), expected);
+        }
+        assert_eq!(read(Path::new("/nonexistent"), MACHINE).unwrap_err().to_string(), "/nonexistent: file not found");
     }
 
     #[test]

@@ -1,17 +1,75 @@
-//! Files that appear whole or not at all.
+//! What a command leaves behind: files that appear whole or not at all, and lines whose reader may have gone.
 
-use std::io::Write;
+use core::fmt::Display;
+use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 
+use comfy_table::{ContentArrangement, Table, presets};
 use serde::Serialize;
 use tempfile::NamedTempFile;
 
+/// Width of every table, that of a plain terminal.
+const COLUMNS: u16 = 80;
+
 /// Why a file was not written.
 #[derive(Debug, thiserror::Error)]
-#[error("{path}: {source}")]
+#[error("{path}: {reason}")]
 pub struct OutputError {
     path: String,
-    source: std::io::Error,
+    reason: String,
+}
+
+impl OutputError {
+    /// For a file.
+    pub fn of(path: &Path, reason: impl Display) -> Self {
+        Self { path: path.display().to_string(), reason: reason.to_string() }
+    }
+}
+
+/// Print a text and a line feed. A reader that has gone, as in `orbitcal fit | head`, is no error.
+///
+/// # Errors
+/// What the system says of stdout, for instance that the disk is full.
+pub fn say(text: impl Display) -> Result<(), OutputError> {
+    let mut stdout = io::stdout().lock();
+    match writeln!(stdout, "{text}").and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(OutputError::of(Path::new("stdout"), error)),
+        _ => Ok(()),
+    }
+}
+
+/// A line on stderr, whether or not anybody reads it.
+pub fn warn(text: impl Display) {
+    let _ = writeln!(io::stderr(), "orbitcal: {text}");
+}
+
+/// A text in lines of 80 columns at most, but for words that are longer.
+pub fn fill(text: &str) -> String {
+    lines(text, usize::from(COLUMNS)).join("\n")
+}
+
+/// A text in lines of this many columns at most, but for words that are longer.
+pub fn lines(text: &str, columns: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= columns => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
+/// An empty table that fits a terminal of 80 columns; cells that are too long are wrapped.
+pub fn table<'h>(header: impl IntoIterator<Item = &'h str>) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
+    table.set_content_arrangement(ContentArrangement::Dynamic).set_width(COLUMNS);
+    table.set_header(header);
+    table
 }
 
 /// Write JSON to a file, or to stdout for `-`.
@@ -19,13 +77,8 @@ pub struct OutputError {
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
 pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
-    let wrong = |source| OutputError { path: path.display().to_string(), source };
-    let mut text = serde_json::to_string_pretty(value).map_err(|e| wrong(e.into()))?;
-    text.push('\n');
-    if path == Path::new("-") {
-        return std::io::stdout().write_all(text.as_bytes()).map_err(wrong);
-    }
-    whole(path, text.as_bytes()).map_err(wrong)
+    let text = serde_json::to_string_pretty(value).map_err(|e| OutputError::of(path, e))?;
+    if path == Path::new("-") { say(text) } else { bytes(path, (text + "\n").as_bytes()) }
 }
 
 /// Write bytes to a file.
@@ -33,21 +86,41 @@ pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
 pub fn bytes(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
-    whole(path, bytes).map_err(|source| OutputError { path: path.display().to_string(), source })
+    let mut file = temporary(path)?;
+    file.write_all(bytes).map_err(|e| OutputError::of(path, e.kind()))?;
+    file.persist(path).map_err(|e| OutputError::of(path, e.error.kind()))?;
+    Ok(())
 }
 
-fn whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let mut file = temporary(path)?;
-    file.write_all(bytes)?;
-    file.persist(path).map_err(|e| e.error)?;
-    Ok(())
+/// See, before work is put into it, that a file can be written; `-` is stdout.
+///
+/// # Errors
+/// [`OutputError`], as later for the file.
+pub fn check(path: &Path) -> Result<(), OutputError> {
+    if path.is_dir() {
+        return Err(OutputError::of(path, "expected a file, found a folder"));
+    }
+    if path == Path::new("-") { Ok(()) } else { temporary(path).map(drop) }
+}
+
+/// The same for a folder that need not be there yet.
+///
+/// # Errors
+/// [`OutputError`].
+pub fn check_folder(path: &Path) -> Result<(), OutputError> {
+    let there = path.ancestors().find(|folder| folder.exists() || folder.as_os_str().is_empty());
+    match there {
+        Some(file) if file.is_file() => Err(OutputError::of(file, "expected a folder, found a file")),
+        Some(folder) => temporary(&folder.join("any")).map(drop).map_err(|error| OutputError::of(path, error.reason)),
+        None => Ok(()),
+    }
 }
 
 /// A temporary file beside its final place, with the permissions that a created file has.
 ///
 /// # Errors
 /// What the system says, for instance that the folder does not exist.
-pub fn temporary(path: &Path) -> std::io::Result<NamedTempFile> {
+pub fn temporary(path: &Path) -> Result<NamedTempFile, OutputError> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut builder = tempfile::Builder::new();
     #[cfg(unix)]
@@ -55,7 +128,19 @@ pub fn temporary(path: &Path) -> std::io::Result<NamedTempFile> {
         use std::os::unix::fs::PermissionsExt;
         builder.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as open(2) does
     }
-    builder.tempfile_in(folder).map_err(|error| error.kind().into()) // without the temporary name
+    builder.tempfile_in(folder).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => OutputError::of(path, "folder not found"),
+        kind => OutputError::of(path, kind), // without the temporary name
+    })
+}
+
+/// What the system says of a file that was to be read.
+pub fn unreadable(error: &io::Error) -> String {
+    match error.kind() {
+        ErrorKind::NotFound => "file not found".into(),
+        ErrorKind::InvalidData => "expected UTF-8 text".into(),
+        kind => kind.to_string(),
+    }
 }
 
 #[cfg(test)]
@@ -73,8 +158,36 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_folder_is_named() {
-        let error = json(Path::new("/nonexistent/a.json"), &1).unwrap_err();
-        assert!(error.to_string().starts_with("/nonexistent/a.json: "), "{error}");
+    fn a_check_finds_what_would_fail_later_and_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |checked: Result<(), OutputError>| checked.unwrap_err().to_string();
+        assert_eq!(said(check(Path::new("/nonexistent/a.json"))), "/nonexistent/a.json: folder not found");
+        let here = folder.path().display();
+        assert_eq!(said(check(folder.path())), format!("{here}: expected a file, found a folder"));
+        let file = folder.path().join("a.csv");
+        std::fs::write(&file, "").unwrap();
+        assert_eq!(
+            said(check_folder(&file.join("draws"))),
+            format!("{}: expected a folder, found a file", file.display())
+        );
+        check(&file).unwrap();
+        check(Path::new("-")).unwrap();
+        check_folder(&folder.path().join("new/draws")).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn long_lines_are_broken_between_words() {
+        let text = "monitors: ".to_owned() + &"x_C6 noisy; ".repeat(20);
+        let filled = fill(&text);
+        assert!(filled.lines().count() == 4 && filled.lines().all(|line| line.len() <= 80), "{filled}");
+        assert_eq!(filled.split_whitespace().collect::<Vec<_>>(), text.split_whitespace().collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn tables_fit_eighty_columns_whatever_is_in_them() {
+        let mut table = table(["recording", "sentence"]);
+        table.add_row(["open-00", &"a long sentence ".repeat(20)]);
+        assert!(table.lines().all(|line| line.chars().count() <= 80), "{table}");
     }
 }

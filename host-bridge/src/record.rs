@@ -1,142 +1,125 @@
-//! An estimate as every process on the machine sees it: plain data of one size, the same for readers in any language.
+//! An estimate on its way out: what every sink gets, for a ring of any size, with the names of what it holds.
 
-use iceoryx2::prelude::ZeroCopySend;
-use inference::stream::BoosterEstimate;
+use std::sync::Arc;
 
-/// Vars in a record.
-pub const VARS: usize = 48;
-/// Monitors in a record.
-pub const MONITORS: usize = 33;
-/// Entries of the lower triangle of a covariance, the diagonal included.
-pub const TRIANGLE: usize = VARS * (VARS + 1) / 2;
+use estimator::MonitorState;
+use inference::stream::Estimate;
+use twin::Ring;
 
-/// One estimate in shared memory.
-///
-/// Little-endian on every machine that this runs on, 8-byte aligned, 5848 bytes, no hidden padding; the type name is
-/// `orbitcal.Estimate.v1`. A change of this table is a new version of the name.
-///
-/// | offset | field | type | unit |
-/// |---|---|---|---|
-/// | 0 | `time_us` | u64 | us, of the frame |
-/// | 8 | `clipped` | u64 | bit `i`: var `i` is at a bound of the prior |
-/// | 16 | `accepted` | u64 | bit `b`: the reading of monitor `b` was used |
-/// | 24 | `rejected` | u64 | bit `b`: monitor `b` reported and was not used |
-/// | 32 | `started_ns` | u64 | ns since 1970, start of the publisher |
-/// | 40 | `published_ns` | u64 | ns since 1970 |
-/// | 48 | `sequence` | u32 | of the frame |
-/// | 52 | `frames` | u32 | used so far; a gap tells of lost estimates |
-/// | 56 | `rejected_frames` | u32 | refused so far |
-/// | 60 | `linearised` | u32 | 1: the model was linearised anew |
-/// | 64 | `nis` | f32 | 1, sum over the readings used |
-/// | 68 | `log_evidence` | f32 | nat |
-/// | 72 | `mean` | f32 x 48 | 1 |
-/// | 264 | `sigma` | f32 x 48 | 1 |
-/// | 456 | `map_params` | f32 x 48 | 1, `ln var` |
-/// | 648 | `params_sigma` | f32 x 48 | 1, of `ln var` |
-/// | 840 | `covariance` | f32 x 1176 | 1, of the vars, see below |
-/// | 5544 | `monitor_sigma` | f32 x 33 | m |
-/// | 5676 | `monitor_rejected` | u32 x 33 | readings not used so far |
-/// | 5808 | `monitor_state` | u8 x 33 | 0 ok, 1 noisy, 2 jumps, 3 dead |
-/// | 5841 | `padding` | u8 x 7 | 0 |
-///
-/// The covariance is its lower triangle row by row, `(0,0) (1,0) (1,1) (2,0) ..`: entry `(i, j)` with `j <= i` stands at
-/// `i (i + 1) / 2 + j`. Vars are in the order A2 .. F8, A1 .. F7, monitors x_A6 .. y_F7.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("orbitcal.Estimate.v1")]
+/// Whose numbers a record holds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Names {
+    /// The machine.
+    pub machine: String,
+    /// Strength factors (vars) [N].
+    pub vars: Vec<String>,
+    /// Read monitors [B].
+    pub monitors: Vec<String>,
+}
+
+impl Names {
+    /// Those of a ring.
+    pub fn of(ring: &Ring) -> Arc<Self> {
+        Arc::new(Self { machine: ring.name.clone(), vars: ring.var_names(), monitors: ring.monitor_names() })
+    }
+}
+
+/// What became of a monitor's reading in a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum ReadingUse {
+    /// The monitor did not report.
+    Absent = 0,
+    /// It was used.
+    Used = 1,
+    /// It was outside the gate, and not used.
+    Rejected = 2,
+}
+
+/// One estimate: vars with error bars and covariance, and the state of every monitor after one frame.
+#[derive(Debug, Clone, PartialEq)]
 pub struct EstimateRecord {
-    /// Time of the frame [us].
-    pub time_us: u64,
-    /// Bit `i` is 1 if var `i` is clipped to the prior's range.
-    pub clipped: u64,
-    /// Bit `b` is 1 if the reading of monitor `b` was used.
-    pub accepted: u64,
-    /// Bit `b` is 1 if monitor `b` reported and its reading was not used.
-    pub rejected: u64,
-    /// Start of the publisher, written by it [ns since 1970]. A new value tells of a restart.
-    pub started_ns: u64,
-    /// When the record was published, written by the publisher [ns since 1970].
-    pub published_ns: u64,
+    /// Whose numbers these are.
+    pub names: Arc<Names>,
     /// Sequence number of the frame.
     pub sequence: u32,
+    /// Time of the frame [us].
+    pub time_us: u64,
     /// Frames used so far: one more with each estimate.
     pub frames: u32,
     /// Frames refused so far.
     pub rejected_frames: u32,
-    /// 1 if the model was linearised anew after this frame, else 0.
-    pub linearised: u32,
-    /// Joint normalised innovation squared of the readings used [1].
+    /// The model was relinearised since the last estimate.
+    pub linearised: bool,
+    /// The readings are further off than noise explains; none where that was not asked.
+    pub mismatch: Option<bool>,
+    /// Joint normalised innovation squared of the readings used, tunes included [1].
     pub nis: f32,
+    /// Measured less predicted tunes x and y; none where the meter did not report, or does not count [1].
+    pub tune_innovation: [Option<f32>; 2],
     /// `ln` of the evidence of all readings under the model [nat].
     pub log_evidence: f32,
-    /// Mean of each var [1].
-    pub mean: [f32; VARS],
-    /// Standard deviation of each var [1].
-    pub sigma: [f32; VARS],
-    /// MAP of each `theta = ln var` [1].
-    pub map_params: [f32; VARS],
-    /// Standard deviation of each theta before truncation [1].
-    pub params_sigma: [f32; VARS],
-    /// Lower triangle of `Cov(var_i, var_j) = mean_i mean_j Cov(theta_i, theta_j)` [1], first order in theta.
-    pub covariance: [f32; TRIANGLE],
-    /// Noise of one reading of each monitor [m].
-    pub monitor_sigma: [f32; MONITORS],
-    /// Readings of each monitor that were not used so far.
-    pub monitor_rejected: [u32; MONITORS],
-    /// [`estimator::MonitorState`] of each monitor.
-    pub monitor_state: [u8; MONITORS],
-    /// Zero, up to a multiple of 8 bytes.
-    pub padding: [u8; 7],
+    /// Mean of each var [N] [1].
+    pub mean: Vec<f32>,
+    /// Standard deviation of each var [N] [1].
+    pub sigma: Vec<f32>,
+    /// Maximum a posteriori of each `theta = ln var` [N] [1].
+    pub map_params: Vec<f32>,
+    /// Centre of the normal of each theta before it is truncated to the prior's range [N] [1].
+    pub centre: Vec<f32>,
+    /// Its standard deviation [N] [1].
+    pub params_sigma: Vec<f32>,
+    /// Whether each var sits at a bound of the prior's range [N].
+    pub clipped: Vec<bool>,
+    /// Lower triangle of `Cov(var_i, var_j) = mean_i mean_j Cov(theta_i, theta_j)`, first order in theta, row by row:
+    /// `(0,0) (1,0) (1,1) (2,0) ..` [N(N+1)/2] [1]. Zero where a device did not send it.
+    pub covariance: Vec<f32>,
+    /// What became of each monitor's reading [B].
+    pub reading: Vec<ReadingUse>,
+    /// State of each monitor [B].
+    pub monitor_state: Vec<MonitorState>,
+    /// Noise of one reading of each monitor [B] [m].
+    pub monitor_sigma: Vec<f32>,
+    /// Readings of each monitor that were not used so far [B].
+    pub monitor_rejected: Vec<u32>,
 }
 
 impl EstimateRecord {
-    /// A record of nothing: all zero.
-    pub const ZERO: Self = Self {
-        time_us: 0,
-        clipped: 0,
-        accepted: 0,
-        rejected: 0,
-        started_ns: 0,
-        published_ns: 0,
-        sequence: 0,
-        frames: 0,
-        rejected_frames: 0,
-        linearised: 0,
-        nis: 0.0,
-        log_evidence: 0.0,
-        mean: [0.0; VARS],
-        sigma: [0.0; VARS],
-        map_params: [0.0; VARS],
-        params_sigma: [0.0; VARS],
-        covariance: [0.0; TRIANGLE],
-        monitor_sigma: [0.0; MONITORS],
-        monitor_rejected: [0; MONITORS],
-        monitor_state: [0; MONITORS],
-        padding: [0; 7],
-    };
-
-    /// What a core says after a frame, with the covariance of two `ln var`; the publisher adds its stamps.
-    pub fn of(estimate: &BoosterEstimate, of_params: impl Fn(usize, usize) -> f32) -> Self {
+    /// What a core says after a frame, with the covariance of two `ln var` and its mismatch alarm.
+    pub fn of(
+        names: &Arc<Names>,
+        estimate: &Estimate,
+        of_params: impl Fn(usize, usize) -> f32,
+        mismatch: Option<bool>,
+    ) -> Self {
+        let reading = |(accepted, rejected): (&bool, &bool)| match (accepted, rejected) {
+            (true, _) => ReadingUse::Used,
+            (false, true) => ReadingUse::Rejected,
+            (false, false) => ReadingUse::Absent,
+        };
+        let Estimate { mean, health, .. } = estimate;
         Self {
-            time_us: estimate.time_us,
-            clipped: estimate.clipped,
-            accepted: estimate.accepted,
-            rejected: estimate.rejected,
+            names: names.clone(),
             sequence: estimate.sequence,
+            time_us: estimate.time_us,
             frames: estimate.frames,
             rejected_frames: estimate.rejected_frames,
-            linearised: u32::from(estimate.linearised),
+            linearised: estimate.linearised,
+            mismatch,
             nis: estimate.nis,
+            tune_innovation: estimate.tune_innovation,
             log_evidence: estimate.log_evidence,
-            mean: estimate.mean,
-            sigma: estimate.sigma,
-            map_params: estimate.map_params,
-            params_sigma: estimate.params_sigma,
-            covariance: triangle(|i, j| estimate.mean[i] * estimate.mean[j] * of_params(i, j)),
-            monitor_sigma: estimate.health.map(|health| health.noise),
-            monitor_rejected: estimate.health.map(|health| health.rejected),
-            monitor_state: estimate.health.map(|health| health.state as u8),
-            ..Self::ZERO
+            mean: mean.clone(),
+            sigma: estimate.sigma.clone(),
+            map_params: estimate.map_params.clone(),
+            centre: estimate.centre.clone(),
+            params_sigma: estimate.params_sigma.clone(),
+            clipped: estimate.clipped.clone(),
+            covariance: triangle(mean.len(), |i, j| mean[i] * mean[j] * of_params(i, j)),
+            reading: estimate.accepted.iter().zip(&estimate.rejected).map(reading).collect(),
+            monitor_state: health.iter().map(|health| health.state).collect(),
+            monitor_sigma: health.iter().map(|health| health.noise).collect(),
+            monitor_rejected: health.iter().map(|health| health.rejected).collect(),
         }
     }
 
@@ -144,22 +127,20 @@ impl EstimateRecord {
     ///
     /// # Panics
     /// If there is no such var.
-    ///
-    /// ```
-    /// # use host_bridge::record::EstimateRecord;
-    /// let mut record = EstimateRecord::ZERO;
-    /// record.covariance[4] = 0.5; // after (0,0) (1,0) (1,1) (2,0)
-    /// assert_eq!([record.covariance_of(2, 1), record.covariance_of(1, 2)], [0.5, 0.5]);
-    /// ```
     pub fn covariance_of(&self, i: usize, j: usize) -> f32 {
         let (row, column) = (i.max(j), i.min(j));
         self.covariance[row * (row + 1) / 2 + column]
     }
 
-    /// NIS per reading used [1]: about 1 if the model and the noise are right; none if no reading was used.
+    /// NIS per reading used, tunes included [1]: about 1 if the model and the noise are right; none if no reading was used.
     pub fn nis_per_reading(&self) -> Option<f32> {
-        let readings = self.accepted.count_ones();
+        let readings = self.readings(ReadingUse::Used) + self.tune_innovation.iter().flatten().count();
         (readings > 0).then(|| self.nis / readings as f32)
+    }
+
+    /// Number of readings of this frame that met this end.
+    pub fn readings(&self, wanted: ReadingUse) -> usize {
+        self.reading.iter().filter(|end| **end == wanted).count()
     }
 
     /// How far var `i` is from 1 [sigmas]; 0 without an error bar.
@@ -169,53 +150,76 @@ impl EstimateRecord {
     pub fn deviation(&self, i: usize) -> f32 {
         if self.sigma[i] > 0.0 { (self.mean[i] - 1.0) / self.sigma[i] } else { 0.0 }
     }
+
+    /// The var that is farthest from 1, in sigmas; none in a ring without any.
+    pub fn farthest(&self) -> Option<usize> {
+        (0..self.mean.len()).max_by(|&i, &j| self.deviation(i).abs().total_cmp(&self.deviation(j).abs()))
+    }
 }
 
 /// A symmetric matrix as its lower triangle, row by row.
-fn triangle(entry: impl Fn(usize, usize) -> f32) -> [f32; TRIANGLE] {
-    let mut packed = [0.0; TRIANGLE];
-    let entries = (0..VARS).flat_map(|i| (0..=i).map(move |j| (i, j)));
-    packed.iter_mut().zip(entries).for_each(|(to, (i, j))| *to = entry(i, j));
-    packed
+fn triangle(n: usize, entry: impl Fn(usize, usize) -> f32) -> Vec<f32> {
+    (0..n).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| entry(i, j)).collect()
 }
 
 #[cfg(test)]
-mod tests {
-    use core::mem::{align_of, offset_of, size_of};
-
+pub(crate) mod tests {
     use super::*;
 
-    #[test]
-    fn the_layout_is_the_documented_one() {
-        assert_eq!((size_of::<EstimateRecord>(), align_of::<EstimateRecord>()), (5848, 8));
-        macro_rules! stands_at {
-            ($($field:ident $offset:literal)*) => {
-                $(assert_eq!(offset_of!(EstimateRecord, $field), $offset, stringify!($field));)*
-            };
-        }
-        stands_at! {
-            time_us 0 clipped 8 accepted 16 rejected 24 started_ns 32 published_ns 40
-            sequence 48 frames 52 rejected_frames 56 linearised 60 nis 64 log_evidence 68
-            mean 72 sigma 264 map_params 456 params_sigma 648 covariance 840
-            monitor_sigma 5544 monitor_rejected 5676 monitor_state 5808 padding 5841
+    /// A record of a ring with this many vars `V0 ..` and monitors `M0 ..`: all vars 1.000 ± 0.010, all readings used.
+    pub(crate) fn record(vars: usize, monitors: usize) -> EstimateRecord {
+        let names = |letter: &str, count| (0..count).map(|i| format!("{letter}{i}")).collect();
+        let names = Names { machine: "test ring".into(), vars: names("V", vars), monitors: names("M", monitors) };
+        EstimateRecord {
+            names: Arc::new(names),
+            sequence: 0,
+            time_us: 0,
+            frames: 1,
+            rejected_frames: 0,
+            linearised: false,
+            mismatch: Some(false),
+            nis: 0.0,
+            tune_innovation: [None; 2],
+            log_evidence: 0.0,
+            mean: vec![1.0; vars],
+            sigma: vec![0.01; vars],
+            map_params: vec![0.0; vars],
+            centre: vec![0.0; vars],
+            params_sigma: vec![0.01; vars],
+            clipped: vec![false; vars],
+            covariance: triangle(vars, |i, j| if i == j { 0.01 * 0.01 } else { 0.0 }),
+            reading: vec![ReadingUse::Used; monitors],
+            monitor_state: vec![MonitorState::Ok; monitors],
+            monitor_sigma: vec![0.15e-3; monitors],
+            monitor_rejected: vec![0; monitors],
         }
     }
 
     #[test]
+    fn the_covariance_is_symmetric_and_its_diagonal_is_sigma_squared() {
+        let mut record = record(4, 2);
+        record.covariance[4] = 0.5; // after (0,0) (1,0) (1,1) (2,0)
+        assert_eq!([record.covariance_of(2, 1), record.covariance_of(1, 2)], [0.5, 0.5]);
+        assert_eq!(record.covariance_of(3, 3), record.sigma[3] * record.sigma[3]);
+    }
+
+    #[test]
     fn a_record_says_what_the_core_says() {
-        let ring = twin::Ring::booster();
+        let ring = Ring::booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let layout = inference::stream::layout(&ring);
-        let recording = inference::Recording::read(&folder, &layout).unwrap();
+        let recording = inference::Recording::read(&folder, &ring).unwrap();
         let mut core = inference::stream::estimator(&ring, &recording, 0.0).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
-        let record = EstimateRecord::of(&estimate, |i, j| core.covariance(i, j));
-        assert_eq!((record.mean, record.sequence, record.frames), (estimate.mean, estimate.sequence, 1));
+        let record = EstimateRecord::of(&Names::of(&ring), &estimate, |i, j| core.covariance(i, j), None);
+        assert_eq!(record.mean, estimate.mean);
+        assert_eq!((record.sequence, record.frames), (estimate.sequence, 1));
         for (i, j) in [(0, 0), (30, 7), (7, 30), (47, 47)] {
             let (of_vars, of_params) = (record.covariance_of(i, j), core.covariance(i, j));
             assert_eq!(of_vars, record.mean[i.max(j)] * record.mean[i.min(j)] * of_params, "({i}, {j})");
         }
         assert_eq!(record.monitor_sigma[32], estimate.health[32].noise);
+        assert_eq!(record.readings(ReadingUse::Used), estimate.accepted.iter().filter(|used| **used).count());
+        assert_eq!(record.tune_innovation.iter().flatten().count(), 2);
     }
 }

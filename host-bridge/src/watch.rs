@@ -8,11 +8,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use twin::Ring;
-
-use crate::publish::{PublishError, Subscriber};
-use crate::record::{EstimateRecord, MONITORS, VARS};
-use crate::trace::{Trace, TraceError};
+use crate::sink::shared_memory::layout::Stamp;
+use crate::sink::shared_memory::{PublishError, Subscriber};
+use crate::sink::trace::{Trace, TraceError};
+use crate::stop::Stop;
 use view::View;
 
 /// What to watch, and when to stop.
@@ -54,16 +53,6 @@ pub enum WatchError {
     /// The terminal, or stdout.
     #[error("cannot show estimates: {0}")]
     Show(#[from] std::io::Error),
-    /// Estimates are of another ring.
-    #[error("{ring} has {vars} vars and {monitors} monitors; an estimate has {VARS} and {MONITORS}")]
-    Ring {
-        /// The ring.
-        ring: String,
-        /// Its vars.
-        vars: usize,
-        /// Its monitors.
-        monitors: usize,
-    },
 }
 
 /// How long to sleep without news: keys, signals and the age on the screen wait for it.
@@ -74,36 +63,27 @@ const TICK: Duration = Duration::from_millis(100);
 ///
 /// # Errors
 /// [`WatchError`].
-pub fn watch(options: &WatchOptions, ring: &Ring) -> Result<WatchSummary, WatchError> {
-    let (vars, monitors) = names(ring)?;
-    let mut trace = options.trace.as_ref().map(|path| Trace::create(path, &vars)).transpose()?;
+pub fn watch(options: &WatchOptions) -> Result<WatchSummary, WatchError> {
+    let stop = Stop::on_signals()?;
+    let mut trace = options.trace.as_ref().map(|path| Trace::create(path)).transpose()?;
     let mut subscriber = Subscriber::try_new(&options.service)?;
-    let mut view = View::open(options, vars, monitors)?;
+    let mut view = View::open(options)?;
     let (mut tally, mut heard) = (Tally::default(), Instant::now());
     while !tally.is_enough(options.count) && options.idle.is_none_or(|idle| heard.elapsed() < idle) {
         let mut records = subscriber.wait(options.idle.map_or(TICK, |idle| idle.min(TICK)))?;
         records.truncate(tally.room(options.count));
         for record in &records {
             heard = Instant::now();
-            tally.add(record);
-            trace.as_mut().map_or(Ok(()), |trace| trace.add(record))?;
+            tally.add(&record.stamp, record.record.frames);
+            trace.as_mut().map_or(Ok(()), |trace| trace.add(&record.record))?;
         }
-        if !view.show(&records, &tally.summary())? || subscriber.is_stop_requested() {
+        if !view.show(&records, &tally.summary())? || stop.is_requested() {
             break;
         }
     }
     drop(view);
-    trace.map_or(Ok(()), Trace::finish)?;
+    trace.map_or(Ok(()), Trace::save)?;
     Ok(tally.summary())
-}
-
-/// Names of the vars and of the monitors.
-fn names(ring: &Ring) -> Result<(Vec<String>, Vec<String>), WatchError> {
-    let (vars, monitors) = (ring.var_names(), ring.monitor_names());
-    if vars.len() == VARS && monitors.len() == MONITORS {
-        return Ok((vars, monitors));
-    }
-    Err(WatchError::Ring { ring: ring.name.clone(), vars: vars.len(), monitors: monitors.len() })
 }
 
 /// Counts estimates. Those of one publisher number their frames without a gap.
@@ -116,10 +96,10 @@ struct Tally {
 }
 
 impl Tally {
-    fn add(&mut self, record: &EstimateRecord) {
+    fn add(&mut self, stamp: &Stamp, frames: u32) {
         self.seen += 1;
-        if let Some(last) = self.publishers.insert(record.started_ns, record.frames) {
-            self.lost += u64::from(record.frames.saturating_sub(last).saturating_sub(1));
+        if let Some(last) = self.publishers.insert(stamp.started_ns, frames) {
+            self.lost += u64::from(frames.saturating_sub(last).saturating_sub(1));
         }
     }
 
@@ -141,12 +121,14 @@ impl Tally {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::publish::Publisher;
+    use crate::record::EstimateRecord;
+    use crate::record::tests::record;
+    use crate::sink::shared_memory::Publisher;
 
     fn tally(stamps: &[(u64, u32)]) -> WatchSummary {
         let mut tally = Tally::default();
         for &(started_ns, frames) in stamps {
-            tally.add(&EstimateRecord { started_ns, frames, ..EstimateRecord::ZERO });
+            tally.add(&Stamp { started_ns, ..Stamp::default() }, frames);
         }
         tally.summary()
     }
@@ -172,15 +154,16 @@ mod tests {
         };
         let service = options.service.clone();
         let writer = std::thread::spawn(move || {
-            let mut publisher = Publisher::try_new(&service).unwrap();
+            let record = |frames| EstimateRecord { sequence: frames, frames, ..record(20, 10) };
+            let mut publisher = Publisher::try_new(&service, "a test", &record(1).names).unwrap();
             for frames in [1, 2, 4, 5] {
-                publisher.publish(&EstimateRecord { sequence: frames, frames, ..EstimateRecord::ZERO }).unwrap();
+                publisher.publish(&record(frames)).unwrap();
             }
             std::thread::sleep(Duration::from_millis(300)); // history is handed over with the next estimate
-            publisher.publish(&EstimateRecord { frames: 6, ..EstimateRecord::ZERO }).unwrap();
+            publisher.publish(&record(6)).unwrap();
             std::thread::sleep(Duration::from_millis(300));
         });
-        let summary = watch(&options, &Ring::booster()).unwrap();
+        let summary = watch(&options).unwrap();
         writer.join().unwrap();
         assert_eq!(summary, WatchSummary { seen: 3, lost: 1, restarts: 0 });
         let text = std::fs::read_to_string(options.trace.unwrap()).unwrap();
@@ -197,6 +180,6 @@ mod tests {
             idle: Some(Duration::from_millis(50)),
             quiet: true,
         };
-        assert_eq!(watch(&options, &Ring::booster()).unwrap(), WatchSummary::default());
+        assert_eq!(watch(&options).unwrap(), WatchSummary::default());
     }
 }

@@ -13,7 +13,7 @@ use estimator::booster::{Estimator, Green};
 use estimator::packet;
 use firmware_sim::link::{REQUEST, Request, Vitals};
 use firmware_sim::{Device, Event, Inbox, Panel};
-use host_bridge::publish::Subscriber;
+use host_bridge::sink::shared_memory::Subscriber;
 use inference::{Recording, stream};
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
@@ -100,12 +100,12 @@ fn a_device_is_published_as_the_core_in_process_is() {
         orbitcal(&["replay", RECORDING, "--service", &service, "--trace", &file("b.csv"), "--json", &file("b.json")]);
     assert!(replayed.status.success());
     assert!(std::fs::read(file("a.csv")).unwrap() == std::fs::read(file("b.csv")).unwrap(), "the traces differ");
-    let answer = |name: &str| {
-        let mut answer: serde_json::Value = serde_json::from_slice(&std::fs::read(file(name)).unwrap()).unwrap();
-        answer["timing"].take();
-        answer
+    let result = |name: &str| {
+        let mut result: serde_json::Value = serde_json::from_slice(&std::fs::read(file(name)).unwrap()).unwrap();
+        result["timing"].take();
+        result
     };
-    assert!(answer("a.json") == answer("b.json"), "the answers differ");
+    assert!(result("a.json") == result("b.json"), "the results differ");
     let table = |output: &Output| {
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
         text.lines().filter(|line| !line.starts_with("frame to estimate")).map(str::to_owned).collect::<Vec<_>>()
@@ -217,17 +217,17 @@ fn a_front_end_may_do_what_it_likes_and_nothing_is_lost() {
     let source = format!("unix:{}", uart.display());
     let serve = ["serve", "--source", &source, "--service", &service, "--trace", &trace.display().to_string()];
     let mut serving = Command::new(env!("CARGO_BIN_EXE_orbitcal")).args(serve).stderr(Stdio::piped()).spawn().unwrap();
-    let mut records = Vec::new();
+    let mut heard = Vec::new();
     while serving.try_wait().unwrap().is_none() {
-        records.extend(subscriber.wait(Duration::from_millis(20)).unwrap());
+        heard.extend(subscriber.wait(Duration::from_millis(20)).unwrap());
     }
-    records.extend(subscriber.wait(Duration::ZERO).unwrap());
+    heard.extend(subscriber.wait(Duration::ZERO).unwrap());
     let output = serving.wait_with_output().unwrap();
     front_end.join().unwrap();
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(1) && said.ends_with("the device has closed its line\n"), "{said}");
     assert_eq!(said.lines().count(), 5, "two spoiled pieces, half a reply, a refused frame, the end: {said}");
-    let heard: Vec<_> = records.iter().map(|r| (r.sequence, r.covariance[0] > 0.0)).collect();
+    let heard: Vec<_> = heard.iter().map(|p| (p.record.sequence, p.record.covariance[0] > 0.0)).collect();
     let expected = [(0, true), (1, true), (2, true), (3, false), (4, false), (5, true), (6, false)];
     assert_eq!(heard, expected, "frames, and whether their covariance came");
     assert_eq!(std::fs::read_to_string(trace).unwrap().lines().count(), 1 + expected.len());
@@ -257,7 +257,7 @@ fn a_silent_device_does_not_hold_up_a_signal() {
 }
 
 #[test]
-fn an_answer_needs_a_recording() {
+fn a_result_needs_a_recording() {
     let output = orbitcal(&["serve", "--source", "unix:/nowhere/uart", "--json", "-"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).starts_with("orbitcal: --json needs --feed: "));

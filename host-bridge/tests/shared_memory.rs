@@ -61,9 +61,12 @@ impl Watch {
         line.trim_end().to_owned()
     }
 
-    /// Frames that went into the next estimate.
+    /// Frames that went into the next estimate; a new publisher is named before its first one.
     fn frames(&mut self) -> u64 {
-        let line = self.line();
+        let mut line = self.line();
+        if line.starts_with("from orbitcal: AGS Booster") {
+            line = self.line();
+        }
         let number = line.split(' ').skip_while(|word| *word != "frames").nth(1);
         number.and_then(|number| number.parse().ok()).unwrap_or_else(|| panic!("no estimate: {line:?}"))
     }

@@ -1,20 +1,22 @@
 //! Correlations of the vars: of one with all others, of all with all, and whether they are the machine's or the method's.
 
-use super::sampled::largest_difference;
-use super::{Bench, SINGLE, Sampled, StudyError, WIDTH};
-use inference::readings::{Campaign, Readings};
 use inference::simulate::{self, Instruments};
+use inference::{Readings, TuneUse};
 use report::{Axes, Figure, Reference, Section, Series};
 
-/// The paper's open question: the same with the readings replaced by simulation at the point estimate.
-pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyError> {
-    let simulated = simulated(bench, reference)?;
-    let names = bench.names();
-    let var = names.iter().position(|name| name == SINGLE).unwrap_or(0);
+use super::sampled::largest_difference;
+use super::sampling::{self, Sampling};
+use super::{Sampled, StudyError};
+
+/// An open question of the published analysis: the same with the readings replaced by simulation at the point estimate.
+pub fn study(sampling: &mut Sampling, reference: &Sampled, var: usize) -> Result<Section, StudyError> {
+    let simulated = simulated(sampling, reference)?;
+    let names = sampling.names();
     let (measured, made) = (reference.correlation(), simulated.correlation());
     // along the ring, where the oscillation shows
     let mut along: Vec<usize> = (0..names.len()).collect();
-    along.sort_by_key(|&j| bench.campaign.ring.quadrupoles[j]);
+    let ring = &sampling.campaign().ring;
+    along.sort_by_key(|&j| ring.quadrupoles[ring.parameters[j].quadrupoles[0]].element);
     let ring_names: Vec<String> = along.iter().map(|&j| names[j].clone()).collect();
     let row = |label: &str, matrix: &nalgebra::DMatrix<f64>| {
         let y = along.iter().map(|&j| if j == var { f64::NAN } else { matrix[(var, j)] });
@@ -25,7 +27,7 @@ pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyErr
         .named(&ring_names)
         .compared(Reference::Level(0.0));
     let alike = likeness(&measured, &made);
-    let answer = if alike > 0.9 {
+    let verdict = if alike > 0.9 {
         "Yes: it is there in readings that the twin alone has made. Posterior covariances follow from how responses depend on \
          neighbouring quadrupoles, from the settings and from the weights, and hardly from the readings themselves, so that this \
          pattern says nothing for or against errors of the machine."
@@ -37,7 +39,7 @@ pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyErr
         text: vec![format!(
             "Posterior correlations of all frames, and the same after every reading was replaced by a simulated one: the twin at the \
              posterior mean, the same settings and read-backs, fresh noise. Entries off the diagonal correlate with {alike:.3} between the two; the \
-             largest difference is {:.2}, of which {:.2} is the sampler's own (three Monte Carlo errors). Is the long oscillation along the ring beam dynamics? {answer}",
+             largest difference is {:.2}, of which {:.2} is the sampler's own (three Monte Carlo errors). Is the long oscillation along the ring beam dynamics? {verdict}",
             largest_difference(&measured, &made),
             3.0 * (2.0 / reference.smallest_ess()).sqrt()
         )],
@@ -59,15 +61,15 @@ pub fn study(bench: &mut Bench, reference: &Sampled) -> Result<Section, StudyErr
     })
 }
 
-fn simulated(bench: &mut Bench, reference: &Sampled) -> Result<Sampled, StudyError> {
-    let seed = bench.seed();
-    let Campaign { ring, recording, .. } = &bench.campaign;
-    let noise = (0..ring.read_monitors.len()).map(|b| bench.campaign.noise(b)).collect();
-    let instruments = Instruments { noise, ..Instruments::healthy(ring, recording)? };
-    let made = simulate::like(recording, ring, &reference.mean(), &instruments, seed)?;
-    let campaign = Campaign::of(ring, &made, |_| ())?;
-    let readings = Readings::of_frames(&campaign, &bench.twin);
-    bench.sample("simulated at the point estimate", readings, WIDTH)
+fn simulated(sampling: &mut Sampling, reference: &Sampled) -> Result<Sampled, StudyError> {
+    let seed = sampling.seed();
+    let campaign = sampling.campaign();
+    let noise = (0..campaign.monitors()).map(|b| campaign.noise(b)).collect();
+    let instruments = Instruments { noise, ..Instruments::healthy(&campaign.ring, &campaign.recording)? };
+    let made = simulate::like(&campaign.recording, &campaign.ring, &reference.mean(), &instruments, seed)?;
+    let reduced = sampling::reduced(&campaign.ring, &made)?;
+    let readings = Readings::of_frames(&reduced, &sampling.twin, TuneUse::LeftOut);
+    sampling.sample("simulated at the point estimate", readings, None)
 }
 
 /// Correlation coefficient of the entries off the diagonals of two matrices.

@@ -1,41 +1,36 @@
-//! The paper's studies of one recording, each a figure and its numbers in one report.
+//! The published studies, of any recording: each a figure and its numbers in one report.
 //!
-//! The reference is NUTS on the exact twin. Where the paper's data are asked for, the readings are differences of one initial
-//! and one final setting per corrector, chosen at random among the repeats ([`Subset`]).
+//! The reference is NUTS on the exact twin. Where the published kind of data is asked for, the readings are differences of one
+//! initial and one final setting per corrector, chosen at random among the repeats ([`Subset`]). The likelihood is the published
+//! one: orbits alone, measured tunes left out.
 
 mod correlations;
 mod laplace;
 mod prediction;
 mod prior;
+mod published;
 mod sampled;
+mod sampling;
+mod settings;
 mod single;
 mod subsets;
 mod trimming;
 
-use std::sync::Arc;
-
+use inference::nuts::{NutsError, NutsSettings};
+use inference::posterior::LaplaceError;
+use inference::{BatchError, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
+use report::Page;
 use serde::Serialize;
 use twin::Ring;
 
-use inference::model::ResponseModel;
-use inference::nuts::{self, NutsError, NutsSettings};
-use inference::posterior::{LaplaceError, Posterior, Width};
-use inference::readings::{Campaign, Readings, ReadingsError};
-use inference::recording::Recording;
-use inference::simulate;
-use inference::stream::StreamError;
-use report::{Page, Section};
-
 pub use laplace::{Comparison, LaplaceRow};
+pub use published::Beside;
 pub use sampled::Sampled;
-pub use subsets::{Kind, Subset};
+pub use sampling::RunNumbers;
+use sampling::Sampling;
+pub use settings::Kind;
+pub use subsets::{Subset, Width, Widths};
 pub use trimming::{Fault, faults};
-
-/// Width of the prior where nothing else is said, the paper's.
-const WIDTH: Width = Width::Lognormal(0.03);
-
-/// The var that the paper looks at by itself.
-const SINGLE: &str = "D8";
 
 /// What a study is made of.
 #[derive(Debug, Clone, Copy)]
@@ -65,35 +60,21 @@ pub struct Numbers {
     /// Every subset of the data.
     pub subsets: Vec<SubsetNumbers>,
     /// Standard deviation of each var in each kind of subset, median over the subsets, and pooled.
-    pub widths: Vec<subsets::Widths>,
+    pub widths: Vec<Widths>,
     /// Laplace approximations beside the reference.
     pub laplace: Vec<Comparison>,
     /// Readings that the trimming finds at fault.
     pub faults: Vec<Fault>,
-}
-
-/// One sampled posterior.
-#[derive(Debug, Clone, Serialize)]
-pub struct RunNumbers {
-    /// What it was.
-    pub name: String,
-    /// Largest R-hat of a var.
-    pub rhat_max: f64,
-    /// Smallest bulk or tail effective sample size of a var.
-    pub ess_min: f64,
-    /// Divergent draws.
-    pub divergences: usize,
-    /// Draws of all chains.
-    pub draws: usize,
-    /// Wall-clock time [s].
-    pub seconds: f64,
+    /// Half widths beside the published ones, for the recording made with the published vars.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub published: Vec<Beside>,
 }
 
 /// One subset of the data.
 #[derive(Debug, Clone, Serialize)]
 pub struct SubsetNumbers {
     /// The settings.
-    pub kind: &'static str,
+    pub kind: String,
     /// Frame pairs in it.
     pub pairs: usize,
     /// Each var.
@@ -123,9 +104,9 @@ pub struct VarNumbers {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StudyError {
-    /// The recording cannot be reduced.
+    /// There is no batch fit.
     #[error(transparent)]
-    Readings(#[from] ReadingsError),
+    Fit(#[from] BatchError),
     /// A posterior has no Laplace approximation.
     #[error("{run}: {source}")]
     Laplace {
@@ -145,81 +126,13 @@ pub enum StudyError {
     /// The ring at a point has no closed orbit.
     #[error(transparent)]
     Orbit(#[from] twin::OrbitError),
-    /// No tables.
-    #[error(transparent)]
-    Training(#[from] training::TrainingError),
     /// The core refuses the recording.
     #[error(transparent)]
     Stream(#[from] StreamError),
-    /// The recording has not what the paper's data need.
-    #[error("{recording}: no corrector has frames for a difference {kind}, which the paper's data are made of")]
-    NoPairs {
-        /// The recording.
-        recording: String,
-        /// From which setting to which.
-        kind: &'static str,
-    },
 }
 
-/// The bench on which posteriors are sampled: one campaign, one model, one seed.
-pub struct Bench<'p> {
-    campaign: Campaign,
-    twin: ResponseModel,
-    options: Options,
-    /// A fresh one for whatever is random.
-    seeds: Box<dyn Iterator<Item = u64>>,
-    runs: Vec<RunNumbers>,
-    progress: &'p mut dyn FnMut(&str, usize, usize),
-}
-
-impl<'p> Bench<'p> {
-    fn new(
-        ring: &Ring,
-        recording: &Recording,
-        options: Options,
-        progress: &'p mut dyn FnMut(&str, usize, usize),
-    ) -> Result<Self, StudyError> {
-        progress("batch fit", 0, 1);
-        let campaign = Campaign::of(ring, recording, |_| ())?;
-        let seeds = Box::new(simulate::seeds(options.nuts.seed));
-        Ok(Self { campaign, twin: ResponseModel::twin(ring)?, options, seeds, runs: Vec::new(), progress })
-    }
-
-    /// Sample one posterior of the twin.
-    fn sample(&mut self, name: &str, readings: Readings, width: Width) -> Result<Sampled, StudyError> {
-        let names = self.campaign.ring.var_names();
-        let posterior = Posterior { model: self.twin.clone(), readings, width };
-        let laplace = posterior
-            .laplace(&self.campaign.fit.map_params)
-            .map_err(|source| StudyError::Laplace { run: name.to_owned(), source })?;
-        let settings = NutsSettings { seed: self.seed(), ..self.options.nuts };
-        let total = settings.chains * (settings.warm_up + settings.draws);
-        let report = &mut *self.progress;
-        let run =
-            nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |done| report(name, done, total))
-                .map_err(|source| StudyError::Nuts { run: name.to_owned(), source })?;
-        let sampled = Sampled::of(&run.draws);
-        self.runs.push(RunNumbers {
-            name: name.to_owned(),
-            rhat_max: sampled.summary.iter().map(|s| s.r_hat).fold(0.0, f64::max),
-            ess_min: sampled.smallest_ess(),
-            divergences: run.draws.divergences(),
-            draws: settings.chains * settings.draws,
-            seconds: run.seconds,
-        });
-        Ok(sampled)
-    }
-
-    fn seed(&mut self) -> u64 {
-        self.seeds.next().expect("seeds do not end")
-    }
-
-    fn names(&self) -> Vec<String> {
-        self.campaign.ring.var_names()
-    }
-}
-
-/// Make all studies of a recording; `progress` hears the name of each posterior and how many of its draws are done.
+/// Make all studies of a recording that it has the data for; `progress` hears the name of each posterior, and how many draws of
+/// how many are done.
 ///
 /// # Errors
 /// [`StudyError`].
@@ -229,97 +142,96 @@ pub fn run(
     options: Options,
     progress: &mut dyn FnMut(&str, usize, usize),
 ) -> Result<Study, StudyError> {
-    let mut bench = Bench::new(ring, recording, options, progress)?;
-    let frames = Readings::of_frames(&bench.campaign, &bench.twin);
-    let reference = bench.sample("all frames", frames, WIDTH)?;
-    let (stability, subsets) = subsets::study(&mut bench)?;
-    let (sensitivity, by_width) = prior::study(&mut bench, &subsets)?;
-    let single = single::study(&bench, &by_width);
-    let correlations = correlations::study(&mut bench, &reference)?;
-    let prediction = prediction::study(&mut bench, &subsets)?;
-    let (approximations, laplace) = laplace::study(&bench, &reference)?;
-    let (trimming, faults) = trimming::study(&bench)?;
+    let mut sampling = Sampling::new(ring, recording, options.nuts, progress)?;
+    let drawn = subsets::drawn(sampling.campaign());
+    // all frames, the subsets, the priors, and the simulated readings
+    sampling.plan(1 + drawn.iter().map(|(_, times)| times).sum::<usize>() + prior::RUNS + 1);
+    let frames = Readings::of_frames(&sampling.reduced, &sampling.twin, TuneUse::LeftOut);
+    let reference = sampling.sample("all frames", frames, None)?;
+    let var = farthest(&reference);
+    let subsets = subsets::sample(&mut sampling, &drawn)?;
+    let (sensitivity, by_width) = prior::study(&mut sampling, &subsets)?;
+    let single = single::study(&sampling, &subsets, &by_width, var);
+    let correlations = correlations::study(&mut sampling, &reference, var)?;
+    let prediction = prediction::study(&mut sampling, &subsets)?;
+    let (approximations, laplace) = laplace::study(&sampling, &reference)?;
+    let (trimming, faults) = trimming::study(&sampling)?;
+    let names = sampling.names();
+    let published = if published::is_published(ring, recording) { published::beside(&subsets) } else { Vec::new() };
+    let stability = (!drawn.is_empty()).then(|| subsets.stability(&names));
+    let beside = (!published.is_empty()).then(|| published::section(&subsets, &published));
+    let first = [Some(subsets::final_table(&sampling, &subsets, &reference)), beside, Some(sensitivity), Some(single)];
+    let then = [stability, Some(correlations), prediction, Some(approximations), Some(trimming)];
+    let sections = first.into_iter().chain(then).flatten().chain([sampling::section(&sampling.runs)]).collect();
+    let title = format!("Quadrupole strengths from {}", recording.name);
+    let page = Page { title, lead: lead(&sampling, &subsets, &reference), sections };
     let numbers = Numbers {
         recording: recording.name.clone(),
-        runs: bench.runs.clone(),
         vars: reference.summary.iter().map(VarNumbers::of).collect(),
         subsets: subsets.numbers(),
-        widths: subsets.widths(&bench.names()),
+        widths: subsets.widths(&names),
+        runs: sampling.runs,
         laplace,
         faults,
-    };
-    let sections = vec![
-        subsets.final_table(&bench, &reference),
-        sensitivity,
-        single,
-        stability,
-        correlations,
-        prediction,
-        approximations,
-        trimming,
-        sampling(&bench.runs),
-    ];
-    let page = Page {
-        title: format!("Quadrupole strengths from {}", recording.name),
-        lead: lead(&bench, &reference),
-        sections,
+        published,
     };
     Ok(Study { page, numbers })
 }
 
-/// The result in three sentences.
-fn lead(bench: &Bench, reference: &Sampled) -> String {
-    let sigma = |range: core::ops::Range<usize>| {
-        let count = range.len() as f64;
-        100.0 * reference.summary[range].iter().map(|s| s.sd).sum::<f64>() / count
-    };
-    let furthest = reference.summary.iter().max_by(|a, b| (a.mean - 1.0).abs().total_cmp(&(b.mean - 1.0).abs()));
+/// The var that is farthest from its design, in its error bars.
+fn farthest(reference: &Sampled) -> usize {
+    let away = |s: &Summary| (s.mean - 1.0).abs() / s.sd;
+    let each = reference.summary.iter().map(away).enumerate();
+    each.max_by(|one, other| one.1.total_cmp(&other.1)).map_or(0, |(var, _)| var)
+}
+
+/// The result in a few sentences.
+fn lead(sampling: &Sampling, subsets: &subsets::Subsets, reference: &Sampled) -> String {
+    let campaign = sampling.campaign();
+    let furthest = reference.summary.get(farthest(reference));
     let furthest = furthest
         .map_or(String::new(), |s| format!("{} is furthest from its design, {:.4} ± {:.4}. ", s.name, s.mean, s.sd));
-    let first = inference::map::first_family(&bench.campaign.ring);
+    let data = subsets.widest().map_or_else(
+        || "The recording holds no pairs of settings of single correctors, so that studies of differences are left out. ".into(),
+        |_| format!("Correctors were set to at most {}. ", subsets.settings.strongest()),
+    );
     format!(
-        "Full NUTS on the exact twin, all {} frames, every baseline unknown, lognormal prior of 3 %: the horizontally focusing \
-         quadrupoles are known to {:.2} %, the vertically focusing ones to {:.2} % (mean standard deviation). {furthest}\
-         Chi-square per degree of freedom is {:.3}. The twin's corrector kick of 0.2 mrad at 22 A was inferred from the very \
-         posterior widths of the published analysis: that widths agree with it is a calibration, not a confirmation.",
-        bench.campaign.recording.rows.len(),
-        sigma(0..first),
-        sigma(first..reference.summary.len()),
-        bench.campaign.fit.chi2_per_dof,
+        "{}: full NUTS on the exact twin, all {} frames, every baseline unknown, measured tunes left out. Mean standard deviation: {}. \
+         {furthest}{data}Chi-square per degree of freedom is {:.3}. {}",
+        campaign.ring.name,
+        campaign.frames(),
+        widths(&campaign.ring, reference),
+        sampling.reduced.fit.chi2_per_dof,
+        tunes(&sampling.reduced.fit.tunes),
     )
 }
 
-/// How well each posterior was sampled.
-fn sampling(runs: &[RunNumbers]) -> Section {
-    let row = |run: &RunNumbers| {
-        vec![
-            run.name.clone(),
-            format!("{:.4}", run.rhat_max),
-            format!("{:.0}", run.ess_min),
-            run.divergences.to_string(),
-            run.draws.to_string(),
-            format!("{:.1}", run.seconds),
-        ]
+/// Tunes of the fitted ring beside the measured ones.
+fn tunes(tunes: &[FittedTune; 2]) -> String {
+    let one = |(plane, tune): (&str, &FittedTune)| {
+        let measured = tune
+            .measured
+            .map_or_else(|| "not measured".into(), |(value, sigma)| format!("measured {value:.4} ± {sigma:.4}"));
+        format!("{plane} {:.4} ({measured})", tune.model)
     };
-    let header = ["posterior", "largest R-hat", "smallest ESS", "divergences", "draws", "time [s]"];
-    Section {
-        heading: "How the posteriors were sampled".into(),
-        text: vec!["Every posterior was sampled by NUTS on the exact twin in coordinates whitened by its Laplace covariance. R-hat is \
-                    rank-normalised and split; the effective sample size is the smaller of bulk and tail, the smallest over all \
-                    vars."
-            .into()],
-        tables: vec![report::Table {
-            caption: "Sampling diagnostics.".into(),
-            header: header.map(str::to_owned).to_vec(),
-            rows: runs.iter().map(row).collect(),
-        }],
-        ..Section::default()
-    }
+    let both: Vec<String> = ["Qx", "Qy"].into_iter().zip(tunes).map(one).collect();
+    format!("Tunes of the fitted ring: {}.", both.join(", "))
+}
+
+/// Mean standard deviation of the focusing and of the defocusing vars, which come after them.
+fn widths(ring: &Ring, reference: &Sampled) -> String {
+    let gradients = ring.gradients();
+    let focuses = |i: &usize| ring.parameters[*i].quadrupoles.first().is_some_and(|q| gradients[*q] > 0.0);
+    let (focusing, others): (Vec<usize>, Vec<usize>) = (0..ring.parameters.len()).partition(focuses);
+    let mean = |of: &[usize]| 100.0 * of.iter().map(|i| reference.summary[*i].sd).sum::<f64>() / of.len() as f64;
+    let each = [("horizontally focusing quadrupoles", focusing), ("vertically focusing ones", others)];
+    let words = each.iter().filter(|(_, of)| !of.is_empty()).map(|(name, of)| format!("{name} {:.2} %", mean(of)));
+    words.collect::<Vec<_>>().join(", ")
 }
 
 impl VarNumbers {
-    fn of(summary: &inference::draws::Summary) -> Self {
-        let inference::draws::Summary { name, mean, sd, q025, q16, q84, q975, .. } = summary.clone();
+    fn of(summary: &Summary) -> Self {
+        let Summary { name, mean, sd, q025, q16, q84, q975, .. } = summary.clone();
         Self { name, mean, sigma: sd, q025, q16, q84, q975 }
     }
 }

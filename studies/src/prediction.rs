@@ -3,15 +3,16 @@
 
 use core::ops::Range;
 
+use inference::diagnostics::quantile;
+use inference::{Pair, simulate};
 use nalgebra::DMatrix;
+use report::{Axes, Figure, Panel, Reference, Section, Series};
 use statrs::distribution::{ContinuousCDF, Normal};
 use twin::{OrbitError, Plane};
 
-use super::subsets::{Kind, Subset, Subsets};
-use super::{Bench, Sampled, StudyError};
-use inference::readings::Pair;
-use inference::simulate;
-use report::{Axes, Figure, Panel, Reference, Section, Series};
+use super::sampling::Sampling;
+use super::subsets::{Subset, Subsets};
+use super::{Sampled, StudyError};
 
 /// Draws that make a predictive distribution; its standard deviation is then known to 5 %.
 const DRAWS: usize = 200;
@@ -34,18 +35,25 @@ struct Checked {
     rank: f64,
 }
 
-/// Predict what the other subsets of -22 to +22 A hold from the posterior of the first.
-pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<Section, StudyError> {
-    let seed = bench.seed();
-    let bench = &*bench;
-    let Some((known, fitted)) = subsets.first(Kind::MinusToPlus) else { return Ok(Section::default()) };
+/// Predict what the other subsets of the widest differences hold from the posterior of the first; none without such.
+///
+/// # Errors
+/// [`StudyError`].
+pub fn study(sampling: &mut Sampling, subsets: &Subsets) -> Result<Option<Section>, StudyError> {
+    let seed = sampling.seed();
+    let sampling = &*sampling;
+    let Some((known, fitted)) = subsets.first() else { return Ok(None) };
+    let differences = subsets.words(known.kind);
     let test = &unseen(subsets, known);
-    let posterior = predictive(bench, test, &posterior_draws(fitted))?;
-    let prior = predictive(bench, test, &prior_draws(bench, seed)?)?;
-    let checked = check(bench, test, &posterior);
+    if test.pairs.is_empty() {
+        return Ok(None);
+    }
+    let posterior = predictive(sampling, test, &posterior_draws(fitted))?;
+    let prior = predictive(sampling, test, &prior_draws(sampling, seed)?)?;
+    let checked = check(sampling, test, &posterior);
     let mut figures = Vec::new();
     for plane in [Plane::X, Plane::Y] {
-        figures.extend(deviations(bench, test, plane, &posterior, &prior));
+        figures.extend(deviations(sampling, test, plane, &differences, &posterior, &prior));
     }
     let curve = |checked: &[&Checked]| calibration(checked);
     let all: Vec<&Checked> = checked.iter().collect();
@@ -59,21 +67,21 @@ pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<Section, StudyError
         name: name.clone(),
         series: curve(&checked.iter().filter(|c| c.monitor == b).collect::<Vec<_>>()),
     };
-    let names = bench.campaign.ring.monitor_names();
+    let names = sampling.campaign().ring.monitor_names();
     let axes = Axes::new("Calibration of each monitor", "stated probability [1]", "share in it [1]")
         .compared(Reference::Diagonal);
     figures.push((
         "The same for each monitor.".into(),
         Figure::small_multiples(&axes, &names.iter().enumerate().map(panel).collect::<Vec<_>>()),
     ));
-    figures.push(twin_error(bench, test, fitted)?);
+    figures.push(twin_error(sampling, test, fitted)?);
     let inside =
         |p: f64| all.iter().filter(|c| (2.0 * c.rank - 1.0).abs() <= p).count() as f64 / all.len().max(1) as f64;
     let rms = (all.iter().map(|c| c.deviation * c.deviation).sum::<f64>() / all.len().max(1) as f64).sqrt();
-    Ok(Section {
+    Ok(Some(Section {
         heading: "Predictions of differences that were not fitted".into(),
         text: vec![format!(
-            "The posterior of the first subset of -22 to +22 A predicts {} pairs of the others, of which no frame was fitted, at the \
+            "The posterior of the first subset of differences {differences} predicts {} pairs of the others, of which no frame was fitted, at the \
              monitors of the plane that is kicked. {} differences: rms deviation {:.3} mm (noisy monitors included); {:.1} % lie in the \
              68 % band and {:.1} % in the 95 % band. The prior's bands are those of rings whose tunes keep a beam.",
             test.pairs.len(),
@@ -84,13 +92,14 @@ pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<Section, StudyError
         )],
         figures,
         ..Section::default()
-    })
+    }))
 }
 
 /// Pairs of the other subsets of a kind, none of whose frames stands in `known`.
 fn unseen(subsets: &Subsets, known: &Subset) -> Subset {
     let seen: Vec<usize> = known.pairs.iter().flat_map(|pair| [pair.initial, pair.last]).collect();
-    let others = subsets.0.iter().filter(|(subset, _)| subset.kind == known.kind).flat_map(|(subset, _)| &subset.pairs);
+    let others =
+        subsets.all.iter().filter(|(subset, _)| subset.kind == known.kind).flat_map(|(subset, _)| &subset.pairs);
     let mut pairs: Vec<Pair> = Vec::new();
     for pair in others.filter(|pair| !seen.contains(&pair.initial) && !seen.contains(&pair.last)) {
         if !pairs.contains(pair) {
@@ -105,15 +114,15 @@ fn posterior_draws(fitted: &Sampled) -> Vec<Vec<f64>> {
     fitted.vars.row_iter().step_by(every).map(|row| row.iter().copied().collect()).collect()
 }
 
-fn prior_draws(bench: &Bench, seed: u64) -> Result<Vec<Vec<f64>>, OrbitError> {
-    let ring = &bench.campaign.ring;
-    simulate::seeds(seed).take(DRAWS).map(|seed| simulate::vars(ring, 0.03, false, seed)).collect()
+fn prior_draws(sampling: &Sampling, seed: u64) -> Result<Vec<Vec<f64>>, OrbitError> {
+    let ring = &sampling.campaign().ring;
+    simulate::seeds(seed).take(DRAWS).map(|seed| simulate::vars(ring, false, seed)).collect()
 }
 
-fn predictive(bench: &Bench, subset: &Subset, draws: &[Vec<f64>]) -> Result<Predictive, OrbitError> {
+fn predictive(sampling: &Sampling, subset: &Subset, draws: &[Vec<f64>]) -> Result<Predictive, OrbitError> {
     let mut predictions = Vec::new();
     for vars in draws {
-        predictions.push(differences(bench, &subset.pairs, vars)?);
+        predictions.push(differences(sampling, &subset.pairs, vars)?);
     }
     let n = predictions.len() as f64;
     let mean = predictions.iter().sum::<DMatrix<f64>>() / n;
@@ -122,52 +131,50 @@ fn predictive(bench: &Bench, subset: &Subset, draws: &[Vec<f64>]) -> Result<Pred
         DMatrix::from_fn(mean.nrows(), mean.ncols(), |i, b| {
             let mut values: Vec<f64> = predictions.iter().map(|one| one[(i, b)]).collect();
             values.sort_by(f64::total_cmp);
-            inference::diagnostics::quantile(&values, p)
+            quantile(&values, p)
         })
     });
     Ok(Predictive { mean, sigma: square.map(f64::sqrt), outer })
 }
 
 /// What a ring with these vars makes of frame pairs [m]: rows pairs, columns monitors.
-fn differences(bench: &Bench, pairs: &[Pair], vars: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
-    let params: Vec<f64> = vars.iter().zip(bench.campaign.supplies()).map(|(var, supply)| var.ln() + supply).collect();
-    let response = bench.twin.response(&params)?;
+fn differences(sampling: &Sampling, pairs: &[Pair], vars: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
+    let params: Vec<f64> = vars.iter().map(|var| var.ln()).collect();
+    let response = sampling.twin.predict(&sampling.reduced.strength(&params))?.response;
     let rows: Vec<_> = pairs
         .iter()
-        .map(|pair| (&response * (bench.campaign.drive(pair.last) - bench.campaign.drive(pair.initial))).transpose())
+        .map(|pair| {
+            (&response * (sampling.reduced.drive(pair.last) - sampling.reduced.drive(pair.initial))).transpose()
+        })
         .collect();
     Ok(DMatrix::from_rows(&rows))
 }
 
-fn difference(bench: &Bench, pair: &Pair, b: usize) -> Option<f64> {
-    Some(bench.campaign.reading(pair.last, b)? - bench.campaign.reading(pair.initial, b)?)
+fn difference(sampling: &Sampling, pair: &Pair, b: usize) -> Option<f64> {
+    Some(sampling.reduced.reading(pair.last, b)? - sampling.reduced.reading(pair.initial, b)?)
 }
 
 /// Monitors of a plane.
-fn monitors(bench: &Bench, plane: Plane) -> Range<usize> {
-    let (horizontal, all) = (bench.campaign.horizontal_monitors(), bench.campaign.ring.read_monitors.len());
+fn monitors(sampling: &Sampling, plane: Plane) -> Range<usize> {
+    let (horizontal, all) = (sampling.campaign().ring.horizontal_monitors(), sampling.campaign().monitors());
     if plane == Plane::X { 0..horizontal } else { horizontal..all }
 }
 
 /// The plane that a pair's corrector kicks in.
-fn kicked(bench: &Bench, pair: &Pair) -> Plane {
-    let correctors = &bench.campaign.ring.correctors;
-    let k = bench.campaign.drive(pair.last) - bench.campaign.drive(pair.initial);
-    let strongest = correctors[k.rows(0, correctors.len()).icamax()];
-    match bench.campaign.ring.elements[strongest].kind {
-        twin::Kind::Corrector { plane, .. } => plane,
-        _ => unreachable!("the list holds correctors"),
-    }
+fn kicked(sampling: &Sampling, pair: &Pair) -> Plane {
+    let correctors = &sampling.campaign().ring.correctors;
+    let k = sampling.reduced.drive(pair.last) - sampling.reduced.drive(pair.initial);
+    correctors[k.rows(0, correctors.len()).icamax()].plane
 }
 
-fn check(bench: &Bench, subset: &Subset, predictive: &Predictive) -> Vec<Checked> {
+fn check(sampling: &Sampling, subset: &Subset, predictive: &Predictive) -> Vec<Checked> {
     let mut checked = Vec::new();
     for (i, pair) in subset.pairs.iter().enumerate() {
         // across the planes a twin without coupling predicts nothing, which would be checked in vain
-        for monitor in monitors(bench, kicked(bench, pair)) {
-            let Some(measured) = difference(bench, pair, monitor) else { continue };
+        for monitor in monitors(sampling, kicked(sampling, pair)) {
+            let Some(measured) = difference(sampling, pair, monitor) else { continue };
             let deviation = measured - predictive.mean[(i, monitor)];
-            let sigma = predictive.sigma[(i, monitor)].hypot(bench.campaign.noise(monitor) * 2f64.sqrt());
+            let sigma = predictive.sigma[(i, monitor)].hypot(sampling.reduced.noise(monitor) * 2f64.sqrt());
             let rank = Normal::standard().cdf(deviation / sigma);
             checked.push(Checked { monitor, deviation, rank });
         }
@@ -192,19 +199,21 @@ fn calibration(checked: &[&Checked]) -> Vec<Series> {
 
 /// Deviations from the posterior mean along the ring for the first corrector of a plane, with the bands of both.
 fn deviations(
-    bench: &Bench,
+    sampling: &Sampling,
     subset: &Subset,
     plane: Plane,
+    differences: &str,
     posterior: &Predictive,
     prior: &Predictive,
 ) -> Option<(String, Figure)> {
-    let ring = &bench.campaign.ring;
-    let monitors = monitors(bench, plane);
-    let (i, pair) = subset.pairs.iter().enumerate().find(|(_, pair)| kicked(bench, pair) == plane)?;
-    let corrector = bench.campaign.recording.rows[pair.last].corrector.clone()?;
+    let ring = &sampling.campaign().ring;
+    let monitors = monitors(sampling, plane);
+    let (i, pair) = subset.pairs.iter().enumerate().find(|(_, pair)| kicked(sampling, pair) == plane)?;
+    let (corrector, _) = sampling.campaign().recording.rows[pair.last].correctors.first()?;
+    let corrector = ring.corrector_name(*corrector);
     let names: Vec<String> = ring.monitor_names()[monitors.clone()].to_vec();
     let x: Vec<f64> = (0..names.len()).map(|b| b as f64).collect();
-    let noise = |b: usize| bench.campaign.noise(b) * 2f64.sqrt();
+    let noise = |b: usize| sampling.reduced.noise(b) * 2f64.sqrt();
     let band = |label: &str, p: &Predictive| {
         let centre: Vec<f64> =
             monitors.clone().map(|b| MILLIMETRE * (p.mean[(i, b)] - posterior.mean[(i, b)])).collect();
@@ -218,7 +227,7 @@ fn deviations(
     };
     let measured = monitors
         .clone()
-        .map(|b| difference(bench, pair, b).map_or(f64::NAN, |d| MILLIMETRE * (d - posterior.mean[(i, b)])));
+        .map(|b| difference(sampling, pair, b).map_or(f64::NAN, |d| MILLIMETRE * (d - posterior.mean[(i, b)])));
     let series = [
         band("prior of rings that hold beam, 95 %", prior),
         band("posterior, 95 %", posterior),
@@ -228,30 +237,30 @@ fn deviations(
     let axes = Axes::new(&title, "monitor", "deviation of x or y [mm]").named(&names).compared(Reference::Level(0.0));
     Some((
         format!(
-            "Difference -22 to +22 A of corrector {corrector}, not fitted, with prior and posterior predictive bands."
+            "Difference {differences} of corrector {corrector}, not fitted, with prior and posterior predictive bands."
         ),
         Figure::lines(&axes, &series),
     ))
 }
 
 /// Rms deviation at each monitor, by the design and by the point estimates.
-fn twin_error(bench: &Bench, subset: &Subset, fitted: &Sampled) -> Result<(String, Figure), OrbitError> {
-    let names = bench.campaign.ring.monitor_names();
+fn twin_error(sampling: &Sampling, subset: &Subset, fitted: &Sampled) -> Result<(String, Figure), OrbitError> {
+    let names = sampling.campaign().ring.monitor_names();
     let rms = |vars: &[f64]| -> Result<Vec<f64>, OrbitError> {
-        let predicted = differences(bench, &subset.pairs, vars)?;
+        let predicted = differences(sampling, &subset.pairs, vars)?;
         let at = |b: usize| {
             let squares: Vec<f64> = subset
                 .pairs
                 .iter()
                 .enumerate()
-                .filter_map(|(i, pair)| Some((difference(bench, pair, b)? - predicted[(i, b)]).powi(2)))
+                .filter_map(|(i, pair)| Some((difference(sampling, pair, b)? - predicted[(i, b)]).powi(2)))
                 .collect();
             MILLIMETRE * (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
         };
         Ok((0..names.len()).map(at).collect())
     };
     let x: Vec<f64> = (0..names.len()).map(|b| b as f64).collect();
-    let noise = (0..names.len()).map(|b| MILLIMETRE * bench.campaign.noise(b) * 2f64.sqrt()).collect();
+    let noise = (0..names.len()).map(|b| MILLIMETRE * sampling.reduced.noise(b) * 2f64.sqrt()).collect();
     let series = [
         Series::points("design (vars = 1)", x.clone(), rms(&vec![1.0; fitted.summary.len()])?),
         Series::points("point estimates", x.clone(), rms(&fitted.mean())?),

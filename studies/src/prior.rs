@@ -1,12 +1,13 @@
 //! Prior sensitivity: the same differences under priors of 1 % to 4 % and without a width.
 
-use super::subsets::{Kind, Subsets};
-use super::{Bench, Sampled, StudyError};
-use inference::posterior::Width;
-use inference::readings::Readings;
+use inference::{Readings, Width};
 use report::{Axes, Band, Figure, Reference, Section};
 
-/// The paper's widths.
+use super::sampling::Sampling;
+use super::subsets::Subsets;
+use super::{Sampled, StudyError};
+
+/// The published widths.
 const WIDTHS: [(&str, Width); 5] = [
     ("1 %", Width::Lognormal(0.01)),
     ("2 %", Width::Lognormal(0.02)),
@@ -15,18 +16,23 @@ const WIDTHS: [(&str, Width); 5] = [
     ("loguniform", Width::Loguniform),
 ];
 
+/// Posteriors that this study samples.
+pub const RUNS: usize = WIDTHS.len();
+
 /// A posterior under each prior, by the prior's word.
 pub type ByWidth = Vec<(&'static str, Sampled)>;
 
-/// Sample the first subset of -22 to +22 A under every prior.
-pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<(Section, ByWidth), StudyError> {
-    let pairs = subsets.first(Kind::MinusToPlus).map_or(Vec::new(), |(subset, _)| subset.pairs.clone());
+/// Sample the first subset with the widest differences under every prior, or all frames where there are no pairs.
+///
+/// # Errors
+/// [`StudyError`].
+pub fn study(sampling: &mut Sampling, subsets: &Subsets) -> Result<(Section, ByWidth), StudyError> {
     let mut by_width = Vec::new();
     for (word, width) in WIDTHS {
-        let readings = Readings::of_pairs(&bench.campaign, &bench.twin, &pairs);
-        by_width.push((word, bench.sample(&format!("prior {word}"), readings, width)?));
+        let readings = readings(sampling, subsets);
+        by_width.push((word, sampling.sample(&format!("prior {word}"), readings, Some(width))?));
     }
-    let names = bench.names();
+    let names = sampling.names();
     let axes = Axes::new("Posterior under five priors: bars 68 %, lines 95 %", "quadrupole", "var [1]");
     let axes = axes.named(&names).compared(Reference::Level(1.0));
     let bands: Vec<Band> = by_width.iter().map(|(word, sampled)| sampled.band(word)).collect();
@@ -36,12 +42,27 @@ pub fn study(bench: &mut Bench, subsets: &Subsets) -> Result<(Section, ByWidth),
     let section = Section {
         heading: "Sensitivity to the prior".into(),
         text: vec![format!(
-            "One subset of -22 to +22 A. Each lognormal has mean exactly 1 (ln var has mean -sigma^2/2) before it ends at 0.94 and \
-             1.06; loguniform is flat in ln var. Mean posterior standard deviation: {}.",
+            "Data: {}. Each lognormal has mean exactly 1 (ln var has mean -sigma²/2) before it ends at the bounds of the var's range; \
+             loguniform is flat in ln var. Mean posterior standard deviation: {}.",
+            data(subsets),
             widths.join(", ")
         )],
         figures: vec![("What the prior's width does to each var.".into(), Figure::bands(&axes, &bands))],
         ..Section::default()
     };
     Ok((section, by_width))
+}
+
+fn readings(sampling: &Sampling, subsets: &Subsets) -> Readings {
+    match subsets.first() {
+        Some((subset, _)) => Readings::of_pairs(&sampling.reduced, &sampling.twin, &subset.pairs),
+        None => Readings::of_frames(&sampling.reduced, &sampling.twin, inference::TuneUse::LeftOut),
+    }
+}
+
+/// What is sampled under every prior, in words.
+pub fn data(subsets: &Subsets) -> String {
+    subsets
+        .widest()
+        .map_or_else(|| "all frames".into(), |kind| format!("one subset of differences {}", subsets.words(kind)))
 }

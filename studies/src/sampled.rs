@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use inference::draws::{Draws, Summary};
+use inference::{Draws, Summary};
 use report::Band;
 
 /// A sampled posterior.

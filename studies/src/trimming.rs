@@ -1,13 +1,15 @@
-//! Outliers, after the paper's Appendix A: all pairs of a corrector's frames, less the model; a reading whose pairs stand out
+//! Outliers, after Appendix A of the published analysis: all pairs of a corrector's frames, less the model; a reading whose pairs stand out
 //! again and again is at fault.
 
+use inference::diagnostics::quantile;
+use inference::recording::Row;
+use inference::{Reduced, ResponseModel};
+use report::{Section, Table};
 use serde::Serialize;
 use twin::OrbitError;
 
-use super::{Bench, StudyError};
-use inference::model::ResponseModel;
-use inference::readings::Campaign;
-use report::{Section, Table};
+use super::StudyError;
+use super::sampling::Sampling;
 
 /// Deviation of a pair that stands out, in standard deviations of a difference. Of 1e5 pairs of normal noise one in 1e5
 /// is expected beyond 4.4; 5 leaves room for the model.
@@ -29,13 +31,13 @@ pub struct Fault {
 }
 
 /// List the readings at fault.
-pub fn study(bench: &Bench) -> Result<(Section, Vec<Fault>), StudyError> {
-    let faults = faults(&bench.campaign, &bench.twin)?;
+pub fn study(sampling: &Sampling) -> Result<(Section, Vec<Fault>), StudyError> {
+    let faults = faults(&sampling.reduced, &sampling.twin)?;
     let row = |f: &Fault| {
         vec![
             f.sequence.to_string(),
             f.corrector.clone(),
-            format!("{:+.0}", f.setting),
+            format!("{:+}", f.setting),
             f.monitor.clone(),
             format!("{:+.2}", 1e3 * f.deviation),
         ]
@@ -66,20 +68,19 @@ pub fn study(bench: &Bench) -> Result<(Section, Vec<Fault>), StudyError> {
 ///
 /// # Errors
 /// [`OrbitError`] if the ring at the MAP is not stable.
-pub fn faults(campaign: &Campaign, model: &ResponseModel) -> Result<Vec<Fault>, OrbitError> {
-    let params: Vec<f64> =
-        campaign.fit.map_params.iter().zip(campaign.supplies()).map(|(theta, s)| theta + s).collect();
-    let response = model.response(&params)?;
-    let monitors = campaign.ring.monitor_names();
+pub fn faults(reduced: &Reduced, model: &ResponseModel) -> Result<Vec<Fault>, OrbitError> {
+    let campaign = &reduced.campaign;
+    let response = model.predict(&reduced.strength(&reduced.fit.map_params))?.response;
+    let (rows, monitors) = (&campaign.recording.rows, campaign.ring.monitor_names());
     let mut faults = Vec::new();
-    for corrector in campaign.ring.cells(&campaign.ring.correctors) {
-        let own = |(_, row): &(usize, &inference::recording::Row)| row.corrector.as_ref() == Some(&corrector);
-        let frames: Vec<usize> = campaign.recording.rows.iter().enumerate().filter(own).map(|(i, _)| i).collect();
+    for (c, corrector) in campaign.ring.corrector_names().into_iter().enumerate() {
+        let own = |row: &Row| row.correctors.iter().any(|(set, _)| *set == c);
+        let frames: Vec<usize> = rows.iter().enumerate().filter(|(_, row)| own(row)).map(|(i, _)| i).collect();
         for (b, monitor) in monitors.iter().enumerate() {
             let deviation =
-                |&frame: &usize| Some((frame, campaign.raw(frame, b)? - (response.row(b) * campaign.drive(frame))[0]));
+                |&frame: &usize| Some((frame, reduced.raw(frame, b)? - (response.row(b) * reduced.drive(frame))[0]));
             let deviations: Vec<(usize, f64)> = frames.iter().filter_map(deviation).collect();
-            let limit = STANDS_OUT * 2f64.sqrt() * campaign.noise(b);
+            let limit = STANDS_OUT * 2f64.sqrt() * reduced.noise(b);
             for &(frame, here) in &deviations {
                 let mut others: Vec<f64> =
                     deviations.iter().filter(|(f, _)| *f != frame).map(|(_, d)| here - d).collect();
@@ -87,13 +88,12 @@ pub fn faults(campaign: &Campaign, model: &ResponseModel) -> Result<Vec<Fault>, 
                 // one difference could be the other reading's fault
                 if others.len() > 1 && 2 * out > others.len() {
                     others.sort_by(f64::total_cmp);
-                    let row = &campaign.recording.rows[frame];
                     faults.push(Fault {
-                        sequence: row.sequence,
+                        sequence: rows[frame].sequence,
                         corrector: corrector.clone(),
-                        setting: row.setting,
+                        setting: rows[frame].setting(c).unwrap_or(0.0),
                         monitor: monitor.clone(),
-                        deviation: inference::diagnostics::quantile(&others, 0.5),
+                        deviation: quantile(&others, 0.5),
                     });
                 }
             }

@@ -4,11 +4,12 @@ use core::error::Error;
 
 use estimator::booster::Estimate;
 use firmware_sim::link::Status;
-use host_bridge::answer::Answer;
-use host_bridge::cli::Rate;
-use host_bridge::command::replay::Clock;
-use host_bridge::command::{CommandError, serve};
-use host_bridge::link::{Heard, Link};
+use host_bridge::record::{EstimateRecord, Names};
+use host_bridge::result::FitResult;
+use host_bridge::source::device::Fed;
+use host_bridge::source::link::{Heard, Link};
+use host_bridge::source::{Clock, Rate};
+use host_bridge::stop::Stop;
 use inference::Recording;
 use inference::stream::{self, Core};
 use twin::Ring;
@@ -32,17 +33,17 @@ pub const REGIONS: [(&str, &str); 8] = [
 pub struct Comparison {
     /// Frames that went through both.
     pub frames: usize,
-    /// Sequence numbers of frames whose answers differ in any bit.
+    /// Sequence numbers of frames whose estimates differ in any bit.
     pub different: Vec<u32>,
     /// How the device was at the end.
     pub status: Status,
     /// Instructions of each region.
     pub counts: Counts,
-    /// The device's answer for a person.
-    pub answer: Answer,
+    /// The device's result for a person.
+    pub result: FitResult,
 }
 
-/// Run the first `frames` of a recording through the chip and in process; `hear` gets each of the chip's answers.
+/// Run the first `frames` of a recording through the chip and in process; `hear` gets each of the chip's estimates.
 ///
 /// # Errors
 /// Whatever stops the emulator, the line or the core.
@@ -51,7 +52,7 @@ pub fn compare(
     (ring, recording): (&Ring, &Recording),
     process_noise: f32,
     count: bool,
-    mut hear: impl FnMut(&Heard) -> Result<(), CommandError>,
+    mut hear: impl FnMut(&EstimateRecord) -> Result<(), Box<dyn Error>>,
 ) -> Result<Comparison, Box<dyn Error>> {
     let regions = if count {
         REGIONS.map(|(_, name)| image.function(name)).into_iter().collect::<Result<_, _>>()?
@@ -62,17 +63,19 @@ pub fn compare(
     let mut core = stream::estimator(ring, recording, process_noise)?;
     let mut link = Link::new(emulator.uart());
     link.restart(&core.setup)?;
-    let mut rows = recording.rows.iter();
-    let mut different = Vec::new();
-    let fed = serve::replay(&mut link, recording, Clock::new(Rate::Max), |heard| {
-        let row = rows.next().expect("one answer a row");
-        let wire = stream::wire(recording, row)?;
-        if !is_same(&mut core, wire, heard) {
+    let (names, clock) = (Names::of(ring), Clock::new(Rate::Max, &Stop::default()));
+    let mut fed = Fed::new(recording, &names, &mut link, clock);
+    let (mut different, mut last) = (Vec::new(), None);
+    for row in &recording.rows {
+        let heard = fed.advance().map_err(|error| error.to_string())?.expect("one reply a row");
+        if !is_same(&mut core, stream::wire(recording, row)?, &heard) {
             different.push(row.sequence);
         }
-        hear(heard)
-    });
-    let fed = fed.map_err(|error| format!("{error:?}"))?;
+        let record = heard.record(&names);
+        hear(&record)?;
+        last = Some(record);
+    }
+    let (last, quality, timing) = (last.ok_or("no frames")?, fed.quality()?, fed.times.quantiles());
     let status = link.status()?;
     let counts = emulator.stop()?.counts;
     Ok(Comparison {
@@ -80,7 +83,7 @@ pub fn compare(
         different,
         status,
         counts,
-        answer: fed.answer(ring, recording, &core.setup),
+        result: FitResult::of_core(ring, recording, &core.setup, &last, quality, timing),
     })
 }
 

@@ -40,7 +40,7 @@ fn concealed_effects_are_found_and_only_those() {
     for i in 0..12 {
         let name = format!("concealed/open-{i:02}");
         let diagnosis = Diagnosis::of(&ring, &read(&name), |_| ()).unwrap();
-        let truth = Truth::read(&repository("recordings").join(&name)).unwrap();
+        let truth = Truth::read(&repository("recordings").join(&name), &ring).unwrap();
         let grade = truth.grade(&diagnosis);
         match i {
             3 => assert!(matches!(grade, Grade::Right | Grade::Listed), "{name}: {}", diagnosis.sentence),
@@ -78,16 +78,16 @@ fn every_kind_is_found_when_it_is_strong() {
         let largest = (80.0 / seen.power).sqrt().min(2.0);
         let sized = |size: f64| {
             let amplitude = kind.prior_scale().map_or(1.0, |scale| size * scale);
-            let effect = Effect { kind, place: seen.term.place.clone(), amplitude };
+            let effect = seen.term.effect(amplitude);
             Some((size, tracked(core::slice::from_ref(&effect), 5)?, effect))
         };
         let kept = (0..6).find_map(|halvings| sized(largest * 0.5_f64.powi(halvings)));
         let (size, recording, effect) = kept.unwrap_or_else(|| panic!("no {} keeps the beam", kind.word()));
         let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
-        let expected = 0.5 * seen.power * if kind.prior_scale().is_some() { size * size } else { 1.0 };
+        let expected = 0.5 * seen.power * if kind.is_switch() { 1.0 } else { size * size };
         let first = diagnosis.findings.first();
         let found = first.is_some_and(|f| {
-            let is = |f: &diagnosis::Finding| f.kind == kind.word() && f.at == effect.place;
+            let is = |f: &diagnosis::Finding| f.term() == Some(&effect.into());
             is(f) || f.alternatives.iter().any(is)
         });
         // normal gradients next to each other are imitated by each other and by the vars: their place is not asserted
@@ -113,12 +113,14 @@ fn empty_campaigns_are_consistent() {
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn scatter_of_a_family_is_ordinary() {
     let ring = Ring::booster();
-    for (kind, names) in
-        [(EffectKind::BpmGain, ring.monitor_names()), (EffectKind::CorrectorGain, ring.corrector_names())]
-    {
+    for kind in [EffectKind::BpmGain, EffectKind::CorrectorGain] {
         let wave = |i: usize| 0.045 * f64::sin(2.4 * i as f64 + 0.3); // 3.2 % rms
-        let effects: Vec<Effect> =
-            names.into_iter().enumerate().map(|(i, place)| Effect { kind, place, amplitude: wave(i) }).collect();
+        let effects: Vec<Effect> = kind
+            .sites(&ring)
+            .into_iter()
+            .enumerate()
+            .map(|(i, site)| Effect { kind, site, amplitude: wave(i) })
+            .collect();
         let diagnosis = Diagnosis::of(&ring, &simulated(&effects, 8), |_| ()).unwrap();
         assert!(diagnosis.verdict != Verdict::Identified, "{}", diagnosis.sentence);
         assert_eq!(
@@ -142,8 +144,8 @@ fn physics_beyond_the_library_is_not_named() {
         // crosstalk between monitors that see the orbit nearly alike is a gain (the next one after D2 does not), and a limit matters
         // only where the orbit is large
         let seen = |unknown: &Unknown| match kind {
-            Crosstalk => unknown.place == "x_D2",
-            Saturation => unknown.place == "x_F2",
+            Crosstalk => unknown.site.name(&ring) == "x_D2",
+            Saturation => unknown.site.name(&ring) == "x_F2",
             _ => true,
         };
         let mut unknown = (3..500).map(|seed| Unknown::of(kind, &ring, &template, seed)).find(seen).unwrap();
@@ -155,7 +157,7 @@ fn physics_beyond_the_library_is_not_named() {
         assert!(open, "{kind:?}: {} {}", diagnosis.verdict.word(), diagnosis.sentence);
         if matches!(kind, Leak | Crosstalk | Saturation) {
             let at = &diagnosis.findings.last().unwrap().at;
-            assert_eq!(at, &unknown.place, "{kind:?}: {}", diagnosis.sentence);
+            assert_eq!(*at, unknown.site.name(&ring), "{kind:?}: {}", diagnosis.sentence);
             let key = ring.var_names().into_iter().zip(vars.iter().copied()).collect();
             let truth = Truth { effects: Vec::new(), vars: key, oracle_gain: None };
             let nees = truth.nees(&ring.var_names(), &diagnosis.vars_after);
@@ -185,7 +187,7 @@ fn the_amplitude_is_that_of_nuts() {
     let ring = Ring::booster();
     for (name, kind, place) in [("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")] {
         let data = Data::of(&ring, &read(&format!("concealed/{name}"))).unwrap();
-        let hypothesis = Hypothesis::default().with(Term::new(kind, place));
+        let hypothesis = Hypothesis::default().with(Term::at(kind, place, &ring).unwrap());
         let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
         let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
@@ -213,10 +215,11 @@ fn the_amplitude_is_that_of_nuts() {
 #[test]
 fn the_extended_machine_is_that_of_the_findings() {
     let ring = Ring::booster();
-    let hypothesis = Hypothesis::default().with(Term::new(EffectKind::BpmGain, "x_E6"));
+    let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", &ring).unwrap());
     let data = Data::of(&ring, &read("concealed/open-02")).unwrap();
     let (machine, _) = hypothesis.machine(&data, &[0.0; 48], &[-1.0]).unwrap();
     let strength: Vec<f64> = data.supplies.iter().map(|s| s.exp()).collect();
-    let direct = Machine::new(ring.with_vars(&strength), Rf::FixedMomentum, &["bpm_gain@x_E6=-0.08".parse().unwrap()]);
-    assert_eq!(machine.response().unwrap().x, direct.unwrap().response().unwrap().x);
+    let gain = Effect::parse("bpm_gain@x_E6=-0.08", &ring).unwrap();
+    let direct = Machine::new(ring.with_vars(&strength), Rf::FixedMomentum, &[gain]).unwrap();
+    assert_eq!(machine.response().unwrap().x, direct.response().unwrap().x);
 }

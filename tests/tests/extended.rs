@@ -62,8 +62,8 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {
         let extended = training::extended::tables(ring, effects, vars).unwrap();
-        model_file::write(path.path(), &extended.tables).unwrap();
-        let core = Core::with_tables(model_file::read(path.path()).unwrap(), setup).unwrap();
+        model_file::write(path.path(), &ring.name, &extended.tables).unwrap();
+        let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup).unwrap();
         answer(core, recording, truth)
     };
     let first = by_file(&design.vars);
@@ -76,7 +76,7 @@ fn a_model_with_the_missing_physics_describes_the_machine() {
     let vars = simulate::vars(&ring, 0.02, true, 3).unwrap();
     for effect in ["quad_roll@F2=-0.018", "fixed_rf_frequency", "bpm_gain@x_E6=-0.076", "stray_gradient@SLOT_A3=-0.026"]
     {
-        let effects = [effect.parse().unwrap()];
+        let effects = [Effect::parse(effect, &ring).unwrap()];
         let recording = recorded(&ring, &vars, &effects);
         let [design, extended] = both(&ring, &recording, &vars, &effects);
         // chi-square falls by 50 at least, of some 10,000; it is that of the noise which the core has learnt, and what a model

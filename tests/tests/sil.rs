@@ -8,13 +8,13 @@ use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
 use firmware_sim::link::{Refusal, Reply, Request, Status};
-use host_bridge::link::Link;
+use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core};
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
-use twin::Ring;
+use twin::{Effect, Ring};
 
 /// Built once for all tests.
 static IMAGE: LazyLock<Image> = LazyLock::new(|| Image::build().unwrap_or_else(|error| panic!("{error}")));
@@ -269,7 +269,7 @@ fn new_tables_reach_the_chip() {
     good[..30].iter().for_each(|wire| pair.agree(wire));
     let mut vars = vec![1.0; 48];
     vars[0] = 1.01;
-    let rolled = ["quad_roll@F2=0.01".parse().unwrap()];
+    let rolled = [Effect::parse("quad_roll@F2=0.01", &ring).unwrap()];
     let other = *training::extended::tables(&ring.with_vars(&vars), &rolled, &[1.0; 48]).unwrap().tables;
     assert!(!other.low_rank.is_empty());
     pair.link.load(&other, || ()).unwrap();

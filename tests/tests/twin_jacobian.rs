@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, Matrix2, Vector2};
 use num_dual::{DualNum, DualSVec64};
 use system_tests::repository;
-use twin::{Hold, Kind, Optics, Plane, Ring};
+use twin::{Hold, Optics, Plane, Ring};
 
 const VARS: usize = 48;
 const ON_MOMENTUM: Hold = Hold::Momentum { delta: 0.0 };
@@ -85,11 +85,11 @@ impl PlainRing {
         let design = Ring::booster().gradients();
         let planes = [0, 1].map(|plane| {
             let constant = |i: usize| {
-                let matrix = ring.elements[i].linearise(&mut twin::map::Phase::zeros());
+                let matrix = ring.elements[i].linearise(&mut twin::Phase::zeros());
                 matrix.fixed_view::<2, 2>(2 * plane, 2 * plane).map(Dual::from_re)
             };
             let mut matrices: Vec<_> = (0..ring.elements.len()).map(constant).collect();
-            for (n, &at) in ring.quadrupoles.iter().enumerate() {
+            for (n, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
                 let var = Dual::from_re(vars[n]).derivative(n);
                 let sign = if plane == 0 { 1.0 } else { -1.0 };
                 matrices[at] = quadrupole(var * (sign * design[n]), ring.elements[at].length);
@@ -111,12 +111,8 @@ impl PlainRing {
         let mut z = Vector2::new(-open[(0, 1)] / determinant, open[(0, 0)] / determinant);
         let mut seen = Vec::new();
         for i in around() {
-            let read = self.ring.read_monitors.iter().position(|&m| m == i);
-            if let (Some(row), Kind::Monitor { plane: p }) = (read, &self.ring.elements[i].kind)
-                && *p == plane
-            {
-                seen.push((row, z[0]));
-            }
+            let read = self.ring.monitors_read().position(|m| m.element == i && m.plane == plane);
+            seen.extend(read.map(|row| (row, z[0])));
             z = matrices[i] * z;
         }
         seen
@@ -126,9 +122,8 @@ impl PlainRing {
     fn response(&self) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
         let mut response = DMatrix::zeros(33, 48);
         let mut jacobian = vec![response.clone(); VARS];
-        for (column, &corrector) in self.ring.correctors.iter().enumerate() {
-            let Kind::Corrector { plane, .. } = self.ring.elements[corrector].kind else { unreachable!() };
-            for (row, x) in self.orbit(plane, corrector) {
+        for (column, corrector) in self.ring.correctors.iter().enumerate() {
+            for (row, x) in self.orbit(corrector.plane, corrector.element) {
                 response[(row, column)] = x.re;
                 let slope = x.eps.unwrap_generic(nalgebra::Const::<VARS>, nalgebra::U1);
                 jacobian.iter_mut().zip(&slope).for_each(|(j, s)| j[(row, column)] = *s);

@@ -44,7 +44,11 @@ fn machines(code: &str) -> Vec<(String, Value, Ring)> {
     let names = design.var_names();
     let of = |(name, answers): (&String, &Value)| {
         let vars: Vec<f64> = names.iter().map(|n| number(&answers["vars"][n])).collect();
-        assert_eq!(words(&answers["bpm"]), design.cells(&design.monitors), "order of the monitors");
+        assert_eq!(
+            words(&answers["bpm"]),
+            design.labels(design.monitors.iter().map(|m| m.element)),
+            "order of the monitors"
+        );
         (format!("{code} {name}"), answers.clone(), design.with_vars(&vars))
     };
     let all: Vec<_> = golden(code)["machines"].as_object().unwrap().iter().map(of).collect();
@@ -77,11 +81,9 @@ fn small(ring: &Ring, hold: Hold) -> [DMatrix<f64>; 2] {
 /// Closed orbits `(x, y, delta)` with one corrector set to `kick` [rad]; x and y at all monitor places.
 fn orbit(ring: &Ring, corrector: usize, kick: f64, hold: Hold) -> (Vec<f64>, Vec<f64>, f64) {
     let mut ring = ring.clone();
-    if let Kind::Corrector { plane, kick: set } = &mut ring.elements[corrector].kind {
-        *set = if *plane == Plane::X { [kick, 0.0] } else { [0.0, kick] };
-    }
+    ring.set_kick(corrector, kick);
     let optics = Optics::of(&ring, hold).unwrap();
-    let at = |coordinate: usize| ring.monitors.iter().map(|&i| optics.orbit(i)[coordinate]).collect();
+    let at = |coordinate: usize| ring.monitors.iter().map(|m| optics.orbit(m.element)[coordinate]).collect();
     (at(0), at(2), optics.orbit(0)[4])
 }
 
@@ -89,8 +91,8 @@ fn orbit(ring: &Ring, corrector: usize, kick: f64, hold: Hold) -> (Vec<f64>, Vec
 fn kicked(ring: &Ring, hold: Hold) -> ([DMatrix<f64>; 2], Vec<f64>) {
     let mut x = DMatrix::zeros(ring.monitors.len(), ring.correctors.len());
     let (mut y, mut momentum) = (x.clone(), Vec::new());
-    for (j, &corrector) in ring.correctors.iter().enumerate() {
-        let [up, down] = [KICK, -KICK].map(|kick| orbit(ring, corrector, kick, hold));
+    for j in 0..ring.correctors.len() {
+        let [up, down] = [KICK, -KICK].map(|kick| orbit(ring, j, kick, hold));
         for i in 0..ring.monitors.len() {
             x[(i, j)] = (up.0[i] - down.0[i]) / (2.0 * KICK);
             y[(i, j)] = (up.1[i] - down.1[i]) / (2.0 * KICK);
@@ -114,7 +116,7 @@ fn beta_functions_equal_those_of_madx_and_bmad() {
     for (what, answers, ring) in both_codes() {
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         for (plane, key) in [(Plane::X, "beta_x"), (Plane::Y, "beta_y")] {
-            let beta: Vec<f64> = ring.monitors.iter().map(|&i| optics.beta(i, plane)).collect();
+            let beta: Vec<f64> = ring.monitors.iter().map(|m| optics.beta(m.element, plane)).collect();
             assert_near(&format!("{what} {key}"), &beta, &numbers(&answers[key]), ROUNDING); // measured 5e-13 m
         }
     }
@@ -206,7 +208,7 @@ fn effect(entry: &Value) -> Effect {
     let kind = entry["kind"].as_str().unwrap();
     let place = entry["at"].as_str().map_or(String::new(), |at| format!("@{at}"));
     let amplitude = entry["amplitude"].as_f64().map_or(String::new(), |a| format!("={a}"));
-    format!("{kind}{place}{amplitude}").parse().unwrap()
+    Effect::parse(&format!("{kind}{place}{amplitude}"), &Ring::booster()).unwrap()
 }
 
 /// The seven cases of a code, both planes, through the words of the command line; tolerance in x and y.

@@ -8,7 +8,7 @@
 
 use estimator::surrogate::TERMS;
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, Effect, EffectKind, Machine, Rf, Ring};
+use twin::{Drives, Effect, EffectKind, Machine, Rf, Ring, Site};
 
 use crate::green::{Instruments, TrainingError, tables_with};
 use crate::response::responses;
@@ -39,8 +39,9 @@ const NEGLIGIBLE: f64 = 2e-3;
 /// # Panics
 /// If there is not one var for each param.
 pub fn tables(ring: &Ring, effects: &[Effect], vars: &[f64]) -> Result<Extended, TrainingError> {
-    let (carried, left_out): (Vec<Effect>, Vec<Effect>) = effects.iter().cloned().partition(|e| is_linear(e.kind));
-    let changed: Vec<Effect> = carried.iter().filter(|e| is_optics(e.kind)).cloned().collect();
+    let (left_out, carried): (Vec<Effect>, Vec<Effect>) =
+        effects.iter().copied().partition(|e| Form::of(e.kind) == Form::None);
+    let changed: Vec<Effect> = carried.iter().copied().filter(|e| Form::of(e.kind) == Form::Optics).collect();
     let changed = Machine::new(ring.clone(), Rf::FixedMomentum, &changed)?;
     let mut tables = tables_with(changed.ring(), &instruments(ring, &carried))?;
     let exact = response(&Machine::new(ring.with_vars(vars), Rf::FixedMomentum, &carried)?)?;
@@ -49,43 +50,59 @@ pub fn tables(ring: &Ring, effects: &[Effect], vars: &[f64]) -> Result<Extended,
     Ok(Extended { tables, carried, left_out, missing })
 }
 
-/// A response shows it, whatever the orbit without kicks.
-fn is_linear(kind: EffectKind) -> bool {
-    !matches!(
-        kind,
-        EffectKind::BpmCubic | EffectKind::CorrectorEven | EffectKind::QuadDrift | EffectKind::SextupoleError
-    )
+/// The form in which tables carry an effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    /// It changes the Green's functions of both planes, and couples none.
+    Optics,
+    /// It is a factor on a row or a column, the order of the rows, or the momentum.
+    Instruments,
+    /// A response shows it: a term of low rank.
+    Term,
+    /// No response shows it, or it depends on the orbit without kicks.
+    None,
 }
 
-/// It changes the Green's functions of both planes, and couples none.
-fn is_optics(kind: EffectKind) -> bool {
-    matches!(kind, EffectKind::StrayGradient | EffectKind::DipoleGradient | EffectKind::DipoleEdge)
+impl Form {
+    fn of(kind: EffectKind) -> Self {
+        match kind {
+            EffectKind::StrayGradient | EffectKind::DipoleGradient | EffectKind::DipoleEdge => Self::Optics,
+            EffectKind::BpmGain
+            | EffectKind::BpmSwap
+            | EffectKind::CorrectorGain
+            | EffectKind::CorrectorPolarity
+            | EffectKind::MomentumOffset => Self::Instruments,
+            EffectKind::BpmRoll
+            | EffectKind::CorrectorRoll
+            | EffectKind::QuadRoll
+            | EffectKind::StraySkewGradient
+            | EffectKind::FixedRfFrequency
+            | EffectKind::RadialLoop => Self::Term,
+            EffectKind::BpmCubic | EffectKind::CorrectorEven | EffectKind::QuadDrift | EffectKind::SextupoleError => {
+                Self::None
+            }
+        }
+    }
 }
 
 /// The effects that are rows, columns, or the momentum of the tables.
 fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
-    let (monitors, correctors) = (ring.monitor_names(), ring.corrector_names());
-    let monitor = |name: &str| monitors.iter().position(|m| m == name);
+    let read = |monitor: usize| ring.read_monitors.iter().position(|&at| at == monitor);
     let mut instruments = Instruments::sound(ring);
-    for Effect { kind, place, amplitude } in effects {
-        let corrector = correctors.iter().position(|c| c == place);
-        match kind {
-            EffectKind::MomentumOffset => instruments.delta += amplitude,
-            EffectKind::BpmGain => {
-                monitor(place).into_iter().for_each(|b| instruments.monitor_gain[b] *= 1.0 + amplitude)
+    for &Effect { kind, site, amplitude } in effects {
+        match (kind, site) {
+            (EffectKind::MomentumOffset, _) => instruments.delta += amplitude,
+            (EffectKind::BpmGain, Site::Monitor(at)) => {
+                read(at).into_iter().for_each(|b| instruments.monitor_gain[b] *= 1.0 + amplitude);
             }
-            EffectKind::BpmSwap => {
-                if let Some((one, other)) = place.split_once(',')
-                    && let (Some(one), Some(other)) = (monitor(one), monitor(other))
-                {
+            (EffectKind::BpmSwap, Site::MonitorPair(one, other)) => {
+                if let (Some(one), Some(other)) = (read(one), read(other)) {
                     instruments.monitor.swap(one, other);
                     instruments.monitor_gain.swap(one, other);
                 }
             }
-            EffectKind::CorrectorGain => {
-                corrector.into_iter().for_each(|c| instruments.corrector_gain[c] *= 1.0 + amplitude);
-            }
-            EffectKind::CorrectorPolarity => corrector.into_iter().for_each(|c| instruments.corrector_gain[c] *= -1.0),
+            (EffectKind::CorrectorGain, Site::Corrector(c)) => instruments.corrector_gain[c] *= 1.0 + amplitude,
+            (EffectKind::CorrectorPolarity, Site::Corrector(c)) => instruments.corrector_gain[c] *= -1.0,
             _ => {}
         }
     }
@@ -134,7 +151,7 @@ mod tests {
     use super::*;
 
     fn effects(words: &[&str]) -> Vec<Effect> {
-        words.iter().map(|word| word.parse().unwrap()).collect()
+        words.iter().map(|word| Effect::parse(word, &Ring::booster()).unwrap()).collect()
     }
 
     /// Vars of a machine, seeded by `i`, this far from 1.
@@ -247,11 +264,8 @@ mod tests {
         let (ring, vars) = (Ring::booster(), vec![1.0; 48]);
         let given = effects(&["quad_drift=0.002", "bpm_gain@x_E6=0.1", "bpm_cubic@x_E6=0.001"]);
         let extended = tables(&ring, &given, &vars).unwrap();
-        assert_eq!(
-            (extended.carried, extended.left_out),
-            (vec![given[1].clone()], vec![given[0].clone(), given[2].clone()])
-        );
-        let astray = tables(&ring, &effects(&["bpm_gain@x_E99=0.1"]), &vars).unwrap_err();
+        assert_eq!((extended.carried, extended.left_out), (vec![given[1]], vec![given[0], given[2]]));
+        let astray = tables(&ring, &[Effect { site: Site::Ring, ..given[1] }], &vars).unwrap_err();
         assert!(astray.to_string().starts_with("effect bpm_gain: expected a monitor"), "{astray}");
     }
 }

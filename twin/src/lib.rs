@@ -11,22 +11,36 @@
 //! assert!((optics.tunes()?.x - 4.83).abs() < 1e-6);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
-pub mod effects;
-pub mod lattice;
-pub mod map;
-pub mod orbit;
-pub mod response;
+mod calibrated;
+mod dispersion;
+mod effects;
+mod lattice;
+mod map;
+mod orbit;
+mod response;
+mod site;
 mod spurious;
-pub mod varied;
+#[cfg(test)]
+mod testing;
+mod tune;
+mod twiss;
+mod varied;
 
+pub use calibrated::CalibratedOptics;
 pub use effects::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, MachineResponse, Rf, Signature, Signatures, Tracked,
+    Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect,
+    HoldEffect, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin, Tracked,
+    Unit,
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
     Quadrupole, Ring, Supply,
 };
+pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
-pub use response::{Gradient, Observer, Optics, Place, Source, Tunes};
+pub use response::{Gradient, Observer, Optics, Place, Source};
+pub use site::Site;
 pub use spurious::spurious_dispersion;
+pub use tune::Tunes;
+pub use twiss::Twiss;
 pub use varied::{VariedOptics, VariedRing};

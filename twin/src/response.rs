@@ -18,10 +18,10 @@
 //!
 //! Source: S. Y. Lee, Accelerator Physics, ch. 2; J. Safranek, NIM A 388 (1997) 27 for the use.
 
-use nalgebra::{DMatrix, DVector, Matrix4, Matrix5, Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, Matrix5, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Corrector, Plane, Ring};
-use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y};
+use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, inverse};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError, invert};
 
 /// A place in the ring: inside element `element`, `depth` [m] from its entrance. Ordered along the beam.
@@ -71,30 +71,21 @@ impl Source {
 /// An element (or a thin place) whose gradient may change.
 #[derive(Debug, Clone, Copy)]
 pub struct Gradient {
-    place: Place,
-    kernel: Matrix6<f64>,
-}
-
-/// Tunes with their integer part.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tunes {
-    /// Horizontal (or the mode that becomes it without coupling).
-    pub x: f64,
-    /// Vertical.
-    pub y: f64,
+    pub(crate) place: Place,
+    pub(crate) kernel: Matrix6<f64>,
 }
 
 /// Linear optics of a ring about its closed orbit.
 #[derive(Debug, Clone)]
 pub struct Optics<'r> {
-    ring: &'r Ring,
-    orbit: ClosedOrbit,
+    pub(crate) ring: &'r Ring,
+    pub(crate) orbit: ClosedOrbit,
     /// Closed orbit at the start for a source, `W`.
     closed: Matrix6<f64>,
     /// The same with the momentum held.
-    closed_at_momentum: Matrix6<f64>,
+    pub(crate) closed_at_momentum: Matrix6<f64>,
     /// Closed orbit at the start for a unit of momentum deviation.
-    dispersive: Vector6<f64>,
+    pub(crate) dispersive: Vector6<f64>,
 }
 
 /// `T^-1 E T` of a skew gradient, as a kick taken away.
@@ -145,12 +136,12 @@ impl<'r> Optics<'r> {
     }
 
     /// Linear map from the start to a place: at an entrance in the ring's frame, inside in the element's own.
-    fn transfer(&self, place: Place) -> Matrix6<f64> {
+    pub(crate) fn transfer(&self, place: Place) -> Matrix6<f64> {
         if place.depth == 0.0 { self.orbit.transfer[place.element] } else { self.transfer_into(place) }
     }
 
     /// Linear map from the start into the element's own (shifted, rolled) frame.
-    fn transfer_into(&self, place: Place) -> Matrix6<f64> {
+    pub(crate) fn transfer_into(&self, place: Place) -> Matrix6<f64> {
         let inside = self.ring.elements[place.element].linearise_into(&self.orbit.at[place.element], place.depth);
         inside * self.orbit.transfer[place.element]
     }
@@ -219,12 +210,6 @@ impl<'r> Optics<'r> {
         Gradient { place: element.into(), kernel }
     }
 
-    /// Derivative of both tunes with respect to a gradient, the planes not being coupled: with `2 cos(2 pi Q) = tr M`,
-    /// `dQ/dk = tr(M Q_kernel)/(4 pi sin(2 pi Q))`, which is `beta/(4 pi)` for a thin one.
-    pub fn tune_slope(&self, gradient: &Gradient) -> [f64; 2] {
-        tune_slope(self.orbit.one_turn(), &gradient.kernel)
-    }
-
     /// Response of one observer to one source [m/rad].
     pub fn green(&self, observer: &Observer, source: &Source) -> f64 {
         let step = source.place < observer.place;
@@ -271,140 +256,6 @@ impl<'r> Optics<'r> {
             .collect()
     }
 
-    /// Dispersion seen by an observer [m], momentum deviations closed at any hold.
-    pub fn dispersion(&self, observer: &Observer) -> f64 {
-        (observer.row * self.dispersive)[0]
-    }
-
-    /// The same of some observers.
-    pub fn dispersion_of(&self, observers: &[Observer]) -> DVector<f64> {
-        DVector::from_iterator(observers.len(), observers.iter().map(|observer| self.dispersion(observer)))
-    }
-
-    /// Derivative of [`Optics::dispersion`], rows observers, columns gradients.
-    pub fn dispersion_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
-        let seen = seen_rows(observers, &self.closed_at_momentum);
-        let sent: Vec<_> = gradients.iter().map(|g| g.kernel * self.dispersive).collect();
-        DMatrix::from_fn(observers.len(), gradients.len(), |i, q| {
-            -(seen[i][usize::from(gradients[q].place < observers[i].place)] * sent[q])[0]
-        })
-    }
-
-    /// Momentum compaction `d(path)/(C d(delta))` [1].
-    pub fn momentum_compaction(&self) -> f64 {
-        (self.orbit.one_turn().row(PATH) * self.dispersive)[0] / self.ring.circumference
-    }
-
-    /// Derivative of [`Optics::momentum_compaction`] with respect to each gradient.
-    ///
-    /// The path driven by a kick equals the dispersion at the kick, so `d(alpha)/dk = -integral(D_x^2 - D_y^2) ds / C`.
-    pub fn compaction_jacobian(&self, gradients: &[Gradient]) -> Vec<f64> {
-        // a unit source's path: row PATH of the turn, of its closed orbit and of itself
-        let path = self.orbit.one_turn().row(PATH) * (self.closed_at_momentum + Matrix6::identity());
-        gradients.iter().map(|g| -(path * g.kernel * self.dispersive)[0] / self.ring.circumference).collect()
-    }
-
-    /// Transition energy over the rest energy.
-    pub fn gamma_transition(&self) -> f64 {
-        self.momentum_compaction().powf(-0.5)
-    }
-
-    /// Revolution frequency on this orbit, relative to that of the reference particle, less 1.
-    pub fn frequency_offset(&self) -> f64 {
-        let (p, length) = (&self.ring.particle, self.ring.circumference + self.orbit.end()[PATH]);
-        p.beta(self.orbit.at[0][DELTA]) / p.beta(0.0) * self.ring.circumference / length - 1.0
-    }
-
-    /// Slip factor `alpha_c - 1/gamma^2` [1].
-    pub fn slip_factor(&self) -> f64 {
-        self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
-    }
-
-    /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients [m per 1/m^2, or per 1/m
-    /// of a thin one].
-    pub fn rf_jacobian(&self, observers: &[Observer], gradients: &[Gradient]) -> DMatrix<f64> {
-        let eta = self.slip_factor();
-        let compaction = self.compaction_jacobian(gradients);
-        let mut slope = self.dispersion_jacobian(observers, gradients) * (-1.0 / eta);
-        for (b, observer) in observers.iter().enumerate() {
-            let per_compaction = self.dispersion(observer) / (eta * eta);
-            slope.row_mut(b).iter_mut().zip(&compaction).for_each(|(s, c)| *s += per_compaction * c);
-        }
-        slope
-    }
-
-    /// Tunes of the two normal modes.
-    ///
-    /// `cos(mu)` of the modes are the roots of the quadratic formed by the trace of the 4x4 one-turn matrix and the
-    /// determinant of its coupling block; the integer part is counted from the projected phase advance.
-    ///
-    /// Source: D. A. Edwards and L. C. Teng, IEEE Trans. Nucl. Sci. 20 (1973) 885, eq. 12-14.
-    ///
-    /// # Errors
-    /// [`OrbitError::Unstable`] with the half trace, [`OrbitError::SumResonance`].
-    pub fn tunes(&self) -> Result<Tunes, OrbitError> {
-        let m = self.transverse();
-        let half = |i: usize| 0.5 * (m[(i, i)] + m[(i + 1, i + 1)]);
-        let (mean, difference) = (0.5 * (half(0) + half(2)), 0.5 * (half(0) - half(2)));
-        // det(m + n^+), n^+ the symplectic conjugate of the lower coupling block
-        let (a, b) = (m[(0, 2)] + m[(3, 1)], m[(0, 3)] - m[(2, 1)]);
-        let (c, d) = (m[(1, 2)] - m[(3, 0)], m[(1, 3)] + m[(2, 0)]);
-        let discriminant = difference * difference + 0.25 * (a * d - b * c);
-        if discriminant < 0.0 {
-            return Err(OrbitError::SumResonance { discriminant });
-        }
-        let split = discriminant.sqrt().copysign(difference);
-        let turns = |mode: char, half_trace: f64, plane: Plane| {
-            if half_trace.is_nan() || half_trace.abs() >= 1.0 {
-                return Err(OrbitError::Unstable { mode, half_trace });
-            }
-            Ok(self.count_turns(half_trace.acos() / core::f64::consts::TAU, plane))
-        };
-        Ok(Tunes { x: turns('x', mean + split, Plane::X)?, y: turns('y', mean - split, Plane::Y)? })
-    }
-
-    fn transverse(&self) -> Matrix4<f64> {
-        self.orbit.one_turn().fixed_view::<4, 4>(0, 0).into_owned()
-    }
-
-    /// The tune that has this fractional part, above or below the half integer, nearest to the projected phase advance.
-    fn count_turns(&self, fraction: f64, plane: Plane) -> f64 {
-        let i = if plane == Plane::X { X } else { Y };
-        let fraction = if self.orbit.one_turn()[(i, i + 1)] < 0.0 { 1.0 - fraction } else { fraction };
-        let phase = self.projected_phase(i);
-        (phase - fraction).round() + fraction
-    }
-
-    /// Phase advance [turns] of the 2x2 block, summed over elements that each advance less than half a turn.
-    fn projected_phase(&self, i: usize) -> f64 {
-        let ((beta, alpha), mut turns, mut last) = (self.start_twiss(i), 0.0, 0.0);
-        for transfer in &self.orbit.transfer {
-            let (m11, m12) = (transfer[(i, i)], transfer[(i, i + 1)]);
-            let phase = m12.atan2(beta * m11 - alpha * m12) / core::f64::consts::TAU;
-            let step = phase - last;
-            turns += step - step.round(); // no element advances by half a turn
-            last = phase;
-        }
-        turns
-    }
-
-    /// Beta [m] and alpha of the 2x2 block at the start.
-    fn start_twiss(&self, i: usize) -> (f64, f64) {
-        let m = self.orbit.one_turn();
-        let cos = 0.5 * (m[(i, i)] + m[(i + 1, i + 1)]);
-        let sin = (1.0 - cos * cos).max(f64::MIN_POSITIVE).sqrt().copysign(m[(i, i + 1)]);
-        (m[(i, i + 1)] / sin, 0.5 * (m[(i, i)] - m[(i + 1, i + 1)]) / sin)
-    }
-
-    /// Beta function at a place [m]: that of the 2x2 block, exact without coupling.
-    pub fn beta(&self, place: impl Into<Place>, plane: Plane) -> f64 {
-        let i = if plane == Plane::X { X } else { Y };
-        let (beta, alpha) = self.start_twiss(i);
-        let transfer = self.transfer(place.into());
-        let (m11, m12) = (transfer[(i, i)], transfer[(i, i + 1)]);
-        ((beta * m11 - alpha * m12).powi(2) + m12 * m12) / beta
-    }
-
     /// Observers of all read monitors, each in its own plane.
     pub fn read_monitors(&self) -> Vec<Observer> {
         self.ring.monitors_read().map(|monitor| self.observe(monitor.element, monitor.plane)).collect()
@@ -421,7 +272,7 @@ impl<'r> Optics<'r> {
     }
 
     /// Direction of a corrector's kick: `(cos, sin)` of its roll for H, `(-sin, cos)` for V.
-    fn axis(&self, corrector: &Corrector) -> [f64; 2] {
+    pub(crate) fn axis(&self, corrector: &Corrector) -> [f64; 2] {
         let (sin, cos) = self.ring.elements[corrector.element].misalignment.roll.sin_cos();
         match corrector.plane {
             Plane::X => [cos, sin],
@@ -458,27 +309,12 @@ fn closed_orbits(inverse: &Matrix5<f64>, turn: &Matrix6<f64>, driven: usize) -> 
 }
 
 /// Rows `a W` and `a (W + 1)` of each observer.
-fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[RowVector6<f64>; 2]> {
+pub(crate) fn seen_rows(observers: &[Observer], closed: &Matrix6<f64>) -> Vec<[RowVector6<f64>; 2]> {
     let rows = |o: &Observer| {
         let near = o.row * closed;
         [near, near + o.row]
     };
     observers.iter().map(rows).collect()
-}
-
-/// Change of both tunes by a gradient of this kernel, see [`Optics::tune_slope`].
-pub(crate) fn tune_slope(turn: &Matrix6<f64>, kernel: &Matrix6<f64>) -> [f64; 2] {
-    let change = turn * kernel;
-    [X, Y].map(|i| {
-        let cos = 0.5 * (turn[(i, i)] + turn[(i + 1, i + 1)]);
-        let sin = (1.0 - cos * cos).max(f64::MIN_POSITIVE).sqrt().copysign(turn[(i, i + 1)]);
-        (change[(i, i)] + change[(i + 1, i + 1)]) / (2.0 * core::f64::consts::TAU * sin)
-    })
-}
-
-/// Inverse of a transfer map; its determinant is 1.
-pub(crate) fn inverse(transfer: &Matrix6<f64>) -> Matrix6<f64> {
-    transfer.try_inverse().expect("maps are symplectic, so their determinant is 1")
 }
 
 #[cfg(test)]
@@ -553,65 +389,6 @@ mod tests {
         [optics.monitor_places(Plane::X), optics.monitor_places(Plane::Y)].concat()
     }
 
-    #[test]
-    fn dispersion_and_compaction_follow_their_derivatives() {
-        let ring = Ring::booster();
-        // whatever the hold: both are slopes in momentum
-        let optics = Optics::of(&ring, Hold::Frequency { offset: 0.0 }).unwrap();
-        let observers = optics.monitor_places(Plane::X);
-        let (exact, compaction) = (
-            optics.dispersion_jacobian(&observers, &optics.quadrupoles()),
-            optics.compaction_jacobian(&optics.quadrupoles()),
-        );
-        for n in [0, 5, 30] {
-            let at = |factor: f64| {
-                let mut vars = [1.0; 48];
-                vars[n] = factor;
-                let ring = ring.with_vars(&vars);
-                let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
-                let seen: Vec<f64> = optics.monitor_places(Plane::X).iter().map(|o| optics.dispersion(o)).collect();
-                (seen, optics.momentum_compaction())
-            };
-            let (h, k1) = (1e-5, ring.gradients()[n]);
-            let (up, down) = (at(1.0 + h), at(1.0 - h));
-            for i in 0..observers.len() {
-                let numeric = (up.0[i] - down.0[i]) / (2.0 * h * k1);
-                assert!(
-                    (numeric - exact[(i, n)]).abs() < 1e-5 * exact.column(n).abs().max(),
-                    "{numeric} {}",
-                    exact[(i, n)]
-                );
-            }
-            let numeric = (up.1 - down.1) / (2.0 * h * k1);
-            assert!((numeric - compaction[n]).abs() < 1e-5 * compaction[n].abs(), "{numeric} {}", compaction[n]);
-        }
-    }
-
-    #[test]
-    fn tunes_follow_their_slopes() {
-        let ring = Ring::booster();
-        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
-        for (n, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate().step_by(7) {
-            let tunes = |factor: f64| {
-                let mut vars = [1.0; 48];
-                vars[n] = factor;
-                Optics::of(&ring.with_vars(&vars), ON_MOMENTUM).unwrap().tunes().unwrap()
-            };
-            let (h, k1) = (1e-4, ring.gradients()[n]);
-            let (up, down, slope) = (tunes(1.0 + h), tunes(1.0 - h), optics.tune_slope(&optics.gradient(at)));
-            for (ours, change) in slope.into_iter().zip([up.x - down.x, up.y - down.y]) {
-                let known = change / (2.0 * h * k1);
-                assert!((ours - known).abs() < 1e-6 * known.abs(), "{ours} {known}"); // truncation h^2, rounding 1e-13/h
-            }
-        }
-        // beta/(4 pi) of a thin gradient, and nothing of a skew one to first order
-        let slot = ring.element("SLOT_F6").unwrap();
-        let beta = [optics.beta(slot, Plane::X), -optics.beta(slot, Plane::Y)];
-        let slope = optics.tune_slope(&optics.thin_gradient(slot.into()));
-        slope.into_iter().zip(beta).for_each(|(s, b)| assert!((s * 2.0 * core::f64::consts::TAU - b).abs() < 1e-9));
-        assert!(optics.tune_slope(&optics.thin_skew_gradient(slot.into())).iter().all(|s| s.abs() < 1e-12));
-    }
-
     /// A rolled quadrupole is one of `k1 cos 2a` with a skew gradient of `-k1 sin 2a`; against differences of the exact twin.
     #[test]
     fn skew_gradients_are_exact() {
@@ -634,25 +411,6 @@ mod tests {
     }
 
     #[test]
-    fn instability_names_its_trace() {
-        let ring = Ring::booster();
-        let strong = ring.with_vars(&[2.2; 48]);
-        let error = Optics::of(&strong, ON_MOMENTUM).unwrap().tunes().unwrap_err();
-        assert!(matches!(error, OrbitError::Unstable { half_trace, .. } if half_trace.abs() > 1.0), "{error}");
-    }
-
-    #[test]
-    fn a_rolled_corrector_leaves_the_tunes_alone() {
-        for i in 1..40 {
-            let mut ring = Ring::booster();
-            let at = ring.correctors[i].element;
-            ring.elements[at].misalignment.roll = 1.37e-3 * i as f64;
-            let tunes = Optics::of(&ring, ON_MOMENTUM).unwrap().tunes().unwrap();
-            assert!((tunes.x - 4.83).abs() < 1e-9 && (tunes.y - 4.665).abs() < 1e-9, "{tunes:?}");
-        }
-    }
-
-    #[test]
     fn a_thin_rolled_gradient_and_a_kick_at_its_entrance_are_exact() {
         let mut ring = Ring::booster();
         let at = ring.element("SLOT_F6").unwrap();
@@ -669,24 +427,5 @@ mod tests {
         let exact = &optics.response_jacobian(&both_planes(&optics), &kick, &[optics.gradient(at)])[0];
         let numeric = (respond(1e-5) - respond(-1e-5)) / 2e-5;
         assert!((exact - numeric).abs().max() < 1e-6 * exact.abs().max()); // differences: (1e-5)^2 and 1e-13/1e-5
-    }
-
-    #[test]
-    fn coupled_modes_keep_their_trace() {
-        let mut ring = Ring::booster();
-        let at = ring.element("SLOT_F6").unwrap();
-        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.05, k2l: 0.0 };
-        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
-        let tunes = optics.tunes().unwrap();
-        // the modes' cosines sum to half the trace of the 4x4 matrix, and eigenvalues lie on the unit circle
-        let m = optics.transverse();
-        let sum = (tunes.x * core::f64::consts::TAU).cos() + (tunes.y * core::f64::consts::TAU).cos();
-        assert!((sum - 0.5 * m.trace()).abs() < 1e-12);
-        for tune in [tunes.x, tunes.y] {
-            let (s, c) = (tune * core::f64::consts::TAU).sin_cos();
-            let z = nalgebra::Complex::new(c, s);
-            let determinant = (m.map(|v| nalgebra::Complex::new(v, 0.0)) - Matrix4::identity() * z).determinant();
-            assert!(determinant.norm() < 1e-10, "{determinant}");
-        }
     }
 }

@@ -20,9 +20,10 @@
 use nalgebra::{DMatrix, Matrix2, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Ring};
-use crate::map::{PATH, PX, PY, X, Y};
-use crate::orbit::{ClosedOrbit, Hold, OrbitError};
-use crate::response::{Optics, close_at_momentum, inverse, tune_slope};
+use crate::map::{PATH, X, Y, inverse};
+use crate::orbit::{Hold, OrbitError};
+use crate::response::{Optics, close_at_momentum};
+use crate::tune::Modes;
 
 /// A ring as a chain of quadrupoles and of what lies between them.
 #[derive(Debug, Clone)]
@@ -56,15 +57,15 @@ enum Instrument {
 
 #[derive(Debug, Clone)]
 struct Quadrupole {
-    /// Index of its var.
-    var: usize,
+    /// Index into [`Ring::quadrupoles`].
+    index: usize,
     k1: f64,
     length: f64,
     /// From the ring's axes to its own.
     roll: Matrix6<f64>,
 }
 
-/// The optics at given vars.
+/// The optics at given strengths.
 #[derive(Debug, Clone)]
 pub struct VariedOptics<'r> {
     ring: &'r VariedRing,
@@ -72,15 +73,15 @@ pub struct VariedOptics<'r> {
     observers: Vec<RowVector6<f64>>,
     /// Column of each corrector, brought to the start.
     sources: Vec<Vector6<f64>>,
-    /// `Q` of each quadrupole along the ring, by its var: `k1 strength` times that of a unit of gradient.
+    /// `Q` of each quadrupole, order of [`Ring::quadrupoles`]: `k1 strength` times that of a unit of gradient.
     kernels: Vec<Matrix6<f64>>,
-    /// Map of a turn from the start.
-    turn: Matrix6<f64>,
     closed: Matrix6<f64>,
     dispersive: Vector6<f64>,
     /// What a source at the start adds to the path of a turn.
     path: RowVector6<f64>,
     slip: f64,
+    turn: Matrix6<f64>,
+    modes: Modes,
 }
 
 impl VariedRing {
@@ -93,17 +94,17 @@ impl VariedRing {
     /// If a place that is said to hold a quadrupole does not.
     pub fn of(ring: &Ring) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-        let orbit = ClosedOrbit::find(ring, Hold::Momentum { delta: 0.0 })?;
         let mut along: Vec<(usize, usize)> = ring.quadrupoles.iter().map(|q| q.element).zip(0..).collect();
         along.sort_unstable();
-        let quadrupoles = along.iter().map(|&(element, var)| Quadrupole::of(ring, element, var)).collect();
+        let quadrupoles = along.iter().map(|&(element, index)| Quadrupole::of(ring, element, index)).collect();
         // each stretch from the end of one quadrupole (or the ring's start) to the entrance of the next (or the end)
         let starts = core::iter::once(0).chain(along.iter().map(|&(element, _)| element + 1));
         let ends = along.iter().map(|&(element, _)| element).chain([ring.elements.len()]);
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
         let stretches = starts.zip(ends).map(|(from, to)| {
-            let (at_start, back) = (orbit.transfer[from], inverse(&orbit.transfer[from]));
-            let map = orbit.transfer[to] * back;
+            let transfer = &optics.closed_orbit().transfer;
+            let (at_start, back) = (transfer[from], inverse(&transfer[from]));
+            let map = transfer[to] * back;
             let seen = observers.iter().enumerate().map(|(b, o)| (o.place, 0, Instrument::Monitor(b, o.row * back)));
             // where both stand at one place, a monitor does not yet see the corrector's kick
             let sent =
@@ -127,11 +128,12 @@ impl VariedRing {
         })
     }
 
-    /// The optics at given vars [48], each the gradient over that of the ring.
+    /// The optics with each quadrupole's gradient multiplied by its factor `[M]`; at params and supplies, that of
+    /// [`Ring::strengths`].
     ///
     /// # Errors
     /// [`OrbitError`] without a closed orbit or stable motion.
-    pub fn at(&self, vars: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
+    pub fn at(&self, factors: &[f64]) -> Result<VariedOptics<'_>, OrbitError> {
         let (mut map, mut back) = (Matrix6::identity(), Matrix6::identity());
         let mut observers = vec![RowVector6::zeros(); self.monitors];
         let mut sources = vec![Vector6::zeros(); self.correctors];
@@ -145,31 +147,26 @@ impl VariedRing {
             }
             (map, back) = (stretch.map * map, back * stretch.back);
             if let Some(quadrupole) = self.quadrupoles.get(i) {
-                let k1 = quadrupole.k1 * vars[quadrupole.var];
-                kernels[quadrupole.var] = back * quadrupole.kernel(k1) * map;
+                let k1 = quadrupole.k1 * factors[quadrupole.index];
+                kernels[quadrupole.index] = back * quadrupole.kernel(k1) * map;
                 (map, back) =
                     (quadrupole.map(k1, quadrupole.length) * map, back * quadrupole.map(k1, -quadrupole.length));
             }
         }
-        check_stable(&map)?;
+        let modes = Modes::of(&map)?;
         let (closed, dispersive) = close_at_momentum(&self.design, 0.0, &map)?;
         let path = map.row(PATH) * (closed + Matrix6::identity());
         let compaction = (map.row(PATH) * dispersive)[0] / self.design.circumference;
         let slip = compaction - self.inverse_gamma_squared;
-        Ok(VariedOptics { ring: self, observers, sources, kernels, turn: map, closed, dispersive, path, slip })
+        Ok(VariedOptics { ring: self, observers, sources, kernels, closed, dispersive, path, slip, turn: map, modes })
     }
 }
 
 impl Quadrupole {
-    fn of(ring: &Ring, element: usize, var: usize) -> Self {
+    fn of(ring: &Ring, element: usize, index: usize) -> Self {
         let element = &ring.elements[element];
         let Kind::Quadrupole { k1 } = element.kind else { panic!("{} is no quadrupole", element.name) };
-        let (sin, cos) = element.misalignment.roll.sin_cos();
-        let mut roll = Matrix6::identity();
-        for (h, v) in [(X, Y), (PX, PY)] {
-            (roll[(h, h)], roll[(h, v)], roll[(v, h)], roll[(v, v)]) = (cos, sin, -sin, cos);
-        }
-        Self { var, k1, length: element.length, roll }
+        Self { index, k1, length: element.length, roll: element.misalignment.rotation() }
     }
 
     fn rolled(&self, own: Matrix6<f64>) -> Matrix6<f64> {
@@ -212,17 +209,6 @@ fn focusing(k: f64, length: f64) -> (f64, f64) {
     }
 }
 
-/// Stable motion without coupling; a roll's is second order in it.
-fn check_stable(turn: &Matrix6<f64>) -> Result<(), OrbitError> {
-    for (mode, i) in [('x', X), ('y', Y)] {
-        let half_trace = 0.5 * (turn[(i, i)] + turn[(i + 1, i + 1)]);
-        if half_trace.is_nan() || half_trace.abs() >= 1.0 {
-            return Err(OrbitError::Unstable { mode, half_trace });
-        }
-    }
-    Ok(())
-}
-
 impl VariedOptics<'_> {
     /// Orbit at the read monitors for a unit kick of each corrector [m/rad], and, last, for a unit of relative RF frequency
     /// offset [m]: rows monitors, columns correctors and one more.
@@ -253,21 +239,18 @@ impl VariedOptics<'_> {
         self.slip
     }
 
-    /// Fractional parts of the tunes x and y, the planes not being coupled: `2 cos(2 pi Q) = tr M`.
+    /// Tunes without their integer part, in 0..1; that takes [`Optics::tunes`].
     pub fn tunes(&self) -> [f64; 2] {
-        [X, Y].map(|i| {
-            let half_trace = 0.5 * (self.turn[(i, i)] + self.turn[(i + 1, i + 1)]);
-            let fraction = half_trace.acos() / core::f64::consts::TAU;
-            if self.turn[(i, i + 1)] < 0.0 { 1.0 - fraction } else { fraction }
-        })
+        self.modes.fractions
     }
 
-    /// Derivative of both tunes with respect to `ln` of each var.
+    /// Derivative of both tunes with respect to `ln` of each quadrupole's gradient `[M]`; by param, see [`Ring::by_parameter`].
     pub fn tune_slopes(&self) -> Vec<[f64; 2]> {
-        self.kernels.iter().map(|kernel| tune_slope(&self.turn, kernel)).collect()
+        let slopes = self.modes.slopes();
+        self.kernels.iter().map(|kernel| Modes::tune_slope(&slopes, &self.turn, kernel)).collect()
     }
 
-    /// Gradient with respect to `ln` of each var of a function of the response, from its derivative `weights` with respect
+    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` (by param, see [`Ring::by_parameter`]) of a function of the response, from its derivative `weights` with respect
     /// to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
@@ -297,8 +280,8 @@ impl VariedOptics<'_> {
                     }
                 }
             }
-            if let Some(quadrupole) = self.ring.quadrupoles.get(i) {
-                gradient[quadrupole.var] = -self.kernels[quadrupole.var].transpose().dot(&pairs);
+            if let Some(Quadrupole { index, .. }) = self.ring.quadrupoles.get(i) {
+                gradient[*index] = -self.kernels[*index].transpose().dot(&pairs);
             }
         }
         gradient
@@ -308,65 +291,72 @@ impl VariedOptics<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::mixed;
 
-    /// Vars of a rather wrong ring with a rolled quadrupole.
-    fn example() -> (Ring, Vec<f64>) {
-        let mut ring = Ring::booster();
-        let rolled = ring.quadrupoles[ring.quadrupole("C3").unwrap()].element;
-        ring.elements[rolled].misalignment.roll = 0.02;
-        (ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
+    /// Params that are rather wrong, and supplies.
+    fn wrong(ring: &Ring) -> (Vec<f64>, Vec<f64>) {
+        let params = (0..ring.parameters.len()).map(|i| 0.015 * f64::sin(3.0 * i as f64));
+        (params.collect(), vec![0.002; ring.supplies.len()])
+    }
+
+    fn rings() -> [Ring; 2] {
+        let mut rolled = Ring::booster();
+        let at = rolled.quadrupoles[rolled.quadrupole("C3").unwrap()].element;
+        rolled.elements[at].misalignment.roll = 0.02;
+        [rolled, mixed()]
     }
 
     #[test]
-    fn responses_are_those_of_the_whole_ring() {
-        let (ring, vars) = example();
-        let varied = VariedRing::of(&ring).unwrap();
-        let (fast, whole) = (varied.at(&vars).unwrap(), ring.with_vars(&vars));
-        let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
-        let expected = optics.response(&optics.read_monitors(), &optics.correctors());
-        let response = fast.response();
-        assert!((response.columns(0, 48) - &expected).amax() < 1e-10 * expected.amax());
-        for (b, observer) in optics.read_monitors().iter().enumerate() {
-            let rf = -optics.dispersion(observer) / optics.slip_factor();
-            assert!((response[(b, 48)] - rf).abs() < 1e-9 * rf.abs().max(1.0), "{b}: {} {rf}", response[(b, 48)]);
+    fn responses_and_tunes_are_those_of_the_whole_ring() {
+        for ring in rings() {
+            let (params, supplies) = wrong(&ring);
+            let varied = VariedRing::of(&ring).unwrap();
+            let whole = ring.with_strengths(&ring.strengths(&params, &supplies));
+            let fast = varied.at(&ring.strengths(&params, &supplies)).unwrap();
+            let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
+            let expected = optics.response(&optics.read_monitors(), &optics.correctors());
+            let response = fast.response();
+            assert!((response.columns(0, 48) - &expected).amax() < 1e-10 * expected.amax());
+            for (b, observer) in optics.read_monitors().iter().enumerate() {
+                let rf = -optics.dispersion(observer) / optics.slip_factor();
+                assert!((response[(b, 48)] - rf).abs() < 1e-9 * rf.abs().max(1.0), "{b}: {} {rf}", response[(b, 48)]);
+            }
+            let tunes = optics.tunes().unwrap();
+            for (ours, known) in fast.tunes().into_iter().zip([tunes.x, tunes.y]) {
+                assert!((ours - known.fract()).abs() < 1e-10, "{ours} {known}");
+            }
         }
     }
 
-    /// A random function of the response, by central differences.
+    /// A random function of response and tunes, by central differences.
     #[test]
-    fn the_gradient_is_that_of_the_response() {
-        let (ring, vars) = example();
-        let varied = VariedRing::of(&ring).unwrap();
+    fn gradients_are_those_of_response_and_tunes() {
         let weights = DMatrix::from_fn(33, 49, |b, c| f64::sin(7.1 * b as f64 + 2.3 * c as f64));
-        let gradient = varied.at(&vars).unwrap().pull_back(&weights);
-        for (q, slope) in gradient.iter().enumerate() {
-            let value = |step: f64| {
-                let mut vars = vars.clone();
-                vars[q] *= step.exp();
-                varied.at(&vars).unwrap().response().dot(&weights)
-            };
-            let h = 1e-3;
-            let difference = (8.0 * (value(h) - value(-h)) - value(2.0 * h) + value(-2.0 * h)) / (12.0 * h);
-            // fourth order in a step of 1e-3
-            assert!((slope / difference - 1.0).abs() < 1e-6, "{q}: {slope} {difference}");
-        }
-    }
-
-    #[test]
-    fn tunes_and_their_slopes_are_those_of_the_whole_ring() {
-        let (_, vars) = example();
-        let ring = Ring::booster(); // without coupling
-        let varied = VariedRing::of(&ring).unwrap();
-        let (fast, whole) = (varied.at(&vars).unwrap(), ring.with_vars(&vars));
-        let optics = Optics::of(&whole, Hold::Momentum { delta: 0.0 }).unwrap();
-        let tunes = optics.tunes().unwrap();
-        let [x, y] = fast.tunes();
-        assert!((tunes.x.fract() - x).abs() < 1e-10 && (tunes.y.fract() - y).abs() < 1e-10, "{tunes:?} {x} {y}");
-        let gradients = optics.quadrupoles().into_iter().zip(whole.gradients());
-        for (q, (gradient, k1)) in gradients.enumerate() {
-            let exact = optics.tune_slope(&gradient).map(|slope| slope * k1);
-            let error = [0, 1].map(|plane| (fast.tune_slopes()[q][plane] - exact[plane]).abs());
-            assert!(error[0].max(error[1]) < 1e-7, "{q}: {error:?}"); // the twin's kernels are integrals by quadrature
+        for ring in rings() {
+            let (params, supplies) = wrong(&ring);
+            let varied = VariedRing::of(&ring).unwrap();
+            let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
+            let gradient = ring.by_parameter(&optics.pull_back(&weights));
+            let slopes = optics.tune_slopes();
+            let tunes =
+                [0, 1].map(|mode| ring.by_parameter(&slopes.iter().map(|slope| slope[mode]).collect::<Vec<_>>()));
+            assert_eq!(gradient.len(), ring.parameters.len());
+            for (q, slope) in gradient.iter().enumerate() {
+                let value = |step: f64| {
+                    let mut params = params.clone();
+                    params[q] += step;
+                    let optics = varied.at(&ring.strengths(&params, &supplies)).unwrap();
+                    let [x, y] = optics.tunes();
+                    [optics.response().dot(&weights), x, y]
+                };
+                let h = 3e-4;
+                let (up, down, far_up, far_down) = (value(h), value(-h), value(2.0 * h), value(-2.0 * h));
+                for (i, slope) in [*slope, tunes[0][q], tunes[1][q]].into_iter().enumerate() {
+                    let known = (8.0 * (up[i] - down[i]) - far_up[i] + far_down[i]) / (12.0 * h);
+                    // fourth order in a step that moves all 24 magnets of a family at once
+                    assert!((slope / known - 1.0).abs() < 1e-6, "{q}, {i}: {slope} {known}");
+                }
+            }
         }
     }
 

@@ -15,7 +15,7 @@ const LEADING: usize = 15;
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
     let found = &diagnosis.found;
     let (null, data) = (&found.null, &found.data);
-    let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term.clone()).collect();
+    let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term).collect();
     let scanned = match found.slots.len() {
         0 => found.next.scanned.clone(),
         1 => found.slots[0].scanned.clone(),
@@ -23,7 +23,8 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
     };
     let count = scanned.len();
     let library = scanned.into_iter().zip(prices(&terms)).map(|(candidate, price)| {
-        let (kind, place) = (candidate.term.kind.word().replace('_', " "), candidate.term.place.replace(',', ", "));
+        let (kind, names) = (candidate.term.kind.word().replace('_', " "), candidate.term.site.names(&data.ring));
+        let place = names.join(", ");
         Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, price: Some(price) }
     });
     let discrepancies = discrepancy::scan(data, null)?;

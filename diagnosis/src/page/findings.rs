@@ -69,20 +69,22 @@ fn meaning(verdict: Verdict) -> &'static str {
 
 fn row(before: &str, finding: &Finding) -> [String; 9] {
     let (amplitude, sigma) = finding.amplitude;
+    let unit = finding.unit();
+    let (amplitude, sigma) = (amplitude * unit.factor, sigma * unit.factor);
     let decimals = if sigma > 0.0 { (1.0 - sigma.log10().floor()).clamp(0.0, 7.0) as usize } else { 2 };
-    let amplitude = match sigma > 0.0 {
-        true => format!("{} ± {sigma:.decimals$}", signed(amplitude, decimals)),
-        false if finding.kind == "unknown" => format!("{amplitude:.1e} (rms)"),
-        false => "\u{2013}".into(),
+    let amplitude = match finding.term() {
+        Some(_) if sigma > 0.0 => format!("{} ± {sigma:.decimals$}", signed(amplitude, decimals)),
+        Some(_) => "\u{2013}".into(),
+        None => format!("{amplitude:.2} (rms)"),
     };
     let gain = finding.heldout.map_or_else(String::new, |(gain, error)| format!("{} ± {error:.1}", signed(gain, 1)));
     [
         before.into(),
-        finding.kind.into(),
-        if finding.at.is_empty() { "whole ring".into() } else { finding.at.replace(',', ", ") },
+        finding.word().into(),
+        if finding.at.is_empty() { "whole ring".into() } else { finding.at.clone() },
         finding.s.map_or_else(|| "\u{2013}".into(), |s| format!("{s:.2}")),
         amplitude,
-        finding.unit.into(),
+        unit.shown.into(),
         signed(finding.log_evidence_gain, 1),
         format!("{:.3}", finding.probability),
         gain,

@@ -66,7 +66,7 @@ fn signed(value: f64, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use twin::{Effect, EffectKind};
+    use twin::Effect;
 
     use super::*;
     use crate::testing::template;
@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn the_page_leads_from_the_sentence_to_the_readings() {
         let (ring, recording) = template();
-        let effects = [Effect { kind: EffectKind::BpmGain, place: "x_E4".into(), amplitude: -0.15 }];
+        let effects = [Effect::parse("bpm_gain@x_E4=-0.15", &ring).unwrap()];
         let truth = Truth { vars: &[1.0; 48], effects: &effects, ..Truth::default() };
         let made = campaign(&recording, &ring, &truth, &Hardware::shipped(&ring, &recording), 3).unwrap();
         let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();

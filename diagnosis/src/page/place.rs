@@ -1,10 +1,10 @@
 //! Where along the beam a gradient would sit.
 
-use twin::{EffectError, EffectKind, Element, Ring};
+use twin::{EffectError, Element, Ring, Thin};
 
 use super::signed;
-use crate::place_scan::{Interval, PlaceScan, thin};
-use crate::{Diagnosis, Verdict};
+use crate::place_scan::{Interval, PlaceScan};
+use crate::{Diagnosis, Finding, Verdict};
 use report::{Axes, Figure, Reference, Section, Series};
 
 /// Share of the posterior that an interval holds.
@@ -28,16 +28,14 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
         ..Section::default()
     };
     let found = &diagnosis.found;
-    for (kind, word, symbol) in
-        [(EffectKind::StrayGradient, "normal", "K1L"), (EffectKind::StraySkewGradient, "skew", "K1sL")]
-    {
+    for (kind, word, symbol) in [(Thin::Normal, "normal", "K1L"), (Thin::Skew, "skew", "K1sL")] {
         let terms = &found.best.hypothesis.terms;
-        let own = terms.iter().position(|term| thin(term.kind) == Some(kind));
+        let own = terms.iter().position(|term| term.kind.thin() == Some(kind));
         let along = PlaceScan::of(&found.data, &found.best, own, kind)?;
         let settled = matches!(diagnosis.verdict, Verdict::Identified | Verdict::Ambiguous);
         let interval = own.filter(|_| settled).map(|_| along.credible(SHARE));
         if let (Some(own), Some(interval)) = (own, &interval) {
-            section.text.push(stated(&along, interval, word, symbol, &terms[own].label()));
+            section.text.push(stated(&along, interval, word, symbol, &terms[own].label(&found.data.ring)));
         }
         section.figures.push(figure(diagnosis, &along, word));
         if let Some(interval) = &interval {
@@ -72,12 +70,12 @@ fn figure(diagnosis: &Diagnosis, along: &PlaceScan, word: &str) -> (String, Figu
         let nearest = (0..s.len()).min_by(|&i, &j| (s[i] - at).abs().total_cmp(&(s[j] - at).abs()));
         nearest.map_or(f64::NAN, |i| along.log_bayes[i])
     };
-    let of_kind = |kind: &str| EffectKind::ALL.iter().any(|one| one.word() == kind && thin(*one) == Some(along.kind));
+    let acts_alike = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(along.kind));
     let marks = diagnosis.findings.iter().flat_map(|finding| {
         core::iter::once((finding, true)).chain(finding.alternatives.iter().map(|other| (other, false)))
     });
     let (mut first, mut others) = (Vec::new(), Vec::new());
-    for (one, leads) in marks.filter(|(one, _)| of_kind(one.kind)) {
+    for (one, leads) in marks.filter(|(one, _)| acts_alike(one)) {
         if let Some(at) = one.s {
             if leads { &mut first } else { &mut others }.push((at, height(at)));
         }

@@ -35,8 +35,8 @@ impl Residuals {
     /// Of a fit.
     pub fn of(name: &'static str, data: &Data, fitted: &Fitted) -> Self {
         let settings = Settings::of(&data.drives);
-        let horizontal: Vec<bool> = data.ring.corrector_names().iter().map(|name| name.starts_with("H_")).collect();
-        let planes: Vec<bool> = data.ring.read_places().iter().map(|(plane, _)| *plane == Plane::X).collect();
+        let horizontal: Vec<bool> = data.ring.correctors.iter().map(|c| c.plane == Plane::X).collect();
+        let planes: Vec<bool> = data.ring.monitors_read().map(|m| m.plane == Plane::X).collect();
         let places = fitted.data(data).places();
         let of = |(place, &value): (Option<(usize, usize)>, &f64)| {
             let (frame, monitor) = place?;

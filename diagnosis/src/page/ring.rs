@@ -1,9 +1,7 @@
 //! Where it is: the ring with what was found marked on it.
 
-use twin::{EffectKind, Kind, Ring};
+use twin::{Class, Kind, Ring};
 
-use crate::data::Data;
-use crate::hypothesis::Term;
 use crate::{Diagnosis, Finding};
 use report::{Figure, Magnet, RingMap, Section, Spotted, Symbol};
 
@@ -12,13 +10,13 @@ const ALTERNATIVES: usize = 4;
 
 /// The map.
 pub fn section(diagnosis: &Diagnosis) -> Section {
-    let data = &diagnosis.found.data;
+    let ring = &diagnosis.found.data.ring;
     let (mut spotted, mut everywhere) = (Vec::new(), Vec::new());
     for finding in &diagnosis.findings {
         let others = finding.alternatives.iter().take(ALTERNATIVES).map(|other| (other, true));
         for (one, pale) in core::iter::once((finding, false)).chain(others) {
-            let places = positions(data, one);
-            let label = format!("{} {}", one.kind.replace('_', " "), one.at);
+            let places = positions(ring, one);
+            let label = format!("{} {}", one.word().replace('_', " "), one.at);
             match places.is_empty() {
                 true if pale => everywhere.push(format!("or {label} (whole ring)")),
                 true => everywhere.push(format!("{label} (whole ring)")),
@@ -26,7 +24,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             }
         }
     }
-    let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(&data.ring) });
+    let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(ring) });
     let caption = if diagnosis.findings.is_empty() {
         "The ring; nothing is missing, so nothing is marked. Names inside the path are half-cells."
     } else {
@@ -41,13 +39,12 @@ fn named(label: &str, pale: bool) -> String {
 }
 
 /// Where a finding is: exchanged monitors are at two places, what acts on the whole ring at none.
-fn positions(data: &Data, finding: &Finding) -> Vec<f64> {
-    if finding.kind == EffectKind::RadialLoop.word() || finding.s.is_none() {
-        return Vec::new();
+fn positions(ring: &Ring, finding: &Finding) -> Vec<f64> {
+    let Some(term) = finding.term() else { return finding.s.into_iter().collect() };
+    match term.kind.class() {
+        Class::Monitor(_) | Class::Corrector(_) | Class::Field(_) => term.site.positions(ring),
+        Class::Hold(_) | Class::Drift(_) => Vec::new(),
     }
-    let of = |place: &str| Term::new(EffectKind::BpmGain, place).position(data);
-    let found: Vec<f64> = finding.at.split(',').filter_map(of).collect();
-    if found.is_empty() { finding.s.into_iter().collect() } else { found }
 }
 
 /// The ring without anything marked.
@@ -56,7 +53,7 @@ fn empty(ring: &Ring) -> RingMap {
         Kind::Bend(_) => Some(Symbol::Bend),
         Kind::Quadrupole { k1 } if *k1 > 0.0 => Some(Symbol::Focusing),
         Kind::Quadrupole { .. } => Some(Symbol::Defocusing),
-        Kind::Monitor { .. } => Some(Symbol::Monitor),
+        Kind::Monitor => Some(Symbol::Monitor),
         Kind::Corrector { .. } => Some(Symbol::Corrector),
         _ => None,
     };
@@ -65,7 +62,8 @@ fn empty(ring: &Ring) -> RingMap {
         .iter()
         .filter_map(|element| Some(Magnet { symbol: symbol(&element.kind)?, s: element.s, length: element.length }));
     let names: Vec<(String, f64)> = (ring.quadrupoles.iter())
-        .map(|&at| (ring.elements[at].cell().to_owned(), ring.elements[at].s + 0.5 * ring.elements[at].length))
+        .map(|q| &ring.elements[q.element])
+        .map(|magnet| (magnet.label.clone(), magnet.s + 0.5 * magnet.length))
         .collect();
     RingMap {
         title: format!("{}, {:.2} m", ring.name, ring.circumference),
@@ -77,15 +75,15 @@ fn empty(ring: &Ring) -> RingMap {
     }
 }
 
-/// Superperiods are the first letters of the half-cells, and begin where their first element does.
+/// Sectors begin where their first element does.
 fn sectors(ring: &Ring) -> Vec<(String, f64)> {
     let mut sectors: Vec<(String, f64)> = Vec::new();
-    for element in ring.elements.iter().filter(|element| element.name.contains('_')) {
-        let letter: String = element.cell().chars().take(1).collect();
-        if sectors.last().is_none_or(|(last, _)| *last != letter) {
+    for element in &ring.elements {
+        let Some(sector) = &element.sector else { continue };
+        if sectors.last().is_none_or(|(last, _)| last != sector) {
             // the first one at the start of the ring
             let s = if sectors.is_empty() { 0.0 } else { element.s };
-            sectors.push((letter, s));
+            sectors.push((sector.clone(), s));
         }
     }
     sectors

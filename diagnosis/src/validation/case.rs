@@ -8,7 +8,7 @@ use twin::{Effect, EffectKind, Ring};
 
 use super::unknown::{Unknown, UnknownKind};
 use crate::hypothesis::Term;
-use crate::score::{TrueEffect, Truth};
+use crate::score::{TrueCause, TrueEffect, Truth};
 use inference::recording::Recording;
 use inference::simulate;
 
@@ -66,7 +66,7 @@ impl Case {
             let sign = if random.random_bool(0.5) { -1.0 } else { 1.0 };
             let size = random.random_range(SIZES[0].ln()..SIZES[1].ln()).exp();
             let amplitude = kind.prior_scale().map_or(1.0, |scale| sign * size * scale);
-            Effect { kind, place: term.place.clone(), amplitude }
+            term.effect(amplitude)
         };
         let effects = match class {
             Class::Empty | Class::Unknown => Vec::new(),
@@ -82,16 +82,12 @@ impl Case {
     /// The answer key.
     pub fn key(&self, ring: &Ring) -> Truth {
         let library = self.effects.iter().map(|effect| TrueEffect {
-            kind: effect.kind.word().into(),
-            at: effect.place.clone(),
-            amplitude: effect.kind.prior_scale().map(|_| effect.amplitude),
-            what: None,
+            cause: TrueCause::Effect((*effect).into()),
+            amplitude: (!effect.kind.is_switch()).then_some(effect.amplitude),
         });
         let beyond = self.beyond.iter().map(|unknown| TrueEffect {
-            kind: "unknown".into(),
-            at: unknown.place.clone(),
+            cause: TrueCause::Unknown { what: unknown.kind.word().into(), at: unknown.site.name(ring) },
             amplitude: Some(unknown.size),
-            what: Some(unknown.kind.word().into()),
         });
         Truth {
             effects: library.chain(beyond).collect(),

@@ -13,12 +13,12 @@ use std::time::Instant;
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
-use twin::{Effect, Ring};
+use twin::{Effect, EffectKind, Ring};
 
 use crate::data::{Data, DataError};
 use crate::fit::Fitted;
-use crate::hypothesis::Hypothesis;
-use crate::score::{Fate, Grade, TrueEffect, Truth};
+use crate::hypothesis::{Hypothesis, Term};
+use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
 use crate::{Diagnosis, Finding, Verdict};
 pub use case::{Case, Class};
 use inference::recording::Recording;
@@ -33,13 +33,13 @@ pub struct Outcome {
     /// What it is.
     pub class: Class,
     /// The effects it was made with.
-    pub truth: Vec<TrueEffect>,
+    pub truth: Vec<Made>,
     /// Gain in `ln` posterior when kind, place and size are given.
     pub oracle_gain: f64,
     /// Of each effect, the same beside the others, and what became of it.
     pub fates: Vec<(f64, Fate)>,
-    /// The verdict's word.
-    pub verdict: String,
+    /// The verdict.
+    pub verdict: Verdict,
     /// How right it is.
     pub grade: Grade,
     /// Kinds and places of the findings, strongest first.
@@ -58,6 +58,29 @@ pub struct Outcome {
     pub nees: [f64; 2],
     /// Time of the diagnosis [s].
     pub seconds: f64,
+}
+
+/// One effect of a case.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Made {
+    /// The word for its kind; of what the library does not hold, what it is.
+    pub kind: String,
+    /// Amplitude in prior standard deviations, if the kind has one.
+    pub size: Option<f64>,
+    /// Kind, place and amplitude in words.
+    pub label: String,
+}
+
+impl Made {
+    fn of(effect: &TrueEffect, ring: &Ring) -> Self {
+        let kind = match &effect.cause {
+            TrueCause::Effect(Term { kind, .. }) | TrueCause::Kind(kind) => kind.word().into(),
+            TrueCause::Unknown { what, .. } => what.clone(),
+        };
+        let scale = effect.kind().and_then(EffectKind::prior_scale);
+        let size = scale.zip(effect.amplitude).map(|(scale, amplitude)| (amplitude / scale).abs());
+        Self { kind, size, label: effect.label(ring) }
+    }
 }
 
 /// Simulate, diagnose and score one case; `None` if its machine keeps no beam.
@@ -82,37 +105,34 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         class: case.class,
         oracle_gain,
         fates: own.into_iter().zip(key.fates(&diagnosis)).collect(),
-        verdict: diagnosis.verdict.word().into(),
+        verdict: diagnosis.verdict,
         grade: key.grade(&diagnosis),
-        found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
+        found: diagnosis.findings.iter().map(Finding::label).collect(),
         stated: stated(&diagnosis, &key),
         nothing: diagnosis.found.nothing(),
         heldout: diagnosis.gain(),
         pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
         covered: covered(ring, &diagnosis, &key),
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
-        truth: key.effects,
+        truth: key.effects.iter().map(|effect| Made::of(effect, ring)).collect(),
         seconds,
     }))
 }
 
 /// What the diagnosis thinks most likely where it is least certain, how likely, and whether it is so.
 fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
-    let least = diagnosis
-        .findings
-        .iter()
-        .filter(|f| f.kind != "unknown")
-        .min_by(|a, b| a.probability.total_cmp(&b.probability));
+    let least =
+        diagnosis.findings.iter().filter(|f| f.term().is_some()).min_by(|a, b| a.probability.total_cmp(&b.probability));
     let nothing = diagnosis.found.nothing();
     match least {
         Some(finding) if diagnosis.verdict != Verdict::Consistent => {
             let is_true = key.effects.iter().any(|effect| effect.is(finding));
-            (format!("{}@{}", finding.kind, finding.at), finding.probability, is_true)
+            (finding.label(), finding.probability, is_true)
         }
         _ if diagnosis.verdict == Verdict::Consistent => ("nothing".into(), nothing, key.effects.is_empty()),
         _ => {
             let unknown = diagnosis.found.next.unknown();
-            ("unknown".into(), unknown, key.effects.iter().any(|effect| effect.kind == "unknown"))
+            ("unknown".into(), unknown, key.effects.iter().any(TrueEffect::is_unknown))
         }
     }
 }
@@ -125,8 +145,7 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
             && key.effects.iter().any(|effect| effect.is(finding))
     };
     let touches = |finding: &Finding| -> Option<bool> {
-        let term = diagnosis.found.best.hypothesis.terms.iter().find(|term| term.place == finding.at)?;
-        let element = &ring.elements[term.element(&diagnosis.found.data)?];
+        let element = &ring.elements[*finding.term()?.site.elements(ring).first()?];
         let (from, to) = (element.s, element.s + element.length);
         Some(finding.interval.iter().any(|one| {
             if one.from_m <= one.to_m {

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF};
-use twin::EffectKind;
 
 use super::{Class, Outcome};
-use crate::score::{Fate, Grade, TrueEffect};
+use crate::Verdict;
+use crate::score::{Fate, Grade};
 
 /// Share of successes among trials, with the 95 % limits of Clopper and Pearson.
 ///
@@ -136,15 +136,15 @@ impl Tables {
             effects.filter(move |(gain, _)| (from..to).contains(gain)).map(|(_, fate)| fate)
         };
         let within = |[from, to]: [f64; 2]| move |o: &&Outcome| (from..to).contains(&o.oracle_gain);
-        let named = |outcome: &Outcome| outcome.verdict == "identified";
-        let undecided = |outcome: &Outcome| matches!(outcome.verdict.as_str(), "unexplained" | "ambiguous");
+        let named = |outcome: &Outcome| outcome.verdict == Verdict::Identified;
+        let undecided = |outcome: &Outcome| matches!(outcome.verdict, Verdict::Unexplained | Verdict::Ambiguous);
         let right = || outcomes.iter().filter(|o| o.grade == Grade::Right && o.class != Class::Empty);
         let pulls: Vec<f64> = outcomes.iter().flat_map(|o| o.pulls.iter().copied()).collect();
         let inside = |limit: f64| Share::new(pulls.iter().filter(|p| p.abs() < limit).count(), pulls.len());
         let covered: Vec<bool> = outcomes.iter().flat_map(|o| o.covered.iter().copied()).collect();
         let seconds: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
         Self {
-            empty_consistent: Share::of(class(Class::Empty), |o| o.verdict == "consistent"),
+            empty_consistent: Share::of(class(Class::Empty), |o| o.verdict == Verdict::Consistent),
             empty_identified: Share::of(class(Class::Empty), named),
             by_gain: GAINS.map(|bin| (bin, Fates::of(with_gain(bin)))).into(),
             wrong: Share::of(outcomes.iter().filter(|o| o.class != Class::Unknown), |o| o.grade == Grade::Wrong),
@@ -256,7 +256,7 @@ fn power<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> BTreeMap<String, [S
     let mut counts: BTreeMap<String, [(usize, usize); 3]> = BTreeMap::new();
     for outcome in outcomes {
         let Some(effect) = outcome.truth.first() else { continue };
-        let third = size(effect).map_or(2, |size| usize::from(size > THIRDS[0]) + usize::from(size > THIRDS[1]));
+        let third = effect.size.map_or(2, |size| usize::from(size > THIRDS[0]) + usize::from(size > THIRDS[1]));
         let (of, trials) = &mut counts.entry(effect.kind.clone()).or_default()[third];
         *of += usize::from(outcome.grade == Grade::Right);
         *trials += 1;
@@ -264,14 +264,8 @@ fn power<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> BTreeMap<String, [S
     counts.into_iter().map(|(kind, thirds)| (kind, thirds.map(|(of, trials)| Share::new(of, trials)))).collect()
 }
 
-/// Amplitude in prior standard deviations, if the kind has one.
-fn size(effect: &TrueEffect) -> Option<f64> {
-    let kind = EffectKind::ALL.iter().find(|kind| kind.word() == effect.kind)?;
-    Some((effect.amplitude? / kind.prior_scale()?).abs())
-}
-
 fn confusion(outcome: &Outcome) -> (String, String) {
-    let truth: Vec<String> = outcome.truth.iter().map(TrueEffect::label).collect();
+    let truth: Vec<&str> = outcome.truth.iter().map(|made| made.label.as_str()).collect();
     let truth = if truth.is_empty() { "nothing".into() } else { truth.join(" + ") };
     (format!("{truth} (oracle gain {:.1})", outcome.oracle_gain), outcome.found.join(" + "))
 }

@@ -18,7 +18,7 @@ use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
-use twin::{Cycle, Kind, Ring};
+use twin::{Cycle, Kind, Plane, Ring, Site};
 
 use inference::recording::Recording;
 use inference::simulate::Beyond;
@@ -51,8 +51,8 @@ pub enum UnknownKind {
 pub struct Unknown {
     /// What happens.
     pub kind: UnknownKind,
-    /// Where, in the words for places.
-    pub place: String,
+    /// Where.
+    pub site: Site,
     /// How much, with its sign; the unit is that of the kind.
     pub size: f64,
     /// Index of the place: read monitor, corrector, quadrupole or element.
@@ -105,20 +105,21 @@ impl UnknownKind {
         }
     }
 
-    /// Where it may act in a campaign, by name and index.
-    fn sites(self, ring: &Ring, campaign: &Recording) -> Vec<(String, usize)> {
-        let all = |names: Vec<String>| names.into_iter().enumerate().map(|(i, name)| (name, i)).collect::<Vec<_>>();
+    /// Where it may act in a campaign.
+    fn sites(self, ring: &Ring, campaign: &Recording) -> Vec<Site> {
+        let correctors = 0..ring.correctors.len();
         match self {
-            Self::WarmUp | Self::Saturation | Self::Crosstalk | Self::BpmWander => all(ring.monitor_names()),
-            Self::QuadJump => all(ring.var_names()),
-            Self::OrbitDrift => all(ring.corrector_names()),
+            Self::WarmUp | Self::Saturation | Self::Crosstalk | Self::BpmWander => {
+                ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect()
+            }
+            Self::QuadJump => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
+            Self::OrbitDrift => correctors.map(Site::Corrector).collect(),
             Self::Hysteresis | Self::Leak => {
-                let correctors = all(ring.corrector_names());
-                correctors.into_iter().filter(|(name, _)| was_set(campaign, name)).collect()
+                correctors.filter(|&at| was_set(campaign, ring, at)).map(Site::Corrector).collect()
             }
             Self::Octupole => {
-                let elements = ring.elements.iter().enumerate().filter(|(_, e)| e.kind == Kind::Marker);
-                elements.map(|(i, e)| (e.name.clone(), i)).collect()
+                let straights = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Marker);
+                straights.map(Site::Element).collect()
             }
         }
     }
@@ -132,12 +133,12 @@ impl Unknown {
     pub fn of(kind: UnknownKind, ring: &Ring, campaign: &Recording, seed: u64) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let sites = kind.sites(ring, campaign);
-        let (place, index) = sites.choose(&mut random).expect("a ring has places of every kind").clone();
+        let site = *sites.choose(&mut random).expect("a ring has places of every kind");
         let [weak, strong] = kind.sizes().map(f64::ln);
         let sign = if kind != UnknownKind::Saturation && random.random_bool(0.5) { -1.0 } else { 1.0 };
         let size = sign * random.random_range(weak..=strong).exp();
-        let next = next_of(kind, ring, index);
-        Self { kind, place, size, index, next, when: random.random_range(-0.5..=0.5) }
+        let [index, next] = indices(kind, ring, site);
+        Self { kind, site, size, index, next, when: random.random_range(-0.5..=0.5) }
     }
 
     /// One of any kind.
@@ -192,22 +193,29 @@ impl Beyond for Unknown {
     }
 }
 
-/// True if the campaign sets this corrector (`H_A2`); its rows name it by half-cell.
-fn was_set(campaign: &Recording, name: &str) -> bool {
-    let cell = name.split_once('_').map_or(name, |(_, cell)| cell);
-    campaign.rows.iter().any(|row| row.setting != 0.0 && row.corrector.as_deref() == Some(cell))
+/// True if the campaign sets this corrector; its rows name it by its label.
+fn was_set(campaign: &Recording, ring: &Ring, corrector: usize) -> bool {
+    let label = ring.label(ring.correctors[corrector].element);
+    campaign.rows.iter().any(|row| row.setting != 0.0 && row.corrector.as_deref() == Some(label))
 }
 
-/// Index of the neighbour, the last one's being the first: the next monitor of the same plane, or the next corrector.
-fn next_of(kind: UnknownKind, ring: &Ring, index: usize) -> usize {
-    let names = match kind {
-        UnknownKind::Crosstalk => ring.monitor_names(),
-        UnknownKind::Leak => ring.corrector_names(),
-        _ => return index,
+/// Index of the place among the read monitors, correctors, quadrupoles or elements, and of the neighbour that it concerns: the next
+/// read monitor of the same plane, or the next corrector, the last one's being the first.
+fn indices(kind: UnknownKind, ring: &Ring, site: Site) -> [usize; 2] {
+    let after = |index: usize, planes: Vec<Plane>| {
+        let mut others = (index + 1..planes.len()).chain(0..index);
+        others.find(|&i| planes[i] == planes[index]).unwrap_or(index)
     };
-    let plane = |i: usize| &names[i][..1];
-    let mut after = (index + 1..names.len()).chain(0..index);
-    after.find(|&i| plane(i) == plane(index)).unwrap_or(index)
+    match (kind, site) {
+        (UnknownKind::Leak, Site::Corrector(at)) => [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())],
+        (_, Site::Monitor(at)) => {
+            let index = ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors");
+            let is_shared = kind == UnknownKind::Crosstalk;
+            [index, if is_shared { after(index, ring.monitors_read().map(|m| m.plane).collect()) } else { index }]
+        }
+        (_, Site::Corrector(at) | Site::Quadrupole(at) | Site::Element(at)) => [at, at],
+        (_, Site::Ring | Site::MonitorPair(..)) => unreachable!("no kind acts there"),
+    }
 }
 
 /// Add a share of what a corrector was set to before its present setting. Read-backs fluctuate, so a setting is another one
@@ -251,11 +259,11 @@ mod tests {
                 println!(
                     "{} {} {:.3e}: {moved} monitors, {:.2e} m",
                     kind.word(),
-                    unknown.place,
+                    unknown.site.name(&ring),
                     unknown.size,
                     change.abs().max()
                 );
-                let of_a_monitor = kind.sites(&ring, &recording)[0].0 == "x_A6";
+                let of_a_monitor = matches!(unknown.site, Site::Monitor(_));
                 // a limit may be out of reach of the orbit
                 let least = if kind == UnknownKind::Saturation { 0 } else { 1 };
                 assert!(moved >= least && (moved <= 1) == of_a_monitor, "{unknown:?}: {moved} monitors");
@@ -278,8 +286,8 @@ mod tests {
         let ring = Ring::booster();
         let names = ring.monitor_names();
         let next = |name: &str| {
-            let at = names.iter().position(|known| known == name).unwrap();
-            &names[next_of(UnknownKind::Crosstalk, &ring, at)]
+            let site = Site::Monitor(Site::monitor(&ring, name).unwrap());
+            &names[indices(UnknownKind::Crosstalk, &ring, site)[1]]
         };
         assert_eq!((next("x_A6").as_str(), next("x_F8").as_str(), next("y_F7").as_str()), ("x_A8", "x_A6", "y_A1"));
     }

@@ -1,20 +1,21 @@
 //! `orbitcal challenge`: every recording below a folder diagnosed, and scored against the answer key beside it.
 
+use core::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use comfy_table::{Table, presets};
-use diagnosis::Diagnosis;
 use diagnosis::score::{Grade, Truth};
+use diagnosis::{Diagnosis, Finding, Verdict};
 use serde::Serialize;
+use twin::Ring;
 
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Challenge;
-use crate::output;
+use crate::output::{self, fill, table};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
-struct Answer {
+struct ChallengeResult {
     recordings: Vec<Scored>,
     /// Number of recordings by grade.
     right: usize,
@@ -31,7 +32,7 @@ struct Answer {
 #[derive(Debug, Serialize)]
 struct Scored {
     recording: String,
-    verdict: &'static str,
+    verdict: Verdict,
     sentence: String,
     found: Vec<String>,
     truth: Vec<String>,
@@ -49,6 +50,7 @@ struct Scored {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Challenge) -> Result<(), CommandError> {
+    check_outputs([options.common.json.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let folders = folders(&options.folder)?;
     let bar = progress(folders.len(), "recordings", options.common.quiet);
@@ -58,19 +60,12 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
         let started = Instant::now();
         let diagnosis = Diagnosis::of(&ring, &recording, |_| {})?;
         let seconds = started.elapsed().as_secs_f64();
-        let truth = Truth::read(folder).map_err(|error| CommandError::Input(error.to_string()))?;
-        recordings.push(Scored::of(&ring.var_names(), &recording.name, &diagnosis, &truth, seconds));
+        let truth = Truth::read(folder, &ring).map_err(|error| CommandError::Input(error.to_string()))?;
+        recordings.push(Scored::of(&ring, &recording.name, &diagnosis, &truth, seconds));
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let answer = Answer::of(recordings);
-    if let Some(path) = &options.common.json {
-        output::json(path, &answer)?;
-    }
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        answer.print();
-    }
-    Ok(())
+    deliver(&options.common, &ChallengeResult::of(recordings))
 }
 
 /// Folders below (or the folder itself) that hold a recording and its key, sorted.
@@ -86,7 +81,8 @@ fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
 }
 
 fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> {
-    let wrong = |error: std::io::Error| CommandError::Input(format!("{}: {error}", folder.display()));
+    let wrong =
+        |error: std::io::Error| CommandError::Input(format!("{}: {}", folder.display(), output::unreadable(&error)));
     if folder.join("frames.csv").is_file() && folder.join("truth.json").is_file() {
         found.push(folder.to_owned());
     }
@@ -101,30 +97,39 @@ fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> 
 }
 
 impl Scored {
-    fn of(names: &[String], recording: &str, diagnosis: &Diagnosis, truth: &Truth, seconds: f64) -> Self {
+    fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis, truth: &Truth, seconds: f64) -> Self {
+        let names = ring.var_names();
         Self {
             recording: recording.into(),
-            verdict: diagnosis.verdict.word(),
+            verdict: diagnosis.verdict,
             sentence: diagnosis.sentence.clone(),
-            found: diagnosis.findings.iter().map(|f| format!("{}@{}", f.kind, f.at)).collect(),
-            truth: truth.effects.iter().map(diagnosis::score::TrueEffect::label).collect(),
+            found: diagnosis.findings.iter().map(Finding::label).collect(),
+            truth: truth.effects.iter().map(|effect| effect.label(ring)).collect(),
             oracle_gain: truth.oracle_gain,
             grade: truth.grade(diagnosis),
             amplitude_pulls: truth.pulls(diagnosis),
-            nees_per_var_before: truth.nees(names, &diagnosis.vars_before),
-            nees_per_var_after: truth.nees(names, &diagnosis.vars_after),
+            nees_per_var_before: truth.nees(&names, &diagnosis.vars_before),
+            nees_per_var_after: truth.nees(&names, &diagnosis.vars_after),
             elpd_gain: diagnosis.gain().into(),
             seconds,
         }
     }
 }
 
-impl Answer {
+impl Scored {
+    /// What was concealed, and how much an oracle gains that knows it [nat].
+    fn truth(&self) -> String {
+        let gain = self.oracle_gain.map_or_else(String::new, |gain| format!(" (oracle {gain:.1})"));
+        if self.truth.is_empty() { "nothing".into() } else { self.truth.join(" + ") + &gain }
+    }
+}
+
+impl ChallengeResult {
     fn of(recordings: Vec<Scored>) -> Self {
         let count = |grade| recordings.iter().filter(|scored| scored.grade == grade).count();
         let pulls: Vec<f64> = recordings
             .iter()
-            .filter(|scored| scored.verdict == "identified")
+            .filter(|scored| scored.verdict == Verdict::Identified)
             .flat_map(|scored| scored.amplitude_pulls.iter().copied())
             .collect();
         Self {
@@ -139,40 +144,28 @@ impl Answer {
             recordings,
         }
     }
+}
 
-    fn print(&self) {
-        let mut table = Table::new();
-        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header([
-            "recording",
-            "verdict",
-            "found",
-            "truth",
-            "oracle",
-            "grade",
-            "pull",
-            "NEES/var",
-            "held-out",
-            "s",
-        ]);
+impl fmt::Display for ChallengeResult {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut table =
+            table(["recording", "found, and the truth below", "grade", "pull", "NEES/var", "held-out", "s"]);
         for scored in &self.recordings {
             let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
             table.add_row([
                 scored.recording.clone(),
-                scored.verdict.into(),
-                scored.found.join(" + "),
-                scored.truth.join(" + "),
-                scored.oracle_gain.map_or_else(String::new, |gain| format!("{gain:.1}")),
+                format!("{}: {}\ntruth: {}", scored.verdict.word(), scored.found.join(" + "), scored.truth()),
                 format!("{:?}", scored.grade).to_lowercase(),
                 pulls.join(" "),
-                format!("{:.2} -> {:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
-                format!("{:.1} ± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
+                format!("{:.2}\n{:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
+                format!("{:.1}\n± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
                 format!("{:.1}", scored.seconds),
             ]);
         }
-        println!("{table}");
-        println!(
-            "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of squared pulls {:.1} of {}",
+        writeln!(f, "{table}")?;
+        let summary = format!(
+            "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of \
+             squared pulls {:.1} of {}",
             self.right,
             self.partial,
             self.listed,
@@ -182,5 +175,13 @@ impl Answer {
             self.amplitude_chi2,
             self.amplitudes
         );
+        write!(
+            f,
+            "{}\n{}",
+            fill(&summary),
+            fill(
+                "NEES, normalised estimation error squared of the vars: before and after what was found is in the model."
+            )
+        )
     }
 }

@@ -1,27 +1,28 @@
 //! `orbitcal diagnose`: what is missing in the model of a recording.
 
+use core::fmt;
 use std::path::Path;
 
-use comfy_table::{Table, presets};
 use diagnosis::average::Vars;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
 use diagnosis::{Diagnosis, Finding, page};
 use serde::Serialize;
-use twin::Ring;
+use twin::{Measured, Ring};
 
-use super::{CommandError, machine, progress, recording};
-use crate::answer::{Monitor, Var, monitors, vars_of};
+use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Diagnose;
-use crate::{model_file, output};
+use crate::model_file;
+use crate::output::{self, fill, table};
+use crate::result::{Monitor, Var, monitors, vars_of};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
-struct Answer {
+struct DiagnosisResult {
     recording: String,
     verdict: &'static str,
     sentence: String,
-    findings: Vec<FindingAnswer>,
+    findings: Vec<FindingResult>,
     monitors: Vec<Monitor>,
     fit: Fits,
     vars_before: Vec<Var>,
@@ -30,11 +31,11 @@ struct Answer {
     /// Probability that nothing (more) is missing, that an effect of the library is, and that something else is.
     probabilities: Probabilities,
     /// Ordinary scatter of families that the fits include.
-    scatter: Vec<ScatterAnswer>,
+    scatter: Vec<ScatterResult>,
 }
 
 #[derive(Debug, Serialize)]
-struct FindingAnswer {
+struct FindingResult {
     kind: &'static str,
     at: String,
     s_m: Option<f64>,
@@ -44,6 +45,9 @@ struct FindingAnswer {
     amplitude: f64,
     sigma: f64,
     unit: &'static str,
+    /// Amplitude and error bar as people read them.
+    #[serde(skip)]
+    measured: String,
     log_evidence_gain: f64,
     probability: f64,
     sentence: String,
@@ -52,13 +56,13 @@ struct FindingAnswer {
     /// Of an alternative: such a recording is not expected to tell it from the finding.
     #[serde(skip_serializing_if = "core::ops::Not::not")]
     inseparable: bool,
-    alternatives: Vec<FindingAnswer>,
+    alternatives: Vec<FindingResult>,
 }
 
 #[derive(Debug, Serialize)]
 struct Fits {
-    before: FitAnswer,
-    after: FitAnswer,
+    before: FitResult,
+    after: FitResult,
     elpd_gain: f64,
     elpd_gain_se: f64,
     /// The same with whole correctors held out, where no effect is a corrector's own.
@@ -67,7 +71,7 @@ struct Fits {
 }
 
 #[derive(Debug, Serialize)]
-struct FitAnswer {
+struct FitResult {
     chi2_per_dof: f64,
     heldout_rms_mm: f64,
     heldout_elpd: f64,
@@ -83,7 +87,7 @@ struct Probabilities {
 }
 
 #[derive(Debug, Serialize)]
-struct ScatterAnswer {
+struct ScatterResult {
     kind: &'static str,
     width: f64,
 }
@@ -103,6 +107,8 @@ impl From<DataError> for CommandError {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Diagnose) -> Result<(), CommandError> {
+    let outputs = [&options.common.json, &options.report, &options.model_out];
+    check_outputs(outputs.map(Option::as_deref))?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
     let bar = progress(5, "", options.common.quiet);
@@ -112,42 +118,43 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     });
     bar.finish_and_clear();
     let diagnosis = made?;
-    let answer = Answer::of(&ring, &recording.name, &diagnosis)?;
-    if let Some(path) = &options.common.json {
-        output::json(path, &answer)?;
-    }
+    let result = DiagnosisResult::of(&ring, &recording.name, &diagnosis)?;
     if let Some(path) = &options.report {
         let page = page::page(&diagnosis, &recording);
         let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
-        let written = page.write(path);
-        written.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
+        output::bytes(path, page.render().as_bytes())?;
     }
-    let left_out = options.model_out.as_deref().map(|path| write_model(&ring, &diagnosis, path)).transpose()?;
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        answer.print();
-        left_out.iter().flatten().for_each(|kind| println!("\n{kind} is beyond what the core's tables can hold"));
-        options.report.iter().for_each(|path| println!("\n{}", path.display()));
+    deliver(&options.common, &result)?;
+    if let Some(path) = options.report.as_ref().filter(|_| options.common.speaks()) {
+        output::say(format_args!("\n{}", path.display()))?;
     }
-    Ok(())
+    options.model_out.as_deref().map_or(Ok(()), |path| write_model(&ring, &diagnosis, path))
 }
 
-/// Write the core's tables of the machine that was found; returns the kinds of effect that they cannot hold.
-fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<Vec<&'static str>, CommandError> {
+/// Write the core's tables of the machine that was found, if they can hold all of it.
+fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<(), CommandError> {
+    let failed = |why: String| CommandError::Other(format!("{}: not written: {why}", path.display()));
+    let effects = diagnosis.effects();
+    if effects.is_empty() {
+        return Err(failed("nothing was identified beyond the ring as designed".into()));
+    }
     let vars: Vec<f64> = diagnosis.found.best.params.iter().map(|theta| theta.exp()).collect();
-    let extended = training::extended::tables(ring, &diagnosis.effects(), &vars);
-    let extended = extended.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))?;
-    model_file::write(path, &extended.tables)?;
-    Ok(extended.left_out.iter().map(|effect| effect.kind.word()).collect())
+    let extended = training::extended::tables(ring, &effects, &vars).map_err(|error| failed(error.to_string()))?;
+    let left_out: Vec<&str> = extended.left_out.iter().map(|effect| effect.kind.word()).collect();
+    if !left_out.is_empty() {
+        return Err(failed(format!("the core's tables cannot hold {}", left_out.join(", "))));
+    }
+    Ok(model_file::write(path, &ring.name, &extended.tables)?)
 }
 
-impl Answer {
+impl DiagnosisResult {
     fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
         let failed = |error: twin::EffectError| CommandError::Other(format!("{recording}: {error}"));
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;
         let (gain, error) = diagnosis.gain();
-        let fit = |fitted: &diagnosis::fit::Fitted, score: &Score| -> Result<FitAnswer, CommandError> {
-            Ok(FitAnswer {
+        let fit = |fitted: &diagnosis::fit::Fitted, score: &Score| -> Result<FitResult, CommandError> {
+            Ok(FitResult {
                 chi2_per_dof: fitted.chi2_per_dof(data).map_err(failed)?,
                 heldout_rms_mm: score.rms * 1e3,
                 heldout_elpd: score.elpd(),
@@ -160,7 +167,7 @@ impl Answer {
             recording: recording.into(),
             verdict: diagnosis.verdict.word(),
             sentence: diagnosis.sentence.clone(),
-            findings: diagnosis.findings.iter().map(FindingAnswer::of).collect(),
+            findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
             monitors: monitors(ring, data.health()),
             fit: Fits {
                 before: fit(&found.null, before)?,
@@ -181,16 +188,16 @@ impl Answer {
                 unknown: next.unknown(),
             },
             scatter: (found.null.hypothesis.scatter.iter())
-                .map(|scatter| ScatterAnswer { kind: scatter.kind.word(), width: scatter.width })
+                .map(|scatter| ScatterResult { kind: scatter.kind.word(), width: scatter.width })
                 .collect(),
         })
     }
+}
 
-    fn print(&self) {
-        println!("{}: {}\n\n{}\n", self.recording, self.verdict, self.sentence);
-        let mut table = Table::new();
-        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header(["effect", "at", "s/m", "amplitude", "unit", "ln evidence", "probability", "held-out gain"]);
+impl fmt::Display for DiagnosisResult {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}: {}\n\n{}\n", self.recording, self.verdict, fill(&self.sentence))?;
+        let mut table = table(["effect", "at", "s/m", "amplitude", "ln evidence", "probability", "held-out gain"]);
         for finding in &self.findings {
             table.add_row(finding.row(""));
             finding.alternatives.iter().take(5).for_each(|other| {
@@ -198,32 +205,34 @@ impl Answer {
             });
         }
         if !self.findings.is_empty() {
-            println!("{table}\n");
+            writeln!(f, "{table}\n")?;
         }
         let Fits { before, after, elpd_gain, elpd_gain_se, .. } = &self.fit;
-        println!(
+        let summary = format!(
             "chi2/dof {:.4} -> {:.4}, held-out rms {:.2} -> {:.2} um, log predictive density {elpd_gain:+.1} ± {elpd_gain_se:.1}",
             before.chi2_per_dof,
             after.chi2_per_dof,
             before.heldout_rms_mm * 1e3,
             after.heldout_rms_mm * 1e3,
         );
-        if let Some(next) = &self.next_measurement {
-            println!("\n{next}");
-        }
+        write!(f, "{}", fill(&summary))?;
+        self.next_measurement.as_ref().map_or(Ok(()), |next| write!(f, "\n\n{}", fill(next)))
     }
 }
 
-impl FindingAnswer {
+impl FindingResult {
     fn of(finding: &Finding) -> Self {
+        let (unit, (value, sigma)) = (finding.unit(), finding.amplitude);
+        let measured = format!("{} {}", Measured { value, sigma }.signed(unit.factor), unit.shown);
         Self {
-            kind: finding.kind,
+            kind: finding.word(),
             at: finding.at.clone(),
             s_m: finding.s,
             s_interval_m: finding.interval.iter().map(|one| [one.from_m, one.to_m]).collect(),
-            amplitude: finding.amplitude.0,
-            sigma: finding.amplitude.1,
-            unit: finding.unit,
+            amplitude: value,
+            sigma,
+            unit: unit.symbol,
+            measured: if sigma > 0.0 { measured } else { String::new() },
             log_evidence_gain: finding.log_evidence_gain,
             probability: finding.probability,
             sentence: finding.phrase.clone(),
@@ -233,25 +242,18 @@ impl FindingAnswer {
         }
     }
 
-    fn row(&self, before: &str) -> [String; 8] {
+    fn row(&self, before: &str) -> [String; 7] {
         let gain = self.heldout_gain.map_or_else(String::new, |[gain, error]| format!("{gain:.1} ± {error:.1}"));
         [
             format!("{before}{}", self.kind),
             self.at.clone(),
             self.s_m.map_or_else(String::new, |s| format!("{s:.2}")),
-            if self.sigma > 0.0 { measured(self.amplitude, self.sigma) } else { String::new() },
-            self.unit.into(),
+            self.measured.clone(),
             format!("{:.1}", self.log_evidence_gain),
             format!("{:.3}", self.probability),
             gain,
         ]
     }
-}
-
-/// Digits down to the second of the error bar.
-fn measured(value: f64, sigma: f64) -> String {
-    let digits = (1.0 - sigma.log10().floor()).clamp(0.0, 9.0) as usize;
-    format!("{value:.digits$} ± {sigma:.digits$}")
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

@@ -2,6 +2,7 @@
 
 pub mod challenge;
 pub mod diagnose;
+pub mod export;
 pub mod fit;
 pub mod prove;
 pub mod replay;
@@ -11,17 +12,26 @@ pub mod study;
 pub mod surrogate;
 pub mod watch;
 
+use core::fmt::Display;
 use std::borrow::Cow;
 use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::readings::ReadingsError;
 use inference::{BatchError, Recording, RecordingError, stream};
-use training::BoosterGreen;
+use serde::Serialize;
+use training::Tables;
 use twin::{LatticeError, Ring};
 
+use crate::cli::{Common, Publishing};
 use crate::model_file::{self, ModelFileError};
-use crate::output::OutputError;
+use crate::output::{self, OutputError};
+use crate::record::{EstimateRecord, Names};
+use crate::serve::serve;
+use crate::sink::Sinks;
+use crate::sink::shared_memory::{PublishError, Publisher};
+use crate::sink::trace::Trace;
+use crate::source::Source;
+use crate::stop::Stop;
 
 /// Why a command ended: bad arguments or input (exit 2), or anything else (exit 1), in one line.
 #[derive(Debug)]
@@ -30,6 +40,18 @@ pub enum CommandError {
     Input(String),
     /// Anything else.
     Other(String),
+}
+
+impl CommandError {
+    /// Nothing that the arguments or the input could help.
+    pub(crate) fn other(error: impl Display) -> Self {
+        Self::Other(error.to_string())
+    }
+
+    /// Somebody has asked for the end.
+    fn interrupted() -> Self {
+        Self::Other("interrupted; nothing was written".into())
+    }
 }
 
 impl From<LatticeError> for CommandError {
@@ -64,19 +86,13 @@ impl From<OutputError> for CommandError {
 
 impl From<BatchError> for CommandError {
     fn from(error: BatchError) -> Self {
-        match error {
-            BatchError::Stream(error) => error.into(),
-            error => Self::Other(error.to_string()),
-        }
+        Self::Other(error.to_string())
     }
 }
 
-impl From<ReadingsError> for CommandError {
-    fn from(error: ReadingsError) -> Self {
-        match error {
-            ReadingsError::Fit(error) => error.into(),
-            error => Self::Other(error.to_string()),
-        }
+impl From<twin::OrbitError> for CommandError {
+    fn from(error: twin::OrbitError) -> Self {
+        Self::Other(format!("no stable ring: {error}"))
     }
 }
 
@@ -86,15 +102,59 @@ fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
 }
 
 /// The core's tables: those of a model file, or of the ring as designed.
-fn tables(ring: &Ring, file: Option<&Path>) -> Result<Box<BoosterGreen>, CommandError> {
+fn tables(ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
     match file {
-        Some(path) => Ok(model_file::read(path)?),
-        None => Ok(Box::new(training::green::tables(ring).map_err(stream::StreamError::from)?)),
+        Some(path) => Ok(model_file::read(path, &ring.name)?),
+        None => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
     }
 }
 
+/// See that files can be written before work is put into them.
+fn check_outputs<'p>(paths: impl IntoIterator<Item = Option<&'p Path>>) -> Result<(), CommandError> {
+    Ok(paths.into_iter().flatten().try_for_each(output::check)?)
+}
+
+/// Stream a recording from a source into the sinks, to its end, and show how far that is.
+fn stream_all(
+    source: &mut impl Source,
+    mut sinks: Sinks,
+    stop: &Stop,
+    bar: &ProgressBar,
+) -> Result<Box<EstimateRecord>, CommandError> {
+    let last = serve(source, &mut sinks, stop, || bar.inc(1));
+    bar.finish_and_clear();
+    // without a last one, or not the last one of the recording, somebody did not want to wait for it
+    let last = last.map_err(CommandError::other)?.filter(|_| !stop.is_requested());
+    let last = last.ok_or_else(CommandError::interrupted)?;
+    sinks.finish().map_err(CommandError::other)?;
+    Ok(last)
+}
+
+/// The sinks that were asked for. Without shared memory a recording can still be replayed: that it is not published is said.
+fn sinks(publishing: &Publishing, trace: Option<&Path>, names: &Names) -> Result<Sinks, CommandError> {
+    let trace = trace.map(Trace::create).transpose().map_err(CommandError::other)?;
+    let publisher = (!publishing.no_publish).then(|| Publisher::try_new(&publishing.service, &publishing.name, names));
+    let publisher = match publisher.transpose() {
+        Err(error @ PublishError::Name { .. }) => return Err(CommandError::Input(error.to_string())),
+        Err(error) => {
+            output::warn(format_args!("not published: {error}; --no-publish leaves this line out"));
+            None
+        }
+        Ok(publisher) => publisher,
+    };
+    Ok(Sinks::default().with_optional(publisher).with(trace))
+}
+
+/// Give a result to whoever asked for it: a program, a person, or both.
+fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), CommandError> {
+    if let Some(path) = &common.json {
+        output::json(path, result)?;
+    }
+    if common.speaks() { Ok(output::say(result)?) } else { Ok(()) }
+}
+
 fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
-    Recording::read(path, &stream::layout(ring))
+    Recording::read(path, ring)
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.

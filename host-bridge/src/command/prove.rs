@@ -14,7 +14,7 @@ use diagnosis::validation::{Case, Class, Outcome, run as prove};
 use inference::Recording;
 use twin::Ring;
 
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Prove;
 use crate::output;
 
@@ -23,6 +23,7 @@ use crate::output;
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Prove) -> Result<(), CommandError> {
+    check_outputs([options.common.json.as_deref(), options.page.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let template = recording(&options.template, &ring)?;
     let key = format!("{} {}", template.name, options.seed);
@@ -44,8 +45,8 @@ pub fn run(options: &Prove) -> Result<(), CommandError> {
     if let Some(path) = &options.page {
         write_between_marks(path, &tables.markdown())?;
     }
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        println!("{}", tables.markdown());
+    if options.common.speaks() {
+        output::say(tables.markdown())?;
     }
     if options.strict && tables.wrong.of > 0 {
         let what = format!(
@@ -145,11 +146,11 @@ const MARKS: [&str; 2] = ["<!-- tables of make prove -->", "<!-- end of tables -
 /// Replace what is between the marks of a page.
 fn write_between_marks(path: &Path, tables: &str) -> Result<(), CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let page = fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let page = fs::read_to_string(path).map_err(|error| wrong(output::unreadable(&error)))?;
     let [start, end] = MARKS.map(|mark| page.find(mark));
     let (Some(start), Some(end)) = (start, end) else {
         return Err(wrong(format!("expected the marks {MARKS:?}, found none")));
     };
     let text = format!("{}{}\n\n{tables}\n{}", &page[..start], MARKS[0], &page[end..]);
-    fs::write(path, text).map_err(|error| wrong(error.to_string()))
+    Ok(output::bytes(path, text.as_bytes())?)
 }

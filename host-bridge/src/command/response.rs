@@ -1,19 +1,19 @@
-//! `orbitcal response`: what the twin answers to every corrector.
+//! `orbitcal response`: how the twin's orbit responds to every corrector.
 
+use core::fmt;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use comfy_table::{Table, presets};
 use nalgebra::DMatrix;
 use serde::Serialize;
 use twin::{EffectError, Machine, MachineResponse, Ring};
 
-use super::{CommandError, machine};
+use super::{CommandError, check_outputs, deliver, machine};
 use crate::cli::Response;
-use crate::output;
+use crate::output::{self, table};
 
 #[derive(Serialize)]
-struct Answer {
+struct ResponseResult {
     machine: String,
     effects: Vec<String>,
     bpm: Vec<String>,
@@ -24,6 +24,9 @@ struct Answer {
     qy: f64,
     gamma_tr: f64,
     dispersion_x: Vec<f64>,
+    /// Horizontal correctors; they come first.
+    #[serde(skip)]
+    horizontal: usize,
 }
 
 /// Run it.
@@ -31,28 +34,24 @@ struct Answer {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Response) -> Result<(), CommandError> {
+    check_outputs([options.common.json.as_deref()])?;
     let mut ring = machine(options.common.machine.as_deref())?;
     if let Some(path) = &options.vars {
         ring = ring.with_vars(&vars(path, &ring)?);
     }
     let input = |error: EffectError| CommandError::Input(error.to_string());
-    let machine = Machine::new(ring.clone(), options.rf.into(), &options.effects).map_err(input)?;
+    let effects = options.effects.iter().map(|effect| effect.resolve(&ring)).collect::<Result<Vec<_>, _>>();
+    let effects = effects.map_err(input)?;
+    let machine = Machine::new(ring.clone(), options.rf.into(), &effects).map_err(input)?;
     let response = machine.response().map_err(|error| CommandError::Other(format!("{}: {error}", ring.name)))?;
-    let effects = options.effects.iter().map(|e| format!("{}@{}={}", e.kind.word(), e.place, e.amplitude)).collect();
-    let answer = Answer::of(&ring, effects, &response);
-    if let Some(path) = &options.common.json {
-        output::json(path, &answer)?;
-    }
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        answer.print(&ring);
-    }
-    Ok(())
+    let effects = effects.iter().map(|effect| effect.text(&ring).to_string()).collect();
+    deliver(&options.common, &ResponseResult::of(&ring, effects, &response))
 }
 
 /// Factor of every quadrupole: those in the file, 1 for the others.
 fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|e| wrong(e.to_string()))?;
+    let text = std::fs::read_to_string(path).map_err(|e| wrong(output::unreadable(&e)))?;
     let file: BTreeMap<String, f64> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
     let names = ring.var_names();
     if let Some(unknown) = file.keys().find(|name| !names.contains(name)) {
@@ -64,38 +63,21 @@ fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
     Ok(names.iter().map(|name| file.get(name).copied().unwrap_or(1.0)).collect())
 }
 
-impl Answer {
+impl ResponseResult {
     fn of(ring: &Ring, effects: Vec<String>, response: &MachineResponse) -> Self {
         Self {
             machine: ring.name.clone(),
             effects,
-            bpm: ring.cells(&ring.monitors),
-            correctors: ring.cells(&ring.correctors),
+            bpm: ring.labels(ring.monitors.iter().map(|m| m.element)),
+            correctors: ring.labels(ring.correctors.iter().map(|c| c.element)),
             response_x_m_per_rad: rows(&response.x),
             response_y_m_per_rad: rows(&response.y),
             qx: response.tunes.x,
             qy: response.tunes.y,
             gamma_tr: response.gamma_transition,
             dispersion_x: response.dispersion.clone(),
+            horizontal: ring.horizontal_correctors(),
         }
-    }
-
-    fn print(&self, ring: &Ring) {
-        println!("{}", self.machine);
-        self.effects.iter().for_each(|effect| println!("with {effect}"));
-        println!("tunes {:.6} {:.6}, gamma_tr {:.4}\n", self.qx, self.qy, self.gamma_tr);
-        let horizontal = ring.correctors.iter().filter(|&&i| is_horizontal(ring, i)).count();
-        let (blocks, names) = ([&self.response_x_m_per_rad, &self.response_y_m_per_rad], ["x", "y"]);
-        let mut table = Table::new();
-        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header(["response", "to", "rms m/rad", "largest m/rad", "at"]);
-        for (rows, name) in blocks.into_iter().zip(names) {
-            for (to, from, until) in [("H", 0, horizontal), ("V", horizontal, self.correctors.len())] {
-                table.add_row(self.summary(rows, name, to, from, until));
-            }
-        }
-        println!("{table}");
-        println!("all {} x {} elements of both planes: --json FILE", self.bpm.len(), self.correctors.len());
     }
 
     /// One line on a block of the response.
@@ -110,8 +92,21 @@ impl Answer {
     }
 }
 
-fn is_horizontal(ring: &Ring, element: usize) -> bool {
-    matches!(ring.elements[element].kind, twin::Kind::Corrector { plane: twin::Plane::X, .. })
+impl fmt::Display for ResponseResult {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}", self.machine)?;
+        self.effects.iter().try_for_each(|effect| writeln!(f, "with {effect}"))?;
+        writeln!(f, "tunes {:.6} {:.6}, gamma_tr {:.4}\n", self.qx, self.qy, self.gamma_tr)?;
+        let (blocks, names) = ([&self.response_x_m_per_rad, &self.response_y_m_per_rad], ["x", "y"]);
+        let mut table = table(["response", "to", "rms m/rad", "largest m/rad", "at"]);
+        for (rows, name) in blocks.into_iter().zip(names) {
+            for (to, from, until) in [("H", 0, self.horizontal), ("V", self.horizontal, self.correctors.len())] {
+                table.add_row(self.summary(rows, name, to, from, until));
+            }
+        }
+        writeln!(f, "{table}")?;
+        write!(f, "all {} x {} elements of both planes: --json FILE", self.bpm.len(), self.correctors.len())
+    }
 }
 
 fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {

@@ -1,8 +1,8 @@
 //! `orbitcal study`: the published studies of a recording, as one report.
 
-use studies::{self, Options, StudyError};
+use studies::{self, Options};
 
-use super::{CommandError, machine, progress, recording};
+use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Study;
 use crate::output;
 
@@ -11,6 +11,7 @@ use crate::output;
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Study) -> Result<(), CommandError> {
+    check_outputs([options.common.json.as_deref(), Some(&options.report)])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
     let bar = progress(1, "", options.common.quiet);
@@ -21,19 +22,13 @@ pub fn run(options: &Study) -> Result<(), CommandError> {
     };
     let made = studies::run(&ring, &recording, Options { nuts: options.sampling.into() }, &mut report);
     bar.finish_and_clear();
-    let made = made.map_err(|error| match error {
-        StudyError::Readings(error) => error.into(),
-        StudyError::Stream(error) => error.into(),
-        error @ StudyError::NoPairs { .. } => CommandError::Input(error.to_string()),
-        error => CommandError::Other(format!("{}: {error}", recording.name)),
-    })?;
-    let written = made.page.write(&options.report);
-    written.map_err(|error| CommandError::Other(format!("{}: {error}", options.report.display())))?;
+    let made = made.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
+    output::bytes(&options.report, made.page.render().as_bytes())?;
     if let Some(path) = &options.common.json {
         output::json(path, &made.numbers)?;
     }
-    if !options.common.quiet && options.common.json.as_deref() != Some("-".as_ref()) {
-        println!("{}\n\n{}", made.page.lead, options.report.display());
+    if !options.common.speaks() {
+        return Ok(());
     }
-    Ok(())
+    Ok(output::say(format_args!("{}\n\n{}", output::fill(&made.page.lead), options.report.display()))?)
 }

@@ -1,12 +1,13 @@
 //! `orbitcal surrogate check`: tables from the twin, and how wrong they are.
 
-use comfy_table::{Table, presets};
+use core::fmt;
+
 use serde::Serialize;
 use training::SurrogateError;
 
-use super::{CommandError, machine, progress};
+use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::{Surrogate, SurrogateAction};
-use crate::output;
+use crate::output::{fill, table};
 
 #[derive(Serialize)]
 struct Check {
@@ -31,20 +32,13 @@ struct Entry {
 /// [`CommandError`].
 pub fn run(options: &Surrogate) -> Result<(), CommandError> {
     let SurrogateAction::Check { common, samples, seed } = &options.action;
+    check_outputs([common.json.as_deref()])?;
     let ring = machine(common.machine.as_deref())?;
     let green = training::green::tables(&ring).map_err(|error| CommandError::Input(error.to_string()))?;
     let bar = progress(*samples, "vars", common.quiet);
     let planes = training::check(&ring, &green, *samples, *seed, || bar.inc(1));
     bar.finish_and_clear();
-    let check = Check { surrogates: planes.iter().map(Entry::of).collect() };
-    if let Some(path) = &common.json {
-        output::json(path, &check)?;
-    }
-    if !common.quiet && common.json.as_deref() != Some("-".as_ref()) {
-        println!("error of the -22 A to +22 A response against the twin, vars 0.94..1.06, tunes within 0.05\n");
-        println!("{}", check.table());
-    }
-    Ok(())
+    deliver(common, &Check { surrogates: planes.iter().map(Entry::of).collect() })
 }
 
 impl Entry {
@@ -62,11 +56,12 @@ impl Entry {
     }
 }
 
-impl Check {
-    fn table(&self) -> Table {
-        let mut table = Table::new();
-        table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-        table.set_header(["surrogate", "plane", "numbers", "bytes", "vars", "rms/um", "largest/um", "stated rms/um"]);
+impl fmt::Display for Check {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let what = "error of the response -22 A to +22 A against the twin, vars 0.94 to 1.06, tunes within 0.05";
+        writeln!(f, "{}\n", fill(what))?;
+        let mut table =
+            table(["surrogate", "plane", "numbers", "bytes", "vars", "rms/um", "largest/um", "stated rms/um"]);
         for e in &self.surrogates {
             let um = |mm: f64| format!("{:.2}", mm * 1e3);
             table.add_row([
@@ -80,6 +75,6 @@ impl Check {
                 um(e.stated_rms_mm),
             ]);
         }
-        table
+        write!(f, "{table}")
     }
 }

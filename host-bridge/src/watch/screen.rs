@@ -1,20 +1,28 @@
-//! The live table: a grid of vars, and the monitors that are not well.
+//! The live table: who publishes, a grid of vars, and the monitors that are not well. What does not fit is counted.
 
 use std::collections::VecDeque;
 
+use estimator::MonitorState;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
-use ratatui::widgets::{Paragraph, Wrap};
+use ratatui::widgets::Paragraph;
 
 use super::WatchSummary;
-use crate::record::{EstimateRecord, MONITORS, VARS};
+use crate::output::lines;
+use crate::record::{EstimateRecord, ReadingUse};
+use crate::result::word;
+use crate::sink::shared_memory::Published;
 
-/// Width of a var's cell without its bar.
-const CELL: usize = 22;
+/// Lines above the grid.
+const HEADER: u16 = 3;
+/// Width of mean, sigma, deviation and a gap.
+const NUMBERS: usize = 19;
 /// Bar and gap on a terminal of 80 columns.
 const BAR: usize = 4;
+/// Widest bar with its gap.
+const WIDEST_BAR: usize = 22;
 /// Deviation that fills half a bar [sigmas].
 const FULL_BAR: f32 = 5.0;
 /// Deviation from which a var stands out [sigmas].
@@ -29,56 +37,95 @@ const RATE_OVER: usize = 64;
 /// What is on the screen.
 pub(super) struct Screen {
     service: String,
-    vars: Vec<String>,
-    monitors: Vec<String>,
-    latest: Option<EstimateRecord>,
+    latest: Option<Published>,
     /// Publication times of the last estimates of one publisher [ns].
     stamps: VecDeque<u64>,
 }
 
-impl Screen {
-    pub(super) fn new(service: String, vars: Vec<String>, monitors: Vec<String>) -> Self {
-        Self { service, vars, monitors, latest: None, stamps: VecDeque::with_capacity(RATE_OVER) }
+/// How the vars are laid out.
+struct Grid {
+    columns: usize,
+    rows: usize,
+    /// Of a column.
+    width: usize,
+    /// Of a name and the gap after it.
+    name: usize,
+    /// Vars that are shown; a line below tells of the others.
+    shown: usize,
+}
+
+impl Grid {
+    /// As many columns as have room for bars; without bars, if that shows all vars; and no more vars than fit.
+    fn of(record: &EstimateRecord, width: usize, height: usize) -> Self {
+        let vars = record.mean.len();
+        let name = 1 + record.names.vars.iter().map(|name| name.chars().count()).max().unwrap_or(0);
+        let cell = name + NUMBERS;
+        let with_bars = (width / (cell + BAR)).max(1);
+        let columns = if vars.div_ceil(with_bars) <= height { with_bars } else { (width / cell).max(1) };
+        let is_whole = vars.div_ceil(columns) <= height;
+        let rows = if is_whole { vars.div_ceil(columns) } else { height.saturating_sub(1) };
+        Self { columns, rows, width: (width / columns).min(cell + WIDEST_BAR), name, shown: vars.min(rows * columns) }
     }
 
-    pub(super) fn take(&mut self, record: &EstimateRecord) {
-        if self.latest.is_some_and(|latest| latest.started_ns != record.started_ns) {
+    /// Lines with the title, and the count of what is left out.
+    fn height(&self, vars: usize) -> u16 {
+        (1 + self.rows + usize::from(self.shown < vars)) as u16
+    }
+}
+
+impl Screen {
+    pub(super) fn new(service: String) -> Self {
+        Self { service, latest: None, stamps: VecDeque::with_capacity(RATE_OVER) }
+    }
+
+    pub(super) fn take(&mut self, published: &Published) {
+        if self.latest.as_ref().is_some_and(|latest| latest.stamp.started_ns != published.stamp.started_ns) {
             self.stamps.clear();
         }
         if self.stamps.len() == RATE_OVER {
             self.stamps.pop_front();
         }
-        self.stamps.push_back(record.published_ns);
-        self.latest = Some(*record);
+        self.stamps.push_back(published.stamp.published_ns);
+        self.latest = Some(published.clone());
     }
 
     pub(super) fn draw(&self, frame: &mut Frame, summary: &WatchSummary, now_ns: u64) {
-        let width = usize::from(frame.area().width);
-        let columns = (width / (CELL + BAR)).clamp(1, 6);
-        let rows = VARS.div_ceil(columns);
-        let areas = [Constraint::Length(3), Constraint::Length(rows as u16 + 1), Constraint::Min(1)];
-        let [top, grid, bottom] = Layout::vertical(areas).areas(frame.area());
-        let Some(record) = &self.latest else {
+        let area = frame.area();
+        let (width, height) = (usize::from(area.width), usize::from(area.height));
+        let Some(published) = &self.latest else {
             let text = format!("{}: waiting for estimates, q quits", self.service);
-            return frame.render_widget(Paragraph::new(text), top);
+            return frame.render_widget(Paragraph::new(text), area);
         };
-        frame.render_widget(Paragraph::new(self.header(record, summary, now_ns)), top);
-        frame.render_widget(Paragraph::new(self.grid(record, columns, width / columns)), grid);
-        frame.render_widget(Paragraph::new(self.unwell(record)).wrap(Wrap { trim: true }), bottom);
+        let record = &published.record;
+        // a title above the vars, a line of monitors below
+        let grid = Grid::of(record, width, height.saturating_sub(usize::from(HEADER) + 2));
+        let heights =
+            [Constraint::Length(HEADER), Constraint::Length(grid.height(record.mean.len())), Constraint::Min(1)];
+        let [top, middle, bottom] = Layout::vertical(heights).areas(area);
+        frame.render_widget(Paragraph::new(self.header(published, summary, now_ns)), top);
+        frame.render_widget(Paragraph::new(vars(record, &grid)), middle);
+        let lines = unwell(record, width, usize::from(bottom.height));
+        frame.render_widget(Paragraph::new(lines.into_iter().map(Line::from).collect::<Vec<_>>()), bottom);
     }
 
-    fn header(&self, record: &EstimateRecord, summary: &WatchSummary, now_ns: u64) -> Vec<Line<'static>> {
+    fn header(&self, published: &Published, summary: &WatchSummary, now_ns: u64) -> Vec<Line<'static>> {
+        let Published { record, stamp } = published;
         let nis = record.nis_per_reading().map_or("-".to_owned(), |nis| format!("{nis:.2}"));
-        let (sequence, rejected, frames) = (record.sequence, record.rejected.count_ones(), record.frames);
-        let (rate, age) = (self.rate(), age(now_ns.saturating_sub(record.published_ns)));
-        let first = format!("seq {sequence}  {rate}  age {age}  nis/reading {nis}  rejected {rejected}");
+        let (rate, age) = (self.rate(), age(now_ns.saturating_sub(stamp.published_ns)));
+        let rejected = record.readings(ReadingUse::Rejected);
+        let first = format!("seq {}  {rate}  age {age}  nis/reading {nis}  rejected {rejected}", record.sequence);
         let WatchSummary { seen, lost, restarts } = summary;
-        let second = format!(
-            "frames {frames}, refused {}  seen {seen}  lost {lost}  restarts {restarts}  q quits",
-            record.rejected_frames
-        );
+        let (frames, refused) = (record.frames, record.rejected_frames);
+        let second =
+            format!("frames {frames}, refused {refused}  seen {seen}  lost {lost}  restarts {restarts}  q quits");
+        let third = format!("from {}: {}", stamp.publisher, record.names.machine);
+        let alarm = if record.mismatch == Some(true) { "MISMATCH beyond noise  " } else { "" };
         let bold = Style::new().add_modifier(Modifier::BOLD);
-        vec![Line::styled(first, bold), Line::from(second), Line::default()]
+        vec![
+            Line::styled(first, bold),
+            Line::from(second),
+            Line::from(vec![Span::styled(alarm, bold.fg(STRONGER)), Span::from(third)]),
+        ]
     }
 
     /// Rate of the last estimates, by their publication.
@@ -88,36 +135,51 @@ impl Screen {
         let periods = self.stamps.len().saturating_sub(1) as f64;
         if seconds > 0.0 { format!("{:.1} Hz", periods / seconds) } else { "- Hz".to_owned() }
     }
+}
 
-    /// Vars down the columns, each with mean, sigma, deviation from 1, and a bar of it.
-    fn grid(&self, record: &EstimateRecord, columns: usize, width: usize) -> Vec<Line<'static>> {
-        let rows = VARS.div_ceil(columns);
-        let title = format!("{:<3}{:>6}{:>6}{:>6}", "var", "mean", "sd/%", "dev");
-        let title = Span::styled(format!("{title:<width$}").repeat(columns), Style::new().add_modifier(Modifier::DIM));
-        let cells = |row| (row..VARS).step_by(rows).flat_map(|i| self.cell(record, i, width));
-        core::iter::once(Line::from(title)).chain((0..rows).map(|row| cells(row).collect())).collect()
-    }
+/// Vars down the columns, each with mean, sigma, deviation from 1, and a bar of it.
+fn vars(record: &EstimateRecord, grid: &Grid) -> Vec<Line<'static>> {
+    let Grid { columns, rows, width, name, shown } = *grid;
+    let title = format!("{:<name$}{:>6}{:>6}{:>6}", "var", "mean", "sd/%", "dev");
+    let title = Span::styled(format!("{title:<width$}").repeat(columns), Style::new().add_modifier(Modifier::DIM));
+    let cells = |row| (row..shown).step_by(rows).flat_map(|i| cell(record, i, grid));
+    let left_out = record.mean.len() - shown;
+    let left_out = (left_out > 0).then(|| {
+        let var = if left_out == 1 { "var" } else { "vars" };
+        Line::from(format!("and {left_out} more {var}: enlarge the window, or --trace FILE"))
+    });
+    core::iter::once(Line::from(title)).chain((0..rows).map(|row| cells(row).collect())).chain(left_out).collect()
+}
 
-    fn cell(&self, record: &EstimateRecord, i: usize, width: usize) -> [Span<'static>; 2] {
-        let deviation = record.deviation(i);
-        let style = Style::new().fg(if deviation < 0.0 { WEAKER } else { STRONGER });
-        let style = if deviation.abs() < NOTABLE { Style::new() } else { style };
-        let percent = 100.0 * record.sigma[i];
-        let text = format!("{:<3}{:>6.4}{percent:>6.2}{deviation:>+6.1} ", self.vars[i], record.mean[i]);
-        let bar = bar(deviation, width.saturating_sub(CELL + 1).min(21));
-        [Span::styled(text, style), Span::styled(format!("{bar:<0$}", width.saturating_sub(CELL)), style)]
-    }
+fn cell(record: &EstimateRecord, i: usize, grid: &Grid) -> [Span<'static>; 2] {
+    let deviation = record.deviation(i);
+    let style = Style::new().fg(if deviation < 0.0 { WEAKER } else { STRONGER });
+    let style = if deviation.abs() < NOTABLE { Style::new() } else { style };
+    let (name, mean, percent) = (&record.names.vars[i], record.mean[i], 100.0 * record.sigma[i]);
+    let text = format!("{name:<0$}{mean:>6.4}{percent:>6.2}{deviation:>+6.1} ", grid.name);
+    let room = grid.width.saturating_sub(grid.name + NUMBERS);
+    let bar = bar(deviation, room.saturating_sub(1));
+    [Span::styled(text, style), Span::styled(format!("{bar:<room$}"), style)]
+}
 
-    /// Monitors that are not ok, with their noise.
-    fn unwell(&self, record: &EstimateRecord) -> Line<'static> {
-        let tell = |b: usize| {
-            let state = ["ok", "noisy", "jumps", "dead"].get(usize::from(record.monitor_state[b])).unwrap_or(&"?");
-            let (mm, rejected) = (1e3 * record.monitor_sigma[b], record.monitor_rejected[b]);
-            format!("{} {state} {mm:.2} mm ({rejected} rejected)", self.monitors[b])
-        };
-        let unwell: Vec<_> = (0..MONITORS).filter(|&b| record.monitor_state[b] != 0).map(tell).collect();
-        Line::from(if unwell.is_empty() { "all monitors ok".to_owned() } else { unwell.join(", ") })
+/// Monitors that are not ok, with their noise, in this many lines; how many more there are.
+fn unwell(record: &EstimateRecord, width: usize, height: usize) -> Vec<String> {
+    let tell = |b: usize| {
+        let (mm, rejected) = (1e3 * record.monitor_sigma[b], record.monitor_rejected[b]);
+        let (name, state) = (&record.names.monitors[b], word(record.monitor_state[b]));
+        format!("{name} {state} {mm:.2} mm ({rejected} rejected)")
+    };
+    let is_unwell = |b: &usize| record.monitor_state[*b] != MonitorState::Ok;
+    let unwell: Vec<String> = (0..record.reading.len()).filter(is_unwell).map(tell).collect();
+    if unwell.is_empty() {
+        return vec!["all monitors ok".to_owned()];
     }
+    let told = |count: usize| {
+        let left_out = unwell.len() - count;
+        let rest = if left_out == 0 { String::new() } else { format!("and {left_out} more monitors not ok") };
+        lines(&unwell[..count].iter().cloned().chain([rest]).collect::<Vec<_>>().join(", "), width)
+    };
+    (0..=unwell.len()).rev().map(told).find(|lines| lines.len() <= height).unwrap_or_default()
 }
 
 /// A bar from the middle, to the left for a deviation below zero; nothing if there is no room.
@@ -139,14 +201,18 @@ fn age(ns: u64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
     use super::*;
+    use crate::record::Names;
+    use crate::record::tests::record;
+    use crate::sink::shared_memory::layout::Stamp;
 
     fn screen() -> Screen {
-        let ring = twin::Ring::booster();
-        Screen::new("orbitcal/estimate".to_owned(), ring.var_names(), ring.monitor_names())
+        Screen::new("orbitcal/estimate".to_owned())
     }
 
     fn drawn(screen: &Screen, width: u16, height: u16) -> String {
@@ -156,35 +222,68 @@ mod tests {
         terminal.backend().to_string()
     }
 
-    fn filled() -> Screen {
-        let mut screen = screen();
-        let mut record =
-            EstimateRecord { sequence: 345, frames: 346, accepted: 0b11, nis: 2.1, ..EstimateRecord::ZERO };
-        (record.mean, record.sigma) = ([1.0; VARS], [0.003; VARS]);
+    /// The Booster, with its last var and its first monitor off.
+    fn booster() -> EstimateRecord {
+        let mut record = EstimateRecord { sequence: 345, frames: 346, nis: 34.65, ..record(48, 33) };
+        record.names = Names::of(&twin::Ring::booster());
+        record.sigma = vec![0.003; 48];
         record.mean[47] = 0.958;
-        (record.monitor_state[0], record.monitor_sigma[0], record.monitor_rejected[0]) = (1, 0.61e-3, 14);
+        (record.monitor_state[0], record.monitor_sigma[0], record.monitor_rejected[0]) =
+            (MonitorState::Noisy, 0.61e-3, 14);
+        record
+    }
+
+    fn filled(record: &EstimateRecord) -> Screen {
+        let mut screen = screen();
         for i in 0..=10 {
-            screen.take(&EstimateRecord { published_ns: 1_000_000_000 + 100_000_000 * i, ..record });
+            let published_ns = 1_000_000_000 + 100_000_000 * i;
+            let stamp = Stamp { publisher: "control room".into(), started_ns: 1, published_ns };
+            screen.take(&Published { record: record.clone(), stamp });
         }
         screen
     }
 
     #[test]
-    fn everything_fits_on_eighty_by_twenty_four() {
-        let text = drawn(&filled(), 80, 24);
+    fn everything_of_the_booster_fits_on_eighty_by_twenty_four() {
+        let text = drawn(&filled(&booster()), 80, 24);
         assert!(text.contains("seq 345  10.0 Hz  age 12 ms  nis/reading 1.05  rejected 0"), "{text}");
         assert!(text.contains("seen 20  lost 0  restarts 1"), "{text}");
+        assert!(text.contains("from control room: AGS Booster"), "{text}");
         assert!(text.contains("F7 0.9580  0.30 -14.0"), "{text}");
         assert!(text.contains("x_A6 noisy 0.61 mm (14 rejected)"), "{text}");
         for name in twin::Ring::booster().var_names() {
             assert!(text.contains(&format!("{name} ")), "{name} is missing:\n{text}");
         }
+        assert!(!text.contains("more"), "{text}");
+    }
+
+    #[test]
+    fn what_is_cut_is_counted() {
+        let mut record = record(260, 120);
+        record.monitor_state = vec![MonitorState::Dead; 120];
+        record.mismatch = Some(true);
+        let text = drawn(&filled(&record), 80, 24);
+        // 24 lines less three of header, the title, one of monitors and the count: 18 rows of three
+        assert!(text.contains("and 206 more vars: enlarge the window, or --trace FILE"), "{text}");
+        assert!(text.contains("V53 ") && !text.contains("V54 "), "{text}");
+        assert!(text.contains("M0 dead 0.15 mm (0 rejected), and 119 more monitors not ok"), "{text}");
+        assert!(text.contains("MISMATCH beyond noise  from control room: test ring"), "{text}");
+    }
+
+    #[test]
+    fn long_names_keep_their_numbers() {
+        let mut record = record(4, 2);
+        let vars = (0..4).map(|i| format!("SR01_QUAD_{i}")).collect();
+        record.names = Arc::new(Names { vars, ..(*record.names).clone() });
+        assert!(drawn(&filled(&record), 80, 24).contains("SR01_QUAD_3 1.0000  1.00  +0.0"));
     }
 
     #[test]
     fn no_size_is_too_small_or_too_large() {
         for (width, height) in [(1, 1), (20, 5), (80, 24), (200, 60), (400, 10)] {
-            drawn(&filled(), width, height);
+            for record in [booster(), record(0, 0), record(260, 500)] {
+                drawn(&filled(&record), width, height);
+            }
             drawn(&screen(), width, height);
         }
     }

@@ -9,8 +9,9 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers
 
 use super::screen::Screen;
 use super::{WatchOptions, WatchSummary};
-use crate::publish::now_ns;
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, ReadingUse};
+use crate::sink::shared_memory::layout::Stamp;
+use crate::sink::shared_memory::{Published, now_ns};
 
 /// Time between two pictures: what an eye can follow.
 const REDRAW: Duration = Duration::from_millis(100);
@@ -25,32 +26,35 @@ pub(super) struct Live {
 /// Where estimates are shown.
 pub(super) enum View {
     Live(Box<Live>),
-    Lines(Vec<String>),
+    Lines {
+        /// The publisher of the last estimate.
+        from: Option<Stamp>,
+    },
     Silent,
 }
 
 impl View {
-    pub(super) fn open(options: &WatchOptions, vars: Vec<String>, monitors: Vec<String>) -> io::Result<Self> {
+    pub(super) fn open(options: &WatchOptions) -> io::Result<Self> {
         if options.quiet {
             return Ok(Self::Silent);
         }
         if !io::stdout().is_terminal() {
             let is_open = say(&format!("listening on {}", options.service))?;
-            return Ok(if is_open { Self::Lines(vars) } else { Self::Silent });
+            return Ok(if is_open { Self::Lines { from: None } } else { Self::Silent });
         }
-        let screen = Screen::new(options.service.clone(), vars, monitors);
+        let screen = Screen::new(options.service.clone());
         let mut live = Box::new(Live { terminal: ratatui::try_init()?, screen, drawn: Instant::now() });
         live.draw(&WatchSummary::default())?;
         Ok(Self::Live(live))
     }
 
     /// Show what has come; false if nobody looks any more.
-    pub(super) fn show(&mut self, records: &[EstimateRecord], summary: &WatchSummary) -> io::Result<bool> {
+    pub(super) fn show(&mut self, published: &[Published], summary: &WatchSummary) -> io::Result<bool> {
         match self {
-            Self::Live(live) => live.show(records, summary),
-            Self::Lines(vars) => {
-                let mut lines = records.iter().map(|record| say(&line(record, vars)));
-                lines.try_fold(true, |open, line| Ok(open && line?))
+            Self::Live(live) => live.show(published, summary),
+            Self::Lines { from } => {
+                let mut lines = published.iter().flat_map(|published| told(published, from));
+                lines.try_fold(true, |open, line| Ok(open && say(&line)?))
             }
             Self::Silent => Ok(true),
         }
@@ -58,8 +62,8 @@ impl View {
 }
 
 impl Live {
-    fn show(&mut self, records: &[EstimateRecord], summary: &WatchSummary) -> io::Result<bool> {
-        records.iter().for_each(|record| self.screen.take(record));
+    fn show(&mut self, published: &[Published], summary: &WatchSummary) -> io::Result<bool> {
+        published.iter().for_each(|one| self.screen.take(one));
         if self.drawn.elapsed() >= REDRAW {
             self.draw(summary)?;
         }
@@ -100,36 +104,56 @@ fn say(line: &str) -> io::Result<bool> {
     }
 }
 
+/// What is said of an estimate: first its publisher, if that is another one than before.
+fn told(published: &Published, from: &mut Option<Stamp>) -> Vec<String> {
+    let Published { record, stamp } = published;
+    let is_new = from.as_ref().is_none_or(|from| from.started_ns != stamp.started_ns);
+    *from = Some(stamp.clone());
+    let publisher = is_new.then(|| format!("from {}: {}", stamp.publisher, record.names.machine));
+    publisher.into_iter().chain([line(record)]).collect()
+}
+
 /// An estimate in a line: what was used, how well it fits, and the var that is farthest from 1.
-fn line(record: &EstimateRecord, vars: &[String]) -> String {
+fn line(record: &EstimateRecord) -> String {
     let nis = record.nis_per_reading().map_or("-".to_owned(), |nis| format!("{nis:.2}"));
-    let farthest = (0..vars.len()).max_by(|&i, &j| record.deviation(i).abs().total_cmp(&record.deviation(j).abs()));
-    let var = farthest.map_or(String::new(), |i| {
-        format!("{} {:.4} +- {:.4} ({:+.1} sigma)", vars[i], record.mean[i], record.sigma[i], record.deviation(i))
+    let var = record.farthest().map_or(String::new(), |i| {
+        let (name, mean, sigma) = (&record.names.vars[i], record.mean[i], record.sigma[i]);
+        format!("{name} {mean:.4} ± {sigma:.4} ({:+.1} sigma)", record.deviation(i))
     });
-    let (sequence, frames, rejected) = (record.sequence, record.frames, record.rejected.count_ones());
-    format!("seq {sequence} frames {frames} nis/reading {nis} rejected {rejected} farthest {var}")
+    let alarm = if record.mismatch == Some(true) { " mismatch" } else { "" };
+    let (sequence, frames, rejected) = (record.sequence, record.frames, record.readings(ReadingUse::Rejected));
+    format!("seq {sequence} frames {frames} nis {nis} rejected {rejected} {var}{alarm}")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::record::tests::record;
 
     #[test]
     fn a_line_names_the_farthest_var() {
-        let mut record = EstimateRecord {
-            sequence: 9,
-            frames: 8,
-            accepted: 0b111,
-            rejected: 0b1000,
-            nis: 3.3,
-            ..EstimateRecord::ZERO
-        };
-        (record.mean, record.sigma) = ([1.0; 48], [0.01; 48]);
+        let mut record = EstimateRecord { sequence: 123_456, frames: 123_455, nis: 3.3, ..record(48, 33) };
+        record.reading = vec![ReadingUse::Absent; 33];
+        record.reading[..4].copy_from_slice(&[
+            ReadingUse::Used,
+            ReadingUse::Used,
+            ReadingUse::Used,
+            ReadingUse::Rejected,
+        ]);
         (record.mean[3], record.mean[5]) = (0.95, 1.02);
-        let vars: Vec<_> = (0..48).map(|i| format!("V{i}")).collect();
-        let expected = "seq 9 frames 8 nis/reading 1.10 rejected 1 farthest V3 0.9500 +- 0.0100 (-5.0 sigma)";
-        assert_eq!(line(&record, &vars), expected);
+        let expected = "seq 123456 frames 123455 nis 1.10 rejected 1 V3 0.9500 ± 0.0100 (-5.0 sigma)";
+        assert_eq!(line(&record), expected);
+    }
+
+    #[test]
+    fn a_publisher_is_named_once() {
+        let stamp = Stamp { publisher: "control room".into(), started_ns: 3, published_ns: 4 };
+        let published = Published { record: record(2, 1), stamp };
+        let mut from = None;
+        assert_eq!(told(&published, &mut from)[0], "from control room: test ring");
+        assert_eq!(told(&published, &mut from).len(), 1);
+        let restarted = Published { stamp: Stamp { started_ns: 5, ..published.stamp.clone() }, ..published };
+        assert_eq!(told(&restarted, &mut from).len(), 2);
     }
 
     #[test]

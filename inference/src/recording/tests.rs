@@ -1,1 +1,442 @@
+//! The document's examples, and one fault at a time.
 
+use super::*;
+
+/// The documents' examples are what these tests read, so that neither can drift from the other.
+const DOCUMENT: &str = include_str!("../../../docs/recording.md");
+const MACHINES: &str = include_str!("../../../docs/machine.md");
+
+/// A block of a document in some language, counted from 0.
+fn block_of(document: &'static str, language: &str, number: usize) -> &'static str {
+    let fence = format!("```{language}\n");
+    let rest = document.split(&fence).nth(1 + number).expect("the document has this block");
+    rest.split_once("```").expect("the block ends").0
+}
+
+fn block(language: &str) -> &'static str {
+    block_of(DOCUMENT, language, 0)
+}
+
+/// The example in format 2.
+fn second(language: &str) -> &'static str {
+    block_of(DOCUMENT, language, 1)
+}
+
+fn toy() -> Ring {
+    Ring::parse(block_of(MACHINES, "json", 0), "machines/toy.json").expect("the example is right")
+}
+
+/// The columns of the example.
+fn columns() -> Vec<String> {
+    block("csv").lines().next().expect("it has columns").split(',').map(String::from).collect()
+}
+
+/// Reads a campaign `toy`; a file without content is left out. The error's path starts at the campaign's folder.
+fn read(header: &[u8], frames: &[u8]) -> Result<Recording, String> {
+    let home = tempfile::tempdir().expect("a temporary folder can be made");
+    let folder = home.path().join("toy");
+    fs::create_dir(&folder).expect("it is writable");
+    for (file, content) in [("header.toml", header), ("frames.csv", frames)] {
+        if !content.is_empty() {
+            fs::write(folder.join(file), content).expect("it is writable");
+        }
+    }
+    let strip = |error: RecordingError| error.to_string().replace(&format!("{}/", home.path().display()), "");
+    Recording::read(&folder, &toy()).map_err(strip)
+}
+
+/// The document's text with its one `old` changed to `new`.
+fn edited(language: &str, old: &str, new: &str) -> String {
+    assert_eq!(block(language).matches(old).count(), 1, "{old} stands once in the example");
+    block(language).replace(old, new)
+}
+
+fn with_frames(old: &str, new: &str) -> Result<Recording, String> {
+    read(block("toml").as_bytes(), edited("csv", old, new).as_bytes())
+}
+
+fn frames_error(old: &str, new: &str) -> String {
+    with_frames(old, new).expect_err(new)
+}
+
+fn header_error(old: &str, new: &str) -> String {
+    read(edited("toml", old, new).as_bytes(), block("csv").as_bytes()).expect_err(new)
+}
+
+fn assert_frames_error(old: &str, new: &str, expected: &str) {
+    assert_eq!(frames_error(old, new), format!("toy/frames.csv, {expected}"));
+}
+
+fn assert_header_error(old: &str, new: &str, expected: &str) {
+    assert_eq!(header_error(old, new), format!("toy/header.toml, {expected}"));
+}
+
+#[test]
+fn example_of_the_document_reads_in_si_units() {
+    let toy = read(block("toml").as_bytes(), block("csv").as_bytes()).expect("the example is right");
+    assert_eq!((toy.name.as_str(), toy.rows.len()), ("toy", 2));
+    assert_eq!((toy.header.noise, toy.header.kick_per_ampere), (vec![0.15e-3; 2], vec![0.00909091e-3; 2]));
+    assert_eq!((toy.header.believed_rf, toy.header.nominal), (BelievedRf::FixedMomentum, vec![1800.0, 1790.0]));
+    assert_eq!(toy.header.radial_loop_monitors, None);
+    let row = &toy.rows[1];
+    assert_eq!((row.sequence, row.time, row.cycle_time, row.rf_offset), (2, 8.0, 0.092, -0.0002));
+    assert_eq!((row.correctors.as_slice(), row.repeats(&toy.rows[0])), ([(0, 22.0)].as_slice(), false));
+    assert_eq!((row.dipole, row.supply.as_slice()), (Some(2400.314), [1799.611, 1789.777].as_slice()));
+    assert_eq!((toy.other.as_slice(), row.other[1]), (["i_sh_A", "i_sv_A"].map(String::from).as_slice(), 0.045576));
+    assert_eq!(row.corrector_current, [21.9987, -0.0121]);
+    assert_eq!(row.reading, [Some(1.9287e-3), None]);
+    assert_eq!(row.tune, [Some(0.80674), None]);
+}
+
+#[test]
+fn example_errors_of_the_document_are_verbatim() {
+    let errors = [
+        header_error("bpm_sigma_mm = 0.15", "bpm_sigma_mm = -0.15"),
+        header_error("lattice = \"toy.json\"\n", ""),
+        frames_error("x_A2_mm", "x_A2_um"),
+        frames_error("1.9287", "NaN"),
+        frames_error("\n2,", "\n0,"),
+    ];
+    assert_eq!(block("text").lines().collect::<Vec<_>>(), errors);
+}
+
+#[test]
+fn missing_files_are_named() {
+    let (header, frames) = (block("toml").as_bytes(), block("csv").as_bytes());
+    assert_eq!(read(b"", frames), Err("toy/header.toml: file not found".into()));
+    assert_eq!(read(header, b""), Err("toy/frames.csv: file not found".into()));
+}
+
+#[test]
+fn bytes_that_are_no_text_are_refused() {
+    let error = read(block("toml").as_bytes(), b"seq,\xff").expect_err("0xff is not UTF-8");
+    assert_eq!(error, "toy/frames.csv: cannot be read as UTF-8 text: invalid data");
+}
+
+#[test]
+fn byte_order_mark_and_crlf_are_accepted() {
+    let [header, frames] =
+        ["toml", "csv"].map(|language| format!("\u{feff}{}", block(language).replace('\n', "\r\n")));
+    assert_eq!(read(header.as_bytes(), frames.as_bytes()), read(block("toml").as_bytes(), block("csv").as_bytes()));
+    let error = read(header.as_bytes(), frames.replace("1.9287", "x").as_bytes()).expect_err("x is no number");
+    assert!(error.contains(", line 3, "), "{error}");
+}
+
+#[test]
+fn header_that_is_not_toml_is_refused() {
+    let expected = "line 5, key kinetic_energy_GeV: string values must be quoted, expected literal string";
+    assert_header_error("kinetic_energy_GeV = 0.05", "kinetic_energy_GeV =", expected);
+    assert_header_error("recorded_with", "lattice", "line 3, key lattice: duplicate key");
+}
+
+#[test]
+fn missing_header_key_is_named() {
+    assert_header_error("lattice = \"toy.json\"\n", "", "line 1: missing field `lattice`");
+    assert_header_error(", qv = 1790.0", "", "line 10, key nominal_A: missing field `qv`");
+}
+
+#[test]
+fn unknown_header_key_is_named() {
+    let expected = "line 10, key qd: unknown field `qd`, expected one of `dipole`, `qh`, `qv`";
+    assert_header_error("qv = 1790.0", "qv = 1790.0, qd = 1.0", expected);
+}
+
+#[test]
+fn header_value_of_wrong_type_is_refused() {
+    let expected = "line 6, key bpm_sigma_mm: invalid type: string \"x\", expected f64";
+    assert_header_error("bpm_sigma_mm = 0.15", "bpm_sigma_mm = \"x\"", expected);
+    let expected = "`fixed_momentum`, `fixed_frequency`, `radial_loop`";
+    let expected = format!("line 9, key believed_rf: unknown variant `none`, expected one of {expected}");
+    assert_header_error("\"fixed_momentum\"", "\"none\"", &expected);
+}
+
+#[test]
+fn header_values_must_be_positive_and_finite() {
+    let keys = ["kinetic_energy_GeV = 0.05", "bpm_sigma_mm = 0.15", "kick_mrad_per_A = 0.00909091"];
+    for assignment in keys.into_iter().chain(["dipole = 2400.0", "qh = 1800.0", "qv = 1790.0"]) {
+        let (key, _) = assignment.split_once(" = ").expect("key = value");
+        for bad in ["0.0", "-1.0", "nan", "inf"] {
+            let error = header_error(assignment, &format!("{key} = {bad}"));
+            assert!(error.contains(&format!(", key {key}: invalid value: ")), "{error}");
+            assert!(error.ends_with(", expected a positive finite number"), "{error}");
+        }
+    }
+}
+
+#[test]
+fn quad_transfer_must_have_a_value_at_nominal_current() {
+    for (bad, sum) in [("[]", "0"), ("[1.0, -1.0]", "0"), ("[1.0, nan]", "NaN"), ("[inf]", "inf")] {
+        let expected = "expected finite coefficients with a sum p(1) that is not 0";
+        let expected = format!("line 11, key quad_transfer: invalid value: p(1) = {sum}, {expected}");
+        assert_header_error("[0.0, 1.0]", bad, &expected);
+    }
+}
+
+#[test]
+fn radial_loop_holds_exactly_two_monitors() {
+    let expected = "line 1: missing field `radial_loop_monitors`, needed as believed_rf is radial_loop";
+    assert_header_error("\"fixed_momentum\"", "\"radial_loop\"", expected);
+    let expected = "line 12, key radial_loop_monitors: invalid length 3, expected two monitors";
+    assert_header_error("note = ", "radial_loop_monitors = [\"a\", \"b\", \"c\"]\nnote = ", expected);
+}
+
+#[test]
+fn missing_column_is_named() {
+    let expected = "line 1, column 14: expected x_A2_mm, found \"y_A1_mm\", so a column is missing";
+    assert_frames_error("x_A2_mm,", "", expected);
+    let expected = "line 1, column 17: expected qy_frac, found the end of the line, so a column is missing";
+    assert_frames_error(",qy_frac", "", expected);
+}
+
+#[test]
+fn unknown_column_is_named() {
+    let fault = "which the machine does not have";
+    let expected = format!("line 1, column 14: expected x_A2_mm, found \"x_A4_mm\", {fault}");
+    assert_frames_error("x_A2_mm", "x_A4_mm", &expected);
+    let expected = format!("line 1, column 18: expected the end of the line, found \"i\", {fault}");
+    assert_frames_error("qy_frac", "qy_frac,i", &expected);
+}
+
+#[test]
+fn misplaced_column_is_named() {
+    let expected = "line 1, column 14: expected x_A2_mm, found \"y_A1_mm\", which is in the wrong place";
+    assert_frames_error("x_A2_mm,y_A1_mm", "y_A1_mm,x_A2_mm", expected);
+}
+
+#[test]
+fn duplicate_column_is_named() {
+    let expected = "line 1, column 15: expected y_A1_mm, found \"x_A2_mm\", which is there already";
+    assert_frames_error("y_A1_mm", "x_A2_mm", expected);
+}
+
+#[test]
+fn wrong_unit_is_named() {
+    for (good, bad, column) in [("x_A2_mm", "x_A2_um", 14), ("x_A2_mm", "x_A2_m", 14), ("time_s", "time_ms", 2)] {
+        let expected = format!("expected {good}, found \"{bad}\", which has the wrong unit");
+        assert_frames_error(good, bad, &format!("line 1, column {column}: {expected}"));
+    }
+}
+
+#[test]
+fn cells_are_counted() {
+    for (old, new, found) in [("1.9287,", "", 16), ("0.80674,", "0.80674,,", 18), ("\n2,", "\n\n2,", 1)] {
+        assert_frames_error(old, new, &format!("line 3: expected 17 cells, found {found}"));
+    }
+}
+
+/// The example's second row with one cell replaced.
+fn cell(index: usize, content: &str) -> Result<Recording, String> {
+    let (above, row) = block("csv").trim_end().rsplit_once('\n').expect("it has rows");
+    let mut cells: Vec<&str> = row.split(',').collect();
+    cells[index] = content;
+    read(block("toml").as_bytes(), format!("{above}\n{}\n", cells.join(",")).as_bytes())
+}
+
+#[test]
+fn every_cell_refuses_what_is_no_finite_number() {
+    for (index, column) in columns().into_iter().enumerate() {
+        for bad in ["NaN", "nan", "inf", "-inf", "1e999", "Z9", "1;5", " 1", "\"1\""] {
+            let error = cell(index, bad).expect_err(bad);
+            assert!(error.starts_with(&format!("toy/frames.csv, line 3, column {column}: expected ")), "{error}");
+            assert!(error.ends_with(&format!(", found {bad:?}")), "{error}");
+        }
+    }
+}
+
+#[test]
+fn only_monitors_and_tunes_may_be_empty() {
+    for (index, column) in columns().into_iter().enumerate() {
+        let result = cell(index, "").map(|_| ());
+        let optional = column.ends_with("_mm") || column.ends_with("_frac");
+        assert_eq!(result.is_ok(), optional, "{column}: {result:?}");
+    }
+    let expected = "line 3, column i_dipole_A: expected a positive finite number, found an empty cell";
+    assert_frames_error("2400.314", "", expected);
+}
+
+#[test]
+fn corrector_must_be_one_of_the_machine() {
+    let expected = "line 3, column corrector: expected a corrector of the machine or nothing, found \"A3\"";
+    assert_frames_error(",A2,22,", ",A3,22,", expected);
+}
+
+#[test]
+fn setting_needs_a_corrector() {
+    let expected = "line 3, column setting_A: expected 0, as no corrector is named, found \"22\"";
+    assert_frames_error(",A2,22,", ",,22,", expected);
+}
+
+#[test]
+fn sequence_does_not_repeat() {
+    let expected = "line 3, column seq: expected more than the 1 of the line before, found 1";
+    assert_frames_error("\n2,", "\n1,", expected);
+}
+
+#[test]
+fn sequence_does_not_go_backward() {
+    let expected = "line 3, column seq: expected more than the 1 of the line before, found 0";
+    assert_frames_error("\n2,", "\n0,", expected);
+}
+
+#[test]
+fn sequence_may_leave_gaps() {
+    assert_eq!(with_frames("\n2,", "\n900,").map(|toy| toy.rows[1].sequence), Ok(900));
+}
+
+#[test]
+fn time_rises() {
+    let expected = "line 3, column time_s: expected more than the 4 of the line before, found 4";
+    assert_frames_error("8.000", "4.000", expected);
+}
+
+#[test]
+fn recording_without_frames_is_refused() {
+    let (columns, _) = block("csv").split_once('\n').expect("it has columns");
+    let error = read(block("toml").as_bytes(), columns.as_bytes()).expect_err("it has no frames");
+    assert_eq!(error, "toy/frames.csv, line 1: expected frames below the columns, found none");
+}
+
+fn assert_range(index: usize, inside: [&str; 2], outside: [&str; 2], expected: &str) {
+    for content in inside {
+        assert_eq!(cell(index, content).map(|_| ()), Ok(()));
+    }
+    for content in outside {
+        let error = cell(index, content).expect_err(content);
+        assert!(error.ends_with(&format!(": expected {expected}, found {content:?}")), "{error}");
+    }
+}
+
+#[test]
+fn readings_stay_within_100_mm() {
+    assert_range(13, ["-100", "100"], ["-100.001", "250"], "a position from -100 to 100 mm");
+}
+
+#[test]
+fn rf_offset_stays_within_one_percent() {
+    assert_range(5, ["-0.01", "1e-2"], ["-0.0101", "0.02"], "a relative offset from -0.01 to 0.01");
+}
+
+#[test]
+fn tune_is_a_fraction() {
+    assert_range(15, ["0", "0.99999"], ["-0.1", "1"], "a fractional tune from 0 to below 1");
+}
+
+#[test]
+fn currents_that_divide_a_gradient_are_positive() {
+    for index in 6..9 {
+        assert_range(index, ["0.001", "1e4"], ["0", "-2400"], "a positive finite number");
+    }
+}
+
+#[test]
+fn error_stays_on_one_line_whatever_the_files_hold() {
+    let errors =
+        [header_error("particle", "\"a\\nb\""), frames_error("seq", "s\"\re\tq"), frames_error("1.9287", "1\r2")];
+    for error in errors {
+        assert!(!error.contains(char::is_control), "{error}");
+    }
+}
+
+#[test]
+fn a_recording_of_another_machine_is_refused() {
+    let fault = "the recording is of another machine";
+    for (old, new, line, key, expected, found) in [
+        ("machine = \"toy\"", "machine = \"ring\"", 1, "machine", "\"toy\"", "\"ring\""),
+        ("\"toy.json\"", "\"ring.json\"", 2, "lattice", "\"toy.json\"", "\"ring.json\""),
+        ("\"proton\"", "\"electron\"", 4, "particle", "\"proton\"", "\"electron\""),
+        ("= 0.05", "= 0.06", 5, "kinetic_energy_GeV", "0.05", "0.06"),
+    ] {
+        let expected = format!("line {line}, key {key}: expected {expected}, found {found}: {fault}");
+        assert_header_error(old, new, &expected);
+    }
+}
+
+#[test]
+fn format_is_1_or_2() {
+    let expected = "line 1, key format: expected 1 or 2, found 3";
+    assert_header_error("machine = \"toy\"", "format = 3\nmachine = \"toy\"", expected);
+    let read = read(edited("toml", "machine =", "format = 1\nmachine =").as_bytes(), block("csv").as_bytes());
+    assert_eq!(read, self::read(block("toml").as_bytes(), block("csv").as_bytes()));
+}
+
+#[test]
+fn names_of_elements_are_columns_too() {
+    let frames = block("csv").replace("ic_A2_A", "ic_DCH_A2_A").replace("x_A2_mm", "x_PUH_A2_mm");
+    let frames = frames.replace("ic_A1_A", "ic_V_A1_A").replace(",A2,22", ",DCH_A2,22");
+    assert_eq!(read(block("toml").as_bytes(), frames.as_bytes()), read(block("toml").as_bytes(), block("csv").as_bytes()));
+}
+
+fn read_second(header: &str, frames: &str) -> Result<Recording, String> {
+    read(header.as_bytes(), frames.as_bytes())
+}
+
+#[test]
+fn example_in_format_2_reads_in_si_units() {
+    let toy = read_second(second("toml"), second("csv")).expect("the example is right");
+    let header = &toy.header;
+    assert_eq!((header.noise.as_slice(), header.nominal_dipole), ([0.15e-3, 0.3e-3].as_slice(), None));
+    assert_eq!(header.kick_per_ampere, [0.00909091e-3, 0.01e-3]);
+    assert_eq!((&header.nominal, &header.transfer[1]), (&vec![1800.0, 1790.0], &vec![0.0, 1.1, -0.1]));
+    let [baseline, bump] = &toy.rows[..] else { panic!("two rows") };
+    assert_eq!((bump.correctors.as_slice(), &baseline.correctors), ([(0, 22.0), (1, -11.0)].as_slice(), &vec![]));
+    assert_eq!((bump.supply.as_slice(), bump.dipole, bump.rf_offset), ([1799.611, 1789.777].as_slice(), None, 0.0));
+    assert_eq!((baseline.intensity, bump.intensity, bump.tune), (Some(2.1e11), None, [None; 2]));
+    assert_eq!((baseline.tune, toy.other(bump, "i_sextupole_A")), ([Some(0.10530), None], Some(0.1)));
+    assert!((toy.nominal_kick() - 22.0 * 0.00909091e-3).abs() < 1e-12);
+}
+
+#[test]
+fn what_is_wrong_in_format_2_is_said() {
+    let header = |old: &str, new: &str| read_second(&second("toml").replace(old, new), second("csv")).unwrap_err();
+    let frames = |old: &str, new: &str| read_second(second("toml"), &second("csv").replace(old, new)).unwrap_err();
+    let cases = [
+        (header("y_A1 = 0.3", "y_B1 = 0.3"), "header.toml, line 7, key bpm_sigma_mm: unknown field `y_B1`, the machine has no such instrument"),
+        (header("default = 0.00909091, ", ""), "header.toml, line 8, key kick_mrad_per_A: missing field `default`, as not every instrument is named"),
+        (header(", QD = 1790.0", ""), "header.toml, line 11, key nominal_A: missing field `QD`, a supply of the machine"),
+        (header("QD = 1790.0", "QD = 1790.0, QT = 1.0"), "header.toml, line 11, key nominal_A: unknown field `QT`, the machine has no such supply"),
+        (header("QF = [0.0, 1.0], ", ""), "header.toml, line 12, key quad_transfer: missing field `QF`, a supply of the machine"),
+        (header("{ default = 0.15, y_A1 = 0.3 }", "\"x\""), "header.toml, line 7, key bpm_sigma_mm: invalid type: string \"x\", expected a number, or a table of numbers by name"),
+        (frames("x_A2_mm,", "x_A3_mm,"), "frames.csv, line 1, column 3: expected a column of this format, found \"x_A3_mm\", which the machine does not have"),
+        (frames("x_A2_mm,", "x_A2_um,"), "frames.csv, line 1, column 3: expected x_A2_mm, found \"x_A2_um\", which has the wrong unit"),
+        (frames("i_QF_A", "i_QD_A"), "frames.csv, line 1, column 10: expected every column once, found \"i_QD_A\", which is there already"),
+        (frames("i_QF_A", "i_Q_A"), "frames.csv, line 1: expected i_QF_A, found no column of this name, so a column is missing"),
+        (frames("setting_A", "i_s_A"), "frames.csv, line 1: expected setting_A, found no column of this name, so a column is missing"),
+        (frames("A2;A1", "A2;A2"), "frames.csv, line 3, column corrector: expected correctors of the machine, each once and joined by `;`, or nothing, found \"A2;A2\""),
+        (frames("22;-11", "22"), "frames.csv, line 3, column setting_A: expected 2 finite numbers joined by `;`, found \"22\""),
+        (frames("2.1e11", "-1"), "frames.csv, line 2, column intensity: expected a finite number from 0, found \"-1\""),
+    ];
+    for (found, expected) in cases {
+        assert_eq!(found, format!("toy/{expected}"));
+    }
+}
+
+/// A ring whose quadrupoles are in series with the dipoles, or of a family of both signs, in format 1.
+#[test]
+fn format_1_powers_every_quadrupole_by_its_sign() {
+    let one = |text: &str| {
+        let ring = Ring::parse(text, "toy.json").expect("a ring");
+        powered(&ring, Format::One).quadrupoles.iter().map(|q| q.supply).collect::<Vec<_>>()
+    };
+    let text = block_of(MACHINES, "json", 0);
+    assert_eq!(one(text), [Some(0), Some(1)]);
+    let without = text.replace("\"family\": \"QF\"", "\"k1\": 0.6");
+    assert_eq!(one(&without), [Some(0), Some(1)]);
+    assert_eq!(Ring::parse(&without, "toy.json").unwrap().quadrupoles[0].supply, None);
+}
+
+#[test]
+fn what_is_written_reads_the_same() {
+    let ring = Ring::booster();
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+    let booster = Recording::read(&folder, &ring).expect("it is committed");
+    let toy_two = read_second(second("toml"), second("csv")).expect("the example is right");
+    for (recording, ring) in [(booster, ring), (toy_two, toy())] {
+        let home = tempfile::tempdir().expect("a temporary folder can be made");
+        let folder = home.path().join(&recording.name);
+        recording.write(&folder, &ring).expect("it is writable");
+        let again = Recording::read(&folder, &ring).unwrap_or_else(|error| panic!("{error}"));
+        let header = Header { format: Format::Two, ..recording.header.clone() };
+        assert_eq!((again.header, again.other), (header, recording.other));
+        assert_eq!(again.rows, recording.rows);
+    }
+}

@@ -6,10 +6,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use comfy_table::{CellAlignment, Table, presets};
-use host_bridge::output;
-use host_bridge::publish::{Publisher, SERVICE};
-use host_bridge::record::EstimateRecord;
+use comfy_table::CellAlignment;
+use host_bridge::output::{self, table};
+use host_bridge::record::Names;
+use host_bridge::sink::shared_memory::{PUBLISHER, Publisher, SERVICE};
 use inference::Recording;
 use inference::stream;
 use serde_json::{Value, json};
@@ -27,7 +27,7 @@ struct Arguments {
     /// First frames of each recording; all of them without it
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// Where the answer goes as JSON
+    /// Where the result goes as JSON
     #[arg(long, value_name = "FILE", default_value = "target/sil.json")]
     json: PathBuf,
     /// Name of the shared-memory service
@@ -50,35 +50,32 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     let (image, ring) = (Image::build()?, Ring::booster());
     let sizes = image.sizes()?;
-    let mut publisher = Publisher::try_new(&arguments.service)?;
-    let mut answers = Vec::new();
+    let mut publisher = Publisher::try_new(&arguments.service, PUBLISHER, &Names::of(&ring))?;
+    let mut results = Vec::new();
     for (name, process_noise) in RECORDINGS {
         let mut recording = Recording::read(&repository(name), &stream::layout(&ring))?;
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
-        let comparison = compare(&image, (&ring, &recording), process_noise, true, |heard| {
+        let comparison = compare(&image, (&ring, &recording), process_noise, true, |record| {
             bar.inc(1);
-            let record = EstimateRecord::of(&heard.estimate, |i, j| heard.covariance(i, j));
-            publisher.publish(&record).map_err(|e| host_bridge::command::CommandError::Other(e.to_string()))
+            Ok(publisher.publish(record)?)
         })?;
         bar.finish_and_clear();
         print(&comparison, &sizes);
-        answers.push(summary(&recording.name, &comparison, &sizes));
+        results.push(summary(&recording.name, &comparison, &sizes));
     }
-    let bit_equal = answers.iter().all(|answer| answer["bit_equal"] == true);
+    let bit_equal = results.iter().all(|result| result["bit_equal"] == true);
     // the first recording's numbers stand at the top, where scripts look for them
-    let mut whole = answers[0].clone();
-    whole["recordings"] = Value::Array(answers);
+    let mut whole = results[0].clone();
+    whole["recordings"] = Value::Array(results);
     output::json(&arguments.json, &whole)?;
     println!("{}", arguments.json.display());
     Ok(bit_equal)
 }
 
 fn print(comparison: &Comparison, sizes: &Sizes) {
-    comparison.answer.print();
-    let mut table = Table::new();
-    table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-    table.set_header(["step", "runs", "median instructions", "most"]);
+    println!("{}", comparison.result);
+    let mut table = table(["step", "runs", "median instructions", "most"]);
     for (word, name) in system_tests::sil::REGIONS {
         let mut runs = comparison.counts.get(name).cloned().unwrap_or_default();
         runs.sort_unstable();
@@ -92,7 +89,7 @@ fn print(comparison: &Comparison, sizes: &Sizes) {
         different => format!("differ from the host's in {} frames, first {}", different.len(), different[0]),
     };
     println!(
-        "{} answers {equal}; flash {} kB, RAM {} kB, stack {:.1} kB; {} bytes lost\n",
+        "{} estimates {equal}; flash {} kB, RAM {} kB, stack {:.1} kB; {} bytes lost\n",
         comparison.frames,
         sizes.flash / 1024,
         sizes.ram / 1024,

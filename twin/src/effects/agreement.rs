@@ -3,8 +3,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
-use crate::lattice::Ring;
+use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
+use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
 
 const NOMINAL: f64 = 2e-4;
@@ -20,6 +20,18 @@ fn drives(ring: &Ring, orbit: Vec<[f64; 2]>) -> Drives {
     let rf_offset = DVector::from_vec(vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-4, -1e-4]);
     let time = DVector::from_vec(vec![-1.0, -0.7, -0.2, 0.1, 0.5, 0.6, 0.8, 1.0]);
     Drives { kick, rf_offset, time, nominal_kick: NOMINAL, orbit }
+}
+
+/// The ring with a monitor that reads both planes and a corrector that kicks in both.
+fn dual() -> Ring {
+    let mut file: serde_json::Value = serde_json::from_str(include_str!("../../../machines/booster.json")).unwrap();
+    for element in file["elements"].as_array_mut().unwrap() {
+        if ["PUH_E4", "DCH_A4"].contains(&element["name"].as_str().unwrap()) {
+            element["plane"] = "HV".into();
+        }
+    }
+    file["data"]["bpm_y"].as_array_mut().unwrap().push("E4".into());
+    Ring::parse(&file.to_string(), "dual.json").unwrap()
 }
 
 /// The ring with one quadrupole of each family out of its place: an orbit of several mm in both planes.
@@ -40,12 +52,13 @@ fn orbit(ring: &Ring, delta: f64) -> Vec<[f64; 2]> {
 /// Every kind with some of its places: the first, the last and each seventh.
 fn effects(ring: &Ring) -> Vec<Effect> {
     let of = |&kind: &EffectKind| {
-        let sites = if kind == EffectKind::RadialLoop { vec!["x_D8,x_E6".into()] } else { kind.sites(ring) };
+        let radial_loop = || Effect::parse("radial_loop@x_D8,x_E6", ring).unwrap().site;
+        let sites = if kind == EffectKind::RadialLoop { vec![radial_loop()] } else { kind.sites(ring) };
         let step = if kind == EffectKind::BpmSwap { 41 } else { 7 };
         let amplitude = kind.prior_scale().unwrap_or(1.0);
         let last = sites.len() - 1;
         let some = sites.into_iter().enumerate().filter(move |(i, _)| i % step == 0 || *i == last);
-        some.map(move |(_, place)| Effect { kind, place, amplitude }).collect::<Vec<_>>()
+        some.map(move |(_, site)| Effect { kind, site, amplitude }).collect::<Vec<_>>()
     };
     EffectKind::ALL.iter().flat_map(of).collect()
 }
@@ -73,14 +86,13 @@ fn tracked(machine: Machine, drives: &Drives) -> DMatrix<f64> {
 }
 
 /// Central difference of readings, tunes and their drift about a machine; the whole change of what is there or not.
-fn difference(about: &[Effect], effect: &Effect, drives: &Drives) -> (DMatrix<f64>, [f64; 2], [f64; 2]) {
-    let ring = Ring::booster();
+fn difference(ring: &Ring, about: &[Effect], effect: &Effect, drives: &Drives) -> (DMatrix<f64>, [f64; 2], [f64; 2]) {
     let with = |amplitude: f64| {
-        let all = [about, &[Effect { amplitude, ..effect.clone() }]].concat();
-        machine(&ring, &all).readings(drives).unwrap()
+        let all = [about, &[Effect { amplitude, ..*effect }]].concat();
+        machine(ring, &all).readings(drives).unwrap()
     };
     let (up, down, width) = match effect.kind.prior_scale() {
-        None => (with(1.0), machine(&ring, about).readings(drives).unwrap(), 1.0),
+        None => (with(1.0), machine(ring, about).readings(drives).unwrap(), 1.0),
         Some(scale) => (with(1e-2 * scale), with(-1e-2 * scale), 2e-2 * scale),
     };
     let tunes = [up.1.x - down.1.x, up.1.y - down.1.y].map(|change| change / width);
@@ -88,14 +100,13 @@ fn difference(about: &[Effect], effect: &Effect, drives: &Drives) -> (DMatrix<f6
     ((up.0 - down.0) / width, tunes, drift)
 }
 
-fn assert_derivatives(about: &[Effect], which: impl Fn(EffectKind) -> bool, tolerance: f64) {
-    let ring = Ring::booster();
-    let drives = drives(&ring, orbit(&displaced(), 0.0));
-    let about_machine = machine(&ring, about);
+fn assert_derivatives(ring: &Ring, about: &[Effect], which: &[Effect], tolerance: f64) {
+    let drives = drives(ring, orbit(&displaced(), 0.0));
+    let about_machine = machine(ring, about);
     let signatures = Signatures::of(&about_machine, &drives).unwrap();
-    for effect in effects(&ring).into_iter().filter(|effect| which(effect.kind)) {
-        let signature = signatures.of_effect(effect.kind, &effect.place).unwrap();
-        let (readings, tunes, drift) = difference(about, &effect, &drives);
+    for effect in which {
+        let signature = signatures.of_effect(effect.kind, effect.site).unwrap();
+        let (readings, tunes, drift) = difference(ring, about, effect, &drives);
         let error = (&signature.readings - &readings).abs().max() / readings.abs().max();
         assert!(error < tolerance, "{effect:?}: {error:e}");
         let pairs = signature.tunes.iter().zip(tunes).chain(signature.tune_drift.iter().zip(drift));
@@ -109,40 +120,44 @@ fn assert_derivatives(about: &[Effect], which: impl Fn(EffectKind) -> bool, tole
 #[test]
 fn signatures_are_the_derivatives_of_the_readings() {
     // measured 8e-5 with the edges of all dipoles, 6e-6 otherwise: truncation of the differences
-    assert_derivatives(&[], |_| true, 2e-4);
+    let ring = Ring::booster();
+    assert_derivatives(&ring, &[], &effects(&ring), 2e-4);
 }
 
 #[test]
 fn signatures_hold_about_a_machine_with_effects() {
-    let about = |text: &str| text.split_whitespace().map(|e| e.parse().unwrap()).collect::<Vec<Effect>>();
+    let ring = Ring::booster();
+    let assert = |about: &[Effect], which: &dyn Fn(EffectKind) -> bool, tolerance| {
+        let some: Vec<Effect> = effects(&ring).into_iter().filter(|effect| which(effect.kind)).collect();
+        assert_derivatives(&ring, about, &some, tolerance);
+    };
+    let about = |text: &str| text.split_whitespace().map(|e| Effect::parse(e, &ring).unwrap()).collect::<Vec<_>>();
     // but for effects of monitors, which stand in the order in which they were given
-    let of_monitor = |kind: EffectKind| kind.word().starts_with("bpm");
     let read = about("bpm_gain@x_E4=0.1 corrector_gain@H_A8=0.1 stray_gradient@SLOT_F6=0.02");
-    assert_derivatives(&read, |kind| !of_monitor(kind), 2e-4);
+    assert(&read, &|kind| !kind.is_of_a_monitor(), 2e-4);
     // off momentum: what the ring holds is exact there, gradients feed down
-    let held =
-        |kind| matches!(kind, EffectKind::MomentumOffset | EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
-    assert_derivatives(&about("momentum_offset=0.002"), held, 5e-5);
+    let held = |kind: EffectKind| matches!(kind.class(), Class::Hold(_));
+    assert(&about("momentum_offset=0.002"), &held, 5e-5);
     // where not the momentum is held, but for the curvature of a sextupole, which is taken at constant momentum
-    let linear = |kind: EffectKind| kind.prior_scale().is_some() && kind != EffectKind::SextupoleError;
-    assert_derivatives(&about("radial_loop@x_D8,x_E6"), linear, 2e-4);
-    assert_derivatives(&about("fixed_rf_frequency"), linear, 2e-4);
+    let linear = |kind: EffectKind| !kind.is_switch() && kind != EffectKind::SextupoleError;
+    assert(&about("radial_loop@x_D8,x_E6"), &linear, 2e-4);
+    assert(&about("fixed_rf_frequency"), &linear, 2e-4);
 }
 
 /// Largest error of the linear change against the exact one, in frames with kicks and in those with an RF offset, the
 /// largest change, and the error of the tunes.
-fn compare(real: &Ring, effect: &Effect) -> [f64; 4] {
-    let aligned = Ring::booster();
+fn compare(aligned: &Ring, real: &Ring, effect: &Effect) -> [f64; 4] {
     let linear = |effects: &[Effect]| {
         let real = machine(real, effects);
-        let drives = drives(&aligned, orbit(real.ring(), real.delta));
-        machine(&aligned, effects).readings(&drives).unwrap()
+        let drives = drives(aligned, orbit(real.ring(), real.hold.delta));
+        machine(aligned, effects).readings(&drives).unwrap()
     };
-    let exact = |effects: &[Effect]| tracked(machine(real, effects), &drives(&aligned, Vec::new()));
+    let exact = |effects: &[Effect]| tracked(machine(real, effects), &drives(aligned, Vec::new()));
     let one = core::slice::from_ref(effect);
     let ((with, tunes, drift), change) = (linear(one), exact(one) - exact(&[]));
     let error = &change - (with - linear(&[]).0);
-    let cycle = |time: f64| Cycle { kick: vec![0.0; 48], strength: vec![0.0; 48], rf_offset: 0.0, time };
+    let cycle =
+        |time: f64| Cycle { kick: vec![0.0; real.correctors.len()], strength: vec![0.0; 48], rf_offset: 0.0, time };
     let still = Tracked::of(machine(real, one), NOMINAL).unwrap();
     let [middle, end] = [0.0, 1.0].map(|time| still.cycle(&cycle(time)).unwrap().1);
     let missed = [middle.x - tunes.x, middle.y - tunes.y, end.x - middle.x - drift[0], end.y - middle.y - drift[1]];
@@ -152,19 +167,19 @@ fn compare(real: &Ring, effect: &Effect) -> [f64; 4] {
 
 /// As large as faults are, half a standard deviation of the prior; whole where there is no amplitude.
 fn typical(effect: Effect) -> Effect {
-    let share = if effect.kind.prior_scale().is_some() { 0.5 } else { 1.0 };
+    let share = if effect.kind.is_switch() { 1.0 } else { 0.5 };
     Effect { amplitude: share * effect.amplitude, ..effect }
 }
 
-fn depends_on_the_orbit(kind: EffectKind) -> bool {
-    matches!(kind, EffectKind::BpmCubic | EffectKind::SextupoleError)
+fn depends_on_the_orbit(ring: &Ring, effect: &Effect) -> bool {
+    !effect.kind.orbit(ring, effect.site).is_empty()
 }
 
 #[test]
 fn linear_readings_are_those_of_exact_orbits() {
     let ring = Ring::booster();
-    for effect in effects(&ring).into_iter().filter(|e| !depends_on_the_orbit(e.kind)).map(typical) {
-        let [kicked, rf, change, tune] = compare(&ring, &effect);
+    for effect in effects(&ring).into_iter().filter(|e| !depends_on_the_orbit(&ring, e)).map(typical) {
+        let [kicked, rf, change, tune] = compare(&Ring::booster(), &ring, &effect);
         // second order in the kicks: a path longer by half the square of slopes of 0.5 mrad moves the momentum by 1e-6
         // (1.8 um measured); a loop's momentum of 1.3e-4 changes the kick's own response (8.6 um)
         let second = match effect.kind {
@@ -185,12 +200,34 @@ fn linear_readings_are_those_of_exact_orbits() {
 #[test]
 fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
     let ring = displaced();
-    for effect in effects(&ring).into_iter().filter(|e| depends_on_the_orbit(e.kind)).map(typical) {
-        let [kicked, rf, change, tune] = compare(&ring, &effect);
+    for effect in effects(&ring).into_iter().filter(|e| depends_on_the_orbit(&ring, e)).map(typical) {
+        let [kicked, rf, change, tune] = compare(&Ring::booster(), &ring, &effect);
         // measured 0.036: the orbit is taken at the entrance of a sextupole, not in its middle
         assert!(kicked < 0.05 * change, "{effect:?}: {kicked:e} of {change:e}");
         // measured 0.061: the dispersion of the two displaced quadrupoles
         assert!(rf < 0.1 * change, "{effect:?}: {rf:e} of {change:e}");
         assert!(tune < 1e-3, "{effect:?}: {tune:e}");
+    }
+}
+
+#[test]
+fn what_reads_or_kicks_in_both_planes_is_rolled_in_both() {
+    let ring = dual();
+    let of = |text: &str| Effect::parse(text, &ring).unwrap();
+    let (monitor, corrector) = (of("bpm_roll@y_E4=0.03"), of("corrector_roll@V_A4=0.03"));
+    assert_eq!((monitor, corrector), (of("bpm_roll@x_E4=0.03"), of("corrector_roll@H_A4=0.03")));
+    let sites = |kind: EffectKind| kind.sites(&ring).len();
+    assert_eq!((sites(EffectKind::BpmGain), sites(EffectKind::BpmRoll)), (34, 33));
+    assert_eq!((sites(EffectKind::CorrectorGain), sites(EffectKind::CorrectorRoll)), (49, 48));
+    let (plain, rolled) = (machine(&ring, &[]).response().unwrap(), machine(&ring, &[monitor]).response().unwrap());
+    let ((sin, cos), [x, y]) =
+        (0.03_f64.sin_cos(), [Plane::X, Plane::Y].map(|plane| ring.monitor(plane, "E4").unwrap()));
+    assert!((rolled.x.row(x) - plain.x.row(x) * cos - plain.y.row(x) * sin).abs().max() < 1e-12);
+    assert!((rolled.y.row(y) - plain.y.row(y) * cos + plain.x.row(y) * sin).abs().max() < 1e-12);
+    // all correctors kick in one of the frames
+    assert_derivatives(&ring, &[], &[monitor, corrector], 2e-4);
+    for effect in [monitor, corrector] {
+        let [kicked, rf, change, _] = compare(&ring, &ring, &effect);
+        assert!(kicked < 2e-3 * change && rf < 0.07 * change, "{effect:?}: {kicked:e} {rf:e} of {change:e}");
     }
 }

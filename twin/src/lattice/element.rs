@@ -9,6 +9,16 @@ pub enum Plane {
     Y,
 }
 
+impl Plane {
+    /// Where it stands in a pair of x and y.
+    pub const fn index(self) -> usize {
+        match self {
+            Self::X => 0,
+            Self::Y => 1,
+        }
+    }
+}
+
 /// Shift and roll of an element's own frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Misalignment {

@@ -5,7 +5,7 @@
 #[non_exhaustive]
 pub enum LatticeError {
     /// The file cannot be read.
-    #[error("{path}: {source}")]
+    #[error("{path}: {}", reason(source))]
     Read {
         /// The file.
         path: String,
@@ -104,4 +104,12 @@ pub enum LatticeError {
         /// The machine.
         machine: String,
     },
+}
+
+/// The system's reason, in short where it is the usual one.
+fn reason(error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "file not found".into(),
+        _ => error.to_string(),
+    }
 }

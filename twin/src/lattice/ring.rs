@@ -1,5 +1,7 @@
 //! A ring: its elements, and which of them are read, set, powered and fitted.
 
+use core::ops::AddAssign;
+
 use super::{Element, Kind, LatticeError, Parameter, Particle, Plane, Quadrupole, Supply};
 
 /// One plane of a beam position monitor.
@@ -94,6 +96,11 @@ impl Ring {
         &self.elements[element].label
     }
 
+    /// Short names of elements.
+    pub fn labels(&self, elements: impl IntoIterator<Item = usize>) -> Vec<String> {
+        elements.into_iter().map(|element| self.label(element).to_owned()).collect()
+    }
+
     /// Names of the params `[N]`.
     pub fn var_names(&self) -> Vec<String> {
         self.parameters.iter().map(|parameter| parameter.name.clone()).collect()
@@ -155,6 +162,18 @@ impl Ring {
         self.quadrupoles.iter().map(|q| (of(params, q.parameter) + of(supplies, q.supply)).exp()).collect()
     }
 
+    /// Derivative with respect to each param `[N]` of what has these derivatives with respect to `ln` of each quadrupole's
+    /// gradient `[M]`: the sum over its quadrupoles.
+    pub fn by_parameter<T: Clone + AddAssign>(&self, of_quadrupoles: &[T]) -> Vec<T> {
+        let sum = |parameter: &Parameter| {
+            let mut all = parameter.quadrupoles.iter().map(|&q| of_quadrupoles[q].clone());
+            let mut sum = all.next().expect("a param scales at least one quadrupole");
+            all.for_each(|slope| sum += slope);
+            sum
+        };
+        self.parameters.iter().map(sum).collect()
+    }
+
     /// The same ring with each quadrupole's gradient multiplied by its factor `[M]`.
     ///
     /// # Panics
@@ -182,7 +201,7 @@ impl Ring {
     pub fn set_kick(&mut self, corrector: usize, angle: f64) {
         let Corrector { element, plane } = self.correctors[corrector];
         match &mut self.elements[element].kind {
-            Kind::Corrector { kick } => kick[usize::from(plane == Plane::Y)] = angle,
+            Kind::Corrector { kick } => kick[plane.index()] = angle,
             _ => unreachable!("the list holds correctors"),
         }
     }

@@ -7,15 +7,29 @@ use std::time::Instant;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::subscriber;
 use iceoryx2::prelude::ipc;
+use iceoryx2::sample::Sample;
 
+use super::layout::{Header, Stamp, decode};
 use super::services::{Services, join};
 use super::{BUFFER, PublishError};
 use crate::record::EstimateRecord;
 
+/// Name of a reader's process among the nodes of the shared memory.
+const READER: &str = "orbitcal-reader";
+
+/// A record as it was published.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Published {
+    /// The estimate.
+    pub record: EstimateRecord,
+    /// By whom, and when.
+    pub stamp: Stamp,
+}
+
 /// A reader's end.
 pub struct Subscriber {
     listener: Listener<ipc::Service>,
-    subscriber: subscriber::Subscriber<ipc::Service, EstimateRecord, ()>,
+    subscriber: subscriber::Subscriber<ipc::Service, [u32], Header>,
     services: Services,
 }
 
@@ -25,7 +39,7 @@ impl Subscriber {
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
     pub fn try_new(service: &str) -> Result<Self, PublishError> {
-        let services = Services::try_join(service)?;
+        let services = Services::try_join(service, READER)?;
         let listener = services.news.listener_builder().create().map_err(|e| join(service, "listener", &e))?;
         let subscriber =
             services.estimates.subscriber_builder().create().map_err(|e| join(service, "subscriber", &e))?;
@@ -36,7 +50,7 @@ impl Subscriber {
     ///
     /// # Errors
     /// [`PublishError::Receive`].
-    pub fn wait(&mut self, timeout: Duration) -> Result<Vec<EstimateRecord>, PublishError> {
+    pub fn wait(&mut self, timeout: Duration) -> Result<Vec<Published>, PublishError> {
         let start = Instant::now();
         loop {
             let records = self.drain()?;
@@ -49,9 +63,13 @@ impl Subscriber {
 
     /// The estimates at hand: wake-ups coalesce, so one may stand for many. No more than a full buffer, or a fast writer
     /// would keep its reader here.
-    fn drain(&self) -> Result<Vec<EstimateRecord>, PublishError> {
+    fn drain(&self) -> Result<Vec<Published>, PublishError> {
         let next = || self.subscriber.receive().map_err(|e| self.wrong(&e)).transpose();
-        core::iter::from_fn(next).take(BUFFER).map(|sample| sample.map(|sample| *sample.payload())).collect()
+        let published = |sample: Sample<ipc::Service, [u32], Header>| {
+            let (record, stamp) = decode(sample.user_header(), sample.payload()).map_err(|e| self.wrong(&e))?;
+            Ok(Published { record, stamp })
+        };
+        core::iter::from_fn(next).take(BUFFER).map(|sample| published(sample?)).collect()
     }
 
     /// Sleep until there is news; true if a signal came instead.
@@ -65,10 +83,5 @@ impl Subscriber {
 
     fn wrong(&self, reason: &dyn Display) -> PublishError {
         PublishError::Receive { service: self.services.name.clone(), reason: reason.to_string() }
-    }
-
-    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves.
-    pub fn is_stop_requested(&self) -> bool {
-        self.services.is_stop_requested()
     }
 }

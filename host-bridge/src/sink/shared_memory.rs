@@ -1,27 +1,30 @@
 //! Estimates in shared memory: loan, write, send; up to 16 readers, none of which can hold the writer up.
 //!
 //! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
-//! killed leaves shared memory behind, which the next process that joins any service clears away.
-//!
-//! Caveat: SIGINT, SIGTERM and their like end the process as usual until it first asks [`Subscriber::is_stop_requested`]
-//! or [`Publisher::is_stop_requested`]. From then on they only set what is asked, so the loop must go on asking.
+//! killed leaves shared memory behind, which the next process that joins any service clears away. Layout: [`layout`].
 
+pub mod layout;
 mod services;
 mod subscriber;
 
 use core::fmt::Display;
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher;
 use iceoryx2::prelude::ipc;
 
-use crate::record::EstimateRecord;
+use super::{Sink, SinkError};
+use crate::record::{EstimateRecord, Names};
+use layout::{Header, Stamp};
 use services::{Services, join};
-pub use subscriber::Subscriber;
+pub use subscriber::{Published, Subscriber};
 
 /// Name of the service of estimates, and of the event that announces each of them.
 pub const SERVICE: &str = "orbitcal/estimate";
+/// Name of a publisher where none is given.
+pub const PUBLISHER: &str = "orbitcal";
 /// Estimates that a reader who joins late still gets.
 pub const HISTORY: usize = 16;
 /// Estimates that wait for a slow reader: a quarter of a second at 1 kHz.
@@ -35,14 +38,17 @@ pub const PUBLISHERS: usize = 4;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PublishError {
-    /// The name cannot be a service.
-    #[error("service {service:?}: expected 1 to 255 ASCII characters, not beginning with iox2://")]
+    /// The name can be no service's or publisher's.
+    #[error("{name:?}: expected a name of 1 to 127 printable ASCII characters, not beginning with iox2://")]
     Name {
         /// The name.
-        service: String,
+        name: String,
     },
     /// The shared memory cannot be joined.
-    #[error("service {service}: cannot create its {part}: {reason} (all processes need one user and one version)")]
+    #[error(
+        "service {service}: cannot create its {part}: {reason} (all processes need one user and one version, see \
+         docs/shared-memory.md)"
+    )]
     Join {
         /// The service.
         service: String,
@@ -74,21 +80,28 @@ pub enum PublishError {
 /// The writer's end.
 pub struct Publisher {
     notifier: Notifier<ipc::Service>,
-    publisher: publisher::Publisher<ipc::Service, EstimateRecord, ()>,
+    publisher: publisher::Publisher<ipc::Service, [u32], Header>,
     services: Services,
+    name: Arc<str>,
     started_ns: u64,
 }
 
 impl Publisher {
-    /// Join a service, or create it, and clear away what dead processes have left.
+    /// Join a service, or create it, as the publisher `name` of estimates with these names, and clear away what dead
+    /// processes have left.
     ///
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
-    pub fn try_new(service: &str) -> Result<Self, PublishError> {
-        let services = Services::try_join(service)?;
-        let publisher = services.estimates.publisher_builder().create().map_err(|e| join(service, "publisher", &e))?;
+    pub fn try_new(service: &str, name: &str, names: &Names) -> Result<Self, PublishError> {
+        let is_name = (1..=127).contains(&name.len()) && name.chars().all(|c| (' '..='~').contains(&c));
+        if !is_name {
+            return Err(PublishError::Name { name: name.to_owned() });
+        }
+        let services = Services::try_join(service, name)?;
+        let publisher = services.estimates.publisher_builder().initial_max_slice_len(layout::words_of(name, names));
+        let publisher = publisher.create().map_err(|e| join(service, "publisher", &e))?;
         let notifier = services.news.notifier_builder().create().map_err(|e| join(service, "notifier", &e))?;
-        let this = Self { notifier, publisher, services, started_ns: now_ns() };
+        let this = Self { notifier, publisher, services, name: name.into(), started_ns: now_ns() };
         this.announce(); // readers connect now, before the first estimate
         Ok(this)
     }
@@ -103,9 +116,11 @@ impl Publisher {
             sequence: record.sequence,
             reason: reason.to_string(),
         };
-        let sample = self.publisher.loan_uninit().map_err(|e| wrong(&e))?;
-        let stamped = EstimateRecord { started_ns: self.started_ns, published_ns: now_ns(), ..*record };
-        sample.write_payload(stamped).send().map_err(|e| wrong(&e))?;
+        let stamp = Stamp { publisher: self.name.clone(), started_ns: self.started_ns, published_ns: now_ns() };
+        let (header, payload) = layout::encode(record, &stamp);
+        let mut sample = self.publisher.loan_slice_uninit(payload.len()).map_err(|e| wrong(&e))?;
+        *sample.user_header_mut() = header;
+        sample.write_from_slice(&payload).send().map_err(|e| wrong(&e))?;
         self.announce();
         Ok(())
     }
@@ -114,10 +129,11 @@ impl Publisher {
     fn announce(&self) {
         let _ = self.notifier.notify();
     }
+}
 
-    /// True once after SIGINT or SIGTERM, which no longer end the process by themselves.
-    pub fn is_stop_requested(&self) -> bool {
-        self.services.is_stop_requested()
+impl Sink for Publisher {
+    fn take(&mut self, record: &EstimateRecord) -> Result<(), SinkError> {
+        Ok(self.publish(record)?)
     }
 }
 
@@ -132,6 +148,7 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
+    use crate::record::tests;
 
     const SOON: Duration = Duration::from_secs(5);
 
@@ -140,27 +157,33 @@ mod tests {
     }
 
     fn record(frames: u32) -> EstimateRecord {
-        EstimateRecord { frames, mean: [frames as f32; 48], ..EstimateRecord::ZERO }
+        EstimateRecord { frames, mean: vec![frames as f32; 20], ..tests::record(20, 10) }
     }
 
-    fn frames(records: &[EstimateRecord]) -> Vec<u32> {
-        records.iter().map(|record| record.frames).collect()
+    fn publisher(test: &str) -> Publisher {
+        Publisher::try_new(&name(test), "a test", &record(0).names).unwrap()
+    }
+
+    fn frames(heard: &[Published]) -> Vec<u32> {
+        heard.iter().map(|published| published.record.frames).collect()
     }
 
     #[test]
     fn a_reader_gets_what_was_written() {
         let mut subscriber = Subscriber::try_new(&name("same")).unwrap();
-        let mut publisher = Publisher::try_new(&name("same")).unwrap();
+        let mut publisher = publisher("same");
         let before = now_ns();
         publisher.publish(&record(7)).unwrap();
         let heard = subscriber.wait(SOON).unwrap();
-        assert_eq!((heard.len(), heard[0].mean), (1, [7.0; 48]));
-        assert!(heard[0].started_ns <= before && before <= heard[0].published_ns);
+        assert_eq!((heard.len(), &heard[0].record), (1, &record(7)));
+        let stamp = &heard[0].stamp;
+        assert_eq!(&*stamp.publisher, "a test");
+        assert!(stamp.started_ns <= before && before <= stamp.published_ns);
     }
 
     #[test]
     fn a_late_reader_gets_the_last_sixteen() {
-        let mut publisher = Publisher::try_new(&name("late")).unwrap();
+        let mut publisher = publisher("late");
         (1..=40).for_each(|i| publisher.publish(&record(i)).unwrap());
         let mut subscriber = Subscriber::try_new(&name("late")).unwrap();
         publisher.publish(&record(41)).unwrap();
@@ -170,7 +193,7 @@ mod tests {
     #[test]
     fn a_reader_that_sleeps_loses_the_oldest_and_the_writer_does_not_wait() {
         let mut subscriber = Subscriber::try_new(&name("slow")).unwrap();
-        let mut publisher = Publisher::try_new(&name("slow")).unwrap();
+        let mut publisher = publisher("slow");
         (1..=1000).for_each(|i| publisher.publish(&record(i)).unwrap());
         assert_eq!(frames(&subscriber.wait(SOON).unwrap()), (745..=1000).collect::<Vec<_>>());
     }
@@ -180,13 +203,13 @@ mod tests {
         let mut subscriber = Subscriber::try_new(&name("again")).unwrap();
         let mut starts = Vec::new();
         for i in 1..=5 {
-            let mut publisher = Publisher::try_new(&name("again")).unwrap();
+            let mut publisher = publisher("again");
             subscriber.wait(Duration::ZERO).unwrap(); // as its wake-up would
             publisher.publish(&record(i)).unwrap();
             drop(publisher);
             let heard = subscriber.wait(SOON).unwrap();
             assert_eq!(frames(&heard), [i]);
-            starts.push(heard[0].started_ns);
+            starts.push(heard[0].stamp.started_ns);
         }
         assert!(starts.is_sorted_by(|a, b| a < b), "{starts:?}");
     }
@@ -201,7 +224,9 @@ mod tests {
 
     #[test]
     fn a_name_that_is_none_is_refused_in_one_line() {
-        let error = Publisher::try_new("").err().unwrap().to_string();
-        assert_eq!(error, "service \"\": expected 1 to 255 ASCII characters, not beginning with iox2://");
+        let said = |service, name| Publisher::try_new(service, name, &record(0).names).err().unwrap().to_string();
+        let expected = "expected a name of 1 to 127 printable ASCII characters, not beginning with iox2://";
+        assert_eq!(said("", "a test"), format!("\"\": {expected}"));
+        assert_eq!(said("orbitcal/test", "two\nlines"), format!("\"two\\nlines\": {expected}"));
     }
 }

@@ -8,13 +8,13 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::time::Instant;
 
-use estimator::booster::Green;
-use estimator::surrogate::ParcelError;
-use estimator::{FrameError, Setup, packet};
-use firmware_sim::link::{Refusal, Reply, Request, Status, TRIANGLE, Taken};
-use inference::stream::BoosterEstimate;
+use estimator::wire::link::{Refusal, Status, Taken};
+use estimator::{FrameError, ParcelError, Tables as _};
+use inference::stream::{Estimate, Setup};
+use training::rooms::large::{PACKET, Reply, Request};
+use training::{LINE, Tables};
 
-/// Longest wait for an answer that is due, and for a device to take bytes.
+/// Longest wait for a reply that is due, and for a device to take bytes.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Longest wait for an estimate that nobody here has asked for: five cycles.
 const LULL: Duration = Duration::from_secs(1);
@@ -25,7 +25,7 @@ const BAUD: u32 = 921_600;
 
 /// Where a device is.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Source {
+pub enum Address {
     /// `tcp://HOST:PORT`
     Tcp(String),
     /// `unix:PATH`
@@ -34,7 +34,7 @@ pub enum Source {
     Serial(String, u32),
 }
 
-impl FromStr for Source {
+impl FromStr for Address {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -56,7 +56,7 @@ impl FromStr for Source {
     }
 }
 
-impl fmt::Display for Source {
+impl fmt::Display for Address {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Tcp(address) => write!(f, "tcp://{address}"),
@@ -74,7 +74,7 @@ pub enum LinkError {
     #[error("{device}: {error}")]
     Open {
         /// Where.
-        device: Source,
+        device: Address,
         /// Why.
         error: io::Error,
     },
@@ -124,37 +124,46 @@ pub enum LinkError {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Heard {
     /// The estimate.
-    pub estimate: BoosterEstimate,
+    pub estimate: Estimate,
     /// Covariance of `theta = ln var`, lower triangle row by row.
-    pub covariance: Option<Box<[f32; TRIANGLE]>>,
+    pub covariance: Option<Vec<f32>>,
 }
 
 /// An estimate whose covariance may follow.
 struct Coming {
-    estimate: BoosterEstimate,
-    covariance: Box<[f32; TRIANGLE]>,
-    /// Entries of it that are there.
-    place: usize,
+    estimate: Estimate,
+    /// Entries that are there.
+    covariance: Vec<f32>,
 }
 
 impl Coming {
-    fn new(estimate: BoosterEstimate) -> Self {
-        Self { estimate, covariance: Box::new([0.0; TRIANGLE]), place: 0 }
+    fn new(estimate: Estimate) -> Self {
+        Self { covariance: Vec::with_capacity(triangle(&estimate)), estimate }
     }
 
     /// Take a piece of a covariance, if it is the next one of this estimate's.
     fn add(&mut self, sequence: u32, first: u16, entries: &[f32]) {
-        if sequence == self.estimate.sequence && usize::from(first) == self.place {
-            let room = self.covariance.iter_mut().skip(self.place);
-            self.place += room.zip(entries).map(|(to, entry)| *to = *entry).count();
+        if sequence == self.estimate.sequence && usize::from(first) == self.covariance.len() {
+            let room = triangle(&self.estimate) - self.covariance.len();
+            self.covariance.extend(entries.iter().take(room));
         }
+    }
+
+    fn is_whole(&self) -> bool {
+        self.covariance.len() == triangle(&self.estimate)
     }
 
     /// What has come: the estimate, and its covariance if that is whole.
     fn heard(self) -> Heard {
-        let is_whole = self.place == TRIANGLE;
+        let is_whole = self.is_whole();
         Heard { estimate: self.estimate, covariance: is_whole.then_some(self.covariance) }
     }
+}
+
+/// Entries of the covariance of its params.
+fn triangle(estimate: &Estimate) -> usize {
+    let params = estimate.mean.len();
+    params * (params + 1) / 2
 }
 
 /// What a line brings.
@@ -189,28 +198,28 @@ impl Link<Box<dyn Line>> {
     ///
     /// # Errors
     /// [`LinkError::Open`].
-    pub fn open(source: &Source) -> Result<Self, LinkError> {
-        let line = connect(source).map_err(|error| LinkError::Open { device: source.clone(), error })?;
+    pub fn open(address: &Address) -> Result<Self, LinkError> {
+        let line = connect(address).map_err(|error| LinkError::Open { device: address.clone(), error })?;
         Ok(Self::new(line))
     }
 }
 
-fn connect(source: &Source) -> io::Result<Box<dyn Line>> {
-    Ok(match source {
-        Source::Tcp(address) => {
+fn connect(address: &Address) -> io::Result<Box<dyn Line>> {
+    Ok(match address {
+        Address::Tcp(address) => {
             let line = TcpStream::connect(address)?;
             line.set_nodelay(true)?;
             line.set_read_timeout(Some(GLANCE))?;
             line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
-        Source::Unix(path) => {
+        Address::Unix(path) => {
             let line = UnixStream::connect(path)?;
             line.set_read_timeout(Some(GLANCE))?;
             line.set_write_timeout(Some(GLANCE))?;
             Box::new(line)
         }
-        Source::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
+        Address::Serial(path, baud) => Box::new(serialport::new(path, *baud).timeout(GLANCE).open()?),
     })
 }
 
@@ -227,7 +236,7 @@ impl<L: Read + Write> Link<L> {
     pub fn restart(&mut self, setup: &Setup) -> Result<(), LinkError> {
         // a zero first: half a packet of somebody before us may be waiting
         self.write(&[0])?;
-        self.send(&Request::Restart(*setup))?;
+        self.send(&Request::Restart(setup.on_wire()))?;
         self.coming = None;
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -236,14 +245,14 @@ impl<L: Read + Write> Link<L> {
                 Ok(Reply::Refused { why: why @ (Refusal::Setup | Refusal::NoDesign), .. }) => {
                     return Err(LinkError::Refused { what: "its setup", why });
                 }
-                // answers to somebody before us, and the half of one that was on its way when the line was opened
+                // replies to somebody before us, and the half of one that was on its way when the line was opened
                 Ok(_) | Err(LinkError::Reply(_)) => {}
                 Err(error) => return Err(error),
             }
         }
     }
 
-    /// Send a frame and wait for its answer, with the covariance.
+    /// Send a frame and wait for the reply, with the covariance.
     ///
     /// # Errors
     /// [`LinkError`].
@@ -273,7 +282,7 @@ impl<L: Read + Write> Link<L> {
             match self.gather(deadline, LULL)? {
                 Event::Heard(heard) => return Ok(heard),
                 Event::Other(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "a packet", why }),
-                Event::Other(_) => {} // an answer to somebody else
+                Event::Other(_) => {} // a reply to somebody else
             }
         }
     }
@@ -282,8 +291,8 @@ impl<L: Read + Write> Link<L> {
     fn gather(&mut self, deadline: Instant, patience: Duration) -> Result<Event, LinkError> {
         loop {
             match self.next_before(deadline, patience) {
-                Ok(Reply::Estimate(answer)) => {
-                    let estimate = answer.estimate().ok_or(LinkError::Reply(FrameError::Malformed))?;
+                Ok(Reply::Estimate(reply)) => {
+                    let estimate = Estimate::of_answer(&reply).ok_or(LinkError::Reply(FrameError::Malformed))?;
                     if let Some(former) = self.coming.replace(Coming::new(estimate)) {
                         return Ok(Event::Heard(former.heard()));
                     }
@@ -292,7 +301,7 @@ impl<L: Read + Write> Link<L> {
                     if let Some(coming) = &mut self.coming {
                         coming.add(sequence, first, &entries);
                     }
-                    if let Some(whole) = self.coming.take_if(|coming| coming.place == TRIANGLE) {
+                    if let Some(whole) = self.coming.take_if(|coming| coming.is_whole()) {
                         return Ok(Event::Heard(whole.heard()));
                     }
                 }
@@ -320,11 +329,11 @@ impl<L: Read + Write> Link<L> {
     ///
     /// # Errors
     /// [`LinkError::Tables`] if the device did not take them, in which case it goes by the former ones.
-    pub fn load(&mut self, tables: &Green, mut progress: impl FnMut()) -> Result<(), LinkError> {
+    pub fn load(&mut self, tables: &Tables, mut progress: impl FnMut()) -> Result<(), LinkError> {
         self.send(&Request::BuiltIn)?;
         self.taken()?;
         let mut last = Taken::BuiltIn;
-        for parcel in tables.parcels() {
+        for parcel in tables.parcels::<LINE>() {
             self.send(&Request::Model(parcel))?;
             last = self.taken()?;
             progress();
@@ -363,7 +372,7 @@ impl<L: Read + Write> Link<L> {
     /// # Errors
     /// [`LinkError`].
     pub fn send(&mut self, request: &Request) -> Result<(), LinkError> {
-        let mut bytes = [0; packet::MAX_WIRE_BYTES];
+        let mut bytes = [0; PACKET];
         let n = request.encode(&mut bytes)?;
         self.write(&bytes[..n])
     }
@@ -388,9 +397,9 @@ impl<L: Read + Write> Link<L> {
                 continue;
             }
             let got = self.received.len();
-            if got > packet::MAX_WIRE_BYTES {
+            if got > PACKET {
                 self.received.clear();
-                return Err(FrameError::Oversized { limit: packet::MAX_WIRE_BYTES, got }.into());
+                return Err(FrameError::Oversized { limit: PACKET, got }.into());
             }
             if Instant::now() >= deadline {
                 return Err(LinkError::Silent { seconds: patience.as_secs() });
@@ -433,7 +442,7 @@ mod tests {
     }
 
     fn sealed(reply: &Reply) -> Vec<u8> {
-        let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+        let mut bytes = vec![0; PACKET];
         let n = reply.encode(&mut bytes).unwrap();
         bytes.truncate(n);
         bytes
@@ -478,15 +487,15 @@ mod tests {
 
     #[test]
     fn sources_are_tcp_unix_or_serial() {
-        assert_eq!("tcp://localhost:5000".parse(), Ok(Source::Tcp("localhost:5000".into())));
-        assert_eq!("unix:/run/device".parse(), Ok(Source::Unix("/run/device".into())));
-        assert_eq!("serial:/dev/ttyACM0".parse(), Ok(Source::Serial("/dev/ttyACM0".into(), 921_600)));
-        assert_eq!("serial:/dev/ttyS1@115200".parse(), Ok(Source::Serial("/dev/ttyS1".into(), 115_200)));
+        assert_eq!("tcp://localhost:5000".parse(), Ok(Address::Tcp("localhost:5000".into())));
+        assert_eq!("unix:/run/device".parse(), Ok(Address::Unix("/run/device".into())));
+        assert_eq!("serial:/dev/ttyACM0".parse(), Ok(Address::Serial("/dev/ttyACM0".into(), 921_600)));
+        assert_eq!("serial:/dev/ttyS1@115200".parse(), Ok(Address::Serial("/dev/ttyS1".into(), 115_200)));
         for wrong in ["", "tcp:localhost:5000", "tcp://localhost", "unix:", "serial:/dev/ttyS1@fast", "usb:1"] {
-            let error = wrong.parse::<Source>().unwrap_err();
+            let error = wrong.parse::<Address>().unwrap_err();
             assert!(error.ends_with(&format!("found {wrong:?}")), "{error}");
         }
         let shown = "serial:/dev/ttyS1@115200";
-        assert_eq!(shown.parse::<Source>().unwrap().to_string(), shown);
+        assert_eq!(shown.parse::<Address>().unwrap().to_string(), shown);
     }
 }

@@ -1,0 +1,211 @@
+//! A calibrated ring in the terms that lattice files share: named elements in beam order, thin monitors and correctors,
+//! and what monitors and correctors make of positions and kicks.
+
+use std::path::Path;
+
+use twin::{Effect, EffectError, EffectKind, Element, Kind, Machine, Misalignment, Particle, Plane, Rf, Ring};
+
+use super::calibration::{Calibration, CalibrationError};
+use super::names::Names;
+
+/// A calibrated ring.
+#[derive(Debug)]
+pub struct Lattice {
+    /// Name of the machine.
+    pub machine: String,
+    /// Reference particle.
+    pub particle: Particle,
+    /// Length of the reference orbit [m].
+    pub circumference: f64,
+    /// Elements in beam order without gaps, each with a name of its own that every format takes. Monitors and correctors
+    /// are thin; what length they have is a drift behind them.
+    pub elements: Vec<Element>,
+    /// Planes of monitors: horizontal in beam order, then vertical.
+    pub monitors: Vec<Channel>,
+    /// Planes of correctors: horizontal in beam order, then vertical.
+    pub correctors: Vec<Channel>,
+    /// Where the strengths come from, what was found, and what of it no element carries; one sentence each.
+    pub remarks: Vec<String>,
+}
+
+/// One plane of a monitor or corrector.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Channel {
+    /// Its name here, `x_E4` or `H_A2`.
+    pub name: String,
+    /// Name in the file of the variable that sets a corrector [rad].
+    pub knob: String,
+    /// Index of the element.
+    pub element: usize,
+    /// Plane.
+    pub plane: Plane,
+    /// Reading over position, or kick over setting [1].
+    pub gain: f64,
+    /// Rotation about the beam axis, positive from x to y [rad].
+    pub roll: f64,
+}
+
+impl Channel {
+    /// What a monitor reads of (x, y); the kick in (x, y) that a corrector set to one gives.
+    pub fn axis(&self) -> [f64; 2] {
+        let (s, c) = self.roll.sin_cos();
+        match self.plane {
+            Plane::X => [self.gain * c, self.gain * s],
+            Plane::Y => [-self.gain * s, self.gain * c],
+        }
+    }
+
+    /// True if it reads or kicks as it should.
+    pub fn is_ideal(&self) -> bool {
+        self.gain == 1.0 && self.roll == 0.0
+    }
+
+    /// What is not ideal, in words.
+    pub fn words(&self) -> String {
+        format!("{}: gain {:?}, roll {:?} rad", self.name, self.gain, self.roll)
+    }
+}
+
+/// Why a result does not make a lattice.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ExportError {
+    /// The result is of another ring.
+    #[error(transparent)]
+    Calibration(#[from] CalibrationError),
+    /// A finding that the ring has no place for.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+}
+
+impl Lattice {
+    /// The ring with the strengths and findings of a result; `path` appears in errors.
+    ///
+    /// # Errors
+    /// [`ExportError`] if the result is of another ring.
+    pub fn of(ring: &Ring, result: &Calibration, path: &Path) -> Result<Self, ExportError> {
+        let effects: Vec<Effect> = result.findings.iter().map(|(effect, _)| effect.clone()).collect();
+        let machine = Machine::new(ring.with_vars(&result.vars(ring, path)?), Rf::FixedMomentum, &effects)?;
+        let mut lattice = Self::plain(machine.ring());
+        lattice.remarks.push(format!("{}: strengths from {}", lattice.machine, result.recording));
+        for (effect, sentence) in &result.findings {
+            let included = lattice.apply(effect);
+            lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
+        }
+        lattice.remarks.extend(result.open.iter().map(|open| format!("open, not in this file: {open}")));
+        Ok(lattice)
+    }
+
+    /// A ring as it is.
+    pub(super) fn plain(ring: &Ring) -> Self {
+        let mut names = Names::new();
+        let (mut elements, mut position, mut remarks) = (Vec::new(), Vec::new(), Vec::new());
+        for element in &ring.elements {
+            position.push(elements.len());
+            let name = names.take(if element.name.is_empty() { "drift_1" } else { &element.name });
+            if !element.name.is_empty() && name != element.name {
+                remarks.push(format!("{:?} is called {name}", element.name));
+            }
+            elements.extend(pieces(Element { name, ..element.clone() }, &mut names));
+        }
+        let channel = |at: usize, plane, name: String| Channel {
+            name,
+            knob: String::new(),
+            element: position[at],
+            plane,
+            gain: 1.0,
+            roll: 0.0,
+        };
+        let monitors = ring.monitors.iter().enumerate();
+        let monitors = monitors.map(|(i, m)| channel(m.element, m.plane, ring.monitor_name(i))).collect();
+        let correctors = ring.correctors.iter().enumerate();
+        let corrector = |(i, c): (usize, &twin::Corrector)| Channel {
+            roll: ring.elements[c.element].misalignment.roll,
+            ..channel(c.element, c.plane, ring.corrector_name(i))
+        };
+        let mut correctors: Vec<Channel> = correctors.map(corrector).collect();
+        name_knobs(&mut correctors, &elements);
+        Self {
+            machine: ring.name.clone(),
+            particle: ring.particle,
+            circumference: ring.circumference,
+            elements,
+            monitors,
+            correctors,
+            remarks,
+        }
+    }
+
+    /// Planes of the monitor or corrector at an element.
+    pub fn channels_of<'l>(channels: &'l [Channel], element: usize) -> impl Iterator<Item = &'l Channel> {
+        channels.iter().filter(move |channel| channel.element == element)
+    }
+
+    /// Roll of the corrector at an element, if its planes are rolled alike, else 0 [rad].
+    pub fn corrector_roll(&self, element: usize) -> f64 {
+        let mut rolls = Self::channels_of(&self.correctors, element).map(|channel| channel.roll);
+        let first = rolls.next().unwrap_or(0.0);
+        if rolls.all(|roll| roll == first) { first } else { 0.0 }
+    }
+
+    /// Let a monitor or corrector have an effect; false if neither it nor the ring can.
+    fn apply(&mut self, effect: &Effect) -> bool {
+        let channels = match effect.kind {
+            EffectKind::BpmGain | EffectKind::BpmRoll => &mut self.monitors,
+            EffectKind::CorrectorGain | EffectKind::CorrectorPolarity => &mut self.correctors,
+            // the ring has them already
+            EffectKind::CorrectorRoll
+            | EffectKind::QuadRoll
+            | EffectKind::StrayGradient
+            | EffectKind::StraySkewGradient
+            | EffectKind::DipoleGradient
+            | EffectKind::DipoleEdge
+            | EffectKind::SextupoleError => return true,
+            EffectKind::BpmCubic
+            | EffectKind::BpmSwap
+            | EffectKind::CorrectorEven
+            | EffectKind::MomentumOffset
+            | EffectKind::FixedRfFrequency
+            | EffectKind::RadialLoop
+            | EffectKind::QuadDrift => return false,
+        };
+        let Some(channel) = channels.iter_mut().find(|channel| channel.name == effect.place) else { return false };
+        match effect.kind {
+            EffectKind::BpmRoll => channel.roll += effect.amplitude,
+            EffectKind::CorrectorPolarity => channel.gain = -channel.gain,
+            _ => channel.gain *= 1.0 + effect.amplitude,
+        }
+        true
+    }
+}
+
+/// Monitors and correctors as thin elements with a drift behind them; markers likewise.
+fn pieces(element: Element, names: &mut Names) -> Vec<Element> {
+    if !matches!(element.kind, Kind::Marker | Kind::Monitor | Kind::Corrector { .. }) {
+        return vec![element];
+    }
+    let (length, name) = (element.length, element.name.clone());
+    // free space has no orientation, a monitor's is passed over, and a corrector's is that of its kick
+    let thin = Element { length: 0.0, misalignment: Misalignment::default(), ..element };
+    let behind = (length > 0.0).then(|| Element {
+        name: names.take(&format!("{name}_drift")),
+        kind: Kind::Drift,
+        length,
+        ..thin.clone()
+    });
+    core::iter::once(thin).chain(behind).collect()
+}
+
+/// `kick_DCH_A2`; of a corrector of both planes `kick_C1_h` and `kick_C1_v`.
+fn name_knobs(correctors: &mut [Channel], elements: &[Element]) {
+    let planes: Vec<usize> =
+        correctors.iter().map(|one| correctors.iter().filter(|c| c.element == one.element).count()).collect();
+    for (channel, planes) in correctors.iter_mut().zip(planes) {
+        let plane = match channel.plane {
+            _ if planes == 1 => "",
+            Plane::X => "_h",
+            Plane::Y => "_v",
+        };
+        channel.knob = format!("kick_{}{plane}", elements[channel.element].name);
+    }
+}

@@ -1,0 +1,120 @@
+//! Where estimates come from: the core in this process fed by a recording, or a device on a line.
+
+pub mod device;
+pub mod link;
+pub mod replay;
+
+use core::str::FromStr;
+use core::time::Duration;
+use std::time::Instant;
+
+use crate::record::EstimateRecord;
+use crate::result::Timing;
+use crate::stop::Stop;
+
+/// Why a source gives no more.
+pub type SourceError = Box<dyn core::error::Error + Send + Sync>;
+
+/// What a source gives next.
+pub enum Next {
+    /// An estimate.
+    Estimate(Box<EstimateRecord>),
+    /// Nothing yet: time to look whether anybody wants more.
+    Nothing,
+    /// Nothing ever again.
+    End,
+}
+
+/// A place that estimates come from, one a frame.
+pub trait Source {
+    /// Wait for the next estimate, a second at most where nobody here has sent its frame.
+    ///
+    /// # Errors
+    /// Whatever ends the stream before its end.
+    fn next(&mut self) -> Result<Next, SourceError>;
+}
+
+/// Frames a second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Rate {
+    /// As fast as possible.
+    Max,
+    /// This many a second [Hz].
+    Hertz(f64),
+}
+
+impl FromStr for Rate {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("expected max, or a number above 0 and below 1e9, found {text:?}");
+        let hertz = || text.parse().ok().filter(|v: &f64| *v > 0.0 && *v < 1e9).map(Self::Hertz);
+        if text == "max" { Ok(Self::Max) } else { hertz().ok_or_else(wrong) }
+    }
+}
+
+/// Releases frames at a fixed rate, without drift.
+#[derive(Debug)]
+pub struct Clock {
+    start: Instant,
+    period: Option<Duration>,
+    ticks: u32,
+    stop: Stop,
+}
+
+impl Clock {
+    /// Begin now.
+    pub fn new(rate: Rate, stop: &Stop) -> Self {
+        let period = match rate {
+            Rate::Max => None,
+            Rate::Hertz(hertz) => Some(Duration::from_secs_f64(1.0 / hertz)),
+        };
+        Self { start: Instant::now(), period, ticks: 0, stop: stop.clone() }
+    }
+
+    /// Wait for the next release, or for somebody to ask for the end.
+    pub fn wait(&mut self) {
+        let Some(period) = self.period else { return };
+        self.stop.sleep_until(self.start + period * self.ticks);
+        self.ticks += 1;
+    }
+}
+
+/// How long each estimate took.
+#[derive(Debug, Default)]
+pub struct Times(Vec<Duration>);
+
+impl Times {
+    /// Run something, and note how long it took.
+    pub fn of<T>(&mut self, run: impl FnOnce() -> T) -> T {
+        let start = Instant::now();
+        let value = run();
+        self.0.push(start.elapsed());
+        value
+    }
+
+    /// Median, 99th percentile and largest.
+    pub fn quantiles(&self) -> Timing {
+        let mut sorted = self.0.clone();
+        sorted.sort_unstable();
+        let at = |p: f64| {
+            let index = (p * sorted.len() as f64) as usize;
+            sorted.get(index.min(sorted.len().saturating_sub(1))).map_or(0.0, |t| t.as_secs_f64() * 1e6)
+        };
+        Timing { update_us_p50: at(0.5), update_us_p99: at(0.99), update_us_max: at(1.0) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_are_numbers_or_max() {
+        assert_eq!("max".parse(), Ok(Rate::Max));
+        assert_eq!("1000".parse(), Ok(Rate::Hertz(1000.0)));
+        for wrong in ["0", "-1", "nan", "inf", "fast"] {
+            assert!(wrong.parse::<Rate>().is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! A recording through the core in this process, as wire bytes.
+
+use std::sync::Arc;
+
+use estimator::FitQuality;
+use inference::Recording;
+use inference::stream::{self, Core};
+
+use super::{Clock, Next, Source, SourceError, Times};
+use crate::record::{EstimateRecord, Names};
+
+/// A recording and the core that it is streamed through.
+pub struct Replay<'r> {
+    recording: &'r Recording,
+    names: Arc<Names>,
+    core: Core,
+    clock: Clock,
+    next: usize,
+    /// From wire bytes to estimate.
+    pub times: Times,
+}
+
+impl<'r> Replay<'r> {
+    /// At the first frame.
+    pub fn new(recording: &'r Recording, names: &Arc<Names>, core: Core, clock: Clock) -> Self {
+        Self { recording, names: names.clone(), core, clock, next: 0, times: Times::default() }
+    }
+
+    /// How well the model describes the frames so far.
+    pub fn quality(&mut self) -> FitQuality {
+        self.core.fit_quality()
+    }
+}
+
+impl Source for Replay<'_> {
+    fn next(&mut self) -> Result<Next, SourceError> {
+        let Some(row) = self.recording.rows.get(self.next) else { return Ok(Next::End) };
+        self.next += 1;
+        let mut bytes = stream::wire(self.recording, row)?;
+        self.core.prepare();
+        self.clock.wait();
+        let estimate = self.times.of(|| self.core.ingest(&mut bytes));
+        let estimate = estimate.map_err(|error| format!("frame {}: {error}", row.sequence))?;
+        let mismatch = self.core.fit_quality().is_mismatch();
+        let covariance = |i, j| self.core.covariance(i, j);
+        Ok(Next::Estimate(Box::new(EstimateRecord::of(&self.names, &estimate, covariance, Some(mismatch)))))
+    }
+}

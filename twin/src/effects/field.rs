@@ -1,0 +1,324 @@
+//! Fields that the model does not have: gradients, edges, rolled quadrupoles, sextupoles.
+//!
+//! The exact form is the changed element, and so is the form per frame, but that a sextupole's field depends on the orbit
+//! that passes it: to a small deviation it is a gradient and a skew gradient ([`on_orbit`]), to larger ones curved ([`curved`]). The derivative is
+//! one formula for all gradients, `dR = -a (W + step) Q (W + step) c` of [`crate::response`].
+
+use nalgebra::{DMatrix, RowVector2};
+
+use super::drives::Drives;
+use super::mechanism::{Measured, Mechanism, Unit};
+use super::{EffectError, EffectKind, Machine, Signature, Signatures};
+use crate::lattice::{Bend, Element, Kind, Plane, Ring};
+use crate::orbit::{Hold, OrbitError};
+use crate::response::{Gradient, Optics, Place};
+use crate::site::Site;
+
+/// What is wrong with the fields.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FieldEffect {
+    /// A quadrupole is rotated [rad].
+    QuadRoll,
+    /// A gradient in a free straight, K1L [1/m].
+    StrayGradient,
+    /// A skew gradient in a free straight, K1sL [1/m].
+    StraySkewGradient,
+    /// A gradient in a dipole's body, K1L [1/m].
+    DipoleGradient,
+    /// Edge angle of one dipole, or of all [rad].
+    DipoleEdge,
+    /// A field in a sextupole, K2L [1/m^2].
+    Sextupole,
+}
+
+/// A thin gradient at one place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Thin {
+    /// `x' -= K1L x`, `y' += K1L y`.
+    Normal,
+    /// `x' += K1sL y`, `y' += K1sL x`.
+    Skew,
+}
+
+impl Thin {
+    /// The kind of effect that is one.
+    pub const fn kind(self) -> EffectKind {
+        match self {
+            Self::Normal => EffectKind::StrayGradient,
+            Self::Skew => EffectKind::StraySkewGradient,
+        }
+    }
+}
+
+impl FieldEffect {
+    /// The thin gradient that acts on the beam as it does, if any.
+    pub fn thin(self) -> Option<Thin> {
+        match self {
+            Self::StrayGradient | Self::DipoleGradient => Some(Thin::Normal),
+            Self::StraySkewGradient | Self::QuadRoll => Some(Thin::Skew),
+            Self::DipoleEdge | Self::Sextupole => None,
+        }
+    }
+
+    /// True for a field that does not grow with the magnets.
+    pub fn is_stray(self) -> bool {
+        match self {
+            Self::StrayGradient | Self::StraySkewGradient => true,
+            Self::QuadRoll | Self::DipoleGradient | Self::DipoleEdge | Self::Sextupole => false,
+        }
+    }
+
+    /// Change a ring, if the site is one of the kind.
+    fn put(self, ring: &mut Ring, site: Site, amplitude: f64) -> Option<()> {
+        match (self, site) {
+            (Self::QuadRoll, Site::Quadrupole(at)) => {
+                ring.elements[ring.quadrupoles[at].element].misalignment.roll += amplitude;
+            }
+            (Self::StrayGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, amplitude, 0.0)?,
+            (Self::StraySkewGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, 0.0, amplitude)?,
+            (Self::DipoleGradient, Site::Element(at)) => {
+                let per_length = amplitude / ring.elements[at].length;
+                bend(&mut ring.elements[at])?.k1 += per_length;
+            }
+            (Self::DipoleEdge, Site::Element(at)) => turn_edges(bend(&mut ring.elements[at])?, amplitude),
+            (Self::DipoleEdge, Site::Ring) => {
+                ring.elements.iter_mut().filter_map(bend).for_each(|bend| turn_edges(bend, amplitude));
+            }
+            (Self::Sextupole, Site::Element(at)) => {
+                let length = ring.elements[at].length;
+                let Kind::Sextupole { k2 } = &mut ring.elements[at].kind else { return None };
+                *k2 += amplitude / length;
+            }
+            _ => return None,
+        }
+        Some(())
+    }
+}
+
+impl Mechanism for FieldEffect {
+    fn word(&self) -> &'static str {
+        match self {
+            Self::QuadRoll => "quad_roll",
+            Self::StrayGradient => "stray_gradient",
+            Self::StraySkewGradient => "stray_skew_gradient",
+            Self::DipoleGradient => "dipole_gradient",
+            Self::DipoleEdge => "dipole_edge",
+            Self::Sextupole => "sextupole_error",
+        }
+    }
+
+    /// Supports turn a quadrupole by 10 mrad, ten times the survey's 1 to 5 mrad; a stray gradient is a tenth of a quadrupole, whose
+    /// K1L is 0.28/m, skew and in a dipole half of that; edges differ by a tenth of the angle over which a rectangular magnet
+    /// would; a chromaticity sextupole at full current has some 1/m2.
+    fn prior_scale(&self) -> Option<f64> {
+        match self {
+            Self::QuadRoll => Some(0.015),
+            Self::StrayGradient => Some(0.025),
+            Self::StraySkewGradient | Self::DipoleGradient => Some(0.012),
+            Self::DipoleEdge => Some(0.05),
+            Self::Sextupole => Some(2.0),
+        }
+    }
+
+    fn unit(&self) -> Unit {
+        match self {
+            Self::QuadRoll | Self::DipoleEdge => Unit::ANGLE,
+            Self::StrayGradient | Self::StraySkewGradient | Self::DipoleGradient => Unit::PER_METRE,
+            Self::Sextupole => Unit::PER_SQUARE_METRE,
+        }
+    }
+
+    fn sites(&self, ring: &Ring) -> Vec<Site> {
+        let elements = |is: fn(&Kind) -> bool| {
+            let found = ring.elements.iter().enumerate().filter(move |(_, element)| is(&element.kind));
+            found.map(|(at, _)| Site::Element(at))
+        };
+        match self {
+            Self::QuadRoll => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
+            Self::StrayGradient | Self::StraySkewGradient => elements(|kind| matches!(kind, Kind::Marker)).collect(),
+            Self::DipoleGradient => elements(is_bend).collect(),
+            Self::DipoleEdge => elements(is_bend).chain([Site::Ring]).collect(),
+            Self::Sextupole => elements(is_sextupole).collect(),
+        }
+    }
+
+    fn expected(&self) -> &'static str {
+        match self {
+            Self::QuadRoll => "a quadrupole",
+            Self::StrayGradient | Self::StraySkewGradient => "a free straight",
+            Self::DipoleGradient | Self::DipoleEdge => "a dipole",
+            Self::Sextupole => "a sextupole",
+        }
+    }
+
+    fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
+        match self {
+            Self::QuadRoll => ring.quadrupole(name).ok().map(Site::Quadrupole),
+            Self::StrayGradient | Self::StraySkewGradient => {
+                Site::element(ring, name, |kind| matches!(kind, Kind::Marker | Kind::Multipole { .. }))
+                    .map(Site::Element)
+            }
+            Self::DipoleEdge if name.is_empty() => Some(Site::Ring),
+            Self::DipoleEdge | Self::DipoleGradient => Site::element(ring, name, is_bend).map(Site::Element),
+            Self::Sextupole => {
+                let short = || Site::element(ring, name.strip_prefix("SX_")?, is_sextupole);
+                Site::element(ring, name, is_sextupole).or_else(short).map(Site::Element)
+            }
+        }
+    }
+
+    fn apply(&self, machine: &mut Machine, site: Site, amplitude: f64) -> Result<(), EffectError> {
+        let put = self.put(&mut machine.ring, site, amplitude);
+        put.ok_or_else(|| self.misplaced(&machine.ring, site.name(&machine.ring)))?;
+        if let (Self::Sextupole, Site::Element(at)) = (self, site) {
+            machine.sextupoles.push((at, amplitude));
+        }
+        Ok(())
+    }
+
+    fn signature(&self, about: &Signatures, site: Site) -> Result<Signature, EffectError> {
+        let (ring, optics) = (&about.machine.ring, &about.optics);
+        match (self, site) {
+            (Self::QuadRoll, Site::Quadrupole(at)) => {
+                // x'' = -k1 (x cos 2a + y sin 2a)
+                let skew = optics.skew_gradient(ring.quadrupoles[at].element);
+                Ok(about.of_gradient(&skew, -2.0 * ring.gradients()[at]))
+            }
+            (Self::StrayGradient, Site::Element(at)) => Ok(thin(about, at.into(), Thin::Normal)),
+            (Self::StraySkewGradient, Site::Element(at)) => Ok(thin(about, at.into(), Thin::Skew)),
+            (Self::DipoleGradient, Site::Element(at)) => {
+                Ok(about.of_gradient(&optics.gradient(at), 1.0 / ring.elements[at].length))
+            }
+            (Self::DipoleEdge, Site::Element(at)) => Ok(edges(about, [at])),
+            (Self::DipoleEdge, Site::Ring) => Ok(edges(about, 0..ring.elements.len())),
+            (Self::Sextupole, Site::Element(at)) => {
+                sextupole(about, at).map_err(|error| EffectError::Orbit { effect: self.word(), error })
+            }
+            _ => Err(self.misplaced(ring, site.name(ring))),
+        }
+    }
+
+    fn orbit(&self, _ring: &Ring, site: Site) -> Vec<(usize, Plane)> {
+        match (self, site) {
+            (Self::Sextupole, Site::Element(at)) => vec![(at, Plane::X), (at, Plane::Y)],
+            _ => Vec::new(),
+        }
+    }
+
+    fn phrase(&self, ring: &Ring, site: Site, amplitude: Measured) -> String {
+        let name = site.name(ring);
+        match (self, site) {
+            (Self::QuadRoll, _) => format!("quadrupole {name} is rolled by {} mrad", amplitude.signed(1e3)),
+            (Self::StrayGradient, _) => format!("there is a gradient K1L = {} /m at {name}", amplitude.signed(1.0)),
+            (Self::StraySkewGradient, _) => {
+                format!("there is a skew gradient K1sL = {} /m at {name}", amplitude.signed(1.0))
+            }
+            (Self::DipoleGradient, _) => format!("dipole {name} has a gradient K1L = {} /m", amplitude.signed(1.0)),
+            (Self::DipoleEdge, Site::Ring) => format!("all dipoles have edge angles of {} mrad", amplitude.signed(1e3)),
+            (Self::DipoleEdge, _) => format!("dipole {name} has edge angles of {} mrad", amplitude.signed(1e3)),
+            (Self::Sextupole, _) => format!("sextupole {name} has a field K2L = {} /m2", amplitude.signed(1.0)),
+        }
+    }
+}
+
+fn is_bend(kind: &Kind) -> bool {
+    matches!(kind, Kind::Bend(_))
+}
+
+fn is_sextupole(kind: &Kind) -> bool {
+    matches!(kind, Kind::Sextupole { .. })
+}
+
+fn bend(element: &mut Element) -> Option<&mut Bend> {
+    match &mut element.kind {
+        Kind::Bend(bend) => Some(bend),
+        _ => None,
+    }
+}
+
+fn turn_edges(bend: &mut Bend, angle: f64) {
+    bend.e1 += angle;
+    bend.e2 += angle;
+}
+
+/// Add to the thin multipole that a free straight then is.
+fn stray(kind: &mut Kind, normal: f64, skew: f64) -> Option<()> {
+    if *kind == Kind::Marker {
+        *kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0 };
+    }
+    let Kind::Multipole { k1l, k1sl, .. } = kind else { return None };
+    *k1l += normal;
+    *k1sl += skew;
+    Some(())
+}
+
+/// Of a thin gradient anywhere.
+pub(super) fn thin(about: &Signatures, place: Place, kind: Thin) -> Signature {
+    let gradient: Gradient = match kind {
+        Thin::Normal => about.optics.thin_gradient(place),
+        Thin::Skew => about.optics.thin_skew_gradient(place),
+    };
+    about.of_gradient(&gradient, 1.0)
+}
+
+/// Pole faces of some dipoles: to first order an edge of angle e is a thin gradient of `-h tan e`, h the bend's curvature. That a
+/// soft fringe focuses y a little less is left out.
+fn edges(about: &Signatures, elements: impl IntoIterator<Item = usize>) -> Signature {
+    let mut sum = about.nothing();
+    for at in elements {
+        let element = &about.machine.ring.elements[at];
+        let Kind::Bend(bend) = &element.kind else { continue };
+        for (depth, angle) in [(0.0, bend.e1), (element.length, bend.e2)] {
+            let gradient = about.optics.thin_gradient(Place { element: at, depth });
+            sum += about.of_gradient(&gradient, -bend.curvature / angle.cos().powi(2));
+        }
+    }
+    sum
+}
+
+/// Feed-down of the orbit that passes a sextupole, and the quadratic kick of the orbit that the correctors add, per unit of K2L.
+fn sextupole(about: &Signatures, at: usize) -> Result<Signature, OrbitError> {
+    let ring = &about.machine.ring;
+    let ([x, y], per_length) = (about.drives.orbit[at], 1.0 / ring.elements[at].length);
+    let mut signature = about.of_gradient(&about.optics.gradient(at), x * per_length);
+    // a skew gradient moves no tune to first order
+    signature.readings += about.of_gradient(&about.optics.skew_gradient(at), y * per_length).readings;
+    signature.readings += ring.own_planes(&curved(ring, (at, 1.0), about.drives, &about.kick)?);
+    Ok(signature)
+}
+
+/// The ring with what each stray sextupole (element, K2L) is to a small deviation from the orbit (x, y) that passes it: a gradient
+/// `k2 x` and a skew gradient `k2 y`, which together are a rolled quadrupole. Its dipole part is in the orbit already.
+pub(super) fn on_orbit(ring: &Ring, sextupoles: &[(usize, f64)], orbit: &[[f64; 2]]) -> Ring {
+    let mut ring = ring.clone();
+    for &(at, _) in sextupoles {
+        let ([x, y], element) = (orbit[at], &mut ring.elements[at]);
+        if let Kind::Sextupole { k2 } = element.kind {
+            element.kind = Kind::Quadrupole { k1: k2 * x.hypot(y) };
+            element.misalignment.roll = -0.5 * y.atan2(x);
+        }
+    }
+    ring
+}
+
+/// Orbit that the quadratic terms of a sextupole field (element, K2L) make: `dx' = -K2L (dx^2 - dy^2)/2`, `dy' = K2L dx dy`, with
+/// (dx, dy) the orbit that the kicks and the RF offset make in its middle. The ring is seen without the gradient of [`on_orbit`]: what
+/// that changes is of third order.
+pub(super) fn curved(
+    ring: &Ring,
+    (element, k2l): (usize, f64),
+    drives: &Drives,
+    kick: &DMatrix<f64>,
+) -> Result<[DMatrix<f64>; 2], OrbitError> {
+    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+    let middle = Place { element, depth: 0.5 * ring.elements[element].length };
+    let observers = [Plane::X, Plane::Y].map(|plane| optics.observe(middle, plane));
+    let mut orbit = kick * optics.response(&observers, &optics.correctors()).transpose();
+    let rf = RowVector2::from(observers.map(|o| -optics.dispersion(&o) / optics.slip_factor()));
+    orbit += &drives.rf_offset * rf;
+    let from = [[1.0, 0.0], [0.0, 1.0]].map(|direction| optics.kick(middle, direction));
+    let strength = |[x, y]: [f64; 2]| [-0.5 * k2l * (x * x - y * y), k2l * x * y];
+    let kicks =
+        DMatrix::from_fn(orbit.nrows(), 2, |frame, plane| strength([orbit[(frame, 0)], orbit[(frame, 1)]])[plane]);
+    Ok([Plane::X, Plane::Y].map(|plane| &kicks * optics.response(&optics.monitor_places(plane), &from).transpose()))
+}

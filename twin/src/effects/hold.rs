@@ -1,0 +1,245 @@
+//! What a machine holds while its correctors kick, if it is not the design momentum: another one, the RF frequency, or the mean
+//! orbit of two monitors.
+//!
+//! With `R` the response at constant momentum, `R_f` that at constant frequency and `D` the dispersion, a share `a` of the
+//! frequency held gives `R + a (R_f - R)`, and a share `a` of the mean of monitors i and j held gives
+//!
+//! `R - D m`, `m = a (R_i + R_j)/(D_i + D_j)` the momentum that brings the mean back.
+//!
+//! Exact orbits close at the momentum that follows in the same way; the derivative is a difference of two machines.
+
+use nalgebra::DMatrix;
+
+use super::mechanism::{Measured, Mechanism, Unit};
+use super::{EffectError, Machine};
+use crate::lattice::{Plane, Ring};
+use crate::map::{DELTA, X};
+use crate::orbit::{ClosedOrbit, Hold, OrbitError};
+use crate::response::{Gradient, Observer, Optics, Source};
+use crate::site::Site;
+
+/// What is held otherwise than thought.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum HoldEffect {
+    /// The beam is off momentum.
+    Momentum,
+    /// The RF frequency is held instead of the momentum, as a fraction.
+    Frequency,
+    /// The mean of two horizontal monitors is held instead of the momentum, as a fraction.
+    RadialLoop,
+}
+
+/// What the RF system holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rf {
+    /// The momentum.
+    FixedMomentum,
+    /// The frequency; the momentum follows the path length.
+    FixedFrequency,
+}
+
+/// What a machine holds.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Holding {
+    /// Momentum of the beam on average.
+    pub delta: f64,
+    /// Share of the answer that is given at fixed RF frequency.
+    frequency_share: f64,
+    /// Monitors whose mean is held, and the share.
+    radial_loop: Option<([usize; 2], f64)>,
+}
+
+impl From<Rf> for Holding {
+    fn from(rf: Rf) -> Self {
+        Self { frequency_share: if rf == Rf::FixedFrequency { 1.0 } else { 0.0 }, ..Self::default() }
+    }
+}
+
+impl Mechanism for HoldEffect {
+    fn word(&self) -> &'static str {
+        match self {
+            Self::Momentum => "momentum_offset",
+            Self::Frequency => "fixed_rf_frequency",
+            Self::RadialLoop => "radial_loop",
+        }
+    }
+
+    /// A radial position is known to some mm at a dispersion of 2 m.
+    fn prior_scale(&self) -> Option<f64> {
+        match self {
+            Self::Momentum => Some(3e-3),
+            Self::Frequency | Self::RadialLoop => None,
+        }
+    }
+
+    fn unit(&self) -> Unit {
+        match self {
+            Self::Momentum => Unit::PER_MILLE,
+            Self::Frequency | Self::RadialLoop => Unit::NONE,
+        }
+    }
+
+    /// A radial loop holds monitors that only the recording's header knows.
+    fn sites(&self, _ring: &Ring) -> Vec<Site> {
+        match self {
+            Self::Momentum | Self::Frequency => vec![Site::Ring],
+            Self::RadialLoop => Vec::new(),
+        }
+    }
+
+    fn expected(&self) -> &'static str {
+        match self {
+            Self::Momentum | Self::Frequency => "no place",
+            Self::RadialLoop => "two horizontal monitors",
+        }
+    }
+
+    fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
+        match self {
+            Self::Momentum | Self::Frequency => name.is_empty().then_some(Site::Ring),
+            Self::RadialLoop => {
+                let [one, other] = Site::monitors(ring, name)?;
+                is_horizontal(ring, [one, other]).then(|| Site::pair(one, other))
+            }
+        }
+    }
+
+    fn apply(&self, machine: &mut Machine, site: Site, amplitude: f64) -> Result<(), EffectError> {
+        let (ring, hold) = (&machine.ring, &mut machine.hold);
+        match (self, site) {
+            (Self::Momentum, Site::Ring) => hold.delta += amplitude,
+            (Self::Frequency, Site::Ring) => hold.frequency_share = amplitude,
+            (Self::RadialLoop, Site::MonitorPair(one, other)) if is_horizontal(ring, [one, other]) => {
+                hold.radial_loop = Some(([one, other], amplitude));
+            }
+            _ => return Err(self.misplaced(ring, site.name(ring))),
+        }
+        Ok(())
+    }
+
+    fn phrase(&self, ring: &Ring, site: Site, amplitude: Measured) -> String {
+        match self {
+            Self::Momentum => format!("the beam is off momentum by {} per mille", amplitude.signed(1e3)),
+            Self::Frequency => "the RF frequency was held, not the momentum".into(),
+            Self::RadialLoop => {
+                format!("a radial loop held the mean of {}, not the momentum", site.names(ring).join(" and "))
+            }
+        }
+    }
+}
+
+fn is_horizontal(ring: &Ring, pair: [usize; 2]) -> bool {
+    pair.iter().all(|&at| ring.monitors[at].plane == Plane::X)
+}
+
+/// Linear responses of a ring that holds something.
+#[derive(Debug)]
+pub(super) struct Held<'r> {
+    /// Optics at constant frequency, and the share of it.
+    frequency: Option<(Optics<'r>, f64)>,
+    /// The two monitors, and the share of the loop.
+    radial: Option<([Observer; 2], f64)>,
+}
+
+impl<'r> Held<'r> {
+    /// On a ring of these optics at constant momentum.
+    pub fn of(ring: &'r Ring, optics: &Optics, holding: Holding) -> Result<Self, OrbitError> {
+        let share = holding.frequency_share;
+        let offset = optics.frequency_offset();
+        let held = || Ok((Optics::of(ring, Hold::Frequency { offset })?, share));
+        let frequency = (share != 0.0).then(held).transpose()?;
+        let observer = |at: usize| optics.observe(ring.monitors[at].element, Plane::X);
+        let radial = holding.radial_loop.map(|(pair, share)| (pair.map(observer), share));
+        Ok(Self { frequency, radial })
+    }
+
+    /// Orbit response, rows observers, columns sources [m/rad].
+    pub fn response(&self, optics: &Optics, observers: &[Observer], sources: &[Source]) -> DMatrix<f64> {
+        let mut response = self.by_frequency(optics, |optics| optics.response(observers, sources));
+        if let Some((pair, share)) = &self.radial {
+            let of_pair = self.by_frequency(optics, |optics| optics.response(pair, sources)).row_sum();
+            let momentum = of_pair * (share / optics.dispersion_of(pair).sum());
+            response -= optics.dispersion_of(observers) * momentum;
+        }
+        response
+    }
+
+    /// Its derivative with respect to a gradient [m/rad per 1/m^2, or per 1/m of a thin one].
+    pub fn jacobian(
+        &self,
+        optics: &Optics,
+        observers: &[Observer],
+        sources: &[Source],
+        gradient: &Gradient,
+    ) -> DMatrix<f64> {
+        let gradients = core::slice::from_ref(gradient);
+        let slope = |observers: &[Observer]| {
+            self.by_frequency(optics, |optics| optics.response_jacobian(observers, sources, gradients).remove(0))
+        };
+        let mut change = slope(observers);
+        if let Some((pair, share)) = &self.radial {
+            let dispersion = optics.dispersion_of(pair).sum();
+            let dispersion_slope = optics.dispersion_jacobian(pair, gradients).sum();
+            let momentum = self.by_frequency(optics, |optics| optics.response(pair, sources)).row_sum() / dispersion;
+            let momentum_slope = (slope(pair).row_sum() - &momentum * dispersion_slope) / dispersion;
+            change -= optics.dispersion_jacobian(observers, gradients) * momentum * *share;
+            change -= optics.dispersion_of(observers) * momentum_slope * *share;
+        }
+        change
+    }
+
+    fn by_frequency(&self, optics: &Optics, of: impl Fn(&Optics) -> DMatrix<f64>) -> DMatrix<f64> {
+        let at_momentum = of(optics);
+        match &self.frequency {
+            Some((held, share)) => at_momentum * (1.0 - share) + of(held) * *share,
+            None => at_momentum,
+        }
+    }
+}
+
+/// Exact closed orbits of a ring that holds something.
+#[derive(Debug, Clone)]
+pub(super) struct Closing {
+    holding: Holding,
+    /// The orbit without kicks, from which that of a cycle is sought.
+    plain: ClosedOrbit,
+    /// Relative frequency at which the ring closes without kicks.
+    frequency: f64,
+    /// Mean of the pair of a radial loop without kicks [m], and its dispersion [m].
+    radial: [f64; 2],
+}
+
+impl Closing {
+    /// About the orbit without kicks.
+    pub fn of(ring: &Ring, holding: Holding) -> Result<Self, OrbitError> {
+        let optics = Optics::of(ring, Hold::Momentum { delta: holding.delta })?;
+        let radial = holding.radial_loop.map_or([0.0, 1.0], |(pair, _)| {
+            let dispersion = pair.map(|at| optics.dispersion(&optics.observe(ring.monitors[at].element, Plane::X)));
+            [mean(ring, pair, optics.closed_orbit()), 0.5 * (dispersion[0] + dispersion[1])]
+        });
+        Ok(Self { holding, plain: optics.closed_orbit().clone(), frequency: optics.frequency_offset(), radial })
+    }
+
+    /// The orbit on which the beam runs in a ring that kicks have changed; a step of the RF frequency overrides whatever is held.
+    pub fn orbit(&self, ring: &Ring, rf_offset: f64) -> Result<ClosedOrbit, OrbitError> {
+        let Holding { delta, frequency_share, radial_loop } = self.holding;
+        let at = |hold: Hold| ClosedOrbit::near(ring, hold, &self.plain);
+        let at_frequency = |offset: f64| at(Hold::Frequency { offset: self.frequency + offset });
+        let at_momentum = |delta: f64| at(Hold::Momentum { delta });
+        if rf_offset != 0.0 {
+            return at_frequency(rf_offset);
+        }
+        if frequency_share != 0.0 {
+            let full = at_frequency(0.0)?.at[0][DELTA];
+            return at_momentum(delta + frequency_share * (full - delta));
+        }
+        let orbit = at_momentum(delta)?;
+        let Some((pair, share)) = radial_loop else { return Ok(orbit) };
+        at_momentum(delta - share * (mean(ring, pair, &orbit) - self.radial[0]) / self.radial[1])
+    }
+}
+
+/// Mean horizontal orbit of two monitors.
+fn mean(ring: &Ring, pair: [usize; 2], orbit: &ClosedOrbit) -> f64 {
+    0.5 * pair.map(|at| orbit.at[ring.monitors[at].element][X]).iter().sum::<f64>()
+}

@@ -1,0 +1,97 @@
+//! What docs/machine.md says, read from the page itself.
+
+use serde_json::Value;
+use twin::{Hold, Optics, Ring};
+
+const PAGE: &str = include_str!("../../docs/machine.md");
+
+/// The JSON blocks of the page, each with the text behind it.
+fn blocks() -> Vec<(&'static str, &'static str)> {
+    PAGE.split("```json\n").skip(1).map(|part| part.split_once("```").expect("a block ends")).collect()
+}
+
+/// The cells of the first table of a text, its head left out.
+fn table(text: &'static str) -> Vec<Vec<&'static str>> {
+    let lines = text.lines().skip_while(|line| !line.starts_with('|')).take_while(|line| line.starts_with('|'));
+    lines.skip(2).map(|line| line.trim_matches('|').split(" | ").map(str::trim).collect()).collect()
+}
+
+fn words(names: impl IntoIterator<Item = String>) -> String {
+    names.into_iter().collect::<Vec<_>>().join(" ")
+}
+
+/// What the table beside an example says of its ring.
+fn said(ring: &Ring, of: &str) -> String {
+    match of {
+        "params" => words(ring.var_names()),
+        "supplies" => words(ring.supplies.iter().map(|supply| supply.name.clone())),
+        "monitors that are read" => words(ring.monitor_names()),
+        "correctors" => words(ring.corrector_names()),
+        "tunes" => {
+            let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap();
+            format!("{:.4} {:.4}", tunes.x, tunes.y)
+        }
+        other => panic!("unknown row {other}"),
+    }
+}
+
+#[test]
+fn the_examples_are_the_rings_that_the_page_describes() {
+    for (file, behind) in &blocks()[..2] {
+        let ring = Ring::parse(file, "toy.json").unwrap();
+        let rows = table(behind);
+        assert!(rows.len() >= 4, "{behind}");
+        rows.iter().for_each(|row| assert_eq!(said(&ring, row[0]), row[1], "{}: {}", ring.name, row[0]));
+    }
+    assert_eq!(Ring::parse(blocks()[0].0, "toy.json").unwrap().elements.len(), 17);
+}
+
+#[test]
+fn supplies_priors_and_sectors_are_those_of_the_example() {
+    let ring = Ring::parse(blocks()[1].0, "toy.json").unwrap();
+    let of = |name: &str| ring.quadrupoles[ring.quadrupole(name).unwrap()];
+    assert_eq!((of("F1").supply, of("F2").supply, of("D1").supply, of("trim").supply), (Some(0), Some(0), None, None));
+    assert_eq!((of("F1").parameter, of("F2").parameter, of("D1").parameter), (Some(0), Some(0), Some(1)));
+    assert_eq!(of("trim").parameter, None);
+    let priors: Vec<_> = ring.parameters.iter().map(|p| (p.prior.width, p.prior.range)).collect();
+    assert_eq!(priors, [(0.01, [0.94, 1.06]), (0.03, [0.9, 1.1])]);
+    assert_eq!(ring.parameters[0].quadrupoles, [0, 1]);
+    let factors = ring.strengths(&[0.1, 0.2], &[0.4]);
+    assert_eq!(factors, [0.5_f64.exp(), 0.5_f64.exp(), 0.2_f64.exp(), 1.0]);
+    let sectors: Vec<_> = ring.elements.iter().filter_map(|e| e.sector.as_deref()).collect();
+    assert_eq!(sectors, ["north", "south"]);
+}
+
+/// JSON merge patch (RFC 7386).
+fn merge(onto: &mut Value, patch: &Value) {
+    let (Value::Object(onto), Value::Object(patch)) = (&mut *onto, patch) else {
+        *onto = patch.clone();
+        return;
+    };
+    for (key, value) in patch {
+        if value.is_null() {
+            onto.remove(key);
+        } else {
+            merge(onto.entry(key.clone()).or_insert(Value::Null), value);
+        }
+    }
+}
+
+#[test]
+fn what_is_refused_is_refused_in_these_words() {
+    let (base, behind) = blocks()[2];
+    let base: Value = serde_json::from_str(base).unwrap();
+    assert!(Ring::parse(&base.to_string(), "toy.json").is_ok());
+    let rows = table(behind);
+    assert_eq!(rows.len(), 22);
+    for row in rows {
+        let [patch, message] = [row[1], row[2]].map(|cell| cell.trim_matches('`'));
+        let mut file = base.clone();
+        merge(&mut file, &serde_json::from_str(patch).unwrap());
+        let error = Ring::parse(&file.to_string(), "toy.json").unwrap_err().to_string();
+        match message.strip_suffix('…') {
+            Some(start) => assert!(error.starts_with(start), "{error}\n{start}"),
+            None => assert_eq!(error, message),
+        }
+    }
+}
