@@ -13,7 +13,7 @@ use estimator::Marginal;
 use nalgebra::{DMatrix, DVector, Vector2};
 use twin::{OrbitError, Tunes};
 
-use crate::campaign::{Campaign, Linearised, Normal};
+use crate::campaign::{Campaign, Linearised, Normal, Weighed};
 use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
 
 /// The batch result for one campaign.
@@ -181,16 +181,17 @@ impl Problem<'_> {
     /// Add up all readings that count.
     fn orbits(&self, params: &DVector<f64>, linearised: &Linearised) -> (Normal, (f64, f64)) {
         let campaign = self.campaign;
-        let predicted = linearised.predict(&campaign.drives);
+        let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
         let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), 0.0);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for b in 0..campaign.monitors() {
-            let mut residuals = Vec::new();
+            let (mut residuals, mut readings) = (Vec::new(), vec![(b, Weighed::default()); campaign.frames()]);
             for i in (0..campaign.frames()).filter(|&i| campaign.counts(i, b)) {
-                let residual = campaign.readings[(i, b)] - predicted.orbit[(i, b)];
-                normal.add(b, predicted.slope[b].column(i), residual, 1.0 / campaign.variance(i, b));
+                let residual = campaign.readings[(i, b)] - orbits[(i, b)];
+                readings[i].1 = Weighed::one(residual, 1.0 / campaign.variance(i, b));
                 residuals.push(residual);
             }
+            normal.add(&slopes[b], &readings);
             if campaign.is_ok(b) && !residuals.is_empty() {
                 chi2 += about_mean(&residuals) / campaign.recording.header.noise[b].powi(2);
                 freedom += residuals.len() as f64 - 1.0;
@@ -208,7 +209,7 @@ impl Problem<'_> {
             let slope = linearised.tune_slopes.row(plane).transpose();
             for number in 0..2 {
                 let slope = &slope * meter.whiten[(number, 0)];
-                normal.add_plain(slope.column(0), miss[number], 1.0);
+                normal.add_plain(&slope, miss[number]);
             }
         }
     }

@@ -69,7 +69,7 @@ impl Reduced {
     pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
         let Campaign { ring, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
-        let exact = Linearised::of(ring, &params, supplies, drives)?.predict(drives).orbit;
+        let exact = Linearised::of(ring, &params, supplies, drives)?.orbits(drives);
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;

@@ -6,9 +6,9 @@ use nalgebra::Matrix6;
 
 use crate::lattice::{Element, Kind, Plane};
 use crate::map::{DELTA, Phase, X, Y};
+use crate::modes::Modes;
 use crate::orbit::OrbitError;
 use crate::response::{Optics, Place};
-use crate::tune::Modes;
 
 /// Linear optics at one place, horizontal and vertical.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -21,9 +21,9 @@ use nalgebra::{DMatrix, Matrix2, Matrix6, RowVector6, Vector6};
 
 use crate::lattice::{Kind, Ring};
 use crate::map::{PATH, X, Y, inverse};
+use crate::modes::Modes;
 use crate::orbit::{Hold, OrbitError};
 use crate::response::{Optics, close_at_momentum};
-use crate::tune::Modes;
 
 /// A ring as a chain of quadrupoles and of what lies between them.
 #[derive(Debug, Clone)]

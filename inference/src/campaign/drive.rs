@@ -43,6 +43,24 @@ pub(crate) fn mean_supplies(drives: &[Drive]) -> Vec<f64> {
     (0..supplies).map(mean).collect()
 }
 
+/// Mean of some drives.
+///
+/// # Panics
+/// Without any.
+pub(crate) fn mean(drives: &[&Drive]) -> Drive {
+    let share = 1.0 / drives.len() as f64;
+    let mut mean = Drive {
+        kick: drives[0].kick.map(|_| 0.0),
+        strength: drives[0].strength.map(|_| 0.0),
+        rf_offset: drives[0].rf_offset,
+    };
+    for drive in drives {
+        mean.kick.axpy(share, &drive.kick, 1.0);
+        mean.strength.axpy(share, &drive.strength, 1.0);
+    }
+    mean
+}
+
 /// Number of frames with each frame's RF offset.
 pub(crate) fn sharing(drives: &[Drive]) -> Vec<f64> {
     let alike = |drive: &Drive| drives.iter().filter(|other| other.rf_offset == drive.rf_offset).count() as f64;

@@ -1,6 +1,6 @@
 //! The exact ring at given params and mean supplies, and to first order about them: what predictions of frames are made of.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{ClosedOrbit, Hold, Optics, OrbitError, Plane, Ring, Tunes};
 
 use super::drive::Drive;
@@ -10,9 +10,9 @@ use super::drive::Drive;
 pub(crate) struct Linearised {
     /// Response of the read monitors to the correctors [B][C] [m/rad].
     response: DMatrix<f64>,
-    /// Its derivative with respect to each param, of each monitor [C][N].
+    /// Its derivative with respect to each param, of each monitor [N][C].
     slopes: Vec<DMatrix<f64>>,
-    /// The same with respect to `ln` of each supply's strength [C][F].
+    /// The same with respect to `ln` of each supply's strength [F][C].
     supply_slopes: Vec<DMatrix<f64>>,
     rf: Vec<RfOrbit>,
     /// Tunes.
@@ -36,15 +36,6 @@ struct RfOrbit {
     supply_slopes: DMatrix<f64>,
 }
 
-/// Orbits of some frames without baselines, and their derivatives.
-#[derive(Debug, Clone)]
-pub(crate) struct Predicted {
-    /// Rows frames, columns monitors [m].
-    pub orbit: DMatrix<f64>,
-    /// Derivative with respect to the params of each monitor: rows params, columns frames.
-    pub slope: Vec<DMatrix<f64>>,
-}
-
 impl Linearised {
     /// About params and supplies, for the RF offsets of some frames.
     pub fn of(ring: &Ring, params: &DVector<f64>, supplies: &[f64], drives: &[Drive]) -> Result<Self, OrbitError> {
@@ -56,15 +47,15 @@ impl Linearised {
         let by_supply = |m: usize| ring.quadrupoles[m].supply;
         let (params, supply_count) = (ring.parameters.len(), ring.supplies.len());
         let (monitors, correctors) = (observers.len(), sources.len());
-        let mut slopes = vec![DMatrix::zeros(correctors, params); monitors];
-        let mut supply_slopes = vec![DMatrix::zeros(correctors, supply_count); monitors];
+        let mut slopes = vec![DMatrix::zeros(params, correctors); monitors];
+        let mut supply_slopes = vec![DMatrix::zeros(supply_count, correctors); monitors];
         // d/d ln k = k1 d/dk1
         for (m, slope) in optics.response_jacobian(&observers, &sources, &gradients).iter().enumerate() {
             for (to, index) in [(&mut slopes, by_param(m)), (&mut supply_slopes, by_supply(m))] {
                 let Some(index) = index else { continue };
                 for (b, to) in to.iter_mut().enumerate() {
-                    let mut column = to.column_mut(index);
-                    column.iter_mut().zip(&slope.row(b)).for_each(|(to, s)| *to += k1[m] * s);
+                    let mut row = to.row_mut(index);
+                    row += slope.row(b) * k1[m];
                 }
             }
         }
@@ -103,29 +94,48 @@ impl Linearised {
         })
     }
 
-    /// Predict frames: the supplies off their mean to first order.
-    pub fn predict(&self, drives: &[Drive]) -> Predicted {
-        let (frames, monitors) = (drives.len(), self.response.nrows());
-        let kicks = columns(self.response.ncols(), drives, |drive| drive.kick.clone());
+    /// Orbits of frames without baselines, the supplies off their mean to first order: rows frames, columns monitors [m].
+    pub fn orbits(&self, drives: &[Drive]) -> DMatrix<f64> {
+        let kicks = self.kicks(drives);
         let off = columns(self.supplies.len(), drives, |drive| &drive.strength - &self.supplies);
-        let rf: Vec<Option<&RfOrbit>> =
-            drives.iter().map(|drive| self.rf.iter().find(|rf| rf.offset == drive.rf_offset)).collect();
-        let mut orbit = (&self.response * &kicks).transpose();
-        let mut slope = Vec::with_capacity(monitors);
-        for b in 0..monitors {
-            let mut of_monitor = self.slopes[b].tr_mul(&kicks);
-            let mut by_supply = self.supply_slopes[b].tr_mul(&kicks);
-            for i in 0..frames {
-                if let Some(rf) = rf[i] {
-                    orbit[(i, b)] += rf.orbit[b];
-                    of_monitor.column_mut(i).axpy(1.0, &rf.slopes.column(b), 1.0);
-                    by_supply.column_mut(i).axpy(1.0, &rf.supply_slopes.column(b), 1.0);
-                }
-                orbit[(i, b)] += by_supply.column(i).dot(&off.column(i));
+        let mut orbits = (&self.response * &kicks).transpose();
+        for (b, mut orbit) in orbits.column_iter_mut().enumerate() {
+            let by_supply = self.along(&self.supply_slopes[b], &kicks, drives, |rf| rf.supply_slopes.column(b));
+            for (i, (orbit, drive)) in orbit.iter_mut().zip(drives).enumerate() {
+                *orbit += self.rf(drive).map_or(0.0, |rf| rf.orbit[b]) + by_supply.column(i).dot(&off.column(i));
             }
-            slope.push(of_monitor);
         }
-        Predicted { orbit, slope }
+        orbits
+    }
+
+    /// Derivative of the orbits with respect to the params, of each monitor: rows params, columns frames.
+    pub fn slopes(&self, drives: &[Drive]) -> Vec<DMatrix<f64>> {
+        let kicks = self.kicks(drives);
+        let slopes = self.slopes.iter().enumerate();
+        slopes.map(|(b, slope)| self.along(slope, &kicks, drives, |rf| rf.slopes.column(b))).collect()
+    }
+
+    /// A derivative of one monitor's response, times the drives of all frames.
+    fn along<'l>(
+        &'l self,
+        slope: &DMatrix<f64>,
+        kicks: &DMatrix<f64>,
+        drives: &[Drive],
+        of_rf: impl Fn(&'l RfOrbit) -> DVectorView<'l, f64>,
+    ) -> DMatrix<f64> {
+        let mut along = slope * kicks;
+        for (mut column, drive) in along.column_iter_mut().zip(drives) {
+            self.rf(drive).into_iter().for_each(|rf| column += of_rf(rf));
+        }
+        along
+    }
+
+    fn rf(&self, drive: &Drive) -> Option<&RfOrbit> {
+        self.rf.iter().find(|rf| rf.offset == drive.rf_offset)
+    }
+
+    fn kicks(&self, drives: &[Drive]) -> DMatrix<f64> {
+        columns(self.response.ncols(), drives, |drive| drive.kick.clone())
     }
 }
 

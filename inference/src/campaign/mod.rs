@@ -20,9 +20,9 @@ pub use drive::Drive;
 pub(crate) use linear::Linearised;
 pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::Normal;
+pub(crate) use normal::{Normal, Weighed};
 pub use screen::Screened;
-use screen::{Screener, Seen};
+use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
 
 /// A recording and what follows from it before any fit.
@@ -80,6 +80,7 @@ impl Campaign {
             drives: &drives,
             supplies: &supplies,
             settings: &settings,
+            groups: Groups::of(&drives, &settings),
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),

@@ -3,7 +3,7 @@
 //! Readings obey `residual = h step + baseline_b + noise`. Sums of weight times `1, h, residual` of each monitor are kept apart, so
 //! that readings can be added and taken away one by one; the baselines at their best leave the Schur complement.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
 
 use crate::optimise::Quadratic;
 use crate::prior::Prior;
@@ -15,6 +15,29 @@ pub(crate) struct Normal {
     vector: DVector<f64>,
     square: f64,
     monitors: Vec<Sums>,
+}
+
+/// Sums over readings of weight times `1, residual, residual^2`.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Weighed {
+    weight: f64,
+    residual: f64,
+    square: f64,
+}
+
+impl Weighed {
+    /// One reading: measured minus predicted, and one over its variance.
+    pub fn one(residual: f64, weight: f64) -> Self {
+        Self { weight, residual: weight * residual, square: weight * residual * residual }
+    }
+}
+
+impl core::ops::AddAssign for Weighed {
+    fn add_assign(&mut self, other: Self) {
+        self.weight += other.weight;
+        self.residual += other.residual;
+        self.square += other.square;
+    }
 }
 
 /// Sums over the readings of one monitor.
@@ -37,30 +60,37 @@ impl Normal {
         }
     }
 
-    /// A reading of a monitor: its derivative, measured minus predicted, one over its variance.
-    pub fn add(&mut self, b: usize, slope: nalgebra::DVectorView<f64>, residual: f64, weight: f64) {
-        self.add_plain(slope, residual, weight);
-        let sums = &mut self.monitors[b];
-        sums.weight += weight;
-        sums.residual += weight * residual;
-        sums.slope.axpy(weight, &slope, 1.0);
+    /// Readings, those that share a derivative together: their derivatives as columns, and of each the monitor and the sums.
+    pub fn add(&mut self, slopes: &DMatrix<f64>, readings: &[(usize, Weighed)]) {
+        for (slope, (b, readings)) in slopes.column_iter().zip(readings) {
+            let sums = &mut self.monitors[*b];
+            sums.weight += readings.weight;
+            sums.residual += readings.residual;
+            sums.slope.axpy(readings.weight, &slope, 1.0);
+            self.square += readings.square;
+            self.vector.axpy(readings.residual, &slope, 1.0);
+        }
+        add_squares(&mut self.matrix, slopes, readings.iter().map(|(_, readings)| readings.weight));
     }
 
-    /// A number that has no baseline.
-    pub fn add_plain(&mut self, slope: nalgebra::DVectorView<f64>, residual: f64, weight: f64) {
-        self.square += weight * residual * residual;
-        self.vector.axpy(weight * residual, &slope, 1.0);
-        self.matrix.ger(weight, &slope, &slope, 1.0);
+    /// A number that has no baseline, of variance 1.
+    pub fn add_plain(&mut self, slope: &DVector<f64>, residual: f64) {
+        self.square += residual * residual;
+        self.vector.axpy(residual, slope, 1.0);
+        self.matrix.ger(1.0, slope, slope, 1.0);
     }
 
     /// Cost and quadratic of the params alone.
     pub fn eliminated(&self) -> (f64, Quadratic) {
         let (mut cost, mut matrix, mut slope) = (self.square, self.matrix.clone(), self.vector.clone());
-        for sums in self.monitors.iter().filter(|sums| sums.weight > 0.0) {
+        let known: Vec<&Sums> = self.monitors.iter().filter(|sums| sums.weight > 0.0).collect();
+        for sums in &known {
             cost -= sums.residual * sums.residual / sums.weight;
-            matrix.ger(-1.0 / sums.weight, &sums.slope, &sums.slope, 1.0);
             slope.axpy(-sums.residual / sums.weight, &sums.slope, 1.0);
         }
+        let mut slopes = DMatrix::zeros(slope.len(), known.len());
+        slopes.column_iter_mut().zip(&known).for_each(|(mut to, sums)| to.copy_from(&sums.slope));
+        add_squares(&mut matrix, &slopes, known.iter().map(|sums| -1.0 / sums.weight));
         (cost, Quadratic { matrix, slope })
     }
 
@@ -75,7 +105,7 @@ impl Normal {
     pub fn expect<'n>(
         &'n self,
         b: usize,
-        slope: nalgebra::DVectorView<f64>,
+        slope: DVectorView<f64>,
         step: &DVector<f64>,
         factor: &'n Cholesky<f64, Dyn>,
     ) -> (f64, f64, impl FnOnce() -> f64 + 'n) {
@@ -85,4 +115,11 @@ impl Normal {
         let of_params = move || factor.l_dirty().solve_lower_triangular(&d).map_or(f64::INFINITY, |z| z.norm_squared());
         (expected, 1.0 / sums.weight, of_params)
     }
+}
+
+/// Add the sum of weight times `h h^T` over columns.
+fn add_squares(matrix: &mut DMatrix<f64>, columns: &DMatrix<f64>, weights: impl Iterator<Item = f64>) {
+    let mut weighted = columns.clone();
+    weighted.column_iter_mut().zip(weights).for_each(|(mut column, weight)| column *= weight);
+    matrix.gemm(1.0, &weighted, &columns.transpose(), 1.0);
 }

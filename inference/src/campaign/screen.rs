@@ -4,13 +4,15 @@
 //! Frames are taken in the order of time. A reading is judged by the repeats of its setting; the first one by the model with all
 //! that is known of the params so far, in normal equations that are linearised anew when the params have moved.
 
+use std::collections::BTreeMap;
+
 use estimator::{Gate, Health, Monitor, PositionCode, Verdict};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{OrbitError, Ring};
 
-use super::drive::Drive;
-use super::linear::{Linearised, Predicted};
-use super::normal::Normal;
+use super::drive::{self, Drive};
+use super::linear::Linearised;
+use super::normal::{Normal, Weighed};
 use super::rms_by_plane;
 use super::setting::Settings;
 use crate::prior::Prior;
@@ -31,6 +33,7 @@ pub(super) struct Screener<'c> {
     pub drives: &'c [Drive],
     pub supplies: &'c [f64],
     pub settings: &'c Settings,
+    pub groups: Groups,
     /// Rows frames, columns monitors, not a number where a monitor did not report [m].
     pub readings: &'c DMatrix<f64>,
     /// Expected noise of each monitor [m].
@@ -39,6 +42,13 @@ pub(super) struct Screener<'c> {
     pub sharing: &'c [f64],
     /// Change of a misaligned ring's orbit per RF offset and rms orbit, in x and y.
     pub spurious: [f64; 2],
+}
+
+/// Frames that share a derivative: those of a setting, or one by itself.
+pub(super) struct Groups {
+    of_frame: Vec<usize>,
+    /// Mean drive of each.
+    drives: Vec<Drive>,
 }
 
 /// What remains when all frames have been taken.
@@ -53,7 +63,7 @@ pub(super) struct Seen {
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f64 = 0.02;
 /// A param that has moved by this many error bars calls for a new linearisation.
-const MOVED: f64 = 0.5;
+const MOVED: f64 = 1.0;
 /// Growth of chi-square that counts as uphill.
 const UPHILL: f64 = 1.0;
 /// Halvings of a step that leads uphill or to an unstable ring.
@@ -93,9 +103,15 @@ struct Screening<'c> {
 }
 
 /// The ring linearised at some params.
+///
+/// Frames of a setting differ by the scatter of idle correctors, a thousandth of its kick: their own orbits count, and the derivative of
+/// their mean drive serves them all.
 struct Model {
     params: DVector<f64>,
-    predicted: Predicted,
+    /// Orbits of the frames, rows frames, columns monitors [m].
+    orbit: DMatrix<f64>,
+    /// Derivative of each monitor's orbit with respect to the params, columns groups of frames.
+    slope: Vec<DMatrix<f64>>,
     /// What the mean drive of each frame's setting adds to the orbit of its own [frame][monitor] [m].
     to_mean_drive: DMatrix<f64>,
 }
@@ -107,6 +123,21 @@ struct Best {
     /// Rms of the baselines in x and y [m].
     orbit: [f64; 2],
     cost: f64,
+}
+
+impl Groups {
+    pub fn of(drives: &[Drive], settings: &Settings) -> Self {
+        let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
+        let mut group = |(frame, drive): (usize, _)| {
+            let key = settings.of_frame[frame].ok_or(frame);
+            let group = *known.entry(key).or_insert(members.len());
+            members.resize(members.len().max(group + 1), Vec::new());
+            members[group].push(drive);
+            group
+        };
+        let of_frame = drives.iter().enumerate().map(&mut group).collect();
+        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect() }
+    }
 }
 
 impl Screener<'_> {
@@ -127,9 +158,10 @@ impl Screener<'_> {
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
-        let predicted = Linearised::of(self.ring, &params, self.supplies, self.drives)?.predict(self.drives);
-        let to_mean_drive = self.to_mean_drive(&predicted.orbit);
-        Ok(Model { params, predicted, to_mean_drive })
+        let linearised = Linearised::of(self.ring, &params, self.supplies, self.drives)?;
+        let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
+        let to_mean_drive = self.to_mean_drive(&orbit);
+        Ok(Model { params, orbit, slope, to_mean_drive })
     }
 
     fn to_mean_drive(&self, orbit: &DMatrix<f64>) -> DMatrix<f64> {
@@ -192,8 +224,20 @@ impl<'c> Screening<'c> {
         if setting.is_none() {
             self.pardon(frame, &rejected);
         }
-        self.add_accepted(frame);
+        self.learn(frame);
         self.best = Best::of(self.of, &self.model, &self.normal);
+    }
+
+    /// Add the readings of a frame that count to the normal equations.
+    fn learn(&mut self, frame: usize) {
+        let group = self.of.groups.of_frame[frame];
+        let counting = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]);
+        let readings: Vec<(usize, Weighed)> = counting.map(|b| (b, self.weighed(frame, b))).collect();
+        let mut slopes = DMatrix::zeros(self.model.params.len(), readings.len());
+        for (mut to, (b, _)) in slopes.column_iter_mut().zip(&readings) {
+            to.copy_from(&self.model.slope[*b].column(group));
+        }
+        self.normal.add(&slopes, &readings);
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
@@ -256,7 +300,7 @@ impl<'c> Screening<'c> {
 
     /// True if the model, with all its uncertainty, expects a reading.
     fn is_expected(&self, frame: usize, b: usize) -> bool {
-        let slope = self.model.predicted.slope[b].column(frame);
+        let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
         let (expected, of_baseline, of_params) = self.normal.expect(b, slope, &self.best.step, &self.best.factor);
         let surprise = (self.residual(frame, b) - expected) as f32;
         let certain = self.variance(frame, b) + of_baseline;
@@ -266,7 +310,7 @@ impl<'c> Screening<'c> {
     }
 
     fn residual(&self, frame: usize, b: usize) -> f64 {
-        self.of.readings[(frame, b)] - self.model.predicted.orbit[(frame, b)]
+        self.of.readings[(frame, b)] - self.model.orbit[(frame, b)]
     }
 
     /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
@@ -276,14 +320,8 @@ impl<'c> Screening<'c> {
         f64::from(self.monitors[b].variance()) + self.of.sharing[frame] * shared * shared
     }
 
-    /// Add the readings of a frame that count to the normal equations.
-    fn add_accepted(&mut self, frame: usize) {
-        for b in 0..self.monitors.len() {
-            if self.accepted[(frame, b)] {
-                let (residual, weight) = (self.residual(frame, b), 1.0 / self.variance(frame, b));
-                self.normal.add(b, self.model.predicted.slope[b].column(frame), residual, weight);
-            }
-        }
+    fn weighed(&self, frame: usize, b: usize) -> Weighed {
+        Weighed::one(self.residual(frame, b), 1.0 / self.variance(frame, b))
     }
 
     /// Linearise at the best params if they have left those of the model, or if readings have to be weighted anew.
@@ -315,7 +353,13 @@ impl<'c> Screening<'c> {
     fn rebuild(&mut self, frames: usize) {
         let monitors = self.monitors.len();
         self.normal = Normal::new(self.of.prior, &self.model.params, monitors, BASELINE.powi(-2));
-        (0..frames).for_each(|frame| self.add_accepted(frame));
+        for b in 0..monitors {
+            let mut sums = vec![(b, Weighed::default()); self.of.groups.drives.len()];
+            for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
+                sums[self.of.groups.of_frame[frame]].1 += self.weighed(frame, b);
+            }
+            self.normal.add(&self.model.slope[b], &sums);
+        }
         self.best = Best::of(self.of, &self.model, &self.normal);
     }
 }

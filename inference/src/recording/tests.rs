@@ -115,8 +115,7 @@ fn bytes_that_are_no_text_are_refused() {
 
 #[test]
 fn byte_order_mark_and_crlf_are_accepted() {
-    let [header, frames] =
-        ["toml", "csv"].map(|language| format!("\u{feff}{}", block(language).replace('\n', "\r\n")));
+    let [header, frames] = ["toml", "csv"].map(|language| format!("\u{feff}{}", block(language).replace('\n', "\r\n")));
     assert_eq!(read(header.as_bytes(), frames.as_bytes()), read(block("toml").as_bytes(), block("csv").as_bytes()));
     let error = read(header.as_bytes(), frames.replace("1.9287", "x").as_bytes()).expect_err("x is no number");
     assert!(error.contains(", line 3, "), "{error}");
@@ -363,7 +362,10 @@ fn format_is_1_or_2() {
 fn names_of_elements_are_columns_too() {
     let frames = block("csv").replace("ic_A2_A", "ic_DCH_A2_A").replace("x_A2_mm", "x_PUH_A2_mm");
     let frames = frames.replace("ic_A1_A", "ic_V_A1_A").replace(",A2,22", ",DCH_A2,22");
-    assert_eq!(read(block("toml").as_bytes(), frames.as_bytes()), read(block("toml").as_bytes(), block("csv").as_bytes()));
+    assert_eq!(
+        read(block("toml").as_bytes(), frames.as_bytes()),
+        read(block("toml").as_bytes(), block("csv").as_bytes())
+    );
 }
 
 fn read_second(header: &str, frames: &str) -> Result<Recording, String> {
@@ -390,19 +392,58 @@ fn what_is_wrong_in_format_2_is_said() {
     let header = |old: &str, new: &str| read_second(&second("toml").replace(old, new), second("csv")).unwrap_err();
     let frames = |old: &str, new: &str| read_second(second("toml"), &second("csv").replace(old, new)).unwrap_err();
     let cases = [
-        (header("y_A1 = 0.3", "y_B1 = 0.3"), "header.toml, line 7, key bpm_sigma_mm: unknown field `y_B1`, the machine has no such instrument"),
-        (header("default = 0.00909091, ", ""), "header.toml, line 8, key kick_mrad_per_A: missing field `default`, as not every instrument is named"),
-        (header(", QD = 1790.0", ""), "header.toml, line 11, key nominal_A: missing field `QD`, a supply of the machine"),
-        (header("QD = 1790.0", "QD = 1790.0, QT = 1.0"), "header.toml, line 11, key nominal_A: unknown field `QT`, the machine has no such supply"),
-        (header("QF = [0.0, 1.0], ", ""), "header.toml, line 12, key quad_transfer: missing field `QF`, a supply of the machine"),
-        (header("{ default = 0.15, y_A1 = 0.3 }", "\"x\""), "header.toml, line 7, key bpm_sigma_mm: invalid type: string \"x\", expected a number, or a table of numbers by name"),
-        (frames("x_A2_mm,", "x_A3_mm,"), "frames.csv, line 1, column 3: expected a column of this format, found \"x_A3_mm\", which the machine does not have"),
-        (frames("x_A2_mm,", "x_A2_um,"), "frames.csv, line 1, column 3: expected x_A2_mm, found \"x_A2_um\", which has the wrong unit"),
-        (frames("i_QF_A", "i_QD_A"), "frames.csv, line 1, column 10: expected every column once, found \"i_QD_A\", which is there already"),
-        (frames("i_QF_A", "i_Q_A"), "frames.csv, line 1: expected i_QF_A, found no column of this name, so a column is missing"),
-        (frames("setting_A", "i_s_A"), "frames.csv, line 1: expected setting_A, found no column of this name, so a column is missing"),
-        (frames("A2;A1", "A2;A2"), "frames.csv, line 3, column corrector: expected correctors of the machine, each once and joined by `;`, or nothing, found \"A2;A2\""),
-        (frames("22;-11", "22"), "frames.csv, line 3, column setting_A: expected 2 finite numbers joined by `;`, found \"22\""),
+        (
+            header("y_A1 = 0.3", "y_B1 = 0.3"),
+            "header.toml, line 7, key bpm_sigma_mm: unknown field `y_B1`, the machine has no such instrument",
+        ),
+        (
+            header("default = 0.00909091, ", ""),
+            "header.toml, line 8, key kick_mrad_per_A: missing field `default`, as not every instrument is named",
+        ),
+        (
+            header(", QD = 1790.0", ""),
+            "header.toml, line 11, key nominal_A: missing field `QD`, a supply of the machine",
+        ),
+        (
+            header("QD = 1790.0", "QD = 1790.0, QT = 1.0"),
+            "header.toml, line 11, key nominal_A: unknown field `QT`, the machine has no such supply",
+        ),
+        (
+            header("QF = [0.0, 1.0], ", ""),
+            "header.toml, line 12, key quad_transfer: missing field `QF`, a supply of the machine",
+        ),
+        (
+            header("{ default = 0.15, y_A1 = 0.3 }", "\"x\""),
+            "header.toml, line 7, key bpm_sigma_mm: invalid type: string \"x\", expected a number, or a table of numbers by name",
+        ),
+        (
+            frames("x_A2_mm,", "x_A3_mm,"),
+            "frames.csv, line 1, column 3: expected a column of this format, found \"x_A3_mm\", which the machine does not have",
+        ),
+        (
+            frames("x_A2_mm,", "x_A2_um,"),
+            "frames.csv, line 1, column 3: expected x_A2_mm, found \"x_A2_um\", which has the wrong unit",
+        ),
+        (
+            frames("i_QF_A", "i_QD_A"),
+            "frames.csv, line 1, column 10: expected every column once, found \"i_QD_A\", which is there already",
+        ),
+        (
+            frames("i_QF_A", "i_Q_A"),
+            "frames.csv, line 1: expected i_QF_A, found no column of this name, so a column is missing",
+        ),
+        (
+            frames("setting_A", "i_s_A"),
+            "frames.csv, line 1: expected setting_A, found no column of this name, so a column is missing",
+        ),
+        (
+            frames("A2;A1", "A2;A2"),
+            "frames.csv, line 3, column corrector: expected correctors of the machine, each once and joined by `;`, or nothing, found \"A2;A2\"",
+        ),
+        (
+            frames("22;-11", "22"),
+            "frames.csv, line 3, column setting_A: expected 2 finite numbers joined by `;`, found \"22\"",
+        ),
         (frames("2.1e11", "-1"), "frames.csv, line 2, column intensity: expected a finite number from 0, found \"-1\""),
     ];
     for (found, expected) in cases {

@@ -41,7 +41,7 @@ pub struct ParameterPrior {
 }
 
 impl Default for ParameterPrior {
-    /// 3 %, within 0.94 to 1.06: gradients of one family scatter by less (docs/model.md).
+    /// 3 %, within 0.94 to 1.06: the published analysis of the Booster (docs/model.md).
     fn default() -> Self {
         Self { width: 0.03, range: [0.94, 1.06] }
     }
