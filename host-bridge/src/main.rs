@@ -6,7 +6,9 @@ use std::process::ExitCode;
 use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
-use host_bridge::command::{CommandError, challenge, check, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch};
+use host_bridge::command::{
+    CommandError, challenge, check, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
+};
 use host_bridge::output::{self, OutputError};
 
 fn main() -> ExitCode {

@@ -105,7 +105,8 @@ impl CheckResult {
         let readings = &campaign.readings;
         let silent = |b: &usize| readings.column(*b).iter().all(|reading| reading.is_nan());
         let names = ring.monitor_names();
-        let passed = rows.windows(2).map(|pair| u6diagnosis::data::LEAST::from(pair[1].sequence - pair[0].sequence) - 1);
+        let passed =
+            rows.windows(2).map(|pair| u6diagnosis::data::LEAST::from(pair[1].sequence - pair[0].sequence) - 1);
         Self {
             recording: name.clone(),
             machine: ring.name.clone(),
@@ -118,7 +119,8 @@ impl CheckResult {
             tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
-            missing: readings.iter().filter(|reading| reading.is_nan()).count() as f6diagnosis::data::LEAST / readings.len().max(1) as f6diagnosis::data::LEAST,
+            missing: readings.iter().filter(|reading| reading.is_nan()).count() as f6diagnosis::data::LEAST
+                / readings.len().max(1) as f6diagnosis::data::LEAST,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
         }
     }
@@ -136,7 +138,8 @@ impl Settings {
         repeats.retain(|count| *count > 0);
         repeats.sort_unstable();
         let at = |i: usize| repeats.get(i).copied().unwrap_or(0);
-        let largest = |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f6diagnosis::data::LEAST::max);
+        let largest =
+            |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f6diagnosis::data::LEAST::max);
         let (names, nominal) = (campaign.ring.corrector_names(), campaign.recording.nominal_kick());
         // idle ones scatter by a thousandth of what others are set to
         let unused: Vec<usize> = (0..names.len()).filter(|&c| largest(c) < 0.05 * nominal).collect();
@@ -161,7 +164,9 @@ impl Noise {
             let own: Vec<usize> =
                 (0..campaign.monitors()).filter(|&b| campaign.plane(b) == plane && campaign.is_ok(b)).collect();
             PlaneNoise {
-                of_repeats_mm: median(own.iter().map(|&b| f6diagnosis::data::LEAST::from(campaign.screened.health[b].noise) * 1e3)),
+                of_repeats_mm: median(
+                    own.iter().map(|&b| f6diagnosis::data::LEAST::from(campaign.screened.health[b].noise) * 1e3),
+                ),
                 of_header_mm: median(own.iter().map(|&b| campaign.recording.header.noise[b] * 1e3)),
             }
         };
@@ -269,7 +274,10 @@ impl CheckResult {
         };
         let lost =
             if self.lost_frames == 0 { String::new() } else { format!(", {} lost between them", self.lost_frames) };
-        let tunes = self.tunes.as_ref().map_or_else(|| "no stable ring".into(), |t| format!("{:.diagnosis::data::LEAST} {:.diagnosis::data::LEAST}", t.x, t.y));
+        let tunes = self.tunes.as_ref().map_or_else(
+            || "no stable ring".into(),
+            |t| format!("{:.diagnosis::data::LEAST} {:.diagnosis::data::LEAST}", t.x, t.y),
+        );
         let offsets = match settings.rf_offsets.as_slice() {
             [] => String::new(),
             offsets => {
