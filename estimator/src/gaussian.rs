@@ -283,6 +283,16 @@ impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
         self.settle();
     }
 
+    /// Count repeats whose mean has been added as one reading: their number, the variance of each, and the sum of their squared
+    /// deviations from the mean. The density of all `n` is that of their mean, times `n` and the usual densities of `n - 1`.
+    pub fn add_repeats(&mut self, number: u32, variance: f32, squares: f32) {
+        let n = number as f32;
+        self.volume.multiply(n);
+        self.volume.add_log((n - 1.0) * libm::logf(variance / USUAL));
+        self.readings.add(n - 1.0);
+        self.add_scatter(squares / variance);
+    }
+
     /// Squared deviations of repeats from their means, over their variance.
     pub fn add_scatter(&mut self, chi_square: f32) {
         self.cost.add(chi_square);

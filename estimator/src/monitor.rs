@@ -135,9 +135,9 @@ impl Noise {
 }
 
 /// Frames without a report after which a monitor counts as dead.
-const SILENCE: u32 = 20;
+const SILENCE: u16 = 20;
 /// Identical codes in a row after which a monitor counts as stuck: noise of 1500 steps makes that once in 1e9 frames.
-const STUCK: u32 = 4;
+const STUCK: u16 = 4;
 /// Share of rejected readings above which a monitor is one that jumps; the gate's own share is 6e-7.
 const JUMPY: f32 = 0.01;
 /// Fewest rejected readings for that.
@@ -154,11 +154,11 @@ pub struct Monitor {
     pub noise: Noise,
     state: MonitorState,
     jumps: bool,
+    silent: u16,
+    unchanged: u16,
     reported: u32,
     rejected: u32,
-    silent: u32,
     last_code: i32,
-    unchanged: u32,
 }
 
 impl Monitor {
@@ -167,11 +167,11 @@ impl Monitor {
         noise: Noise::BLANK,
         state: MonitorState::Ok,
         jumps: false,
+        silent: 0,
+        unchanged: 0,
         reported: 0,
         rejected: 0,
-        silent: 0,
         last_code: 0,
-        unchanged: 0,
     };
 
     /// Begin anew, with an expected noise [m].
@@ -314,7 +314,7 @@ mod tests {
         monitor.judge();
         assert_eq!(monitor.health().state, MonitorState::Ok);
         let used = (0..100).filter(|_| monitor.hear(Some(5))).count();
-        assert_eq!(used as u32, STUCK - 1);
+        assert_eq!(used, usize::from(STUCK) - 1);
         monitor.judge();
         assert_eq!(monitor.health().state, MonitorState::Dead);
     }

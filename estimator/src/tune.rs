@@ -5,6 +5,7 @@
 
 use crate::campaign::{move_mean, ratio, ratio_steps};
 use crate::monitor::{Gate, Noise};
+use crate::sum::Sum;
 use crate::wire::TuneCode;
 
 /// Order of magnitude of its noise [1]; what is learnt reaches from 3e-5 to 0.1.
@@ -23,12 +24,15 @@ pub struct TuneMeter<const F: usize> {
     count: u32,
     /// Mean of `ln` of the supplies' factors over the readings in the mean, in steps.
     strength: [i32; F],
+    /// Sum of squared deviations from the mean.
+    scatter: Sum,
     last: Option<(TuneCode, [f32; F])>,
 }
 
 impl<const F: usize> TuneMeter<F> {
     /// Memory for one.
-    pub const BLANK: Self = Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], last: None };
+    pub const BLANK: Self =
+        Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: Sum::ZERO, last: None };
 
     /// Begin anew.
     pub fn clear(&mut self) {
@@ -47,12 +51,17 @@ impl<const F: usize> TuneMeter<F> {
         self.noise.learn(difference);
         let counts = gate.agree(difference, 0.0, self.noise.sigma());
         if counts {
-            self.add(code, strength);
+            self.add(code, strength, ripple);
         }
         counts
     }
 
-    fn add(&mut self, code: TuneCode, strength: &[f32; F]) {
+    /// Count a reading into the mean: the squared distance from it grows the sum of squared deviations by `(n - 1)/n`.
+    fn add(&mut self, code: TuneCode, strength: &[f32; F], ripple: impl Fn(&[f32; F]) -> f32) {
+        let (mean, mut change, before) = self.mean();
+        change.iter_mut().zip(strength).for_each(|(change, s)| *change = s - *change);
+        let deviation = wrapped(code.value() - mean - ripple(&change));
+        self.scatter.add(deviation * deviation * before as f32 / (before as f32 + 1.0));
         self.count = self.count.saturating_add(1);
         // the whole turns that bring it next to the mean
         let distance = code.steps() - (self.mean >> FRACTION);
@@ -72,6 +81,11 @@ impl<const F: usize> TuneMeter<F> {
     pub fn variance(&self) -> Option<f32> {
         let sigma = self.noise.sigma();
         sigma.is_finite().then_some(sigma * sigma)
+    }
+
+    /// Sum of squared deviations of the readings that count from their mean [1].
+    pub fn scatter(&self) -> f32 {
+        self.scatter.value()
     }
 
     /// Mean of the readings that count [1], the mean of `ln` of the supplies' factors over them, and their number.
@@ -119,6 +133,8 @@ mod tests {
             // uniform in +-1e-3: 5.8e-4 rms, and the 68 % quantile of a difference over sqrt 2 is 6.2e-4
             let sigma = libm::sqrtf(meter.variance().unwrap());
             assert!((5e-4..8e-4).contains(&sigma), "{sigma}");
+            let rms = libm::sqrtf(meter.scatter() / count as f32);
+            assert!((rms / 5.8e-4 - 1.0).abs() < 0.1, "{rms}"); // 1/sqrt(800)
         }
     }
 

@@ -202,6 +202,9 @@ pub struct Fit {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub sampling: Sampling,
+    /// The optics of the calibrated ring with error bars, as one page
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
     /// Folder for the draws, one CmdStan CSV a chain, as `arviz.from_cmdstan` reads it
     #[arg(long, value_name = "DIR")]
     pub save_draws: Option<PathBuf>,

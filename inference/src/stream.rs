@@ -4,6 +4,8 @@ mod estimate;
 mod held;
 mod setup;
 
+use core::fmt;
+
 use estimator::surrogate::Unstable;
 use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode, Prior,
@@ -73,7 +75,7 @@ pub enum StreamError {
 
 /// A core on the host for a ring of any size, with the model that it goes by: the core of exactly the ring's sizes if there is one,
 /// else the smallest with room for it, see [`training::rooms`].
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Core {
     /// The ring.
     pub tables: Tables,
@@ -164,6 +166,15 @@ impl Core {
     /// If there is no such param.
     pub fn prior(&self, i: usize) -> Prior {
         self.setup.priors[self.tables.prior_group(i)]
+    }
+}
+
+impl fmt::Debug for Core {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Core")
+            .field("sizes", &self.tables.sizes())
+            .field("stream", &self.stream)
+            .finish_non_exhaustive()
     }
 }
 

@@ -166,9 +166,11 @@ impl<
         for plane in 0..2 {
             let Some(meter) = self.tunes.get(plane) else { continue };
             if let (Some(variance), (mean, strength, count @ 1..)) = (meter.variance(), meter.mean()) {
+                let squares = meter.scatter();
                 let innovation = self.tune_innovation(model, plane, mean, &strength);
                 let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
                 self.gaussian.condition(B + plane, innovation, variance / count as f32, &slope);
+                self.gaussian.add_repeats(count, variance, squares);
             }
         }
     }

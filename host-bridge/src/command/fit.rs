@@ -9,8 +9,8 @@ use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
-use crate::output;
 use crate::result::FitResult;
+use crate::{fit_page, output};
 
 /// Run it.
 ///
@@ -24,6 +24,11 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
         Method::Map => by_steps(options, &ring, &recording)?,
         Method::Nuts => by_draws(options, &ring, &recording)?,
     };
+    if let Some(path) = &options.report {
+        let page = fit_page::page(&ring, &result);
+        let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
+        output::bytes(path, page.render().as_bytes())?;
+    }
     deliver(&options.common, &result)
 }
 
@@ -35,7 +40,7 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     if options.method == Method::Map && options.save_draws.is_some() {
         return Err(CommandError::Input("--save-draws needs --method nuts".into()));
     }
-    check_outputs([options.common.json.as_deref()])?;
+    check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)
 }
 

@@ -219,7 +219,7 @@ mod tests {
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": 1.0}]}"#),
-            "fit.json: expected a var B2 of AGS Booster (BNL), design model, found none"
+            "fit.json: expected a var A4 of AGS Booster (BNL), design model, found none"
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": -1.0}]}"#),

@@ -62,7 +62,7 @@ impl Channel {
 
     /// What is not ideal, in words.
     pub fn words(&self) -> String {
-        format!("{}: gain {:?}, roll {:?} rad", self.name, self.gain, self.roll)
+        format!("{}, gain {:?}, roll {:?} rad", self.name, self.gain, self.roll)
     }
 }
 
@@ -87,24 +87,30 @@ impl Lattice {
         let effects: Vec<Effect> = result.findings.iter().map(|(effect, _)| effect.clone()).collect();
         let machine = Machine::new(ring.with_vars(&result.vars(ring, path)?), Rf::FixedMomentum, &effects)?;
         let mut lattice = Self::plain(machine.ring());
-        lattice.remarks.push(format!("{}: strengths from {}", lattice.machine, result.recording));
+        let version = env!("CARGO_PKG_VERSION");
+        lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));
         for (effect, sentence) in &result.findings {
             let included = lattice.apply(effect);
             lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
         }
         lattice.remarks.extend(result.open.iter().map(|open| format!("open, not in this file: {open}")));
+        lattice.remarks.iter_mut().for_each(|remark| *remark = one_line(remark));
         Ok(lattice)
     }
 
     /// A ring as it is.
     pub(super) fn plain(ring: &Ring) -> Self {
         let mut names = Names::new();
-        let (mut elements, mut position, mut remarks) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut elements, mut position, mut remarks, mut drifts) = (Vec::new(), Vec::new(), Vec::new(), 1..);
         for element in &ring.elements {
             position.push(elements.len());
-            let name = names.take(if element.name.is_empty() { "drift_1" } else { &element.name });
-            if !element.name.is_empty() && name != element.name {
-                remarks.push(format!("{:?} is called {name}", element.name));
+            let wanted = match element.name.as_str() {
+                "" => format!("drift_{}", drifts.next().expect("numbers do not end")),
+                name => name.into(),
+            };
+            let name = names.take(&wanted);
+            if name != wanted {
+                remarks.push(format!("{wanted:?} is called {name}"));
             }
             elements.extend(pieces(Element { name, ..element.clone() }, &mut names));
         }
@@ -139,6 +145,21 @@ impl Lattice {
     /// Planes of the monitor or corrector at an element.
     pub fn channels_of<'l>(channels: &'l [Channel], element: usize) -> impl Iterator<Item = &'l Channel> {
         channels.iter().filter(move |channel| channel.element == element)
+    }
+
+    /// The remarks, and one for each monitor or corrector that the format has no words for.
+    pub fn remarks_of<'l>(&'l self, format: &str, without_words: impl Iterator<Item = &'l Channel>) -> Vec<String> {
+        let without_words = without_words.map(|channel| format!("{format} does not act on {}", channel.words()));
+        self.remarks.iter().cloned().chain(without_words).collect()
+    }
+
+    /// Monitors that are not ideal, and correctors with a gain or planes of different rolls: what a format without knobs
+    /// cannot say.
+    pub fn not_acted_on(&self) -> impl Iterator<Item = &Channel> {
+        let monitors = self.monitors.iter().filter(|channel| !channel.is_ideal());
+        let is_beyond =
+            |channel: &&Channel| channel.gain != 1.0 || channel.roll != self.corrector_roll(channel.element);
+        monitors.chain(self.correctors.iter().filter(is_beyond))
     }
 
     /// Roll of the corrector at an element, if its planes are rolled alike, else 0 [rad].
@@ -177,6 +198,11 @@ impl Lattice {
         }
         true
     }
+}
+
+/// A comment ends with its line, whatever the names in it hold.
+fn one_line(text: &str) -> String {
+    text.split(char::is_control).collect::<Vec<_>>().join(" ")
 }
 
 /// Monitors and correctors as thin elements with a drift behind them; markers likewise.
