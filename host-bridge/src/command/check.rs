@@ -17,7 +17,7 @@ use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
 /// Fewest monitors with readings, and correctors that were moved, for a diagnosis.
 const LEAST: usize = diagnosis::data::LEAST;
 /// Rate of a device's serial line where none is given [baud], and bits of a byte on it.
-const LINE: (f6diagnosis::data::LEAST, f6diagnosis::data::LEAST) = (921_600.0, 10.0);
+const LINE: (f64, f64) = (921_600.0, 10.0);
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
@@ -26,8 +26,8 @@ struct CheckResult {
     machine: String,
     frames: usize,
     /// Frames that the counter has passed over.
-    lost_frames: u6diagnosis::data::LEAST,
-    seconds: f6diagnosis::data::LEAST,
+    lost_frames: u64,
+    seconds: f64,
     settings: Settings,
     noise: Noise,
     tunes: Option<Design>,
@@ -36,7 +36,7 @@ struct CheckResult {
     /// Monitors without any reading.
     silent_monitors: Vec<String>,
     /// Share of readings that are missing.
-    missing: f6diagnosis::data::LEAST,
+    missing: f64,
     commands: Vec<Usable>,
 }
 
@@ -52,9 +52,9 @@ struct Settings {
     /// Correctors that were not.
     unused: Vec<String>,
     /// Largest kick [mrad].
-    largest_kick_mrad: f6diagnosis::data::LEAST,
+    largest_kick_mrad: f64,
     /// RF frequency offsets other than 0 [1].
-    rf_offsets: Vec<f6diagnosis::data::LEAST>,
+    rf_offsets: Vec<f64>,
 }
 
 /// Noise of one reading: median over the monitors in state ok, by the scatter of repeats and by the header [mm].
@@ -66,15 +66,15 @@ struct Noise {
 
 #[derive(Debug, Serialize)]
 struct PlaneNoise {
-    of_repeats_mm: Option<f6diagnosis::data::LEAST>,
-    of_header_mm: Option<f6diagnosis::data::LEAST>,
+    of_repeats_mm: Option<f64>,
+    of_header_mm: Option<f64>,
 }
 
 /// Tunes of the ring as designed, at the recording's mean currents.
 #[derive(Debug, Serialize)]
 struct Design {
-    x: f6diagnosis::data::LEAST,
-    y: f6diagnosis::data::LEAST,
+    x: f64,
+    y: f64,
 }
 
 /// What a command can do with the recording.
@@ -105,8 +105,7 @@ impl CheckResult {
         let readings = &campaign.readings;
         let silent = |b: &usize| readings.column(*b).iter().all(|reading| reading.is_nan());
         let names = ring.monitor_names();
-        let passed =
-            rows.windows(2).map(|pair| u6diagnosis::data::LEAST::from(pair[1].sequence - pair[0].sequence) - 1);
+        let passed = rows.windows(2).map(|pair| u64::from(pair[1].sequence - pair[0].sequence) - 1);
         Self {
             recording: name.clone(),
             machine: ring.name.clone(),
@@ -119,8 +118,7 @@ impl CheckResult {
             tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
-            missing: readings.iter().filter(|reading| reading.is_nan()).count() as f6diagnosis::data::LEAST
-                / readings.len().max(1) as f6diagnosis::data::LEAST,
+            missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
         }
     }
@@ -138,21 +136,20 @@ impl Settings {
         repeats.retain(|count| *count > 0);
         repeats.sort_unstable();
         let at = |i: usize| repeats.get(i).copied().unwrap_or(0);
-        let largest =
-            |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f6diagnosis::data::LEAST::max);
+        let largest = |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f64::max);
         let (names, nominal) = (campaign.ring.corrector_names(), campaign.recording.nominal_kick());
         // idle ones scatter by a thousandth of what others are set to
         let unused: Vec<usize> = (0..names.len()).filter(|&c| largest(c) < 0.05 * nominal).collect();
-        let mut offsets: Vec<f6diagnosis::data::LEAST> =
+        let mut offsets: Vec<f64> =
             campaign.drives.iter().map(|drive| drive.rf_offset).filter(|offset| *offset != 0.0).collect();
-        offsets.sort_by(f6diagnosis::data::LEAST::total_cmp);
+        offsets.sort_by(f64::total_cmp);
         offsets.dedup();
         Self {
             count: campaign.settings.count,
             repeats: [at(0), at(repeats.len() / 2), at(repeats.len().saturating_sub(1))],
             correctors: [names.len() - unused.len(), names.len()],
             unused: unused.into_iter().map(|c| names[c].clone()).collect(),
-            largest_kick_mrad: (0..names.len()).map(largest).fold(0.0, f6diagnosis::data::LEAST::max) * 1e3,
+            largest_kick_mrad: (0..names.len()).map(largest).fold(0.0, f64::max) * 1e3,
             rf_offsets: offsets,
         }
     }
@@ -164,9 +161,7 @@ impl Noise {
             let own: Vec<usize> =
                 (0..campaign.monitors()).filter(|&b| campaign.plane(b) == plane && campaign.is_ok(b)).collect();
             PlaneNoise {
-                of_repeats_mm: median(
-                    own.iter().map(|&b| f6diagnosis::data::LEAST::from(campaign.screened.health[b].noise) * 1e3),
-                ),
+                of_repeats_mm: median(own.iter().map(|&b| f64::from(campaign.screened.health[b].noise) * 1e3)),
                 of_header_mm: median(own.iter().map(|&b| campaign.recording.header.noise[b] * 1e3)),
             }
         };
@@ -174,9 +169,9 @@ impl Noise {
     }
 }
 
-fn median(values: impl Iterator<Item = f6diagnosis::data::LEAST>) -> Option<f6diagnosis::data::LEAST> {
-    let mut values: Vec<f6diagnosis::data::LEAST> = values.collect();
-    values.sort_by(f6diagnosis::data::LEAST::total_cmp);
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied()
 }
 
@@ -235,7 +230,7 @@ fn device(campaign: &Campaign) -> Usable {
         return Usable { command: "device", can: false, what: "a frame cannot carry its values".into() };
     };
     let can = training::green::sizes(&campaign.ring).is_ok_and(|sizes| large::SIZES.hold(&sizes));
-    let milliseconds = wire.len() as f6diagnosis::data::LEAST * LINE.1 / LINE.0 * 1e3;
+    let milliseconds = wire.len() as f64 * LINE.1 / LINE.0 * 1e3;
     let what = format!(
         "{} bytes a frame, {milliseconds:.1} ms at {} baud; make firmware builds the image, and says whether it fits",
         wire.len(),
@@ -274,10 +269,7 @@ impl CheckResult {
         };
         let lost =
             if self.lost_frames == 0 { String::new() } else { format!(", {} lost between them", self.lost_frames) };
-        let tunes = self.tunes.as_ref().map_or_else(
-            || "no stable ring".into(),
-            |t| format!("{:.diagnosis::data::LEAST} {:.diagnosis::data::LEAST}", t.x, t.y),
-        );
+        let tunes = self.tunes.as_ref().map_or_else(|| "no stable ring".into(), |t| format!("{:.4} {:.4}", t.x, t.y));
         let offsets = match settings.rf_offsets.as_slice() {
             [] => String::new(),
             offsets => {
