@@ -135,7 +135,8 @@ impl<'r> Calibrated<'r> {
         }
         let figure = Figure::lines(&Axes::new("Dispersion", "path length [m]", "dispersion [m]"), &all);
         let mut section = section("Dispersion", "The change of the closed orbit with the momentum.".into(), figure);
-        let change = self.optics.twiss.iter().zip(&self.design.0).map(|(t, design)| t.dispersion[0] - design.dispersion[0]);
+        let change =
+            self.optics.twiss.iter().zip(&self.design.0).map(|(t, design)| t.dispersion[0] - design.dispersion[0]);
         let change = self.series("x", change, self.sigma.0.iter().map(|sigma| sigma.dispersion[0]));
         let axes = Axes::new("Change of the dispersion", "path length [m]", "calibrated less design [m]");
         let figure = Figure::lines(&axes.compared(Reference::Level(0.0)), &[change]);
