@@ -19,6 +19,7 @@ use twin::{
 
 use super::baseline::Baseline;
 use super::evidence::Units;
+use super::fit::FitError;
 use super::settings::Settings;
 use inference::recording::{BelievedRf, Recording};
 use inference::{Campaign, Meter, Screened};
@@ -94,6 +95,9 @@ pub enum DataError {
     /// An effect that the ring cannot have.
     #[error(transparent)]
     Effect(#[from] EffectError),
+    /// No hypothesis can be fitted.
+    #[error(transparent)]
+    Fit(#[from] FitError),
 }
 
 /// Prior standard deviation of a baseline [m].

@@ -12,10 +12,10 @@
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector, DVectorView};
-use twin::{EffectError, Plane, Signatures};
+use twin::{Plane, Signatures};
 
 use super::data::Data;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::location::Location;
 use super::settings::Settings;
 
@@ -72,8 +72,8 @@ struct Bench<'f> {
 /// Give freedom to every place in turn.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, EffectError> {
+/// [`FitError`].
+pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = fitted.data(data);
     let bench = Bench { fitted };
     let settings = Settings::of(&data.drives);
@@ -235,7 +235,7 @@ fn independent(mut columns: DMatrix<f64>) -> DMatrix<f64> {
 }
 
 /// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
-fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, EffectError> {
+fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, FitError> {
     let ring = machine.ring();
     let optics = twin::Optics::of(ring, twin::Hold::Momentum { delta: 0.0 })?;
     let observers = optics.read_monitors();

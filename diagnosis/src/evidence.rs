@@ -91,11 +91,8 @@ pub struct Within {
 }
 
 impl Within {
-    /// Of a precision and slope at `u`, the first of which are params and have a range.
-    ///
-    /// # Panics
-    /// If the precision is not positive.
-    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Self {
+    /// Of a precision and slope at `u`, the first of which are params and have a range; none if the precision is not positive.
+    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Option<Self> {
         let vars = units.len();
         let against = |&i: &usize| {
             let [lower, upper] = units.range[i];
@@ -109,7 +106,7 @@ impl Within {
             matrix.column_mut(i).fill(0.0);
             matrix[(i, i)] = HELD;
         }
-        let free = matrix.cholesky().expect("1 + J^T J is positive");
+        let free = matrix.cholesky()?;
         let mut log_inside = 0.0;
         for (&i, &pull) in &held {
             let along =
@@ -122,7 +119,7 @@ impl Within {
             log_inside += (normal_cdf((upper - u[i]) / sigma) - normal_cdf((lower - u[i]) / sigma)).ln();
         }
         let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-        Self { free, slope, log_det: log_det - held.len() as f64 * HELD.ln(), log_inside }
+        Some(Self { free, slope, log_det: log_det - held.len() as f64 * HELD.ln(), log_inside })
     }
 }
 

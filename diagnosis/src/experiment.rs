@@ -4,10 +4,10 @@
 //! new campaign below each other, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, Machine, Quadrupole, Signatures};
+use twin::{Drives, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Term;
 use super::scan::Rivals;
 
@@ -47,8 +47,8 @@ impl Menu {
     /// For a cause of some amplitude and what competes with it (another, or nothing), beside a fit.
     ///
     /// # Errors
-    /// [`EffectError`].
-    pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
         let (machine, drives) = fitted.machine(data)?;
         let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
@@ -73,13 +73,13 @@ impl Campaign {
         one: &Term,
         other: Option<&Term>,
         weight: f64,
-    ) -> Result<Self, EffectError> {
+    ) -> Result<Self, FitError> {
         let signatures = Signatures::of(machine, drives)?;
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
         let columns: Vec<_> =
             of_vars.iter().zip(&data.units.sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
-        let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
+        let of = |term: &Term| -> Result<DVector<f64>, FitError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
             Ok(data.signature(&signatures.of_effect(term.kind, term.site)?) * scale)

@@ -9,7 +9,7 @@
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, Machine, Signature, Signatures};
+use twin::{Drives, EffectError, Machine, OrbitError, Signature, Signatures};
 
 use super::data::Data;
 use super::evidence::{Units, Within};
@@ -68,25 +68,38 @@ struct Point {
     cost: f64,
 }
 
+/// Why a hypothesis has no fit.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FitError {
+    /// No stable machine where the fit begins, or an effect that the ring cannot have.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+    /// A derivative is so large, or not a number, that the normal matrix is not positive.
+    #[error("the normal matrix of a fit is not positive")]
+    Degenerate,
+}
+
+impl From<OrbitError> for FitError {
+    fn from(error: OrbitError) -> Self {
+        Self::Effect(error.into())
+    }
+}
+
 impl Fitted {
     /// Fit, from a guess of the vars (and of the other unknowns, if it is as long).
     ///
     /// # Errors
-    /// [`EffectError`] if there is no stable machine at the guess.
-    pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, FitError> {
         Self::against(data, hypothesis, guess, f64::INFINITY)
     }
 
     /// The same, given up after a few steps if the cost stays far above that of a rival.
     ///
     /// # Errors
-    /// [`EffectError`] if there is no stable machine at the guess.
-    pub fn against(
-        data: &Data,
-        hypothesis: &Hypothesis,
-        guess: &DVector<f64>,
-        rival: f64,
-    ) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn against(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, FitError> {
         if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind.moves_baselines()) {
             let drifting = data.drifting(given.amplitude.abs());
             let fitted = Self::minimise(&drifting, hypothesis, guess, rival)?;
@@ -105,15 +118,15 @@ impl Fitted {
     /// The hypothesis at the prior's mean, linearised and not fitted.
     ///
     /// # Errors
-    /// [`EffectError`].
-    pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
         let problem = Problem::new(data, hypothesis);
         let u = DVector::zeros(problem.size());
         let residual = problem.residual(&u)?;
         let jacobian = problem.jacobian(&u)?;
         let cost = residual.norm_squared() + u.norm_squared();
-        let factor = normal(&jacobian).cholesky().expect("1 + J^T J is positive");
-        Ok(Self::at(&problem, Point { u, residual, cost }, factor, jacobian))
+        let factor = normal(&jacobian).cholesky().ok_or(FitError::Degenerate)?;
+        Self::at(&problem, Point { u, residual, cost }, factor, jacobian)
     }
 
     /// The data as this fit whitens them.
@@ -121,31 +134,36 @@ impl Fitted {
         self.drifting.as_deref().unwrap_or(data)
     }
 
-    fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, EffectError> {
+    fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, FitError> {
         let problem = Problem::new(data, hypothesis);
         let start = guess.clone().resize_vertically(problem.size(), 0.0);
         let hopeful = |steps, cost| steps < TRIAL || cost <= HOPELESS * rival;
         let found = minimise(&problem, &start, &data.units.bounds(problem.size()), &LIMITS, hopeful);
         let found = found.map_err(|error| match error {
-            OptimiseError::Start(error) => error,
-            OptimiseError::Degenerate => unreachable!("1 + J^T J is positive"),
+            OptimiseError::Start(error) => FitError::Effect(error),
+            OptimiseError::Degenerate => FitError::Degenerate,
         })?;
-        let factor = found.quadratic.factor().expect("1 + J^T J is positive");
+        let factor = found.quadratic.factor().ok_or(FitError::Degenerate)?;
         let here = Point { u: found.x, residual: found.point, cost: found.cost };
-        Ok(Self::at(&problem, here, factor, found.slopes))
+        Self::at(&problem, here, factor, found.slopes)
     }
 
-    fn at(problem: &Problem, here: Point, factor: Cholesky<f64, Dyn>, jacobian: DMatrix<f64>) -> Self {
+    fn at(
+        problem: &Problem,
+        here: Point,
+        factor: Cholesky<f64, Dyn>,
+        jacobian: DMatrix<f64>,
+    ) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.data.units.clone());
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
         let lower = factor.l();
-        let Within { free, slope, log_det, log_inside } =
-            Within::of(&lower * lower.transpose(), &here.u, slope, &units);
+        let within = Within::of(&lower * lower.transpose(), &here.u, slope, &units);
+        let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
         let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
-        Self {
+        Ok(Self {
             hypothesis,
             units,
             params,
@@ -158,7 +176,7 @@ impl Fitted {
             slope,
             u,
             drifting: None,
-        }
+        })
     }
 
     /// `ln` posterior at another point, and its gradient.

@@ -17,10 +17,9 @@ use std::collections::BTreeMap;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::EffectError;
 
 use super::data::Data;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Hypothesis;
 use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Recording;
@@ -83,8 +82,8 @@ impl Score {
     /// Score a hypothesis that has been fitted to all frames.
     ///
     /// # Errors
-    /// [`EffectError`].
-    pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, FitError> {
         let monitors = data.readings.ncols();
         let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
         let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
@@ -163,7 +162,7 @@ fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
 }
 
 /// Predict the left-out readings by a fit to the kept ones.
-fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, EffectError> {
+fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, FitError> {
     let (residual, slopes) = (all.miss(&fit.predicted(kept)?), fit.slopes(kept)?);
     let mut left = Vec::new();
     for column in columns(all, kept, fold) {
@@ -190,8 +189,10 @@ fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Lef
 }
 
 /// The same fit without one of its terms.
-pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, EffectError> {
+pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
     let vars = fitted.params.len();
     let without: Hypothesis = fitted.hypothesis.without(term);
-    Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned())
+    let near = Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned());
+    // vars that kept the beam with the term need not keep it without
+    near.or_else(|_| Fitted::of(data, &without, &DVector::zeros(vars)))
 }

@@ -88,12 +88,14 @@ impl Diagnosis {
         let whole = !found.slots.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {
             let folds = heldout::by_corrector(recording);
-            Some((Score::of(data, &found.null, &folds)?, Score::of(data, &found.best, &folds)?))
+            let scored = |fitted| Score::of(data, fitted, &folds).ok();
+            scored(&found.null).zip(scored(&found.best))
         } else {
             None
         };
         progress("what to measure next");
-        let next_measurement = verdict::next_measurement(data, &found, verdict)?;
+        // a proposal is a help, and no part of the verdict
+        let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let sentence = verdict::sentence(data, &found, verdict, &findings);
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
         Ok(Self {

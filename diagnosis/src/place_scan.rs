@@ -6,10 +6,10 @@
 
 use nalgebra::{DMatrix, DVector};
 use twin::Place;
-use twin::{EffectError, Signatures, Thin};
+use twin::{Signatures, Thin};
 
 use super::data::Data;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::scan::{BATCH, Projection, Score};
 
 /// Longest cell [m], and longest where the gradient may be.
@@ -56,10 +56,10 @@ impl PlaceScan {
     /// Scan the ring about a fit, one of its effects left out if the scan stands in for it.
     ///
     /// # Errors
-    /// [`EffectError`].
-    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, EffectError> {
+    /// [`FitError`].
+    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
-        let bench = unknown.map_or_else(|| Projection::of(fitted), |at| Projection::without(fitted, at));
+        let bench = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
         let (machine, drives) = fitted.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;

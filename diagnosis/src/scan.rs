@@ -8,10 +8,10 @@
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{EffectError, EffectKind, Signatures, Site};
+use twin::{EffectKind, Signatures, Site};
 
 use super::data::Data;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::{Term, members};
 
 /// One candidate.
@@ -71,13 +71,16 @@ impl Projection {
     }
 
     /// About the same point without one of its unknowns: residuals are what they are with it at zero.
-    pub fn without(fitted: &Fitted, unknown: usize) -> Self {
+    ///
+    /// # Errors
+    /// [`FitError::Degenerate`].
+    pub fn without(fitted: &Fitted, unknown: usize) -> Result<Self, FitError> {
         let residual = &fitted.residual + fitted.jacobian.column(unknown) * fitted.u[unknown];
         let back = fitted.jacobian.transpose().remove_row(unknown);
         let normal = &back * back.transpose() + DMatrix::identity(back.nrows(), back.nrows());
-        let factor = normal.cholesky().expect("1 + J^T J is positive");
+        let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
         let slope = &back * &residual - fitted.u.clone().remove_row(unknown);
-        Self { residual, back, factor, slope }
+        Ok(Self { residual, back, factor, slope })
     }
 
     /// `d P r` of whitened signatures, one a column.
@@ -133,8 +136,8 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 /// Scan them.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, EffectError> {
+/// [`FitError`].
+pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let bench = Projection::of(fitted);
@@ -183,13 +186,13 @@ impl Rivals {
 /// [`Rivals::expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
 ///
 /// # Errors
-/// [`EffectError`].
+/// [`FitError`].
 pub fn separations(
     data: &Data,
     fitted: &Fitted,
     (term, amplitude): (&Term, f64),
     others: &[&Term],
-) -> Result<Vec<f64>, EffectError> {
+) -> Result<Vec<f64>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let data = fitted.data(data);
@@ -215,14 +218,14 @@ fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
 /// `ln` Bayes factor of all members of a family having amplitudes of one of some standard deviations, to first order.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, EffectError> {
+/// [`FitError`].
+pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let columns: Vec<DVector<f64>> = members
         .iter()
         .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, term.site)?)))
-        .collect::<Result<_, EffectError>>()?;
+        .collect::<Result<_, FitError>>()?;
     let columns = DMatrix::from_columns(&columns);
     let bench = Projection::of(fitted);
     let pulls = bench.pulls(&columns);

@@ -12,12 +12,12 @@
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::{EffectError, EffectKind};
+use twin::EffectKind;
 
 use super::alternatives::{Alternative, Slot};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::location::SORTS;
 use super::scan::{Candidate, scan};
@@ -106,8 +106,8 @@ impl Search {
     /// Search.
     ///
     /// # Errors
-    /// [`EffectError`].
-    pub fn run(&self, data: Data) -> Result<Found, EffectError> {
+    /// [`FitError`].
+    pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let mut found = self.without_effects(data)?;
         // effects can put each other out, so that there may be more steps than effects
         for _ in 0..2 * MOST {
@@ -115,7 +115,8 @@ impl Search {
                 break;
             }
             let Some(leader) = found.next.leader() else { break };
-            let further = self.further(&found, leader)?;
+            // a trial that leads to no stable machine is not taken
+            let Ok(further) = self.further(&found, leader) else { break };
             // back where it was: one effect has put another out
             let gained = self.log_posterior(&further.best) - self.log_posterior(&found.best);
             if further.slots.len() <= found.slots.len() && gained < BETTER {
@@ -131,19 +132,22 @@ impl Search {
     }
 
     /// Nothing but vars, and the ordinary scatter of a family if there is any.
-    fn without_effects(&self, mut data: Data) -> Result<Found, EffectError> {
+    fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let zero = DVector::zeros(data.units.len());
         let mut null = straighten(&mut data, &Hypothesis::default(), &zero)?;
         let mut next = self.slot(&data, &null)?;
-        if let Some(scatter) = scatter(&data, &null, &next)? {
-            null = straighten(&mut data, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)?;
-            next = self.slot(&data, &null)?;
+        if let Ok(Some(scatter)) = scatter(&data, &null, &next) {
+            let mut scattered = data.clone();
+            if let Ok(fitted) = straighten(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero) {
+                (data, null) = (scattered, fitted);
+                next = self.slot(&data, &null)?;
+            }
         }
         Ok(Found { data, best: null.clone(), null, slots: Vec::new(), next })
     }
 
     /// One more effect.
-    fn further(&self, found: &Found, leader: Fitted) -> Result<Found, EffectError> {
+    fn further(&self, found: &Found, leader: Fitted) -> Result<Found, FitError> {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
         let (mut best, mut slots) = self.settle(&data, leader, &found.next)?;
@@ -174,7 +178,7 @@ impl Search {
 
     /// Let all candidates compete for each slot, given the others, until the best one is in each; what then need not be there is
     /// taken out. The last effect of the fit has just won the competition for its slot.
-    fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), EffectError> {
+    fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), FitError> {
         let (mut best, mut slots) = self.compete(data, fitted, Some(won))?;
         while let Some(idle) =
             slots.iter().filter(|slot| !slot.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
@@ -186,7 +190,7 @@ impl Search {
     }
 
     /// The competition for every slot, again where a better one has got into one of them.
-    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Slot>) -> Result<(Fitted, Vec<Slot>), EffectError> {
+    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Slot>) -> Result<(Fitted, Vec<Slot>), FitError> {
         let mut best = fitted;
         let last = best.hypothesis.terms.len() - 1;
         let mut slots = Vec::new();
@@ -213,19 +217,19 @@ impl Search {
     }
 
     /// The competition for one of the effects of a fit.
-    fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Slot, EffectError> {
+    fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Slot, FitError> {
         let rest = super::heldout::reduced(data, fitted, term)?;
         let present = Alternative::exact(data, &rest, fitted.clone(), term);
         self.competition(data, &rest, Some(present))
     }
 
     /// The competition for one more effect beside those of a fit.
-    fn slot(&self, data: &Data, fitted: &Fitted) -> Result<Slot, EffectError> {
+    fn slot(&self, data: &Data, fitted: &Fitted) -> Result<Slot, FitError> {
         self.competition(data, fitted, None)
     }
 
     /// The same, where one of the candidates has been fitted already.
-    fn competition(&self, data: &Data, fitted: &Fitted, present: Option<Alternative>) -> Result<Slot, EffectError> {
+    fn competition(&self, data: &Data, fitted: &Fitted, present: Option<Alternative>) -> Result<Slot, FitError> {
         let odds = odds(fitted.hypothesis.terms.len());
         let scanned = scan(fitted.data(data), fitted, &self.terms)?;
         let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNKNOWN) * odds).ln();
@@ -259,11 +263,11 @@ impl Search {
 
     /// The candidates that are worth an exact fit. Where the fit is far off, its vars are bent out of shape and mislead: those
     /// that lead at the prior's mean are then taken too.
-    fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, EffectError> {
+    fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, FitError> {
         let mut leaders = self.first(scanned, &fitted.hypothesis);
         if fitted.is_gross() {
-            let start = Fitted::unfitted(data, &fitted.hypothesis)?;
-            leaders.extend(self.first(&scan(data, &start, &self.terms)?, &fitted.hypothesis));
+            let at_mean = Fitted::unfitted(data, &fitted.hypothesis).and_then(|start| scan(data, &start, &self.terms));
+            leaders.extend(at_mean.map_or_else(|_| Vec::new(), |scanned| self.first(&scanned, &fitted.hypothesis)));
         }
         Ok(leaders)
     }
@@ -283,7 +287,7 @@ impl Search {
 }
 
 /// Fit, and straighten the readings by the machine that was found, until that changes them no more.
-fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, EffectError> {
+fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
     if !fitted.is_gross() {
         data.trim(&fitted.residual);
@@ -292,7 +296,8 @@ fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) ->
     for _ in 0..PASSES {
         // a machine that keeps no beam in one of the settings is not the one that was recorded
         let Ok(moved) = data.straighten(&fitted.machine(data)?.0) else { break };
-        fitted = Fitted::of(data, hypothesis, &fitted.u)?;
+        let Ok(again) = Fitted::of(data, hypothesis, &fitted.u) else { break };
+        fitted = again;
         if moved < CURVED {
             break;
         }
@@ -324,7 +329,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
 }
 
 /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
-fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, EffectError> {
+fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, FitError> {
     let single = next.log_odds;
     let mut best: Option<(Scatter, f64)> = None;
     for &(kind, name, widths) in &FAMILIES {

@@ -1,11 +1,12 @@
 //! The verdict, in one word and in one sentence.
 
 use serde::{Deserialize, Serialize};
-use twin::{EffectError, EffectKind, Measured, Unit};
+use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Slot};
 use super::data::Data;
 use super::experiment::Menu;
+use super::fit::FitError;
 use super::heldout::{Fold, PROVEN, Score};
 use super::hypothesis::{Scatter, Term};
 use super::place_scan::{Interval, PlaceScan};
@@ -128,7 +129,7 @@ impl Finding {
     }
 
     /// The first of a competition, with the others below it.
-    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Result<Self, EffectError> {
+    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Result<Self, FitError> {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
         let others: Vec<&Alternative> = slot.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
         let finding = Self::of(data, &slot.alternatives[first]);
@@ -179,14 +180,14 @@ impl Finding {
 /// Held-out gain of each effect: all effects against all but this one.
 ///
 /// # Errors
-/// [`EffectError`].
+/// [`FitError`].
 pub fn gains(
     data: &Data,
     found: &Found,
     before: &Score,
     after: &Score,
     folds: &[Fold],
-) -> Result<Vec<(f64, f64)>, EffectError> {
+) -> Result<Vec<(f64, f64)>, FitError> {
     if found.slots.len() == 1 {
         return Ok(vec![after.gain_over(before)]);
     }
@@ -196,19 +197,16 @@ pub fn gains(
 /// One finding for each effect, strongest first; of what is not in the model, the most likely.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn findings(
-    data: &Data,
-    found: &Found,
-    gains: &[(f64, f64)],
-    verdict: Verdict,
-) -> Result<Vec<Finding>, EffectError> {
+/// [`FitError`].
+pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Result<Vec<Finding>, FitError> {
     let mut all: Vec<Finding> = Vec::new();
     for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
         let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
-            Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)?.credible(CREDIBLE),
+            // without a scan there is no interval, and the finding stands
+            Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)
+                .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
         all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first)? });
@@ -304,8 +302,8 @@ fn capitalised(text: &str) -> String {
 /// What could be measured, and the labels of the two causes that it would take apart, for what is not settled.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu, [String; 2])>, EffectError> {
+/// [`FitError`].
+pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu, [String; 2])>, FitError> {
     if verdict != Verdict::Ambiguous {
         return Ok(None);
     }
@@ -324,8 +322,8 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
 /// The measurement that would take the two most likely causes furthest apart, for what is not settled.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, EffectError> {
+/// [`FitError`].
+pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, FitError> {
     let Some((menu, [one, against])) = menu(data, found, verdict)? else { return Ok(None) };
     Ok(menu.proposals.first().map(|best| {
         format!(

@@ -1,6 +1,6 @@
 //! What competes in the first search, and the price that it pays.
 
-use twin::EffectError;
+use crate::fit::FitError;
 
 use crate::Diagnosis;
 use crate::discrepancy;
@@ -12,7 +12,7 @@ use report::{Axes, Figure, Ranked, Section};
 const LEADING: usize = 15;
 
 /// The leading causes, the model without any effect being the alternative.
-pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
+pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let found = &diagnosis.found;
     let (null, data) = (&found.null, &found.data);
     let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term).collect();

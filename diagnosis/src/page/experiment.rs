@@ -1,13 +1,13 @@
 //! What is not settled, and the measurement that would settle it.
 
-use twin::EffectError;
+use crate::fit::FitError;
 
 use super::table;
 use crate::{Diagnosis, Verdict, verdict};
 use report::Section;
 
 /// Alternatives of the leading findings, and the menu.
-pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
+pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut section = Section { heading: "What to measure next".into(), ..Section::default() };
     section.text.push(match &diagnosis.next_measurement {
         Some(next) => format!("{}.", next.trim_end_matches('.')),

@@ -1,6 +1,6 @@
 //! The findings, each with what competes with it.
 
-use twin::EffectError;
+use crate::fit::FitError;
 
 use super::{signed, table};
 use crate::{Diagnosis, Finding, Verdict};
@@ -11,7 +11,7 @@ use report::Section;
 const ALTERNATIVES: usize = 5;
 
 /// Verdict, circumstances, findings.
-pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, EffectError> {
+pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, FitError> {
     let found = &diagnosis.found;
     let next = &found.next;
     let percent = |p: f64| format!("{:.1} %", 100.0 * p);

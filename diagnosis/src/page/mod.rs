@@ -13,7 +13,7 @@ mod residuals;
 mod ring;
 mod vars;
 
-use twin::EffectError;
+use crate::fit::FitError;
 
 use super::Diagnosis;
 use inference::recording::Recording;
@@ -23,8 +23,8 @@ use residuals::Residuals;
 /// The page of a diagnosis.
 ///
 /// # Errors
-/// [`EffectError`].
-pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, EffectError> {
+/// [`FitError`].
+pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, FitError> {
     let found = &diagnosis.found;
     let data = &found.data;
     let mut residuals = vec![Residuals::of("before", data, &found.null)];

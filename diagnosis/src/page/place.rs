@@ -1,8 +1,9 @@
 //! Where along the beam a gradient would sit.
 
-use twin::{EffectError, Element, Ring, Thin};
+use twin::{Element, Ring, Thin};
 
 use super::signed;
+use crate::fit::FitError;
 use crate::place_scan::{Interval, PlaceScan};
 use crate::{Diagnosis, Finding, Verdict};
 use report::{Axes, Figure, Reference, Section, Series};
@@ -16,7 +17,7 @@ const NEGLIGIBLE: f64 = 1e-3;
 const AROUND: f64 = 0.5;
 
 /// The scans for normal and skew gradients.
-pub fn section(diagnosis: &Diagnosis) -> Result<Section, EffectError> {
+pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut section = Section {
         heading: "The scan along the ring".into(),
         text: vec![
