@@ -95,7 +95,6 @@ struct ScatterResult {
 impl From<DataError> for CommandError {
     fn from(error: DataError) -> Self {
         match error {
-            DataError::Stream(error) => error.into(),
             error @ DataError::TooLittle { .. } => Self::Input(error.to_string()),
             error => Self::Other(error.to_string()),
         }
