@@ -101,7 +101,7 @@ const BASELINE: f64 = 20e-3;
 /// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
 const FAULTY: f64 = 4.0;
 /// Monitors and correctors below which nothing can be told apart.
-const LEAST: usize = 4;
+pub const LEAST: usize = 4;
 
 impl Data {
     /// Whiten a campaign.

@@ -8,8 +8,9 @@
 use std::path::Path;
 use std::sync::LazyLock;
 
+use estimator::booster::Frame;
 use inference::Recording;
-use inference::stream::{self, BoosterEstimate, BoosterFrame, Core};
+use inference::stream::{self, Core, Estimate};
 use libfuzzer_sys::fuzz_target;
 use twin::Ring;
 
@@ -27,7 +28,7 @@ const HEARD: usize = 100;
 static CAMPAIGN: LazyLock<Campaign> = LazyLock::new(|| {
     let ring = Ring::booster();
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-    let recording = Recording::read(&path, &stream::layout(&ring)).expect("a recording that ships with the repository");
+    let recording = Recording::read(&path, &ring).expect("a recording that ships with the repository");
     let wires: Vec<_> = recording.rows.iter().map(|row| stream::wire(&recording, row).expect("a frame")).collect();
     let [fresh, mut seasoned] =
         [1e-5, 0.0].map(|walk| stream::estimator(&ring, &recording, walk).expect("a stable ring"));
@@ -43,7 +44,7 @@ static CAMPAIGN: LazyLock<Campaign> = LazyLock::new(|| {
 
 /// A body as a wire frame whose version, length and CRC are right.
 fn sealed(body: &[u8]) -> Vec<u8> {
-    let mut plain = vec![BoosterFrame::VERSION, body.len() as u8, (body.len() >> 8) as u8];
+    let mut plain = vec![Frame::VERSION, body.len() as u8, (body.len() >> 8) as u8];
     plain.extend_from_slice(body);
     plain.extend_from_slice(&CRC.checksum(&plain).to_le_bytes());
     let mut wire = vec![0; cobs::max_encoding_length(plain.len()) + 1];
@@ -60,9 +61,10 @@ fn is_sealed(wire: &[u8]) -> bool {
         .is_some_and(|(covered, crc)| CRC.checksum(covered).to_le_bytes() == *crc)
 }
 
-fn is_finite(e: &BoosterEstimate) -> bool {
+fn is_finite(e: &Estimate) -> bool {
     let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma];
-    lists.into_iter().flatten().chain([&e.nis, &e.log_evidence]).all(|v| v.is_finite())
+    let numbers = lists.into_iter().flatten().chain([&e.nis, &e.log_evidence]).chain(e.tune_innovation.iter().flatten());
+    numbers.copied().all(f32::is_finite)
 }
 
 fn ingest(core: &mut Core, wire: &[u8]) {

@@ -9,7 +9,7 @@ use nalgebra::DMatrix;
 use report::{Axes, Band, Figure, Page, Reference, Section, Series, Table};
 use twin::{CalibratedOptics, Hold, Optics, OrbitError, Ring, Tunes, Twiss};
 
-use crate::result::FitResult;
+use crate::result::{FitResult, TuneMeasured};
 
 /// What each figure's band is.
 const BAND: &str = "Bands are 68 % intervals.";
@@ -79,18 +79,20 @@ impl<'r> Calibrated<'r> {
     }
 
     fn tunes(&self) -> Section {
-        let row = |plane: &str, of: fn(&Tunes) -> f64| {
+        let row = |plane: &str, of: fn(&Tunes) -> f64, measured: Option<TuneMeasured>| {
             let (design, tune, sigma) = (of(&self.design.1), of(&self.optics.tunes), of(&self.sigma.1));
             vec![
                 plane.into(),
                 format!("{design:.5}"),
                 format!("{tune:.5} ± {sigma:.5}"),
                 format!("{:+.5}", tune - design),
+                measured.map_or("none".into(), |tune| format!("{:.5} ± {:.5}", tune.mean, tune.sigma)),
             ]
         };
-        let header = ["plane", "design", "calibrated", "difference"].map(str::to_owned).to_vec();
+        let header = ["plane", "design", "calibrated", "less design", "measured"].map(str::to_owned).to_vec();
         let caption = "Tunes with their integer part; errors are standard deviations.".into();
-        let rows = vec![row("x", |t| t.x), row("y", |t| t.y)];
+        let measured = self.result.tunes_measured;
+        let rows = vec![row("x", |t| t.x, measured.x), row("y", |t| t.y, measured.y)];
         Section { heading: "Tunes".into(), tables: vec![Table { caption, header, rows }], ..Section::default() }
     }
 
@@ -135,7 +137,8 @@ impl<'r> Calibrated<'r> {
         }
         let figure = Figure::lines(&Axes::new("Dispersion", "path length [m]", "dispersion [m]"), &all);
         let mut section = section("Dispersion", "The change of the closed orbit with the momentum.".into(), figure);
-        let change = self.optics.twiss.iter().zip(&self.design.0).map(|(t, design)| t.dispersion[0] - design.dispersion[0]);
+        let change =
+            self.optics.twiss.iter().zip(&self.design.0).map(|(t, design)| t.dispersion[0] - design.dispersion[0]);
         let change = self.series("x", change, self.sigma.0.iter().map(|sigma| sigma.dispersion[0]));
         let axes = Axes::new("Change of the dispersion", "path length [m]", "calibrated less design [m]");
         let figure = Figure::lines(&axes.compared(Reference::Level(0.0)), &[change]);

@@ -111,6 +111,15 @@ impl Core {
         Self::holding(tables, setup, stream)
     }
 
+    /// The same in the largest core of all.
+    ///
+    /// # Errors
+    /// [`StreamError::Unstable`].
+    pub fn in_largest_room(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
+        let stream = Held::<large::Estimator>::boxed(&tables, &setup);
+        Self::holding(tables, setup, Some(stream))
+    }
+
     fn holding(
         tables: Tables,
         setup: Setup,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use estimator::{Health, MonitorState};
-use inference::stream::{self, BoosterEstimate};
+use inference::stream::{self, Estimate};
 use inference::{Campaign, Recording};
 use nalgebra::DMatrix;
 use twin::Ring;
@@ -26,16 +26,16 @@ fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>) {
     let (mut accepted, mut health) = (DMatrix::from_element(frames, monitors, false), Vec::new());
     let mut history: Vec<Vec<usize>> = Vec::new();
     let mut at = 0;
-    let set = |accepted: &mut DMatrix<bool>, row: usize, mask: u64, to: bool| {
-        (0..monitors).filter(|b| mask >> b & 1 == 1).for_each(|b| accepted[(row, b)] = to);
+    let set = |accepted: &mut DMatrix<bool>, row: usize, mask: &[bool], to: bool| {
+        (0..monitors).filter(|b| mask[*b]).for_each(|b| accepted[(row, b)] = to);
     };
-    stream::replay(&mut core, recording, |_, estimate: &BoosterEstimate| {
-        set(&mut accepted, at, estimate.accepted, true);
+    stream::replay(&mut core, recording, |_, estimate: &Estimate| {
+        set(&mut accepted, at, &estimate.accepted, true);
         if let Some(setting) = estimate.setting {
             history.resize(history.len().max(usize::from(setting) + 1), Vec::new());
             let rows = &mut history[usize::from(setting)];
-            rows.iter().for_each(|&row| set(&mut accepted, row, estimate.restarted, false));
-            rows.last().into_iter().for_each(|&last| set(&mut accepted, last, estimate.confirmed, true));
+            rows.iter().for_each(|&row| set(&mut accepted, row, &estimate.restarted, false));
+            rows.last().into_iter().for_each(|&last| set(&mut accepted, last, &estimate.confirmed, true));
             rows.push(at);
         }
         health = estimate.health.to_vec();

@@ -1,19 +1,22 @@
 //! Time of the core on one core of the host: a whole frame, and each step of its path.
 
 use divan::{Bencher, black_box};
-use estimator::surrogate::Surrogate;
-use estimator::{Calibration, Drive, Frame, Gaussian, Prediction, Prior, Solution};
-use inference::stream::{self, BoosterFrame, Core};
+use estimator::booster::{
+    self, CHANNELS, CORRECTORS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
+};
+use estimator::{Gaussian, Layout, Prior, Solution, Surrogate};
+use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
-use training::BoosterGreen;
 use twin::Ring;
+
+const LAYOUT: Layout = Layout { ring: booster::SIZES, room: booster::SIZES };
 
 fn main() {
     divan::main();
 }
 
-type Linearised = <BoosterGreen as Surrogate<33, 48, 48>>::Linearised;
+type Linearised = <Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised;
 
 /// Frames of `recordings/paper-vars` as wire bytes, and a core that has heard some of them.
 struct Campaign {
@@ -78,38 +81,37 @@ fn linearise_anew(bencher: Bencher) {
 #[divan::bench]
 fn decode(bencher: Bencher) {
     let wire = Campaign::read().wires.swap_remove(100);
-    bencher.with_inputs(|| wire.clone()).bench_local_refs(|wire| BoosterFrame::decode(wire).unwrap());
+    bencher.with_inputs(|| wire.clone()).bench_local_refs(|wire| Frame::decode(&LAYOUT, wire).unwrap());
 }
 
 /// Frame to bytes.
 #[divan::bench]
 fn encode(bencher: Bencher) {
-    let frame = BoosterFrame::decode(&mut Campaign::read().wires[100]).unwrap();
+    let frame = Frame::decode(&LAYOUT, &mut Campaign::read().wires[100]).unwrap();
     bencher
-        .with_inputs(|| [0; BoosterFrame::MAX_WIRE_BYTES])
-        .bench_local_refs(|bytes| black_box(&frame).encode(bytes).unwrap());
+        .with_inputs(|| [0; Frame::MAX_WIRE_BYTES])
+        .bench_local_refs(|bytes| black_box(&frame).encode(&LAYOUT, bytes).unwrap());
 }
 
-/// One powered corrector, and the stray currents of the others.
-fn drive(calibration: &Calibration) -> Drive<48> {
-    let frame: Frame<33, 48> = Frame::decode(&mut Campaign::read().wires[100]).unwrap();
-    calibration.drive(&frame).unwrap()
-}
-
-/// Tables, linearised at vars of a few per cent, and what they predict.
-fn predicted() -> (BoosterGreen, Box<Linearised>, Drive<48>, Box<Prediction<33, 48>>) {
+/// Tables, linearised at vars of a few per cent, and what they predict of one powered corrector and the stray currents of the
+/// others.
+fn predicted() -> (Box<Green>, Box<Linearised>, Drive, Box<Prediction>) {
     let core = Campaign::read().core;
-    let (tables, drive) = (BoosterGreen::clone(&core.tables), drive(&core.setup.calibration));
-    let (mut linearised, mut prediction) =
-        (Box::new(<BoosterGreen as Surrogate<33, 48, 48>>::BLANK), Box::new(Prediction::BLANK));
+    let frame = Frame::decode(&LAYOUT, &mut Campaign::read().wires[100]).unwrap();
+    let setup: booster::Setup = core.setup.in_room(&LAYOUT);
+    let drive = setup.calibration.drive(&frame).unwrap();
+    let mut tables = Box::new(Green::BLANK);
+    core.tables.fill(&mut *tables).unwrap();
+    let unlinearised = <Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED;
+    let (mut linearised, mut prediction) = (Box::new(unlinearised), Box::new(Prediction::BLANK));
     linearise(&tables, &mut linearised);
     tables.predict(&linearised, &drive, &mut prediction);
     (tables, linearised, drive, prediction)
 }
 
-fn linearise(tables: &BoosterGreen, linearised: &mut Linearised) {
-    let strength: [f32; 48] = core::array::from_fn(|i| 1.0 + 0.03 * (1.7 * i as f32).sin());
-    Surrogate::<33, 48, 48>::linearise(tables, black_box(&strength), linearised).unwrap();
+fn linearise(tables: &Green, linearised: &mut Linearised) {
+    let params: [f32; PARAMS] = core::array::from_fn(|i| 0.03 * (1.7 * i as f32).sin());
+    tables.linearise(black_box(&params), &[0.0; SUPPLIES], linearised).unwrap();
 }
 
 /// The surrogate at new gradients.
@@ -126,17 +128,19 @@ fn predict(bencher: Bencher) {
     bencher.bench_local(|| tables.predict(black_box(&linearised), &drive, &mut prediction));
 }
 
-const PRIOR_WIDTH: f32 = 0.03;
+const PRIOR: Prior = Prior { mean: 0.0, sigma: 0.03, lower: -0.06, upper: 0.06 };
 
-fn prior(prior: &Prior) -> Box<Gaussian<33, 48, 1176>> {
+type Posterior = Gaussian<CHANNELS, PARAMS, TRIANGLE>;
+
+fn prior() -> Box<Posterior> {
     let mut gaussian = Box::new(Gaussian::BLANK);
-    gaussian.reset(prior);
+    gaussian.reset(|_| PRIOR, |_| 0.02);
     gaussian
 }
 
 /// A frame's 33 readings enter the Gaussian.
-fn condition_all(gaussian: &mut Gaussian<33, 48, 1176>, prediction: &Prediction<33, 48>) {
-    for (b, slope) in prediction.jacobian.as_slice().chunks_exact(48).enumerate() {
+fn condition_all(gaussian: &mut Posterior, prediction: &Prediction) {
+    for (b, slope) in prediction.jacobian.as_slice().chunks_exact(PARAMS).enumerate() {
         gaussian.condition(b, black_box(1e-3), 2.25e-8, slope);
     }
     gaussian.settle();
@@ -146,7 +150,7 @@ fn condition_all(gaussian: &mut Gaussian<33, 48, 1176>, prediction: &Prediction<
 #[divan::bench]
 fn condition(bencher: Bencher) {
     let (.., prediction) = predicted();
-    let mut gaussian = prior(&Prior::lognormal(PRIOR_WIDTH));
+    let mut gaussian = prior();
     bencher.bench_local(|| condition_all(&mut gaussian, &prediction));
 }
 
@@ -154,15 +158,14 @@ fn condition(bencher: Bencher) {
 #[divan::bench]
 fn solve(bencher: Bencher) {
     let (.., prediction) = predicted();
-    let width = Prior::lognormal(PRIOR_WIDTH);
-    let (mut gaussian, mut solution) = (prior(&width), Box::new(Solution::BLANK));
+    let (mut gaussian, mut solution) = (prior(), Box::new(Solution::<PARAMS, TRIANGLE, WORDS>::BLANK));
     condition_all(&mut gaussian, &prediction);
-    bencher.bench_local(|| assert!(solution.solve(black_box(&gaussian), &width)));
+    bencher.bench_local(|| assert!(solution.solve(black_box(&gaussian), |_| PRIOR)));
 }
 
 /// The surrogate's tables from the twin.
 #[divan::bench]
 fn tables(bencher: Bencher) {
     let ring = Ring::booster();
-    bencher.bench_local(|| training::green::tables::<15, 18, 24, 24, 96, 4656>(black_box(&ring)).unwrap());
+    bencher.bench_local(|| training::green::tables(black_box(&ring)).unwrap());
 }

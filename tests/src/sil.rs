@@ -2,8 +2,7 @@
 
 use core::error::Error;
 
-use estimator::booster::Estimate;
-use firmware_sim::link::Status;
+use estimator::wire::link::Status;
 use host_bridge::record::{EstimateRecord, Names};
 use host_bridge::result::FitResult;
 use host_bridge::source::device::Fed;
@@ -11,7 +10,7 @@ use host_bridge::source::link::{Heard, Link};
 use host_bridge::source::{Clock, Rate};
 use host_bridge::stop::Stop;
 use inference::Recording;
-use inference::stream::{self, Core};
+use inference::stream::{self, Core, Estimate};
 use twin::Ring;
 
 use crate::qemu::{Counts, Emulator, Image, Options};
@@ -91,7 +90,7 @@ pub fn compare(
 fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
     core.prepare();
     let Ok(estimate) = core.ingest(&mut wire) else { return false };
-    let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
+    let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));
     bits(&estimate) == bits(&heard.estimate)
         && places.all(|(i, j)| core.covariance(i, j).to_bits() == heard.covariance(i, j).to_bits())
 }
@@ -104,9 +103,11 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
         [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
     });
     let numbers = [e.sequence, e.frames, e.rejected_frames, u32::from(e.linearised)].map(u64::from);
-    let masks = [e.time_us, e.clipped, e.accepted, e.rejected, e.confirmed, e.restarted];
-    let setting = e.setting.map_or(u64::MAX, u64::from);
-    numbers.into_iter().chain(masks).chain([setting]).chain(floats).chain(health).collect()
+    let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
+    let masks = masks.map(|bit| u64::from(*bit));
+    let tunes = e.tune_innovation.map(|tune| tune.map_or(u64::MAX, |tune| u64::from(tune.to_bits())));
+    let rest = [e.time_us, e.setting.map_or(u64::MAX, u64::from), tunes[0], tunes[1]];
+    numbers.into_iter().chain(masks).chain(rest).chain(floats).chain(health).collect()
 }
 
 /// Most instructions of each region in a run, in the order of [`REGIONS`].

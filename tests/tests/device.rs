@@ -2,14 +2,15 @@
 //! process.
 
 use embedded_io::{ErrorKind, ErrorType, Read, Write};
-use estimator::booster::{Estimator, Green};
-use estimator::packet;
-use estimator::surrogate::{Parcel, ParcelError, Table};
-use firmware_sim::link::{Answer, Refusal, Reply, Request, Status, TRIANGLE, Taken, Vitals};
+use estimator::booster::{Answer, Estimator, Green, LINE, PACKET, Parcel, Reply, Request, TRIANGLE};
+use estimator::surrogate::Table;
+use estimator::wire::link::{Refusal, Status, Taken, Vitals};
+use estimator::{ParcelError, Tables as _};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
-use inference::stream::{self, BoosterEstimate, Core};
+use inference::stream::{self, Core, Estimate};
 use system_tests::repository;
+use training::{Tables, rooms};
 use twin::Ring;
 
 /// Bytes from memory, a cycle of silence where there is none.
@@ -65,15 +66,16 @@ impl embedded_hal::digital::OutputPin for Dark {
 /// What a device with these tables in flash says to these bytes.
 fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-    let mut device = Device::new(&mut core, built_in, &mut slot);
+    let mut device = Device::<_, LINE>::new(&mut *core, built_in, &mut *slot);
     let (mut source, mut sink) = (Source(bytes.iter().rev().copied().collect()), Sink(Vec::new()));
     let mut panel = Panel::new(Dark, Dark, Dark);
-    firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default).unwrap();
+    let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+    run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default).unwrap();
     sink.0.split_inclusive_mut(|byte| *byte == 0).map(|packet| Reply::decode(packet).unwrap()).collect()
 }
 
 fn request(request: &Request) -> Vec<Option<u8>> {
-    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+    let mut bytes = vec![0; PACKET];
     let n = request.encode(&mut bytes).unwrap();
     heard(&bytes[..n])
 }
@@ -93,12 +95,36 @@ fn wires(recording: &Recording) -> Vec<Vec<u8>> {
 }
 
 fn start(core: &Core) -> Vec<Option<u8>> {
-    request(&Request::Restart(core.setup))
+    restart(&core.setup)
 }
 
-fn estimates(replies: &[Reply]) -> Vec<BoosterEstimate> {
+/// As a host that talks to devices of any size.
+fn restart(setup: &stream::Setup) -> Vec<Option<u8>> {
+    let mut bytes = vec![0; rooms::large::PACKET];
+    let n = rooms::large::Request::Restart(setup.on_wire()).encode(&mut bytes).unwrap();
+    heard(&bytes[..n])
+}
+
+/// Tables as a device of this machine has them in flash.
+fn in_flash(tables: &Tables) -> Box<Green> {
+    let mut green = Box::new(Green::BLANK);
+    tables.fill(&mut *green).unwrap();
+    green
+}
+
+/// An answer as a host reads it that hears devices of any size.
+fn estimate_of(answer: &Answer) -> Estimate {
+    let mut bytes = vec![0; PACKET];
+    let n = Reply::Estimate(answer.clone()).encode(&mut bytes).unwrap();
+    let rooms::large::Reply::Estimate(answer) = rooms::large::Reply::decode(&mut bytes[..n]).unwrap() else {
+        panic!("another reply")
+    };
+    Estimate::of_answer(&answer).unwrap()
+}
+
+fn estimates(replies: &[Reply]) -> Vec<Estimate> {
     let answer = |reply: &Reply| match reply {
-        Reply::Estimate(answer) => Some(answer.estimate().unwrap()),
+        Reply::Estimate(answer) => Some(estimate_of(answer)),
         _ => None,
     };
     replies.iter().filter_map(answer).collect()
@@ -116,13 +142,14 @@ fn the_loop_answers_as_the_core_in_process() {
         bytes.extend(heard(wire));
     }
     bytes.extend(request(&Request::Status));
-    let replies = replies(&core.tables.clone(), &bytes);
+    let replies = replies(&in_flash(&core.tables), &bytes);
     let mut replies = replies.iter();
     assert_eq!(replies.next(), Some(&Reply::Restarted));
     for (at, wire) in wires(&recording).iter_mut().enumerate() {
         core.prepare();
         let estimate = core.ingest(wire).unwrap();
-        assert!(replies.next() == Some(&Reply::Estimate(Answer::from(&estimate))), "frame {at}");
+        let Some(Reply::Estimate(answer)) = replies.next() else { panic!("no estimate") };
+        assert!(estimate_of(answer) == estimate, "frame {at}");
         let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
         for _ in (0..if at % 100 == 0 { TRIANGLE } else { 0 }).step_by(56) {
             let Some(Reply::Covariance { sequence, entries, .. }) = replies.next() else { panic!("no covariance") };
@@ -182,8 +209,8 @@ fn bad_bytes_are_counted_and_good_frames_answered_as_if_there_were_none() {
             }
         }
     }
-    let (clean, disturbed) = (replies(&core.tables, &clean), replies(&core.tables, &disturbed));
-    let rejected_frames = |mut estimate: BoosterEstimate| {
+    let (clean, disturbed) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &disturbed));
+    let rejected_frames = |mut estimate: Estimate| {
         estimate.rejected_frames = 0;
         estimate
     };
@@ -206,7 +233,7 @@ fn bad_bytes_are_counted_and_good_frames_answered_as_if_there_were_none() {
 }
 
 /// Tables of a ring whose first quadrupole is 1 % stronger than the design.
-fn other_tables(ring: &Ring) -> Green {
+fn other_tables(ring: &Ring) -> Tables {
     let mut vars = vec![1.0; 48];
     vars[0] = 1.01;
     training::green::tables(&ring.with_vars(&vars)).unwrap()
@@ -220,15 +247,14 @@ fn new_tables_change_the_answer_as_they_do_in_process() {
     let other = other_tables(&ring);
     let mut bytes = start(&core);
     good[..200].iter().for_each(|wire| bytes.extend(heard(wire)));
-    other.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    other.parcels::<LINE>().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
     good[200..].iter().for_each(|wire| bytes.extend(heard(wire)));
     bytes.extend(request(&Request::Status));
     bytes.extend(request(&Request::BuiltIn));
     bytes.extend(request(&Request::Status));
-    let replies = replies(&core.tables, &bytes);
+    let replies = replies(&in_flash(&core.tables), &bytes);
     // a core that went by the new tables from its first frame on, linearised at other moments
-    let mut expected = core.clone();
-    *expected.tables = other.clone();
+    let mut expected = Core::with_tables(other.clone(), core.setup.clone()).unwrap();
     let mut last = None;
     stream::replay(&mut expected, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     let (last, got) = (last.unwrap(), estimates(&replies).pop().unwrap());
@@ -239,8 +265,8 @@ fn new_tables_change_the_answer_as_they_do_in_process() {
     // ln var is relative to the tables' own ring
     assert!((got.map_params[0] - (0.99862_f32 / 1.01).ln()).abs() < 5e-4, "{}", got.map_params[0]);
     let status: Vec<_> = replies.iter().filter_map(|r| if let Reply::Status(s) = r { Some(s) } else { None }).collect();
-    assert_eq!((status[0].loaded, status[0].tables), (true, other.digest()));
-    assert_eq!((status[1].loaded, status[1].tables), (false, core.tables.digest()));
+    assert_eq!((status[0].loaded, status[0].tables), (true, other.digest::<LINE>()));
+    assert_eq!((status[1].loaded, status[1].tables), (false, core.tables.digest::<LINE>()));
 }
 
 #[test]
@@ -259,7 +285,9 @@ fn damaged_tables_are_rejected_whole() {
     // one code changed, and its packet's CRC right
     for parcel in &parcels {
         let mut parcel = parcel.clone();
-        if let Parcel::Codes { table: Table::Mutual(0), line: 50, codes } = &mut parcel {
+        if let Parcel::Codes { table, line: 50, codes } = &mut parcel
+            && *table == Table::MutualX as u8
+        {
             codes[3] += 1;
         }
         disturbed.extend(request(&Request::Model(parcel)));
@@ -267,7 +295,7 @@ fn damaged_tables_are_rejected_whole() {
     // a part without its head
     disturbed.extend(request(&Request::Model(parcels[5].clone())));
     good[20..40].iter().for_each(|wire| disturbed.extend(heard(wire)));
-    let (clean, disturbed) = (replies(&core.tables, &clean), replies(&core.tables, &disturbed));
+    let (clean, disturbed) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &disturbed));
     assert!(estimates(&clean) == estimates(&disturbed), "another posterior");
     let wrong: Vec<ParcelError> =
         disturbed.iter().filter_map(|r| if let Reply::Model(Err(e)) = r { Some(*e) } else { None }).collect();
@@ -291,12 +319,12 @@ fn tables_that_cannot_be_left_stay_in_use() {
     // given tables in flash that are right at vars = 1 and have no stable ring anywhere else
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
-    let mut steep = (*core.tables).clone();
-    steep.x.weight.iter_mut().for_each(|weight| *weight *= 1e4);
+    let mut steep = in_flash(&core.tables);
+    steep.weight.iter_mut().for_each(|weight| *weight *= 1e4);
     // when frames by other tables have moved the vars, and the device is to go back
     let good = wires(&recording);
     let mut bytes = start(&core);
-    core.tables.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    core.tables.parcels::<LINE>().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
     good[..60].iter().for_each(|wire| bytes.extend(heard(wire)));
     bytes.extend(request(&Request::BuiltIn));
     good[60..90].iter().for_each(|wire| bytes.extend(heard(wire)));
@@ -305,7 +333,7 @@ fn tables_that_cannot_be_left_stay_in_use() {
     // then it says that it cannot, and answers on by the tables that it has
     assert!(replies.contains(&Reply::Model(Err(ParcelError::Unstable))));
     let status = last_status(&replies);
-    assert_eq!((status.loaded, status.tables, status.frames), (true, core.tables.digest(), 90));
+    assert_eq!((status.loaded, status.tables, status.frames), (true, core.tables.digest::<LINE>(), 90));
     let answers = estimates(&replies);
     for (wire, got) in good[..90].iter().zip(&answers) {
         core.prepare();
@@ -322,32 +350,33 @@ fn a_restart_by_tables_without_a_design_goes_back_to_those_in_flash() {
     // given tables whose Green's function between nodes is beyond all numbers
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
-    let mut endless = (*core.tables).clone();
+    let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     // when they come before the first setup, and then it
     let mut bytes = Vec::new();
-    endless.parcels().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    endless.parcels::<LINE>().for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
     bytes.extend(start(&core));
     let wire = &wires(&recording)[0];
     bytes.extend(heard(wire));
     bytes.extend(request(&Request::Status));
-    let replies = replies(&core.tables, &bytes);
+    let replies = replies(&in_flash(&core.tables), &bytes);
     // then they are given up, aloud, and the frame is answered by those in flash
     let [.., Reply::Model(taken), Reply::Model(Err(ParcelError::Unstable)), Reply::Restarted, answer, _] = &replies[..]
     else {
         panic!("{:?}", replies.iter().rev().take(5).collect::<Vec<_>>());
     };
     assert_eq!(*taken, Ok(Taken::InUse));
-    assert!(*answer == Reply::Estimate((&core.ingest(&mut wire.clone()).unwrap()).into()));
+    let Reply::Estimate(answer) = answer else { panic!("no estimate") };
+    assert!(estimate_of(answer) == core.ingest(&mut wire.clone()).unwrap());
     let status = last_status(&replies);
-    assert_eq!((status.loaded, status.tables, status.refused), (false, core.tables.digest(), 0));
+    assert_eq!((status.loaded, status.tables, status.refused), (false, core.tables.digest::<LINE>(), 0));
 }
 
 #[test]
 fn a_device_without_a_design_says_so() {
     let (ring, recording) = paper_vars();
     let core = stream::estimator(&ring, &recording, 0.0).unwrap();
-    let mut endless = (*core.tables).clone();
+    let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     let bytes = [start(&core), heard(&wires(&recording)[0])].concat();
     let replies = replies(&endless, &bytes);
@@ -365,7 +394,7 @@ fn a_front_end_that_counts_anew_is_taken_after_a_word() {
     bytes.extend(heard(&good[0]));
     bytes.extend(request(&Request::ForgetSequence));
     bytes.extend(heard(&good[0]));
-    let replies = replies(&core.tables, &bytes);
+    let replies = replies(&in_flash(&core.tables), &bytes);
     assert!(matches!(replies[2], Reply::Refused { why: Refusal::OutOfOrder, count: 1 }));
     assert!(matches!(&replies[4], Reply::Estimate(answer) if answer.sequence == 0 && answer.frames == 2));
 }
@@ -375,8 +404,23 @@ fn a_device_says_what_it_lacks() {
     let (ring, recording) = paper_vars();
     let core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let mut bytes = heard(&wires(&recording)[0]);
-    bytes.extend(request(&Request::Restart(estimator::Setup { noise: 0.0, ..core.setup })));
-    let replies = replies(&core.tables, &bytes);
+    bytes.extend(restart(&stream::Setup { noise: vec![0.0; 33], ..core.setup.clone() }));
+    let replies = replies(&in_flash(&core.tables), &bytes);
     assert_eq!(replies[0], Reply::Refused { why: Refusal::NotStarted, count: 1 });
     assert_eq!(replies[1], Reply::Refused { why: Refusal::Setup, count: 2 });
+}
+
+#[test]
+fn tables_of_another_ring_are_refused() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    // given a ring with one monitor less, for which there would be room
+    let mut smaller = ring.clone();
+    smaller.read_monitors.pop();
+    let other = training::green::tables(&smaller).unwrap();
+    let mut bytes = start(&core);
+    other.parcels::<LINE>().take(1).for_each(|parcel| bytes.extend(request(&Request::Model(parcel))));
+    let replies = replies(&in_flash(&core.tables), &bytes);
+    let got = other.sizes();
+    assert_eq!(replies[1], Reply::Model(Err(ParcelError::Sizes { room: core.tables.sizes(), got })));
 }

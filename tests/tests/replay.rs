@@ -1,7 +1,7 @@
 //! The main job on the recordings that ship with the repository: readings in, vars out, against the truth, against the
 //! exact batch answer, and in another order.
 
-use inference::stream::{self, BoosterEstimate, Core};
+use inference::stream::{self, Core, Estimate, Setup};
 use inference::{BatchFit, Recording};
 use nalgebra::{DMatrix, DVector};
 use system_tests::{repository, truth};
@@ -11,7 +11,7 @@ struct Replayed {
     ring: Ring,
     recording: Recording,
     core: Core,
-    last: BoosterEstimate,
+    last: Estimate,
 }
 
 fn read(name: &str) -> (Ring, Recording) {
@@ -21,10 +21,20 @@ fn read(name: &str) -> (Ring, Recording) {
 }
 
 fn replay((ring, recording): (Ring, Recording)) -> Replayed {
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    replay_through(core, (ring, recording))
+}
+
+fn replay_through(mut core: Core, (ring, recording): (Ring, Recording)) -> Replayed {
     let mut last = None;
     stream::replay(&mut core, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     Replayed { ring, recording, core, last: last.unwrap() }
+}
+
+/// Without the tunes: orbits alone.
+fn without_tunes((ring, recording): (Ring, Recording)) -> Replayed {
+    let setup = Setup { tune_calibration: None, ..stream::setup(&ring, &recording, 0.0).unwrap() };
+    replay_through(Core::try_new(&ring, setup).unwrap(), (ring, recording))
 }
 
 impl Replayed {
@@ -134,21 +144,79 @@ fn shuffled(name: &str, seed: u32) -> (Ring, Recording) {
     (ring, recording)
 }
 
-/// Has any number changed? `BLESS=1` rewrites the file; its diff is then reviewed.
+/// Has any number changed? `BLESS=1` rewrites the files; their diff is then reviewed. `NAME-orbits.csv` is the answer without
+/// tunes.
 #[test]
 fn the_final_table_is_the_committed_one() {
     for name in ["paper-vars", "random-vars"] {
-        let run = replay(read(name));
-        let mut table = String::from("var,mean,sigma\n");
-        for (i, var) in run.ring.var_names().iter().enumerate() {
-            // five decimals: a hundredth of an error bar
-            table += &format!("{var},{:.5},{:.5}\n", run.last.mean[i], run.last.sigma[i]);
+        check_table(name, &replay(read(name)));
+        check_table(&format!("{name}-orbits"), &without_tunes(read(name)));
+    }
+}
+
+fn check_table(name: &str, run: &Replayed) {
+    let mut table = String::from("var,mean,sigma\n");
+    for (i, var) in run.ring.var_names().iter().enumerate() {
+        // five decimals: a hundredth of an error bar
+        table += &format!("{var},{:.5},{:.5}\n", run.last.mean[i], run.last.sigma[i]);
+    }
+    let path = repository("tests/golden").join(format!("{name}.csv"));
+    if std::env::var_os("BLESS").is_some() {
+        std::fs::write(&path, &table).unwrap();
+    }
+    let golden = std::fs::read_to_string(&path).unwrap_or_default();
+    assert_eq!(table, golden, "{}: BLESS=1 rewrites it", path.display());
+}
+
+/// Tunes are known to their calibration error, 3e-4, of which a tune depends on all vars together: they narrow that one direction.
+#[test]
+fn tunes_narrow_what_orbits_leave_open() {
+    let ([with, without], ring) = ([replay(read("paper-vars")), without_tunes(read("paper-vars"))], Ring::booster());
+    let optics = twin::Optics::of(&ring, twin::Hold::Momentum { delta: 0.0 }).unwrap();
+    let slopes: Vec<[f64; 2]> = optics
+        .quadrupoles()
+        .iter()
+        .zip(ring.gradients())
+        .map(|(gradient, k1)| optics.tune_slope(gradient).map(|slope| slope * k1))
+        .collect();
+    for plane in [0, 1] {
+        let sigma = |run: &Replayed| {
+            let entry = |i: usize, j: usize| f64::from(run.core.covariance(i, j)) * slopes[i][plane] * slopes[j][plane];
+            (0..48).flat_map(|i| (0..48).map(move |j| (i, j))).map(|(i, j)| entry(i, j)).sum::<f64>().sqrt()
+        };
+        let [with, without] = [sigma(&with), sigma(&without)];
+        assert!(with < 3.3e-4 && with < without, "tune {plane}: {with:.2e}, by orbits alone {without:.2e}");
+    }
+}
+
+#[test]
+fn a_core_with_spare_room_gives_the_same_answer() {
+    for name in ["paper-vars", "random-vars"] {
+        let exact = replay(read(name));
+        let setup = exact.core.setup.clone();
+        let roomy = Core::with_spare_room(exact.core.tables.clone(), setup).unwrap();
+        let mut roomy = replay_through(roomy, read(name));
+        for i in 0..48 {
+            let shift = (roomy.last.mean[i] - exact.last.mean[i]) / exact.last.sigma[i];
+            assert!(shift.abs() < 0.01, "{name}, {}: {shift:.4} sigma", exact.ring.var_names()[i]);
         }
-        let path = repository("tests/golden").join(format!("{name}.csv"));
-        if std::env::var_os("BLESS").is_some() {
-            std::fs::write(&path, &table).unwrap();
-        }
-        let golden = std::fs::read_to_string(&path).unwrap_or_default();
-        assert_eq!(table, golden, "{}: BLESS=1 rewrites it", path.display());
+        let mut core = exact.core.clone();
+        let (quality, expected) = (roomy.core.fit_quality(), core.fit_quality());
+        assert_eq!(quality.degrees_of_freedom, expected.degrees_of_freedom);
+        assert_eq!(roomy.last.health, exact.last.health);
+    }
+}
+
+/// The largest core, on the threads that it needs: as large as the design of a light source.
+#[test]
+fn the_largest_core_takes_a_campaign() {
+    let (ring, mut recording) = read("paper-vars");
+    recording.rows.truncate(40);
+    let exact = replay((ring.clone(), recording.clone()));
+    let (tables, setup) = (exact.core.tables.clone(), exact.core.setup.clone());
+    let largest = replay_through(Core::in_largest_room(tables, setup).unwrap(), (ring, recording));
+    for i in 0..48 {
+        let shift = (largest.last.mean[i] - exact.last.mean[i]) / exact.last.sigma[i];
+        assert!(shift.abs() < 0.01, "{i}: {shift:.4} sigma");
     }
 }

@@ -1,19 +1,21 @@
 //! What the core makes of bytes that are no frame, of frames that no machine sends, of settings that never repeat, and of a
 //! monitor that falls silent.
 
-use estimator::surrogate::Surrogate;
+use estimator::booster::{self, CORRECTORS, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, Setup};
 use estimator::{
-    CurrentCode, Frame, FrameError, IngestError, MagnetCurrents, MonitorState, PositionCode, Prior, RfCode, Setup,
-    TuneCode,
+    CurrentCode, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, MonitorState, PositionCode,
+    Prior, RfCode, Surrogate, TuneCode,
 };
 use inference::Recording;
-use inference::stream::{self, BoosterEstimate, BoosterFrame, Core};
+use inference::stream::{self, Core, Estimate};
 use nalgebra::{DMatrix, DVector};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use system_tests::{repository, truth};
-use training::BoosterGreen;
 use twin::Ring;
+
+/// A Booster in a core of its size.
+const LAYOUT: Layout = Layout { ring: booster::SIZES, room: booster::SIZES };
 
 /// Random numbers, seeded. Source: G. Marsaglia, Xorshift RNGs, J. Stat. Softw. 8 (2003) 14.
 struct Random(u64);
@@ -62,7 +64,12 @@ fn wires(recording: &Recording) -> Vec<Vec<u8>> {
 // ---- Bytes that are no frame ----
 
 /// The body of a frame, whatever it says.
-type Body<'a> = (u32, u64, u32, &'a [i32], [i32; 5], i32, &'a [i32], [Option<i32>; 2], u64);
+type Body<'a> = (u32, u64, u32, &'a [i32], i32, &'a [i32], i32, &'a [i32], [Option<i32>; 2], Option<i32>, &'a [u32]);
+
+/// Currents of the main supplies in a frame that would be good.
+const MAGNETS: (i32, [i32; 2]) = (23_997_850, [17_997_850; 2]);
+/// All monitors are valid.
+const ALL: [u32; 2] = [u32::MAX, 1];
 
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
@@ -93,9 +100,9 @@ fn serialised(body: &Body) -> Vec<u8> {
     postcard::to_slice(body, &mut [0; 4096]).unwrap().to_vec()
 }
 
-fn wire_of(frame: &BoosterFrame) -> Vec<u8> {
-    let mut wire = vec![0; BoosterFrame::MAX_WIRE_BYTES];
-    let n = frame.encode(&mut wire).unwrap();
+fn wire_of(frame: &Frame) -> Vec<u8> {
+    let mut wire = vec![0; Frame::MAX_WIRE_BYTES];
+    let n = frame.encode(&LAYOUT, &mut wire).unwrap();
     wire.truncate(n);
     wire
 }
@@ -103,28 +110,33 @@ fn wire_of(frame: &BoosterFrame) -> Vec<u8> {
 /// A frame that would be good but for the lengths of its lists.
 fn miscounted(sequence: u32, monitors: usize, correctors: usize) -> Vec<u8> {
     let (readings, currents) = (vec![1000; monitors], vec![-5; correctors]);
-    let body = (sequence, 1, 2, currents.as_slice(), [23_997_850; 5], 0, readings.as_slice(), [None; 2], u64::MAX);
-    sealed(BoosterFrame::VERSION, &serialised(&body))
+    let (dipole, supply) = MAGNETS;
+    let valid = vec![u32::MAX; monitors.div_ceil(32)];
+    let body = (sequence, 1, 2, &currents[..], dipole, &supply[..], 0, &readings[..], [None; 2], None, &valid[..]);
+    sealed(Frame::VERSION, &serialised(&body))
 }
 
 /// A frame that would be good but for one value.
 fn beyond(sequence: u32, random: &mut Random) -> Vec<u8> {
-    let (mut currents, mut magnets, mut rf_offset, mut readings, mut tune) =
-        ([0; 48], [23_997_850; 5], 0, [1000; 33], [Some(800_000), None]);
+    let (mut currents, (mut dipole, mut supply), mut rf_offset, mut readings) = ([0; 48], MAGNETS, 0, [1000; 33]);
+    let (mut tune, mut intensity) = ([Some(800_000), None], None);
     let far = |limit: i32, random: &mut Random| {
         let steps = limit + 1 + random.below((i32::MAX - limit) as usize) as i32;
         if random.below(2) == 0 { steps } else { -steps }
     };
-    match random.below(6) {
+    match random.below(8) {
         0 => currents[random.below(48)] = far(CurrentCode::LIMIT, random),
-        1 => magnets[random.below(5)] = far(CurrentCode::LIMIT, random),
-        2 => rf_offset = far(RfCode::LIMIT, random),
-        3 => readings[random.below(33)] = far(PositionCode::LIMIT, random),
-        4 => tune[random.below(2)] = Some(far(TuneCode::LIMIT, random)),
+        1 => dipole = far(CurrentCode::LIMIT, random),
+        2 => supply[random.below(2)] = far(CurrentCode::LIMIT, random),
+        3 => rf_offset = far(RfCode::LIMIT, random),
+        4 => readings[random.below(33)] = far(PositionCode::LIMIT, random),
+        5 => tune[random.below(2)] = Some(far(TuneCode::LIMIT, random)),
+        6 => intensity = Some(far(IntensityCode::LIMIT, random)),
         _ => tune[random.below(2)] = Some(-1),
     }
-    let body = (sequence, 1, 2, currents.as_slice(), magnets, rf_offset, readings.as_slice(), tune, u64::MAX);
-    sealed(BoosterFrame::VERSION, &serialised(&body))
+    let body =
+        (sequence, 1, 2, &currents[..], dipole, &supply[..], rf_offset, &readings[..], tune, intensity, &ALL[..]);
+    sealed(Frame::VERSION, &serialised(&body))
 }
 
 /// The faults thrown at the core.
@@ -172,9 +184,9 @@ fn faulty(
         }
         4 => ((0..random.below(600)).map(|_| random.byte()).collect(), garbled),
         5 => {
-            let long = BoosterFrame::MAX_WIRE_BYTES + 1 + random.below(3000);
+            let long = booster::Frame::MAX_WIRE_BYTES + 1 + random.below(3000);
             ((0..long).map(|_| random.byte()).collect(), |e| {
-                matches!(e, Frame(Oversized { limit: BoosterFrame::MAX_WIRE_BYTES, .. }))
+                matches!(e, Frame(Oversized { limit: booster::Frame::MAX_WIRE_BYTES, .. }))
             })
         }
         6 => {
@@ -185,26 +197,26 @@ fn faulty(
         7 => (Vec::new(), |e| *e == Frame(Truncated { need: 7, got: 0 })),
         8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Framing)),
         9 => {
-            let (plain, other) = (plain(next), 2 + random.below(254) as u8);
-            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 1, .. })))
+            let (plain, other) = (plain(next), 3 + random.below(253) as u8);
+            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 2, .. })))
         }
         10 => {
-            let (monitors, correctors) = [(33, 47), (33, 49), (32, 48), (34, 48), (0, 0), (64, 64)][random.below(6)];
+            let (monitors, correctors) = [(33, 47), (33, 49), (32, 48), (34, 48), (0, 0), (40, 40)][random.below(6)];
             (miscounted(sequence, monitors, correctors), |e| matches!(e, Frame(Count { .. })))
         }
         11 => (beyond(sequence, random), |e| matches!(e, Frame(Range { .. }))),
         12 => {
             let mut plain = plain(next);
             plain.truncate(plain.len() - 5); // the last byte of the mask
-            (sealed(BoosterFrame::VERSION, &plain[3..]), |e| *e == Frame(Malformed))
+            (sealed(booster::Frame::VERSION, &plain[3..]), |e| *e == Frame(Malformed))
         }
         13 => (last.to_vec(), |e| matches!(e, Repeated { .. })),
         14 => (first.to_vec(), |e| matches!(e, OutOfOrder { .. } | Repeated { .. })),
         15 => {
-            let mut frame = BoosterFrame::decode(&mut bytes).unwrap();
+            let mut frame = booster::Frame::decode(&LAYOUT, &mut bytes).unwrap();
             match random.below(4) {
                 0 => frame.magnets.dipole = CurrentCode::default(),
-                1 => frame.magnets.qv = CurrentCode::try_new(-17_900_000).unwrap(),
+                1 => frame.magnets.supply[1] = CurrentCode::try_new(-17_900_000).unwrap(),
                 2 => frame.corrector = [CurrentCode::try_new(CurrentCode::LIMIT).unwrap(); 48],
                 _ => frame.rf_offset = RfCode::try_new(-RfCode::LIMIT).unwrap(),
             }
@@ -220,7 +232,7 @@ fn faulty(
 }
 
 /// Everything that an estimate says, to the bit, but the number of refused frames.
-fn bits(core: &Core, estimate: &BoosterEstimate) -> Vec<u64> {
+fn bits(core: &Core, estimate: &Estimate) -> Vec<u64> {
     let e = estimate;
     let of = |values: &[f32]| values.iter().map(|v| u64::from(v.to_bits())).collect::<Vec<_>>();
     let health = e.health.iter().flat_map(|h| {
@@ -228,11 +240,14 @@ fn bits(core: &Core, estimate: &BoosterEstimate) -> Vec<u64> {
     });
     let covariance: Vec<f32> =
         (0..48).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| core.covariance(i, j)).collect();
-    let counts =
-        [u64::from(e.sequence), e.time_us, u64::from(e.frames), e.clipped, e.accepted, e.rejected, e.confirmed];
-    let more = [e.restarted, e.setting.map_or(u64::MAX, u64::from), u64::from(e.linearised)];
+    let counts = [u64::from(e.sequence), e.time_us, u64::from(e.frames)];
+    let more = [e.setting.map_or(u64::MAX, u64::from), u64::from(e.linearised)];
+    let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
+    let masks: Vec<u64> = masks.map(|bit| u64::from(*bit)).collect();
     let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma].map(|list| of(list)).concat();
-    [&counts[..], &more, &lists, &of(&[e.nis, e.log_evidence]), &of(&covariance), &health.collect::<Vec<_>>()].concat()
+    let floats = [e.nis, e.log_evidence, e.tune_innovation[0].unwrap_or(9.0), e.tune_innovation[1].unwrap_or(9.0)];
+    let health: Vec<u64> = health.collect();
+    [&counts[..], &more, &masks, &lists, &of(&floats), &of(&covariance), &health].concat()
 }
 
 #[test]
@@ -271,7 +286,7 @@ fn seeded(cases: u32) -> ProptestConfig {
 }
 
 /// A core that has heard 150 frames, and what it said last.
-fn seasoned() -> (Core, BoosterEstimate) {
+fn seasoned() -> (Core, Estimate) {
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let mut last = None;
@@ -295,19 +310,20 @@ fn is_sealed(wire: &[u8]) -> bool {
 fn bytes_never_panic_and_pass_only_with_their_crc() {
     let (core, _) = seasoned();
     let bytes = || prop::collection::vec(any::<u8>(), 0..900);
-    let body = (any::<u32>(), any::<u64>(), any::<u32>(), prop::collection::vec(any::<i32>(), 48), any::<[i32; 5]>());
-    let rest = (any::<i32>(), prop::collection::vec(any::<i32>(), 33), any::<[Option<i32>; 2]>(), any::<u64>());
+    let body = (any::<u32>(), any::<u64>(), any::<u32>(), prop::collection::vec(any::<i32>(), 48), any::<[i32; 3]>());
+    let rest = (any::<i32>(), prop::collection::vec(any::<i32>(), 33), any::<[Option<i32>; 3]>(), any::<[u32; 2]>());
     // half of the small values are within their ranges
     let frames = (body, rest, 0..31_u32).prop_map(|((sequence, time, cycle, c, m), (rf, r, tune, valid), shift)| {
         let small = |v: &i32| v >> shift;
         let (c, r): (Vec<_>, Vec<_>) = (c.iter().map(small).collect(), r.iter().map(small).collect());
-        let tune = tune.map(|t| t.map(|t| t >> shift));
-        serialised(&(sequence, time, cycle, &c, m.map(|v| v >> shift), rf >> shift, &r, tune, valid))
+        let ([dipole, supply @ ..], [x, y, intensity]) = (m.map(|v| v >> shift), tune.map(|t| t.map(|t| t >> shift)));
+        let (sequence, rf) = (sequence, rf >> shift);
+        serialised(&(sequence, time, cycle, &c, dipole, &supply[..], rf, &r, [x, y], intensity, &valid[..]))
     });
     let any = prop_oneof![
         bytes(),
-        bytes().prop_map(|body| sealed(1, &body[..body.len().min(757)])),
-        frames.prop_map(|body| sealed(1, &body)),
+        bytes().prop_map(|body| sealed(2, &body[..body.len().min(Frame::MAX_BYTES)])),
+        frames.prop_map(|body| sealed(2, &body)),
     ];
     proptest!(seeded(1000), |(wire in any)| {
         let taken = core.clone().ingest(&mut wire.clone());
@@ -331,14 +347,14 @@ fn current(limit: i32, usual: i32) -> impl Strategy<Value = CurrentCode> {
     steps(limit, usual).prop_map(|s| CurrentCode::try_new(s).unwrap())
 }
 
-fn magnets() -> impl Strategy<Value = MagnetCurrents> {
+fn magnets() -> impl Strategy<Value = MagnetCurrents<2>> {
     let wild = |usual| current(CurrentCode::LIMIT, usual);
     let near = |usual: i32| (-usual / 50..=usual / 50).prop_map(move |s| CurrentCode::try_new(usual + s).unwrap());
     let supplies = prop_oneof![
         4 => (near(24_000_000), near(18_000_000), near(17_900_000)),
         1 => (wild(24_000_000), wild(18_000_000), wild(17_900_000)),
     ];
-    (supplies, wild(0), wild(0)).prop_map(|((dipole, qh, qv), sh, sv)| MagnetCurrents { dipole, qh, qv, sh, sv })
+    supplies.prop_map(|(dipole, qh, qv)| MagnetCurrents { dipole, supply: [qh, qv] })
 }
 
 /// At most one powered corrector, as in a campaign; many within what a beam survives; or anything at all.
@@ -359,8 +375,20 @@ fn readings() -> impl Strategy<Value = [PositionCode; 33]> {
     prop::collection::vec(code, 33).prop_map(|v| v.try_into().unwrap())
 }
 
-fn frame() -> impl Strategy<Value = BoosterFrame> {
-    let mask = prop_oneof![Just(u64::MAX), Just(0), any::<u64>()];
+/// Next to the design's, none, or anything.
+fn tunes() -> impl Strategy<Value = [Option<TuneCode>; 2]> {
+    let near = |usual: i32| (-3_000..3_000).prop_map(move |s| TuneCode::try_new(usual + s));
+    let any = || (0..=TuneCode::LIMIT).prop_map(TuneCode::try_new);
+    prop_oneof![
+        4 => (near(830_000), near(665_000)),
+        1 => (any(), any()),
+        1 => Just((None, TuneCode::try_new(999_999))),
+    ]
+    .prop_map(|(x, y)| [x, y])
+}
+
+fn frame() -> impl Strategy<Value = Frame> {
+    let mask = prop_oneof![Just([u32::MAX; 2]), Just([0; 2]), any::<[u32; 2]>()];
     let sequence = prop_oneof![any::<u32>(), 0..100_u32];
     (
         sequence,
@@ -370,9 +398,9 @@ fn frame() -> impl Strategy<Value = BoosterFrame> {
         magnets(),
         prop_oneof![1 => steps(RfCode::LIMIT, 0), 4 => steps(1_000_000, 200_000)],
         readings(),
-        mask,
+        (tunes(), mask),
     )
-        .prop_map(|(sequence, time_us, cycle_time_us, corrector, magnets, rf, reading, valid)| Frame {
+        .prop_map(|(sequence, time_us, cycle_time_us, corrector, magnets, rf, reading, (tune, valid))| Frame {
             sequence,
             time_us,
             cycle_time_us,
@@ -380,15 +408,16 @@ fn frame() -> impl Strategy<Value = BoosterFrame> {
             magnets,
             rf_offset: RfCode::try_new(rf).unwrap(),
             reading,
-            tune: [TuneCode::try_new(999_999), None],
-            valid,
+            tune,
+            intensity: None,
+            valid: Mask::from_words(&valid),
         })
 }
 
 /// What holds of an estimate whatever the frames were.
-fn check(core: &Core, estimate: &BoosterEstimate, prior: &Prior, walks: bool) -> Result<(), String> {
+fn check(core: &Core, estimate: &Estimate, prior: &Prior, walks: bool) -> Result<(), String> {
     let e = estimate;
-    let finite = [e.mean, e.sigma, e.map_params, e.centre, e.params_sigma].concat();
+    let finite = [&e.mean[..], &e.sigma, &e.map_params, &e.centre, &e.params_sigma].concat();
     if !finite.iter().chain(&[e.nis, e.log_evidence]).all(|v| v.is_finite()) {
         return Err(format!("not finite: {e:?}"));
     }
@@ -437,7 +466,7 @@ fn extreme_frames_leave_every_estimate_sound() {
             core.prepare();
             match core.ingest(&mut wire_of(&frame)) {
                 Ok(estimate) => {
-                    let sound = check(&core, &estimate, &core.setup.prior, walks == 1);
+                    let sound = check(&core, &estimate, &core.prior(0), walks == 1);
                     prop_assert!(sound.is_ok(), "frame {at}: {}", sound.unwrap_err());
                 }
                 Err(IngestError::Beyond(_)) => {}
@@ -454,9 +483,10 @@ fn extreme_frames_leave_every_estimate_sound() {
 
 /// A machine of known vars that steers with several correctors at once.
 struct Machine {
-    surrogate: BoosterGreen,
-    at: Box<<BoosterGreen as Surrogate<33, 48, 48>>::Linearised>,
-    prediction: Box<estimator::Prediction<33, 48>>,
+    surrogate: Box<Green>,
+    setup: Setup,
+    at: Box<<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised>,
+    prediction: Box<Prediction>,
     params: [f32; 48],
     offset: [f64; 33],
     random: Random,
@@ -466,7 +496,9 @@ impl Machine {
     /// Vars drawn from the prior.
     fn drawn(core: &Core, seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let prior = core.setup.prior;
+        let prior = core.prior(0);
+        let mut surrogate = Box::new(Green::BLANK);
+        core.tables.fill(&mut *surrogate).unwrap();
         let mut theta = || loop {
             let theta = prior.mean + prior.sigma * random.normal() as f32;
             if (prior.lower..=prior.upper).contains(&theta) {
@@ -474,9 +506,10 @@ impl Machine {
             }
         };
         Self {
-            surrogate: BoosterGreen::clone(&core.tables),
-            at: Box::new(<BoosterGreen as Surrogate<33, 48, 48>>::BLANK),
-            prediction: Box::new(estimator::Prediction::BLANK),
+            surrogate,
+            setup: core.setup.in_room(&LAYOUT),
+            at: Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED),
+            prediction: Box::new(Prediction::BLANK),
             params: core::array::from_fn(|_| theta()),
             offset: core::array::from_fn(|_| 2e-3 * random.normal()),
             random,
@@ -489,7 +522,7 @@ impl Machine {
     }
 
     /// A cycle with five correctors of 5 to 22 A; the readings are the surrogate's, and noise.
-    fn cycle(&mut self, setup: &Setup, sequence: u32) -> BoosterFrame {
+    fn cycle(&mut self, sequence: u32) -> Frame {
         let mut corrector = [CurrentCode::default(); 48];
         let mut powered = 0;
         while powered < 5 {
@@ -500,8 +533,10 @@ impl Machine {
                 powered += 1;
             }
         }
-        let [dipole, qh, qv] = setup.calibration.nominal.map(|a| CurrentCode::nearest(f64::from(a)).unwrap());
-        let magnets = MagnetCurrents { dipole, qh, qv, ..MagnetCurrents::default() };
+        let current = |a: f32| CurrentCode::nearest(f64::from(a)).unwrap();
+        let calibration = &self.setup.calibration;
+        let supply = [0, 1].map(|f| current(calibration.supplies[f].nominal));
+        let magnets = MagnetCurrents { dipole: current(calibration.dipole.unwrap()), supply };
         let mut frame = Frame {
             sequence,
             time_us: 100_000 * u64::from(sequence),
@@ -511,13 +546,13 @@ impl Machine {
             rf_offset: RfCode::default(),
             reading: [PositionCode::default(); 33],
             tune: [None; 2],
-            valid: (1 << 33) - 1,
+            intensity: None,
+            valid: Mask::from_words(&ALL),
         };
-        let strength = self.params.map(f32::exp);
-        Surrogate::<33, 48, 48>::linearise(&self.surrogate, &strength, &mut self.at).unwrap();
-        self.surrogate.predict(&self.at, &setup.calibration.drive(&frame).unwrap(), &mut self.prediction);
-        for b in 0..33 {
-            let noise = f64::from(setup.noise) * self.random.normal();
+        self.surrogate.linearise(&self.params, &[0.0; SUPPLIES], &mut self.at).unwrap();
+        self.surrogate.predict(&self.at, &self.setup.calibration.drive(&frame).unwrap(), &mut self.prediction);
+        for b in 0..MONITORS {
+            let noise = f64::from(self.setup.noise.of(b)) * self.random.normal();
             let position = f64::from(self.prediction.reading[b]) + self.offset[b] + noise;
             frame.reading[b] = PositionCode::nearest(position).unwrap();
         }
@@ -525,13 +560,13 @@ impl Machine {
     }
 }
 
-fn ingest(core: &mut Core, frame: &BoosterFrame) -> BoosterEstimate {
+fn ingest(core: &mut Core, frame: &Frame) -> Estimate {
     core.prepare();
     core.ingest(&mut wire_of(frame)).unwrap()
 }
 
 /// Normalised estimation error squared of the params.
-fn nees(core: &Core, estimate: &BoosterEstimate, params: &[f64]) -> f64 {
+fn nees(core: &Core, estimate: &Estimate, params: &[f64]) -> f64 {
     let error = DVector::from_fn(48, |i, _| f64::from(estimate.map_params[i]) - params[i]);
     let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
     (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0]
@@ -549,10 +584,10 @@ fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
             if process_noise > 0.0 && sequence > 0 {
                 machine.walk(process_noise);
             }
-            let estimate = ingest(&mut core, &machine.cycle(&start.setup, sequence));
+            let estimate = ingest(&mut core, &machine.cycle(sequence));
             assert_eq!(estimate.setting, None);
             nis += f64::from(estimate.nis);
-            readings += f64::from(estimate.accepted.count_ones());
+            readings += estimate.readings() as f64;
             last = Some(estimate);
         }
         total += nees(&core, &last.unwrap(), &machine.params.map(f64::from));
@@ -585,7 +620,7 @@ fn a_frame_without_beam_moves_nothing() {
         let mut machine = Machine::drawn(&core, 1);
         let mut before = None;
         for sequence in 0..=100 {
-            let mut frame = machine.cycle(&core.setup, sequence);
+            let mut frame = machine.cycle(sequence);
             let is_lost = sequence == 100;
             if is_lost {
                 frame.reading =
@@ -595,8 +630,8 @@ fn a_frame_without_beam_moves_nothing() {
             let estimate = ingest(&mut core, &frame);
             // then none of its readings is used, and no monitor is blamed
             if is_lost {
-                let last: BoosterEstimate = before.take().unwrap();
-                assert_eq!((estimate.accepted, estimate.rejected), (0, (1 << 33) - 1));
+                let last: Estimate = before.take().unwrap();
+                assert_eq!((estimate.accepted, estimate.rejected), (vec![false; 33], vec![true; 33]));
                 assert_eq!(estimate.health, last.health);
                 let shift = (0..48).map(|i| (estimate.map_params[i] - last.map_params[i]).abs() / last.params_sigma[i]);
                 assert!(shift.fold(0.0, f32::max) < 0.05);
@@ -616,9 +651,9 @@ fn a_silent_monitor_is_dead_until_it_speaks() {
     let (monitor, silence) = (10, 20..320);
     let mut last = None;
     for (at, row) in recording.rows.iter().enumerate() {
-        let mut frame = stream::frame(&recording, row).unwrap();
+        let mut frame = Frame::decode(&LAYOUT, &mut stream::wire(&recording, row).unwrap()).unwrap();
         if silence.contains(&at) {
-            frame.valid &= !(1 << monitor);
+            frame.valid.put(monitor, false);
         }
         // when the frames are taken in
         let estimate = ingest(&mut core, &frame);
@@ -626,11 +661,11 @@ fn a_silent_monitor_is_dead_until_it_speaks() {
         let dead = (silence.start + 19..silence.end).contains(&at);
         let state = estimate.health[monitor].state;
         assert_eq!(state, if dead { MonitorState::Dead } else { MonitorState::Ok }, "frame {at}");
-        assert!(!silence.contains(&at) || (estimate.accepted | estimate.rejected) >> monitor & 1 == 0);
+        assert!(!silence.contains(&at) || !(estimate.accepted[monitor] || estimate.rejected[monitor]));
         last = Some(estimate);
     }
     let last = last.unwrap();
-    assert_eq!(last.accepted >> monitor & 1, 1, "it is used again");
+    assert!(last.accepted[monitor], "it is used again");
     // and the others find the vars
     let params: Vec<f64> = truth("recordings/paper-vars", &ring).iter().map(|var| var.ln()).collect();
     let nees = nees(&core, &last, &params) / 48.0;

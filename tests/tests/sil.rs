@@ -7,10 +7,10 @@ use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
-use firmware_sim::link::{Refusal, Reply, Request, Status};
+use estimator::wire::link::{Refusal, Status};
 use host_bridge::source::link::Link;
 use inference::Recording;
-use inference::stream::{self, Core};
+use inference::stream::{self, Core, Estimate};
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
@@ -110,7 +110,7 @@ impl<'e> Pair<'e> {
         self.expect(wire, heard.estimate);
     }
 
-    fn expect(&mut self, wire: &[u8], mut answer: estimator::booster::Estimate) {
+    fn expect(&mut self, wire: &[u8], mut answer: Estimate) {
         self.core.prepare();
         let expected = self.core.ingest(&mut wire.to_vec()).unwrap();
         answer.rejected_frames = expected.rejected_frames;
@@ -194,7 +194,7 @@ fn frames_that_come_during_an_update_are_not_lost() {
         pair.link.write(&burst).unwrap();
         for wire in &good[at..at + 13] {
             let Reply::Estimate(answer) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
-            pair.expect(wire, answer.estimate().unwrap());
+            pair.expect(wire, Estimate::of_answer(&answer).unwrap());
         }
         at += 13;
         bursts += 1;
@@ -211,7 +211,7 @@ fn a_storm_of_frames_is_survived() {
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
     // covariances with every frame keep the chip busy sending; meanwhile its queue fills
-    let mut request = vec![0; estimator::packet::MAX_WIRE_BYTES];
+    let mut request = vec![0; PACKET];
     let n = Request::Covariance.encode(&mut request).unwrap();
     let storm: Vec<u8> = good[..200].iter().flat_map(|wire| [&request[..n], wire].concat()).collect();
     let status = {
@@ -234,7 +234,7 @@ fn a_storm_of_frames_is_survived() {
     let status = loop {
         match pair.link.next().unwrap() {
             Reply::Estimate(answer) => {
-                let answer = answer.estimate().unwrap();
+                let answer = Estimate::of_answer(&answer).unwrap();
                 pair.expect(&good[answer.sequence as usize], answer);
                 answered += 1;
             }
@@ -253,7 +253,7 @@ fn a_storm_of_frames_is_survived() {
     pair.link.write(&good[200]).unwrap();
     loop {
         match pair.link.next().unwrap() {
-            Reply::Estimate(answer) => break pair.expect(&good[200], answer.estimate().unwrap()),
+            Reply::Estimate(answer) => break pair.expect(&good[200], Estimate::of_answer(&answer).unwrap()),
             Reply::Status(_) | Reply::Covariance { .. } => {} // asked for during the storm
             other => panic!("{other:?}"),
         }
@@ -270,15 +270,15 @@ fn new_tables_reach_the_chip() {
     let mut vars = vec![1.0; 48];
     vars[0] = 1.01;
     let rolled = [Effect::parse("quad_roll@F2=0.01", &ring).unwrap()];
-    let other = *training::extended::tables(&ring.with_vars(&vars), &rolled, &[1.0; 48]).unwrap().tables;
-    assert!(!other.low_rank.is_empty());
+    let other = training::extended::tables(&ring.with_vars(&vars), &rolled, &[1.0; 48]).unwrap().tables;
+    assert!(other.terms() > 0);
     pair.link.load(&other, || ()).unwrap();
     // the host goes over to them after the same frame
     pair.core.prepare();
     pair.core.adopt(other.clone()).unwrap();
     good[30..60].iter().for_each(|wire| pair.agree(wire));
     let status = pair.link.status().unwrap();
-    assert_eq!((status.loaded, status.tables), (true, other.digest()));
+    assert_eq!((status.loaded, status.tables), (true, other.digest::<LINE>()));
     check_stack(&status); // a parcel lies on it while the tables are linearised
 }
 

@@ -7,7 +7,7 @@ use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
 use crate::result::FitResult;
 use crate::{fit_page, output};
@@ -18,7 +18,7 @@ use crate::{fit_page, output};
 /// [`CommandError`].
 pub fn run(options: &Fit) -> Result<(), CommandError> {
     check(options)?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let result = match options.method {
         Method::Map => by_steps(options, &ring, &recording)?,

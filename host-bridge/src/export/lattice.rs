@@ -3,7 +3,10 @@
 
 use std::path::Path;
 
-use twin::{Effect, EffectError, EffectKind, Element, Kind, Machine, Misalignment, Particle, Plane, Rf, Ring};
+use twin::{
+    Class, CorrectorEffect, Effect, EffectError, Element, Kind, Machine, Misalignment, MonitorEffect, Particle, Plane,
+    Rf, Ring, Site,
+};
 
 use super::calibration::{Calibration, CalibrationError};
 use super::names::Names;
@@ -84,12 +87,13 @@ impl Lattice {
     /// # Errors
     /// [`ExportError`] if the result is of another ring.
     pub fn of(ring: &Ring, result: &Calibration, path: &Path) -> Result<Self, ExportError> {
-        let effects: Vec<Effect> = result.findings.iter().map(|(effect, _)| effect.clone()).collect();
+        let effects: Result<Vec<Effect>, _> = result.findings.iter().map(|(text, _)| text.resolve(ring)).collect();
+        let effects = effects?;
         let machine = Machine::new(ring.with_vars(&result.vars(ring, path)?), Rf::FixedMomentum, &effects)?;
         let mut lattice = Self::plain(machine.ring());
         let version = env!("CARGO_PKG_VERSION");
         lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));
-        for (effect, sentence) in &result.findings {
+        for (effect, (_, sentence)) in effects.iter().zip(&result.findings) {
             let included = lattice.apply(effect);
             lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
         }
@@ -143,7 +147,7 @@ impl Lattice {
     }
 
     /// Planes of the monitor or corrector at an element.
-    pub fn channels_of<'l>(channels: &'l [Channel], element: usize) -> impl Iterator<Item = &'l Channel> {
+    pub fn channels_of(channels: &[Channel], element: usize) -> impl Iterator<Item = &Channel> {
         channels.iter().filter(move |channel| channel.element == element)
     }
 
@@ -169,32 +173,37 @@ impl Lattice {
         if rolls.all(|roll| roll == first) { first } else { 0.0 }
     }
 
-    /// Let a monitor or corrector have an effect; false if neither it nor the ring can.
+    /// Let a monitor or corrector have an effect, if the ring does not have it yet; false if neither can.
     fn apply(&mut self, effect: &Effect) -> bool {
-        let channels = match effect.kind {
-            EffectKind::BpmGain | EffectKind::BpmRoll => &mut self.monitors,
-            EffectKind::CorrectorGain | EffectKind::CorrectorPolarity => &mut self.correctors,
-            // the ring has them already
-            EffectKind::CorrectorRoll
-            | EffectKind::QuadRoll
-            | EffectKind::StrayGradient
-            | EffectKind::StraySkewGradient
-            | EffectKind::DipoleGradient
-            | EffectKind::DipoleEdge
-            | EffectKind::SextupoleError => return true,
-            EffectKind::BpmCubic
-            | EffectKind::BpmSwap
-            | EffectKind::CorrectorEven
-            | EffectKind::MomentumOffset
-            | EffectKind::FixedRfFrequency
-            | EffectKind::RadialLoop
-            | EffectKind::QuadDrift => return false,
-        };
-        let Some(channel) = channels.iter_mut().find(|channel| channel.name == effect.place) else { return false };
-        match effect.kind {
-            EffectKind::BpmRoll => channel.roll += effect.amplitude,
-            EffectKind::CorrectorPolarity => channel.gain = -channel.gain,
-            _ => channel.gain *= 1.0 + effect.amplitude,
+        match (effect.kind.class(), effect.site) {
+            (Class::Field(_), _) => true,
+            (Class::Monitor(how), Site::Monitor(at)) => self.distort(how, at, effect.amplitude),
+            (Class::Corrector(how), Site::Corrector(at)) => self.misset(how, at, effect.amplitude),
+            (Class::Monitor(_) | Class::Corrector(_) | Class::Hold(_) | Class::Drift(_), _) => false,
+        }
+    }
+
+    fn distort(&mut self, how: MonitorEffect, monitor: usize, amplitude: f64) -> bool {
+        match how {
+            MonitorEffect::Gain => self.monitors[monitor].gain *= 1.0 + amplitude,
+            MonitorEffect::Roll => {
+                let element = self.monitors[monitor].element;
+                let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);
+                planes.for_each(|channel| channel.roll += amplitude);
+            }
+            MonitorEffect::Cubic | MonitorEffect::Swap => return false,
+        }
+        true
+    }
+
+    fn misset(&mut self, how: CorrectorEffect, corrector: usize, amplitude: f64) -> bool {
+        let channel = &mut self.correctors[corrector];
+        match how {
+            CorrectorEffect::Gain => channel.gain *= 1.0 + amplitude,
+            CorrectorEffect::Polarity => channel.gain = -channel.gain,
+            // the ring has it
+            CorrectorEffect::Roll => {}
+            CorrectorEffect::Even => return false,
         }
         true
     }

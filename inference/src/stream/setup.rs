@@ -76,7 +76,7 @@ impl Setup {
     }
 
     /// For a core that has room for the ring.
-    pub(super) fn in_room<const B: usize, const C: usize, const F: usize>(
+    pub fn in_room<const B: usize, const C: usize, const F: usize>(
         &self,
         layout: &Layout,
     ) -> estimator::Setup<B, C, F> {
