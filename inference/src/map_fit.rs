@@ -59,7 +59,7 @@ impl FittedTune {
 pub enum Lack {
     /// No monitor has a reading that counts.
     Readings,
-    /// No kick and no RF offset moved the beam.
+    /// No kick and no RF offset moved the beam by more than its readings scatter.
     Kick,
 }
 
@@ -67,7 +67,7 @@ impl fmt::Display for Lack {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Readings => "no monitor has a reading that counts",
-            Self::Kick => "no corrector and no RF offset moved the beam",
+            Self::Kick => "kicks and RF offsets move the beam by too little to tell anything",
         })
     }
 }
@@ -111,9 +111,10 @@ impl From<OptimiseError<OrbitError>> for BatchError {
     }
 }
 
-const LIMITS: Limits = Limits { settled: 1e-6, steps: 30, halvings: 8 };
-/// Share of a param's prior standard deviation that orbits have to take away from one of them, to say anything.
-const LEARNT: f64 = 0.01;
+const LIMITS: Limits = Limits { settled: 1e-5, steps: 30, halvings: 8 };
+/// Share of a param's prior standard deviation that orbits have to take away from one of them, to say anything: the scatter of idle
+/// correctors takes some percent.
+const LEARNT: f64 = 0.1;
 
 impl BatchFit {
     /// Fit a campaign; `progress` hears of each step.
