@@ -6,7 +6,7 @@ RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench peers prove prove-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil train bench peers exports prove prove-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -57,6 +57,13 @@ peers: build .venv-peers ## NUTS of numpyro and blackjax beside ours, on the den
 	cargo run --locked --release -p system-tests --bin density -- $(RECORDING) --json target/density.json
 	.venv-peers/bin/python tests/peers/numpyro_nuts.py target/density.json $(ORBITCAL) $(RECORDING)
 
+exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the schema of PALS, tunes and responses compared; two minutes
+	.venv-export/bin/python tests/peers/exports.py $(ORBITCAL)
+
+.venv-export:
+	python3 -m venv .venv-export
+	.venv-export/bin/pip install --quiet numpy cpymad==1.20.0 accelerator-toolbox==0.9.0 xsuite==0.67.0 xtrack==0.118.4 pals-schema==0.3.0
+
 # apart from .venv, as JAX is large
 .venv-peers:
 	python3 -m venv .venv-peers
@@ -77,4 +84,4 @@ fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv .venv-peers
+	rm -rf .venv .venv-peers .venv-export

@@ -8,7 +8,6 @@ use nalgebra::{DMatrix, DVector};
 
 use super::alternatives::{Cause, DECISIVE, Slot};
 use super::discrepancy::Discrepancy;
-use super::evidence::prior;
 use super::fit::Fitted;
 use super::search::Found;
 
@@ -36,19 +35,19 @@ impl Vars {
 
     fn over(slot: &Slot) -> Self {
         let plain = Self::of(&slot.without);
-        let (vars, (_, sigma)) = (plain.mean.len(), prior());
+        let (vars, units) = (plain.mean.len(), &slot.without.units);
         let mut parts = vec![(slot.nothing, plain.clone())];
         for alternative in &slot.alternatives {
             let part = match (&alternative.fitted, &alternative.cause) {
                 (Some(fitted), _) => Self::of(fitted),
                 (None, Cause::Unknown(Discrepancy { adapted: Some(adapted), .. })) => Self {
-                    mean: &plain.mean + adapted.step.rows(0, vars) * sigma,
-                    covariance: adapted.covariance.view((0, 0), (vars, vars)) * (sigma * sigma),
+                    mean: &plain.mean + units.step(&adapted.step),
+                    covariance: units.covariance(&adapted.covariance),
                 },
                 (None, Cause::Unknown(_)) => plain.clone(),
                 (None, Cause::Effect(_)) => {
                     // to first order: the fit moves along with the amplitude, and shares its uncertainty
-                    let shift = alternative.adapting.rows(0, vars) * sigma;
+                    let shift = units.step(&alternative.adapting);
                     let (amplitude, error) = alternative.amplitude;
                     let along = if amplitude == 0.0 { &shift * 0.0 } else { &shift * (error / amplitude) };
                     Self { mean: &plain.mean + shift, covariance: &plain.covariance + &along * along.transpose() }

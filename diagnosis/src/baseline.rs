@@ -6,7 +6,7 @@
 use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Tunes};
 
-use inference::map::Screened;
+use inference::Screened;
 
 /// What is known of the orbit without kicks.
 #[derive(Debug, Clone)]
@@ -75,7 +75,7 @@ fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
 /// Mean of each monitor's readings [m]; none for a silent one.
 fn means(readings: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
     let of = |b: usize| {
-        let counts = |i: usize| screened.accepted[i] >> b & 1 == 1 && !readings[(i, b)].is_nan();
+        let counts = |i: usize| screened.accepted[(i, b)] && !readings[(i, b)].is_nan();
         let counting: Vec<f64> = (0..readings.nrows()).filter(|&i| counts(i)).map(|i| readings[(i, b)]).collect();
         (!counting.is_empty()).then(|| counting.iter().sum::<f64>() / counting.len() as f64)
     };

@@ -11,41 +11,42 @@
 //! its change from start to end.
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, Matrix2, RowVector2, Vector2};
-use training::BoosterGreen;
+use nalgebra::{DMatrix, DVector, RowVector2, Vector2};
 use twin::{
     Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
     Tunes,
 };
 
 use super::baseline::Baseline;
+use super::evidence::Units;
 use super::settings::Settings;
-use inference::map::{Drive, Screened, first_family, screen};
 use inference::recording::{BelievedRf, Recording};
-use inference::stream::StreamError;
+use inference::{Campaign, Meter, Screened};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
 pub struct Data {
     /// The ring as designed.
     pub ring: Ring,
+    /// The params in units of their priors.
+    pub units: Units,
     /// What drove the beam, and the orbit it started from.
     pub drives: Drives,
     /// What is known of that orbit.
     pub baseline: Baseline,
     /// Which readings count, and the state of the monitors.
     pub screened: Screened,
-    /// `ln` of each quadrupole's mean supply factor.
+    /// `ln` of each supply's mean factor [F].
     pub supplies: Vec<f64>,
     /// Readings at the mean supply currents, without what the orbit has beyond first order in kicks and RF offset, rows frames,
     /// columns monitors [m].
     pub readings: DMatrix<f64>,
     /// As recorded [m]; one that is missing is not a number.
     recorded: DMatrix<f64>,
-    /// `ln` of the supplies' factors off their mean, of each frame.
-    fluctuation: [DVector<f64>; 2],
-    /// Noise of a reading by the recording's header [m].
-    pub expected_noise: f64,
+    /// `ln` of each supply's factor off its mean, of each frame [F].
+    fluctuation: Vec<DVector<f64>>,
+    /// Noise of a reading of each monitor by the recording's header [B] [m].
+    pub expected_noise: Vec<f64>,
     channels: Vec<Channel>,
     /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
     tunes: DMatrix<f64>,
@@ -71,29 +72,13 @@ struct Channel {
     log_det: f64,
 }
 
-/// One tune: what it was in mid-campaign, and how much it changed to the end.
-#[derive(Debug, Clone)]
-struct Meter {
-    value: Vector2<f64>,
-    /// Noise of one frame's tune.
-    noise: f64,
-    /// Whitens (value, change).
-    whiten: Matrix2<f64>,
-}
-
 /// Why a recording cannot be diagnosed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DataError {
-    /// The recording does not stream.
-    #[error(transparent)]
-    Stream(#[from] StreamError),
     /// The design has no orbit.
     #[error("the ring as designed: {0}")]
     Orbit(#[from] OrbitError),
-    /// No tables for this ring.
-    #[error(transparent)]
-    Training(#[from] training::TrainingError),
     /// Too little to tell anything from.
     #[error("{recording}: {what}: expected at least {expected}, found {found}")]
     TooLittle {
@@ -113,58 +98,50 @@ pub enum DataError {
 
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
-/// Calibration error of a tune meter [1], of the order of its resolution.
-pub const TUNE_CALIBRATION: f64 = 3e-4;
 /// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
 const FAULTY: f64 = 4.0;
 /// Monitors and correctors below which nothing can be told apart.
-const LEAST: usize = 4;
+pub const LEAST: usize = 4;
 
 impl Data {
-    /// Screen a recording by the core and whiten it.
+    /// Whiten a campaign.
     ///
     /// # Errors
     /// [`DataError`].
-    pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, DataError> {
-        let screened = screen(ring, recording)?;
-        let driven: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(recording, row)).collect();
-        let mean = |family: usize| driven.iter().map(|d| d.strength[family]).sum::<f64>() / driven.len() as f64;
-        let means = [mean(0), mean(1)];
-        let first = first_family(ring);
-        let supplies: Vec<f64> = (0..ring.quadrupoles.len()).map(|q| means[usize::from(q >= first)]).collect();
-        let fluctuation = [0, 1].map(|family| {
-            DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[family] - means[family]))
-        });
-        let mut drives = drives_of(recording, &driven, ring);
+    pub fn of(campaign: &Campaign) -> Result<Self, DataError> {
+        let Campaign { ring, recording, drives: driven, supplies, screened, readings: recorded, .. } = campaign;
+        let fluctuation: Vec<DVector<f64>> = (supplies.iter().enumerate())
+            .map(|(f, mean)| DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[f] - mean)))
+            .collect();
+        let mut drives = drives_of(campaign);
         let believed = believed(recording, ring)?;
-        let design = Machine::new(ring.with_vars(&exp(&supplies)), Rf::FixedMomentum, &believed)?;
-        let recorded = raw(recording, ring);
+        let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
+        let design = Machine::new(at_supplies, Rf::FixedMomentum, &believed)?;
+        let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
-            recording.rows[i].tune[plane].filter(|_| drives.rf_offset[i] == 0.0).unwrap_or(f64::NAN)
+            if of_momentum(i, plane) { campaign.tunes[(i, plane)] } else { f64::NAN }
         });
-        let kicked_off = &recorded - design.readings(&drives)?.0;
-        let tables: BoosterGreen = training::green::tables(ring)?;
-        let per_rms = tables.dispersion.spurious.map(f64::from);
-        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, &screened, &recorded_tunes, per_rms)?;
+        let kicked_off = recorded - design.readings(&drives)?.0;
+        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
         let shared = |b: usize| {
-            let supply = baseline.per_gradient(usize::from(b >= ring.horizontal_monitors()));
-            DMatrix::from_columns(&[
-                DVector::from_element(driven.len(), BASELINE),
-                &fluctuation[0] * supply,
-                &fluctuation[1] * supply,
-            ])
+            let per_gradient = baseline.per_gradient(campaign.plane(b));
+            let of_supplies = fluctuation.iter().map(|off| off * per_gradient);
+            let columns: Vec<_> =
+                core::iter::once(DVector::from_element(driven.len(), BASELINE)).chain(of_supplies).collect();
+            DMatrix::from_columns(&columns)
         };
         let mut data = Self {
             ring: ring.clone(),
-            screened,
-            supplies,
+            units: Units::of(&campaign.prior),
+            screened: screened.clone(),
+            supplies: supplies.clone(),
             readings: recorded.clone(),
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
-            recorded,
+            recorded: recorded.clone(),
             fluctuation,
-            expected_noise: recording.header.bpm_sigma,
+            expected_noise: recording.header.noise.clone(),
             channels: Vec::new(),
             meter: [None, None],
             tunes: recorded_tunes.clone(),
@@ -188,16 +165,15 @@ impl Data {
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn straighten(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let beyond = self.beyond(machine)?;
-        let slopes = Signatures::of(machine, &self.drives)?.of_vars();
+        let slopes = Signatures::of(machine, &self.drives)?.of_quadrupoles();
         let (mut readings, mut tunes) = (&self.recorded - beyond, self.recorded_tunes.clone());
-        let first = first_family(&self.ring);
-        for (off, range) in self.fluctuation.iter().zip([0..first, first..slopes.len()]) {
-            for slope in &slopes[range] {
-                for (b, mut column) in readings.column_iter_mut().enumerate() {
-                    column -= off.component_mul(&slope.readings.column(b));
-                }
-                tunes -= off * RowVector2::from(slope.tunes);
+        for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
+            let Some(supply) = quadrupole.supply else { continue };
+            let off = &self.fluctuation[supply];
+            for (b, mut column) in readings.column_iter_mut().enumerate() {
+                column -= off.component_mul(&slope.readings.column(b));
             }
+            tunes -= off * RowVector2::from(slope.tunes);
         }
         let moved = self.whiten(|b, frame| readings[(frame, b)] - self.readings[(frame, b)], [Vector2::zeros(); 2]);
         (self.readings, self.tunes) = (readings, tunes);
@@ -205,14 +181,14 @@ impl Data {
         Ok(moved.norm_squared())
     }
 
-    /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the core took for a first reading.
+    /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the screening took for a first reading.
     pub fn trim(&mut self, residual: &DVector<f64>) {
         for (r, place) in residual.iter().zip(self.places()) {
             if let Some((frame, b)) = place
                 && r.abs() > FAULTY
                 && self.health()[b].state != MonitorState::Ok
             {
-                self.screened.accepted[frame] &= !(1 << b);
+                self.screened.accepted[(frame, b)] = false;
             }
         }
         self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
@@ -270,7 +246,7 @@ impl Data {
     pub fn without(&self, frames: &[usize]) -> Self {
         let mut data = self.clone();
         for &frame in frames {
-            data.screened.accepted[frame] = 0;
+            data.screened.accepted.row_mut(frame).fill(false);
             data.tunes.row_mut(frame).fill(f64::NAN);
         }
         data.meter = data.meters();
@@ -430,7 +406,7 @@ impl Data {
 
     /// True if a reading counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
-        self.screened.accepted[frame] >> b & 1 == 1 && !self.readings[(frame, b)].is_nan()
+        self.screened.accepted[(frame, b)] && !self.readings[(frame, b)].is_nan()
     }
 
     /// Frames in which a monitor's reading counts.
@@ -441,6 +417,11 @@ impl Data {
     /// What readings of a monitor share in some frames, in standard deviations [frames][factors] [m].
     pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
         self.shared_of(b, frames, self.drift)
+    }
+
+    /// Mean over the monitors of what the recording's header expects as their noise [m].
+    pub fn mean_noise(&self) -> f64 {
+        self.expected_noise.iter().sum::<f64>() / self.expected_noise.len().max(1) as f64
     }
 
     /// Noise of one reading of a monitor [m].
@@ -479,33 +460,6 @@ impl Channel {
     }
 }
 
-impl Meter {
-    /// A line through the tunes of the frames over time.
-    fn of<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
-        let points: Vec<(f64, f64)> =
-            frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
-        // a line needs a few points, and its noise some more
-        if points.len() < 8 {
-            return None;
-        }
-        let normal = points.iter().fold(Matrix2::zeros(), |sum, &(t, _)| sum + Matrix2::new(1.0, t, t, t * t));
-        let moment = points.iter().fold(Vector2::zeros(), |sum, &(t, tune)| sum + Vector2::new(tune, t * tune));
-        let value = normal.try_inverse()? * moment;
-        // from one frame to the next, as the tune itself may move
-        let squares: f64 = points.windows(2).map(|pair| (pair[1].1 - pair[0].1).powi(2)).sum();
-        let variance = 0.5 * squares / (points.len() - 1) as f64;
-        let covariance = normal.try_inverse()? * variance + Matrix2::new(TUNE_CALIBRATION.powi(2), 0.0, 0.0, 0.0);
-        let whiten = covariance.cholesky()?.l().try_inverse()?;
-        Some(Self { value, noise: variance.sqrt(), whiten })
-    }
-
-    fn miss(&self, predicted: Vector2<f64>) -> Vector2<f64> {
-        let mut miss = self.value - predicted;
-        miss[0] -= miss[0].round();
-        self.whiten * miss
-    }
-}
-
 /// What the recording's header says was held, as an effect.
 fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
     let pair = recording.header.radial_loop_monitors.as_ref();
@@ -517,24 +471,14 @@ fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectErr
     held.into_iter().map(|(kind, place)| Effect::at(kind, &place, 1.0, ring)).collect()
 }
 
-fn exp(ln: &[f64]) -> Vec<f64> {
-    ln.iter().map(|l| l.exp()).collect()
-}
-
-fn drives_of(recording: &Recording, driven: &[Drive], ring: &Ring) -> Drives {
+fn drives_of(campaign: &Campaign) -> Drives {
+    let driven = &campaign.drives;
     let rows: Vec<_> = driven.iter().map(|d| d.kick.transpose()).collect();
     Drives {
         kick: DMatrix::from_rows(&rows),
         rf_offset: DVector::from_iterator(driven.len(), driven.iter().map(|d| d.rf_offset)),
-        time: DVector::from_vec(recording.times()),
-        nominal_kick: recording.nominal_kick(),
-        orbit: vec![[0.0; 2]; ring.elements.len()],
+        time: DVector::from_vec(campaign.time.clone()),
+        nominal_kick: campaign.recording.nominal_kick(),
+        orbit: vec![[0.0; 2]; campaign.ring.elements.len()],
     }
-}
-
-/// Readings as recorded; one that is missing is not a number.
-fn raw(recording: &Recording, ring: &Ring) -> DMatrix<f64> {
-    DMatrix::from_fn(recording.rows.len(), ring.read_monitors.len(), |i, b| {
-        recording.rows[i].reading[b].unwrap_or(f64::NAN)
-    })
 }

@@ -323,7 +323,7 @@ impl Data {
             columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
             columns
         };
-        let columns = centred(indicator.select_rows(&frames)) / self.expected_noise;
+        let columns = centred(indicator.select_rows(&frames)) / self.mean_noise();
         let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
         Some(Cells {
             gram: columns.tr_mul(&columns),

@@ -8,18 +8,74 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
-use inference::posterior::RANGE;
-use inference::stream::PRIOR_WIDTH;
+use inference::Prior;
+use inference::bounded::Coordinates;
 
 /// Precision of a var that is held.
 const HELD: f64 = 1e12;
 /// How near a bound a var is at it, in prior standard deviations.
 const AT: f64 = 1e-9;
 
-/// `(mean, sigma)` of `ln var`.
-pub fn prior() -> (f64, f64) {
-    let variance = f64::from(PRIOR_WIDTH).powi(2).ln_1p();
-    (-0.5 * variance, variance.sqrt())
+/// Params `theta = ln var` in units of their prior standard deviations, `u = (theta - mean)/sigma` [N].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Units {
+    mean: DVector<f64>,
+    /// Prior standard deviation of each param.
+    pub sigma: DVector<f64>,
+    /// Range of each u.
+    range: Vec<[f64; 2]>,
+    /// Their coordinates without bounds, for a sampler.
+    pub coordinates: Coordinates,
+}
+
+impl Units {
+    /// Of a prior that has a width.
+    pub fn of(prior: &Prior) -> Self {
+        let sigma = prior.precision.map(|precision| precision.sqrt().recip());
+        let range = |(i, range): (usize, &[f64; 2])| range.map(|bound| (bound - prior.mean[i]) / sigma[i]);
+        Self {
+            range: prior.range.iter().enumerate().map(range).collect(),
+            mean: prior.mean.clone(),
+            sigma,
+            coordinates: Coordinates::of(prior),
+        }
+    }
+
+    /// Number of params.
+    pub fn len(&self) -> usize {
+        self.range.len()
+    }
+
+    /// True without any.
+    pub fn is_empty(&self) -> bool {
+        self.range.is_empty()
+    }
+
+    /// Params of the first unknowns.
+    pub fn params(&self, u: &DVector<f64>) -> Vec<f64> {
+        (0..self.len()).map(|i| self.mean[i] + self.sigma[i] * u[i]).collect()
+    }
+
+    /// The first unknowns of params.
+    pub fn unknowns(&self, params: &[f64]) -> impl Iterator<Item = f64> {
+        params.iter().enumerate().map(|(i, theta)| (theta - self.mean[i]) / self.sigma[i])
+    }
+
+    /// Bounds of some unknowns, the params first; the others have none.
+    pub fn bounds(&self, unknowns: usize) -> Vec<[f64; 2]> {
+        let free = core::iter::repeat([f64::NEG_INFINITY, f64::INFINITY]);
+        self.range.iter().copied().chain(free).take(unknowns).collect()
+    }
+
+    /// A covariance of unknowns as that of the params.
+    pub fn covariance(&self, of_unknowns: &DMatrix<f64>) -> DMatrix<f64> {
+        DMatrix::from_fn(self.len(), self.len(), |i, j| of_unknowns[(i, j)] * self.sigma[i] * self.sigma[j])
+    }
+
+    /// A step of the unknowns as one of the params.
+    pub fn step(&self, of_unknowns: &DVector<f64>) -> DVector<f64> {
+        of_unknowns.rows(0, self.len()).component_mul(&self.sigma)
+    }
 }
 
 /// A Gaussian and what the range leaves of it.
@@ -35,13 +91,16 @@ pub struct Within {
 }
 
 impl Within {
-    /// Of a precision and slope at `u`, the first `vars` of which have a range.
+    /// Of a precision and slope at `u`, the first of which are params and have a range.
     ///
     /// # Panics
     /// If the precision is not positive.
-    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, vars: usize) -> Self {
-        let [lower, upper] = range();
-        let against = |&i: &usize| (u[i] <= lower + AT && slope[i] < 0.0) || (u[i] >= upper - AT && slope[i] > 0.0);
+    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Self {
+        let vars = units.len();
+        let against = |&i: &usize| {
+            let [lower, upper] = units.range[i];
+            (u[i] <= lower + AT && slope[i] < 0.0) || (u[i] >= upper - AT && slope[i] > 0.0)
+        };
         let held: BTreeMap<usize, f64> = (0..vars).filter(against).map(|i| (i, slope[i].abs())).collect();
         let mut matrix = precision.clone();
         for &i in held.keys() {
@@ -59,24 +118,12 @@ impl Within {
         }
         let covariance = free.inverse();
         for i in (0..vars).filter(|i| !held.contains_key(i)) {
-            let sigma = covariance[(i, i)].sqrt();
+            let (sigma, [lower, upper]) = (covariance[(i, i)].sqrt(), units.range[i]);
             log_inside += (normal_cdf((upper - u[i]) / sigma) - normal_cdf((lower - u[i]) / sigma)).ln();
         }
         let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         Self { free, slope, log_det: log_det - held.len() as f64 * HELD.ln(), log_inside }
     }
-}
-
-/// Range of a var, in prior standard deviations of its logarithm.
-pub fn range() -> [f64; 2] {
-    let (mean, sigma) = prior();
-    RANGE.map(|bound| (bound.ln() - mean) / sigma)
-}
-
-/// The nearest value within the range.
-pub fn bounded(u: f64) -> f64 {
-    let [lower, upper] = range();
-    u.clamp(lower, upper)
 }
 
 /// `ln` of the integral of `exp(-g x - h x^2/2)` over x > 0, over that of a standard normal.

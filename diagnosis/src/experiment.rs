@@ -7,7 +7,6 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
-use super::evidence::prior;
 use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Rivals;
@@ -77,8 +76,9 @@ impl Campaign {
     ) -> Result<Self, EffectError> {
         let signatures = Signatures::of(machine, drives)?;
         let data = &data.driven_by(drives);
-        let (_, sigma) = prior();
-        let columns: Vec<_> = signatures.of_vars().iter().map(|s| data.signature(s) * sigma).collect();
+        let of_vars = signatures.of_vars();
+        let columns: Vec<_> =
+            of_vars.iter().zip(&data.units.sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, EffectError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);

@@ -12,8 +12,9 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Drives, EffectError, Machine, Signature, Signatures};
 
 use super::data::Data;
-use super::evidence::{Within, bounded, prior};
+use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Unknown};
+use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]
@@ -22,6 +23,8 @@ pub struct Fitted {
     pub hypothesis: Hypothesis,
     /// Vars and other unknowns, in units of their prior standard deviations.
     pub u: DVector<f64>,
+    /// The vars in these units.
+    pub units: Units,
     /// `ln` of each var at the best point.
     pub params: Vec<f64>,
     /// `|r|^2 + |u|^2`.
@@ -42,19 +45,23 @@ pub struct Fitted {
     drifting: Option<Box<Data>>,
 }
 
-/// Expected decrease of the cost at which the steps have settled.
-const SETTLED: f64 = 0.01;
+const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
 /// Chi-square per number beyond which a fit is far off.
 const GROSS: f64 = 1.3;
-const STEPS: usize = 25;
 /// Steps after which a fit is given up whose cost is larger than a rival's by this factor.
 const TRIAL: usize = 4;
 const HOPELESS: f64 = 1.5;
-const HALVINGS: usize = 6;
-const SWEEPS: usize = 1000;
 /// Step of an amplitude for its derivative, in prior standard deviations.
 const DIFFERENCE: f64 = 0.02;
 
+/// A hypothesis and the data that it is fitted to.
+struct Problem<'d> {
+    data: &'d Data,
+    hypothesis: &'d Hypothesis,
+    unknowns: Vec<Unknown>,
+}
+
+/// A point of the fit.
 struct Point {
     u: DVector<f64>,
     residual: DVector<f64>,
@@ -100,11 +107,13 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, EffectError> {
-        let unknowns = hypothesis.unknowns(data);
-        let u = DVector::zeros(data.ring.quadrupoles.len() + unknowns.len());
-        let here = point(data, hypothesis, u)?;
-        let jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
-        Ok(Self::at(data, hypothesis, here, normal(&jacobian), jacobian))
+        let problem = Problem::new(data, hypothesis);
+        let u = DVector::zeros(problem.size());
+        let residual = problem.residual(&u)?;
+        let jacobian = problem.jacobian(&u)?;
+        let cost = residual.norm_squared() + u.norm_squared();
+        let factor = normal(&jacobian).cholesky().expect("1 + J^T J is positive");
+        Ok(Self::at(&problem, Point { u, residual, cost }, factor, jacobian))
     }
 
     /// The data as this fit whitens them.
@@ -113,46 +122,43 @@ impl Fitted {
     }
 
     fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, EffectError> {
-        let vars = data.ring.quadrupoles.len();
-        let unknowns = hypothesis.unknowns(data);
-        let mut u = guess.clone().resize_vertically(vars + unknowns.len(), 0.0);
-        u.rows_mut(0, vars).iter_mut().for_each(|u| *u = bounded(*u));
-        let mut here = point(data, hypothesis, u)?;
-        let mut jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
-        let mut factor = normal(&jacobian);
-        for taken in 0..STEPS {
-            if taken >= TRIAL && here.cost > HOPELESS * rival {
-                break;
-            }
-            let slope = jacobian.tr_mul(&here.residual) - &here.u;
-            let step = within(&here.u, &factor.solve(&slope), &slope, &jacobian, vars);
-            let Some((next, expected)) = descend(data, hypothesis, &here, &step, &slope) else { break };
-            here = next;
-            if expected < SETTLED {
-                break;
-            }
-            jacobian = differentiate(data, hypothesis, &unknowns, &here)?;
-            factor = normal(&jacobian);
-        }
-        Ok(Self::at(data, hypothesis, here, factor, jacobian))
+        let problem = Problem::new(data, hypothesis);
+        let start = guess.clone().resize_vertically(problem.size(), 0.0);
+        let hopeful = |steps, cost| steps < TRIAL || cost <= HOPELESS * rival;
+        let found = minimise(&problem, &start, &data.units.bounds(problem.size()), &LIMITS, hopeful);
+        let found = found.map_err(|error| match error {
+            OptimiseError::Start(error) => error,
+            OptimiseError::Degenerate => unreachable!("1 + J^T J is positive"),
+        })?;
+        let factor = found.quadratic.factor().expect("1 + J^T J is positive");
+        let here = Point { u: found.x, residual: found.point, cost: found.cost };
+        Ok(Self::at(&problem, here, factor, found.slopes))
     }
 
-    fn at(
-        data: &Data,
-        hypothesis: &Hypothesis,
-        here: Point,
-        factor: Cholesky<f64, Dyn>,
-        jacobian: DMatrix<f64>,
-    ) -> Self {
-        let vars = data.ring.quadrupoles.len();
-        let params = params_of(&here.u, vars);
+    fn at(problem: &Problem, here: Point, factor: Cholesky<f64, Dyn>, jacobian: DMatrix<f64>) -> Self {
+        let (data, units) = (problem.data, problem.data.units.clone());
+        let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
         let lower = factor.l();
-        let Within { free, slope, log_det, log_inside } = Within::of(&lower * lower.transpose(), &here.u, slope, vars);
+        let Within { free, slope, log_det, log_inside } =
+            Within::of(&lower * lower.transpose(), &here.u, slope, &units);
         let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
-        let hypothesis = hypothesis.clone();
+        let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
-        Self { hypothesis, params, cost, log_evidence, residual, jacobian, factor, free, slope, u, drifting: None }
+        Self {
+            hypothesis,
+            units,
+            params,
+            cost,
+            log_evidence,
+            residual,
+            jacobian,
+            factor,
+            free,
+            slope,
+            u,
+            drifting: None,
+        }
     }
 
     /// `ln` posterior at another point, and its gradient.
@@ -160,10 +166,10 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
     pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
-        let data = self.data(data);
-        let here = point(data, &self.hypothesis, u.clone())?;
-        let jacobian = differentiate(data, &self.hypothesis, &self.hypothesis.unknowns(data), &here)?;
-        Ok((-0.5 * here.cost, jacobian.tr_mul(&here.residual) - u))
+        let problem = Problem::new(self.data(data), &self.hypothesis);
+        let residual = problem.residual(u)?;
+        let slope = problem.jacobian(u)?.tr_mul(&residual) - u;
+        Ok((-0.5 * (residual.norm_squared() + u.norm_squared()), slope))
     }
 
     /// True where the fit is so far off that its vars are bent out of shape.
@@ -212,7 +218,7 @@ impl Fitted {
 
     fn predicted_at(&self, data: &Data, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let vars = self.params.len();
-        let (machine, drives) = self.hypothesis.machine(data, &params_of(u, vars), &u.as_slice()[vars..])?;
+        let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
         let (readings, tunes, tune_drift) = machine.readings(&drives)?;
         Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift }.by_frame(&drives.time))
     }
@@ -226,8 +232,8 @@ impl Fitted {
         let (machine, drives) = self.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;
         let by_frame = |signature: Signature, scale: f64| signature.by_frame(&drives.time) * scale;
-        let of_vars = signatures.of_vars().into_iter().map(|signature| by_frame(signature, prior().1));
-        let mut slopes: Vec<DMatrix<f64>> = of_vars.collect();
+        let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
+        let mut slopes: Vec<DMatrix<f64>> = of_vars.map(|(signature, sigma)| by_frame(signature, *sigma)).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
                 Unknown::Member(term, width) => by_frame(signatures.of_effect(term.kind, term.site)?, *width),
@@ -255,120 +261,88 @@ impl Fitted {
         let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
         for b in data.speaking_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
             let own = data.about_baseline(b, &miss.column(b).into_owned());
-            sum += own.norm_squared();
+            sum += own.norm_squared() / data.expected_noise[b].powi(2);
             freedom += own.len() as f64 - 1.0;
         }
-        Ok(sum / data.expected_noise.powi(2) / freedom)
+        Ok(sum / freedom)
     }
 
     /// Covariance of `ln` of the vars.
     pub fn covariance(&self) -> DMatrix<f64> {
-        let (vars, (_, sigma)) = (self.params.len(), prior());
-        self.factor.inverse().view((0, 0), (vars, vars)) * (sigma * sigma)
+        self.units.covariance(&self.factor.inverse())
     }
 }
 
-/// `ln` vars of the first unknowns.
-fn params_of(u: &DVector<f64>, vars: usize) -> Vec<f64> {
-    let (mean, sigma) = prior();
-    u.rows(0, vars).iter().map(|u| mean + sigma * u).collect()
+impl<'d> Problem<'d> {
+    fn new(data: &'d Data, hypothesis: &'d Hypothesis) -> Self {
+        Self { data, hypothesis, unknowns: hypothesis.unknowns(data) }
+    }
+
+    /// Number of unknowns, vars included.
+    fn size(&self) -> usize {
+        self.data.units.len() + self.unknowns.len()
+    }
+
+    fn machine(&self, u: &DVector<f64>) -> Result<(Machine, Drives), EffectError> {
+        let units = &self.data.units;
+        self.hypothesis.machine(self.data, &units.params(u), &u.as_slice()[units.len()..])
+    }
+
+    /// Whitened residuals.
+    fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
+        let (machine, drives) = self.machine(u)?;
+        let (readings, tunes, tune_drift) = machine.readings(&drives)?;
+        Ok(self.data.residual(&readings, tunes, tune_drift))
+    }
+
+    /// Derivative of the predicted numbers with respect to u.
+    fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
+        let (data, vars) = (self.data, self.data.units.len());
+        let (machine, drives) = self.machine(u)?;
+        let signatures = Signatures::of(&machine, &drives)?;
+        let mut jacobian = DMatrix::zeros(data.size(), self.size());
+        for (i, signature) in signatures.of_vars().iter().enumerate() {
+            jacobian.set_column(i, &(data.signature(signature) * data.units.sigma[i]));
+        }
+        for (i, unknown) in self.unknowns.iter().enumerate() {
+            let column = match unknown {
+                Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, term.site)?) * *width,
+                _ => {
+                    let at = |step: f64| {
+                        let mut u = u.clone();
+                        u[vars + i] += step;
+                        self.residual(&u)
+                    };
+                    (at(-DIFFERENCE)? - at(DIFFERENCE)?) / (2.0 * DIFFERENCE)
+                }
+            };
+            jacobian.set_column(vars + i, &column);
+        }
+        Ok(jacobian)
+    }
 }
 
-/// The best step within the range: the full one if it stays there, else by projected Gauss-Seidel sweeps.
-fn within(
-    u: &DVector<f64>,
-    full: &DVector<f64>,
-    slope: &DVector<f64>,
-    jacobian: &DMatrix<f64>,
-    vars: usize,
-) -> DVector<f64> {
-    let clamp = |i: usize, step: f64| if i < vars { bounded(u[i] + step) - u[i] } else { step };
-    let mut step = DVector::from_fn(u.len(), |i, _| clamp(i, full[i]));
-    if step == *full {
-        return step;
+impl Objective for Problem<'_> {
+    /// Whitened residuals.
+    type Point = DVector<f64>;
+    /// Derivative of the predicted numbers.
+    type Slopes = DMatrix<f64>;
+    type Error = EffectError;
+
+    fn evaluate(&self, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+        let residual = self.residual(u)?;
+        Ok((residual.norm_squared() + u.norm_squared(), residual))
     }
+
+    fn linearise(&self, u: &DVector<f64>, residual: &DVector<f64>) -> Result<(Quadratic, DMatrix<f64>), EffectError> {
+        let jacobian = self.jacobian(u)?;
+        Ok((Quadratic { matrix: normal(&jacobian), slope: jacobian.tr_mul(residual) - u }, jacobian))
+    }
+}
+
+/// `1 + J^T J`.
+fn normal(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
     let mut matrix = jacobian.transpose() * jacobian;
     (0..matrix.ncols()).for_each(|i| matrix[(i, i)] += 1.0);
-    for _ in 0..SWEEPS {
-        let mut moved = 0.0_f64;
-        for i in 0..step.len() {
-            let pull = slope[i] - matrix.column(i).dot(&step);
-            let next = clamp(i, step[i] + pull / matrix[(i, i)]);
-            moved = moved.max((next - step[i]).abs());
-            step[i] = next;
-        }
-        if moved < 1e-6 {
-            break;
-        }
-    }
-    step
-}
-
-fn normal(jacobian: &DMatrix<f64>) -> Cholesky<f64, Dyn> {
-    let mut matrix = jacobian.transpose() * jacobian;
-    (0..matrix.ncols()).for_each(|i| matrix[(i, i)] += 1.0);
-    matrix.cholesky().expect("1 + J^T J is positive")
-}
-
-fn point(data: &Data, hypothesis: &Hypothesis, u: DVector<f64>) -> Result<Point, EffectError> {
-    let vars = data.ring.quadrupoles.len();
-    let (machine, drives) = hypothesis.machine(data, &params_of(&u, vars), &u.as_slice()[vars..])?;
-    let (readings, tunes, tune_drift) = machine.readings(&drives)?;
-    let residual = data.residual(&readings, tunes, tune_drift);
-    let cost = residual.norm_squared() + u.norm_squared();
-    Ok(Point { u, residual, cost })
-}
-
-/// Half the way as long as the full step leads uphill or to an unstable ring; returns the decrease that was expected too.
-fn descend(
-    data: &Data,
-    hypothesis: &Hypothesis,
-    here: &Point,
-    step: &DVector<f64>,
-    slope: &DVector<f64>,
-) -> Option<(Point, f64)> {
-    let mut share = 1.0;
-    for _ in 0..HALVINGS {
-        let u = &here.u + step * share;
-        let expected = (&u - &here.u).dot(slope);
-        if let Ok(next) = point(data, hypothesis, u)
-            && next.cost <= here.cost
-        {
-            return Some((next, expected));
-        }
-        share *= 0.5;
-    }
-    None
-}
-
-/// Derivative of the predicted numbers with respect to u.
-fn differentiate(
-    data: &Data,
-    hypothesis: &Hypothesis,
-    unknowns: &[Unknown],
-    here: &Point,
-) -> Result<DMatrix<f64>, EffectError> {
-    let vars = data.ring.quadrupoles.len();
-    let (_, sigma) = prior();
-    let (machine, drives) = hypothesis.machine(data, &params_of(&here.u, vars), &here.u.as_slice()[vars..])?;
-    let signatures = Signatures::of(&machine, &drives)?;
-    let mut jacobian = DMatrix::zeros(data.size(), vars + unknowns.len());
-    for (q, signature) in signatures.of_vars().iter().enumerate() {
-        jacobian.set_column(q, &(data.signature(signature) * sigma));
-    }
-    for (i, unknown) in unknowns.iter().enumerate() {
-        let column = match unknown {
-            Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, term.site)?) * *width,
-            _ => {
-                let at = |step: f64| {
-                    let mut u = here.u.clone();
-                    u[vars + i] += step;
-                    point(data, hypothesis, u)
-                };
-                (at(-DIFFERENCE)?.residual - at(DIFFERENCE)?.residual) / (2.0 * DIFFERENCE)
-            }
-        };
-        jacobian.set_column(vars + i, &column);
-    }
-    Ok(jacobian)
+    matrix
 }

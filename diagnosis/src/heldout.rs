@@ -19,9 +19,10 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::EffectError;
 
-use super::data::{Data, TUNE_CALIBRATION};
+use super::data::Data;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
+use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Recording;
 
 /// Frames that are left out together.
@@ -34,10 +35,11 @@ const FOLDS: usize = 5;
 
 /// One repeat of every setting in each fold.
 pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
-    let mut seen: BTreeMap<(Option<&str>, u64, u64), (usize, usize)> = BTreeMap::new();
+    let mut seen: BTreeMap<(Vec<(usize, u64)>, u64), (usize, usize)> = BTreeMap::new();
     let mut folds = vec![Fold::new(); FOLDS];
     for (i, row) in recording.rows.iter().enumerate() {
-        let key = (row.corrector.as_deref(), row.setting.to_bits(), row.rf_offset.to_bits());
+        let correctors = row.correctors.iter().map(|(corrector, setting)| (*corrector, setting.to_bits())).collect();
+        let key = (correctors, row.rf_offset.to_bits());
         let settings = seen.len();
         let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
         // settings begin in different folds, so that one that is never repeated does not fall in with all others
@@ -48,13 +50,13 @@ pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
     folds
 }
 
-/// All frames of every fifth corrector in each fold.
+/// All frames of every fifth corrector in each fold; frames in which several are set go with the first of them.
 pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
-    let mut order: Vec<&str> = Vec::new();
+    let mut order: Vec<usize> = Vec::new();
     let mut folds = vec![Fold::new(); FOLDS];
     for (i, row) in recording.rows.iter().enumerate() {
-        let Some(corrector) = row.corrector.as_deref() else { continue };
-        let at = order.iter().position(|name| *name == corrector).unwrap_or_else(|| {
+        let Some(&(corrector, _)) = row.correctors.first() else { continue };
+        let at = order.iter().position(|known| *known == corrector).unwrap_or_else(|| {
             order.push(corrector);
             order.len() - 1
         });

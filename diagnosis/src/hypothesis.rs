@@ -121,8 +121,6 @@ impl Hypothesis {
     /// # Errors
     /// [`EffectError`] if a place is none.
     pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
-        let strength: Vec<f64> =
-            params.iter().zip(&data.supplies).map(|(theta, supply)| (theta + supply).exp()).collect();
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
         effects.extend(self.given.iter().chain(&data.believed));
         let mut drives = data.drives.clone();
@@ -133,7 +131,8 @@ impl Hypothesis {
                 Unknown::Member(term, sigma) => effects.push(term.effect(u * sigma)),
             }
         }
-        Ok((Machine::new(data.ring.with_vars(&strength), Rf::FixedMomentum, &effects)?, drives))
+        let ring = data.ring.with_strengths(&data.ring.strengths(params, &data.supplies));
+        Ok((Machine::new(ring, Rf::FixedMomentum, &effects)?, drives))
     }
 
     /// `kind@place + kind@place`, or `nothing`.

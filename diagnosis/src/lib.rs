@@ -35,6 +35,7 @@ use average::Vars;
 use data::{Data, DataError};
 use heldout::Score;
 use hypothesis::Term;
+use inference::Campaign;
 use inference::recording::Recording;
 use search::{Found, Search};
 pub use verdict::{Finding, Verdict};
@@ -71,7 +72,7 @@ impl Diagnosis {
     /// [`DataError`].
     pub fn of(ring: &Ring, recording: &Recording, mut progress: impl FnMut(&str)) -> Result<Self, DataError> {
         progress("reading");
-        let data = Data::of(ring, recording)?;
+        let data = Data::of(&Campaign::of(ring, recording)?)?;
         let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
         progress("searching");
         let found = Search::new(candidates).run(data)?;

@@ -188,7 +188,7 @@ mod tests {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
             let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
             let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
-            let mut data = Data::of(&ring, &made).unwrap();
+            let mut data = Data::of(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;

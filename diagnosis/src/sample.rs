@@ -1,17 +1,16 @@
 //! The posterior of vars and amplitudes of a hypothesis, for NUTS: what the Gaussian of [`super::fit`] is checked by.
 //!
 //! In units of prior standard deviations, `-cost/2` is the log-density of u. The vars have coordinates w without bounds (see
-//! [`inference::posterior`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
+//! [`inference::bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
 
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
 use super::data::Data;
-use super::evidence::prior;
 use super::fit::Fitted;
+use inference::bounded::Bounded;
 use inference::nuts::{Density, NutsError, NutsRun, NutsSettings, Unstable, explore};
-use inference::posterior::{Bounded, params_of, unbounded_of};
 
 /// A fitted hypothesis, its density sampled.
 struct Extended {
@@ -39,12 +38,12 @@ pub fn sample(data: &Data, fitted: &Fitted, settings: NutsSettings) -> Result<Nu
 
 /// `1 + J^T J` in coordinates without bounds, and what the bounds bend.
 fn curvature(fitted: &Fitted) -> DMatrix<f64> {
-    let sigma = prior().1;
     let lower = fitted.factor.l();
     let mut curvature = &lower * lower.transpose();
     let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
-    for (i, free) in unbounded_of(&fitted.params).iter().enumerate() {
-        let bound = Bounded::at(*free);
+    let free = fitted.units.coordinates.unbounded(&fitted.params);
+    for (i, bound) in bounded(fitted, free.as_slice()).enumerate() {
+        let sigma = fitted.units.sigma[i];
         curvature.row_mut(i).scale_mut(bound.slope);
         curvature.column_mut(i).scale_mut(bound.slope);
         let bend = sigma * sigma * bound.log_curvature - slope[i] * sigma * bound.bend;
@@ -53,12 +52,17 @@ fn curvature(fitted: &Fitted) -> DMatrix<f64> {
     curvature
 }
 
+/// The map of each var at its coordinate without bounds.
+fn bounded<'f>(fitted: &'f Fitted, free: &'f [f64]) -> impl Iterator<Item = Bounded> + 'f {
+    fitted.units.coordinates.each().iter().zip(free).map(|(one, free)| one.at(*free))
+}
+
 impl Extended {
     /// The vars' coordinates without bounds (`ln var`), and the other unknowns.
     fn at(&self, position: &[f64]) -> (DVector<f64>, DVector<f64>) {
-        let (vars, (_, sigma)) = (self.fitted.params.len(), prior());
+        let (units, vars) = (&self.fitted.units, self.fitted.params.len());
         let step = &self.spread * DVector::from_column_slice(position);
-        let free = unbounded_of(&self.fitted.params) + step.rows(0, vars) * sigma;
+        let free = units.coordinates.unbounded(&self.fitted.params) + units.step(&step);
         let others = self.fitted.u.rows(vars, step.len() - vars) + step.rows(vars, step.len() - vars);
         (free, others)
     }
@@ -70,26 +74,25 @@ impl Density for Extended {
     }
 
     fn evaluate(&self, position: &[f64]) -> Result<(f64, Vec<f64>), Unstable> {
-        let (mean, sigma) = prior();
+        let units = &self.fitted.units;
         let (free, others) = self.at(position);
-        let params = params_of(free.as_slice());
-        let u = params.iter().map(|theta| (theta - mean) / sigma).chain(others.iter().copied());
-        let u = DVector::from_iterator(self.dimension(), u);
+        let params = units.coordinates.params(free.as_slice());
+        let u = DVector::from_iterator(self.dimension(), units.unknowns(&params).chain(others.iter().copied()));
         let (mut value, mut slope) = self.fitted.density_at(&self.data, &u).map_err(Unstable::new)?;
-        for (slope, free) in slope.iter_mut().zip(free.iter()) {
-            let bound = Bounded::at(*free);
+        for (i, bound) in bounded(&self.fitted, free.as_slice()).enumerate() {
             value += bound.slope.ln();
-            *slope = *slope * bound.slope + sigma * bound.log_slope_slope;
+            slope[i] = slope[i] * bound.slope + units.sigma[i] * bound.log_slope_slope;
         }
         Ok((value, self.spread.tr_mul(&slope).as_slice().to_vec()))
     }
 
-    fn vars(&self) -> usize {
-        self.fitted.params.len()
+    fn ranges(&self) -> Vec<[f64; 2]> {
+        self.data.ring.parameters.iter().map(|parameter| parameter.prior.range).collect()
     }
 
     fn expand(&self, position: &[f64]) -> Vec<f64> {
         let (free, others) = self.at(position);
-        params_of(free.as_slice()).iter().map(|theta| theta.exp()).chain(others.iter().copied()).collect()
+        let params = self.fitted.units.coordinates.params(free.as_slice());
+        params.iter().map(|theta| theta.exp()).chain(others.iter().copied()).collect()
     }
 }

@@ -21,7 +21,7 @@ use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Scatter, Term, members};
 use super::location::SORTS;
 use super::scan::{Candidate, scan};
-use inference::posterior::softplus;
+use inference::bounded::softplus;
 
 /// Prior odds of one (more) effect.
 const ODDS: f64 = 1.0;
@@ -132,7 +132,7 @@ impl Search {
 
     /// Nothing but vars, and the ordinary scatter of a family if there is any.
     fn without_effects(&self, mut data: Data) -> Result<Found, EffectError> {
-        let zero = DVector::zeros(data.ring.quadrupoles.len());
+        let zero = DVector::zeros(data.units.len());
         let mut null = straighten(&mut data, &Hypothesis::default(), &zero)?;
         let mut next = self.slot(&data, &null)?;
         if let Some(scatter) = scatter(&data, &null, &next)? {

@@ -9,31 +9,31 @@ use twin::Drives;
 pub struct Settings {
     /// Setting of each frame.
     pub of_frame: Vec<usize>,
-    /// Corrector that is powered (the strongest kick), and how much, in fifths of the nominal setting.
-    powered: Vec<Option<(usize, i64)>>,
+    /// Correctors that are powered in each setting, and how much, in fifths of the nominal setting.
+    powered: Vec<Vec<(usize, i64)>>,
 }
 
 impl Settings {
     /// Group the frames.
     pub fn of(drives: &Drives) -> Self {
-        let (mut known, mut of_frame, mut powered) = (BTreeMap::new(), Vec::new(), Vec::new());
-        for frame in 0..drives.kick.nrows() {
-            let kick = drives.kick.row(frame).transpose();
-            let c = kick.iamax();
-            let fifths = (5.0 * kick[c] / drives.nominal_kick).round() as i64;
-            let key = ((fifths != 0).then_some((c, fifths)), drives.rf_offset[frame].to_bits());
-            let setting = *known.entry(key).or_insert_with(|| {
-                powered.push(key.0);
+        let (mut known, mut powered) = (BTreeMap::new(), Vec::new());
+        let mut setting = |frame: usize| {
+            let fifths = drives.kick.row(frame).map(|kick| (5.0 * kick / drives.nominal_kick).round() as i64);
+            let kicks: Vec<(usize, i64)> =
+                fifths.iter().copied().enumerate().filter(|(_, fifths)| *fifths != 0).collect();
+            *known.entry((kicks.clone(), drives.rf_offset[frame].to_bits())).or_insert_with(|| {
+                powered.push(kicks);
                 powered.len() - 1
-            });
-            of_frame.push(setting);
-        }
+            })
+        };
+        let of_frame = (0..drives.kick.nrows()).map(&mut setting).collect();
         Self { of_frame, powered }
     }
 
-    /// The corrector that is powered in a frame, and the sign of its kick.
+    /// The corrector that is powered most in a frame, and the sign of its kick.
     pub fn kick(&self, frame: usize) -> Option<(usize, f64)> {
-        self.powered[self.of_frame[frame]].map(|(corrector, fifths)| (corrector, fifths.signum() as f64))
+        let strongest = self.powered[self.of_frame[frame]].iter().max_by_key(|(_, fifths)| fifths.abs());
+        strongest.map(|(corrector, fifths)| (*corrector, fifths.signum() as f64))
     }
 
     /// Rows frames, columns settings.
@@ -45,14 +45,13 @@ impl Settings {
 
     /// Settings in which a corrector is powered.
     pub fn of_corrector(&self, c: usize) -> Vec<usize> {
-        let powered = |&i: &usize| self.powered[i].is_some_and(|(of, _)| of == c);
-        (0..self.powered.len()).filter(powered).collect()
+        (0..self.powered.len()).filter(|&i| self.powered[i].iter().any(|(of, _)| *of == c)).collect()
     }
 
     /// What a corrector is set to in each setting, in units of the nominal.
     pub fn strength(&self, c: usize) -> DVector<f64> {
-        let set = |powered: &Option<(usize, i64)>| {
-            powered.filter(|(of, _)| *of == c).map_or(0.0, |(_, fifths)| 0.2 * fifths as f64)
+        let set = |powered: &Vec<(usize, i64)>| {
+            powered.iter().find(|(of, _)| *of == c).map_or(0.0, |(_, fifths)| 0.2 * *fifths as f64)
         };
         DVector::from_iterator(self.powered.len(), self.powered.iter().map(set))
     }

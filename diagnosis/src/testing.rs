@@ -11,7 +11,7 @@ use twin::Ring;
 pub fn template() -> (Ring, Recording) {
     let ring = Ring::booster();
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-    let recording = Recording::read(&folder, &inference::stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&folder, &ring).unwrap();
     (ring, recording)
 }
 

@@ -23,13 +23,15 @@ pub struct Cli {
 /// What the program can do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Is a recording readable, what does it hold, and what can be done with it
+    Check(Check),
     /// Stream a recording through the core as wire bytes, publish every estimate, print the final table
     Replay(Replay),
     /// Subscribe to published estimates and show them live
     Watch(Watch),
     /// Orbit response, tunes and dispersion of the twin
     Response(Response),
-    /// The host's batch answer for a recording, with the exact twin
+    /// All frames of a recording at once, with the exact twin; by Gauss-Newton or by NUTS
     Fit(Fit),
     /// The published studies of a recording as one report: priors, subsets, correlations, predictions, Laplace against NUTS
     Study(Study),
@@ -68,6 +70,20 @@ impl Common {
     }
 }
 
+/// Priors of the strength factors (vars); those of the machine file without them.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct Priors {
+    /// Width of the prior of every var, such as 0.03; the machine file's without it
+    #[arg(long, value_name = "W", value_parser = width)]
+    pub prior_width: Option<f64>,
+    /// Range of every var, such as 0.94,1.06; the machine file's without it
+    #[arg(long, value_name = "LOW,HIGH", value_parser = range)]
+    pub range: Option<Range>,
+}
+
+/// Smallest and largest value of a var.
+pub type Range = [f64; 2];
+
 /// How estimates are published.
 #[derive(Debug, Args)]
 pub struct Publishing {
@@ -82,6 +98,16 @@ pub struct Publishing {
     pub no_publish: bool,
 }
 
+/// `orbitcal check`.
+#[derive(Debug, Args)]
+pub struct Check {
+    /// Folder with header.toml and frames.csv
+    pub recording: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+}
+
 /// `orbitcal replay`.
 #[derive(Debug, Args)]
 pub struct Replay {
@@ -90,6 +116,9 @@ pub struct Replay {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
     /// Random walk of each ln var, standard deviation per sqrt(frame)
     #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
     pub process_noise: f32,
@@ -193,6 +222,9 @@ pub struct Fit {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
     /// How to fit
     #[arg(long, value_enum, default_value_t = Method::Map)]
     pub method: Method,
@@ -202,6 +234,9 @@ pub struct Fit {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub sampling: Sampling,
+    /// The optics of the calibrated ring with error bars, as one page
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
     /// Folder for the draws, one CmdStan CSV a chain, as `arviz.from_cmdstan` reads it
     #[arg(long, value_name = "DIR")]
     pub save_draws: Option<PathBuf>,
@@ -215,6 +250,9 @@ pub struct Study {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub sampling: Sampling,
@@ -231,6 +269,9 @@ pub struct Diagnose {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
     /// The report, one file with all figures and their numbers
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
@@ -423,6 +464,19 @@ fn positive(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|v: &f64| *v > 0.0 && *v < 1e9).ok_or_else(wrong)
 }
 
+fn width(text: &str) -> Result<f64, String> {
+    let wrong = || format!("expected a number above 0 and at most 1, found {text:?}");
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or_else(wrong)
+}
+
+fn range(text: &str) -> Result<Range, String> {
+    let wrong = || format!("expected LOW,HIGH with 0.1 <= LOW < 1 < HIGH <= 10, found {text:?}");
+    let (low, high) = text.split_once(',').ok_or_else(wrong)?;
+    let bounds = low.trim().parse().ok().zip(high.trim().parse().ok());
+    let is_range = |(low, high): &(f64, f64)| (0.1..1.0).contains(low) && *high > 1.0 && *high <= 10.0;
+    bounds.filter(is_range).map(|(low, high)| [low, high]).ok_or_else(wrong)
+}
+
 fn walk(text: &str) -> Result<f32, String> {
     let wrong = || format!("expected a number from 0 to 0.1, found {text:?}");
     text.parse().ok().filter(|v: &f32| (0.0..=0.1).contains(v)).ok_or_else(wrong)
@@ -436,5 +490,13 @@ mod tests {
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
         Cli::command().debug_assert();
+    }
+    #[test]
+    fn a_range_holds_one() {
+        assert_eq!(range("0.94,1.06"), Ok([0.94, 1.06]));
+        for wrong in ["", "0.9", "1.01,1.06", "0.9,0.99", "0.9,nan", "0,2", "0.9,1.1,1.2"] {
+            let said = range(wrong).unwrap_err();
+            assert_eq!(said, format!("expected LOW,HIGH with 0.1 <= LOW < 1 < HIGH <= 10, found {wrong:?}"));
+        }
     }
 }

@@ -7,7 +7,7 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
+    CommandError, challenge, check, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -23,6 +23,7 @@ fn main() -> ExitCode {
         Err(help) => return said(output::say(help.to_string().trim_end())),
     };
     let done = match &cli.command {
+        Command::Check(options) => check::run(options),
         Command::Replay(options) => replay::run(options),
         Command::Watch(options) => watch::run(options),
         Command::Response(options) => response::run(options),

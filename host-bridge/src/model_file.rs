@@ -163,7 +163,7 @@ fn take(tables: &mut Tables, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
 
 #[cfg(test)]
 mod tests {
-    use estimator::surrogate::Head;
+    use estimator::Sizes;
     use twin::{Effect, Ring};
 
     use super::*;
@@ -196,8 +196,8 @@ mod tests {
         let path = folder.path().join("model");
         write(&path, MACHINE, &tables).unwrap();
         assert_eq!(read(&path, MACHINE).unwrap(), tables);
-        // 328 parcels of every ring, four of each of two terms, and two lists of them
-        assert_eq!(std::fs::read(&path).unwrap().split_inclusive(|byte| *byte == 0).count(), 328 + 4 * 2 + 2);
+        let packets = std::fs::read(&path).unwrap().split_inclusive(|byte| *byte == 0).count();
+        assert_eq!(packets, tables.parcels::<LINE>().count());
     }
 
     #[test]
@@ -205,7 +205,7 @@ mod tests {
         let other = refused_whole(b"orbitcal model of ten cells\n");
         assert_eq!(other, ": a model of \"ten cells\", this machine is \"a machine\"");
         let expected = ": expected a model file, which begins with the line \"orbitcal model of \" and its machine";
-        for bytes in [&b""[..], b"{}", b"{}\n", &wire(extended().parcels().next().unwrap())] {
+        for bytes in [&b""[..], b"{}", b"{}\n", &wire(extended().parcels::<LINE>().next().unwrap())] {
             assert_eq!(refused_whole(bytes), expected);
         }
         assert_eq!(read(Path::new("/nonexistent"), MACHINE).unwrap_err().to_string(), "/nonexistent: file not found");
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn what_is_no_model_is_refused_by_the_packet_that_says_so() {
-        let packets: Vec<Vec<u8>> = extended().parcels().map(wire).collect();
+        let packets: Vec<Vec<u8>> = extended().parcels::<LINE>().map(wire).collect();
         let (head, seal) = (&packets[0], packets.last().unwrap());
         assert_eq!(refused(&[]), ", packet 1: expected the head of tables, found the end of the file");
         assert_eq!(refused(&packets[1]), ", packet 1: expected the head of tables, found a part of tables");
@@ -223,14 +223,19 @@ mod tests {
             ", packet 10: expected the rest of the tables and their seal, found the end of the file"
         );
         let more = [packets.concat(), head.clone()].concat();
-        assert_eq!(refused(&more), ", packet 339: expected the end of the file, found a head");
+        assert_eq!(
+            refused(&more),
+            format!(", packet {}: expected the end of the file, found a head", packets.len() + 1)
+        );
         let lost = [head.clone(), packets[2..].concat()].concat();
-        assert!(refused(&lost).starts_with(", packet 337: a part is missing or was changed: the tables' CRC is "));
+        let missing = format!(", packet {}: a part is missing or was changed: the tables' CRC is ", packets.len() - 1);
+        assert!(refused(&lost).starts_with(&missing), "{}", refused(&lost));
         assert!(refused(b"[model]").starts_with(", packet 1: "), "{}", refused(b"[model]"));
-        let Parcel::Head(first) = extended().parcels().next().unwrap() else { panic!("a head comes first") };
-        let old = [wire(Parcel::Head(Head { version: 1, ..first })), seal.clone()].concat();
-        assert_eq!(refused(&old), ", packet 1: tables of version 1, this reads version 2");
-        let other = [wire(Parcel::Head(Head { counts: [1; 5], ..first })), seal.clone()].concat();
-        assert!(refused(&other).starts_with(", packet 1: tables of another ring: "), "{}", refused(&other));
+        let Parcel::Head { version, sizes } = extended().parcels::<LINE>().next().unwrap() else { panic!("no head") };
+        let old = [wire(Parcel::Head { version: 1, sizes }), seal.clone()].concat();
+        assert_eq!(refused(&old), format!(", packet 1: tables of version 1, this reads version {version}"));
+        let sizes = Sizes { monitors: [500, 1], ..sizes };
+        let other = [wire(Parcel::Head { version, sizes }), seal.clone()].concat();
+        assert!(refused(&other).starts_with(", packet 1: "), "{}", refused(&other));
     }
 }

@@ -5,10 +5,11 @@ use core::fmt;
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Health, Marginal, MonitorState, Prior};
 use inference::nuts::{NutsRun, UNMIXED};
-use inference::{BatchFit, Campaign, FittedTune, Lack, Recording, Reduced, Summary};
+use inference::recording::Row;
+use inference::{BatchFit, Campaign, FittedTune, Lack, Meter, Recording, Reduced, Summary};
 use serde::Serialize;
 use studies::Sampled;
-use twin::{Hold, Optics, OrbitError, Ring};
+use twin::{Hold, Optics, Ring};
 
 use crate::output::{fill, table};
 use crate::record::EstimateRecord;
@@ -155,9 +156,6 @@ impl Var {
 
 impl FitResult {
     /// What a core says after its last frame, here or on a device; with the prior of each param.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the ring as designed is not stable.
     pub fn of_core(
         ring: &Ring,
         recording: &Recording,
@@ -165,7 +163,7 @@ impl FitResult {
         last: &EstimateRecord,
         quality: FitQuality,
         timing: Timing,
-    ) -> Result<Self, OrbitError> {
+    ) -> Self {
         let marginal = |(i, Prior { lower, upper, .. }): (usize, &Prior)| Marginal {
             mean: last.centre[i],
             sigma: last.params_sigma[i],
@@ -175,16 +173,16 @@ impl FitResult {
         let marginals = priors.iter().enumerate().map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
-        let (n, tunes, campaign) = (vars.len(), tunes(ring, &vars), Campaign::of(ring, recording)?);
-        Ok(Self {
+        let (n, tunes) = (vars.len(), tunes(ring, &vars));
+        Self {
             recording: recording.name.clone(),
             method: "laplace",
             model: "green",
             frames: last.frames as usize,
             rejected_frames: last.rejected_frames,
             covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),
-            tunes_measured: TunesMeasured::of_campaign(&campaign, tunes.as_ref()),
-            lack: lack(&campaign).map(|lack| lack.to_string()),
+            tunes_measured: TunesMeasured::of_recording(recording, tunes.map(|tunes| [tunes.x, tunes.y])),
+            lack: lack(recording).map(|lack| lack.to_string()),
             tunes,
             vars,
             chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),
@@ -194,7 +192,7 @@ impl FitResult {
             timing: Some(timing),
             nuts: None,
             notes: Vec::new(),
-        })
+        }
     }
 
     /// What the batch fit says.
@@ -307,13 +305,17 @@ impl fmt::Display for FitResult {
 }
 
 impl TunesMeasured {
-    /// What the meter says of a campaign, with the integer parts of the model's.
-    fn of_campaign(campaign: &Campaign, model: Option<&Tunes>) -> Self {
-        let one = |plane: usize, model: f64| {
-            let meter = campaign.meters[plane].as_ref()?;
-            Some(TuneMeasured { mean: meter.near(model), sigma: meter.sigma })
+    /// What the meter says of a recording, with the integer parts of the model's.
+    pub fn of_recording(recording: &Recording, model: Option<[f64; 2]>) -> Self {
+        let time = recording.times();
+        let one = |plane: usize| {
+            // an RF offset moves the tune
+            let tune = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
+            let tunes: Vec<f64> = recording.rows.iter().map(tune).collect();
+            let meter = Meter::of(tunes.iter().zip(&time))?;
+            Some(TuneMeasured { mean: meter.near(model.map_or(0.0, |tunes| tunes[plane])), sigma: meter.sigma })
         };
-        Self { x: one(0, model.map_or(0.0, |tunes| tunes.x)), y: one(1, model.map_or(0.0, |tunes| tunes.y)) }
+        Self { x: one(0), y: one(1) }
     }
 
     /// What is wrong with the model's, if anything is.
@@ -346,10 +348,12 @@ fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
     tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
 }
 
-/// What a campaign lacks, by what was read and what was moved.
-fn lack(campaign: &Campaign) -> Option<Lack> {
-    let is_moved = campaign.settings.count > 1;
-    if !campaign.has_readings() { Some(Lack::Readings) } else { (!is_moved).then_some(Lack::Kick) }
+/// What a recording lacks to say anything, by what was read and what was moved.
+pub fn lack(recording: &Recording) -> Option<Lack> {
+    let is_read = recording.rows.iter().any(|row| row.reading.iter().any(Option::is_some));
+    // a recording without a kick has a nominal one of 1 rad
+    let is_kicked = recording.nominal_kick() < 1.0 || recording.rows.iter().any(|row| row.rf_offset != 0.0);
+    if is_read { (!is_kicked).then_some(Lack::Kick) } else { Some(Lack::Readings) }
 }
 
 impl Sampling {

@@ -17,7 +17,7 @@ fn diagnose(recording: &str) -> Value {
     serde_json::from_slice(&run.stdout).unwrap()
 }
 
-/// The answer has what the contract says, and the model that comes out fits better in the core.
+/// The result has what the contract says, and the model that comes out fits better in the core.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn an_identified_effect_reaches_the_core() {
@@ -36,31 +36,48 @@ fn an_identified_effect_reaches_the_core() {
         report.to_str().unwrap(),
     ]);
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
-    let answer: Value = serde_json::from_slice(&run.stdout).unwrap();
-    assert_eq!(answer["verdict"], "identified");
-    let finding = &answer["findings"][0];
+    let result: Value = serde_json::from_slice(&run.stdout).unwrap();
+    assert_eq!(result["verdict"], "identified");
+    let finding = &result["findings"][0];
     assert_eq!(
         (finding["kind"].as_str(), finding["at"].as_str(), finding["unit"].as_str()),
         (Some("quad_roll"), Some("F2"), Some("rad"))
     );
     assert!(finding["probability"].as_f64().unwrap() >= 0.95);
-    let gain = |key: &str| answer["fit"][key].as_f64().unwrap();
+    let gain = |key: &str| result["fit"][key].as_f64().unwrap();
     assert!(gain("elpd_gain") > 2.0 * gain("elpd_gain_se"));
-    assert_eq!(answer["vars_before"].as_array().map(Vec::len), Some(48));
-    assert_eq!(answer["vars_after"].as_array().map(Vec::len), Some(48));
-    assert_eq!(answer["monitors"].as_array().map(Vec::len), Some(33));
+    let measured = &result["tunes_measured"]["x"];
+    let away = measured["mean"].as_f64().unwrap() - result["tunes"]["x"].as_f64().unwrap();
+    assert!(away.abs() < 4.0 * measured["sigma"].as_f64().unwrap(), "tune x is {away} away from {measured}");
+    assert_eq!(result["vars_before"].as_array().map(Vec::len), Some(48));
+    assert_eq!(result["vars_after"].as_array().map(Vec::len), Some(48));
+    assert_eq!(result["monitors"].as_array().map(Vec::len), Some(33));
     assert!(fs::read_to_string(&report).unwrap().contains("quad_roll"));
     let core = |path: &Path, more: &[&str]| {
         let arguments =
             ["replay", recording, "--quiet", "--service", "orbitcal.DiagnoseTest.v1", "--json", path.to_str().unwrap()];
         let run = orbitcal(&[arguments.as_slice(), more].concat());
         assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
-        let answer: Value = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
-        (answer["chi2_per_dof"].as_f64().unwrap(), answer["mismatch"].as_bool().unwrap())
+        let result: Value = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+        (result["chi2_per_dof"].as_f64().unwrap(), result["mismatch"].as_bool().unwrap())
     };
     let (plain, extended) = (core(&before, &[]), core(&after, &["--model-file", model.to_str().unwrap()]));
     assert!(extended.0 < plain.0 - 0.04, "{plain:?} {extended:?}");
     assert!(plain.1 && !extended.1, "the core's alarm before, and silence after: {plain:?} {extended:?}");
+}
+
+/// Where nothing was found, the design would be no model of what was.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_model_of_nothing_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("model.bin");
+    let arguments = ["diagnose", "recordings/random-vars", "--quiet", "--model-out", model.to_str().unwrap()];
+    let run = orbitcal(&arguments);
+    let said = String::from_utf8_lossy(&run.stderr).into_owned();
+    assert_eq!(run.status.code(), Some(1), "{said}");
+    assert!(said.ends_with("not written: nothing was identified beyond the ring as designed\n"), "{said}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
 /// Rewrites the rows of a recording into a folder.
@@ -110,8 +127,8 @@ fn bad_recordings_invent_no_effect() {
     }
     let folder = folder();
     let answer = diagnose(&altered(folder.path(), no_baseline));
-    let at = answer["findings"][0]["at"].as_str();
-    assert!(answer["verdict"] == "consistent" || at == Some("x_E6"), "{answer:#}");
+    let at = result["findings"][0]["at"].as_str();
+    assert!(result["verdict"] == "consistent" || at == Some("x_E6"), "{answer:#}");
 }
 
 #[test]

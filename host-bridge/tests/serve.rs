@@ -9,12 +9,13 @@ use std::thread::{self, JoinHandle};
 
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, Write};
-use estimator::booster::{Estimator, Green};
-use estimator::packet;
-use firmware_sim::link::{REQUEST, Request, Vitals};
+use estimator::Tables as _;
+use estimator::booster::{Estimator, Green, LINE, PACKET, Request};
+use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Event, Inbox, Panel};
 use host_bridge::sink::shared_memory::Subscriber;
 use inference::{Recording, stream};
+use training::rooms::large;
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 
@@ -58,8 +59,10 @@ impl OutputPin for NoLamp {
     }
 }
 
-fn tables() -> Green {
-    training::green::tables(&twin::Ring::booster()).unwrap()
+fn tables() -> Box<Green> {
+    let mut green = Box::new(Green::BLANK);
+    training::green::tables(&twin::Ring::booster()).unwrap().fill(&mut *green).unwrap();
+    green
 }
 
 /// Something at the other end of a line, beside the test.
@@ -72,13 +75,14 @@ fn beside(path: &Path, run: impl FnOnce(UnixStream) + Send + 'static) -> JoinHan
 }
 
 /// A device that serves one host.
-fn device(path: &Path, tables: Green) {
+fn device(path: &Path, tables: Box<Green>) {
     beside(path, move |line| {
         let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-        let mut device = Device::new(&mut core, &tables, &mut slot);
+        let mut device = Device::<_, LINE>::new(&mut *core, &tables, &mut *slot);
         let (mut source, mut sink) = (Socket(line.try_clone().unwrap()), Socket(line));
         let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
-        let _ = firmware_sim::run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
+        let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+        let _ = run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
     });
 }
 
@@ -118,7 +122,11 @@ fn tables_of_another_ring_are_not_answered_by() {
     let folder = tempfile::tempdir().unwrap();
     let mut other = tables();
     other.stated_error[0] *= 2.0;
-    let message = format!("goes by tables {:08x}, this model has {:08x}; --load", other.digest(), tables().digest());
+    let message = format!(
+        "goes by tables {:08x}, this model has {:08x}; --load",
+        other.digest::<LINE>(),
+        tables().digest::<LINE>()
+    );
     device(&folder.path().join("uart"), other);
     let source = format!("unix:{}", folder.path().join("uart").display());
     let service = format!("orbitcal/test/{}/other", std::process::id());
@@ -129,9 +137,9 @@ fn tables_of_another_ring_are_not_answered_by() {
 
 /// A line on which a front end and a host talk to one device.
 struct Shared<'d> {
-    device: Device<'d>,
+    device: Device<'d, Estimator, LINE>,
     host: UnixStream,
-    inbox: Inbox,
+    inbox: Inbox<PACKET>,
     /// Replies until one that is spoiled on its way.
     spoiled: Option<u32>,
 }
@@ -141,7 +149,7 @@ impl Shared<'_> {
     fn send(&mut self, mut bytes: Vec<u8>, requests: u32) {
         let (host, spoiled) = (&mut self.host, &mut self.spoiled);
         self.device.hear(&mut bytes, Vitals::default, &mut |reply| {
-            let mut bytes = [0; packet::MAX_WIRE_BYTES];
+            let mut bytes = [0; PACKET];
             let n = reply.encode(&mut bytes).unwrap();
             *spoiled = spoiled.and_then(|left| left.checked_sub(1).or_else(|| flip(&mut bytes[5])));
             host.write_all(&bytes[..n]).unwrap();
@@ -153,7 +161,7 @@ impl Shared<'_> {
         for _ in 0..requests {
             let mut source = Socket(self.host.try_clone().unwrap());
             let Event::Packet(bytes) = self.inbox.next(&mut source).unwrap() else { panic!("no request") };
-            let request: Request = packet::unseal(REQUEST, &mut bytes.to_vec()).unwrap();
+            let request = Request::decode(&mut bytes.to_vec()).unwrap();
             assert_eq!(request, Request::Covariance);
             self.device.hear(bytes, Vitals::default, &mut |reply| panic!("{reply:?}"));
         }
@@ -166,8 +174,16 @@ fn flip(byte: &mut u8) -> Option<u32> {
     None
 }
 
+/// The setup as a host sends it, in packets that are the same for a machine of any size.
+fn restart(setup: &stream::Setup) -> Vec<u8> {
+    let mut bytes = vec![0; large::PACKET];
+    let n = large::Request::Restart(setup.on_wire()).encode(&mut bytes).unwrap();
+    bytes.truncate(n);
+    bytes
+}
+
 fn request(request: &Request) -> Vec<u8> {
-    let mut bytes = vec![0; packet::MAX_WIRE_BYTES];
+    let mut bytes = vec![0; PACKET];
     let n = request.encode(&mut bytes).unwrap();
     bytes.truncate(n);
     bytes
@@ -175,12 +191,14 @@ fn request(request: &Request) -> Vec<u8> {
 
 /// Everything that may happen while somebody else feeds the device; then the line breaks.
 fn a_day_of_a_front_end(line: UnixStream) {
-    let recording = Recording::read(Path::new(RECORDING), &stream::layout(&twin::Ring::booster())).unwrap();
-    let restart = || request(&Request::Restart(stream::setup(&recording, 0.0).unwrap()));
+    let recording = Recording::read(Path::new(RECORDING), &twin::Ring::booster()).unwrap();
+    let ring = twin::Ring::booster();
+    let setup = stream::setup(&recording.powered(&ring), &recording, 0.0).unwrap();
+    let restart = || restart(&setup);
     let frame = |at: usize| stream::wire(&recording, &recording.rows[at]).unwrap();
     let tables = tables();
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-    let device = Device::new(&mut core, &tables, &mut slot);
+    let device = Device::new(&mut *core, &tables, &mut *slot);
     let mut shared = Shared { device, host: line, inbox: Inbox::default(), spoiled: None };
     // the host begins to listen in the middle of a reply
     shared.host.write_all(&[9, 9, 9, 0]).unwrap();
@@ -198,7 +216,7 @@ fn a_day_of_a_front_end(line: UnixStream) {
     // the device is reset, and knows no more what was asked of it
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
     let Shared { host, inbox, .. } = shared;
-    let mut shared = Shared { device: Device::new(&mut core, &tables, &mut slot), host, inbox, spoiled: None };
+    let mut shared = Shared { device: Device::new(&mut *core, &tables, &mut *slot), host, inbox, spoiled: None };
     shared.send(restart(), 0);
     shared.send(frame(4), 1);
     shared.send(frame(5), 2);

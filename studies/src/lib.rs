@@ -18,7 +18,7 @@ mod trimming;
 
 use inference::nuts::{NutsError, NutsSettings};
 use inference::posterior::LaplaceError;
-use inference::{BatchError, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
+use inference::{BatchError, Campaign, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
 use report::Page;
 use serde::Serialize;
 use twin::Ring;
@@ -57,6 +57,8 @@ pub struct Numbers {
     pub runs: Vec<RunNumbers>,
     /// The reference: all frames, twin.
     pub vars: Vec<VarNumbers>,
+    /// Tunes of the fitted ring, which was not told the measured ones.
+    pub tunes: [TuneNumbers; 2],
     /// Every subset of the data.
     pub subsets: Vec<SubsetNumbers>,
     /// Standard deviation of each var in each kind of subset, median over the subsets, and pooled.
@@ -68,6 +70,17 @@ pub struct Numbers {
     /// Half widths beside the published ones, for the recording made with the published vars.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub published: Vec<Beside>,
+}
+
+/// One tune of the ring at the MAP, and as measured.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct TuneNumbers {
+    /// Plane, `x` or `y`.
+    pub plane: &'static str,
+    /// Of the fitted ring.
+    pub model: f64,
+    /// Mean of what was measured and its standard deviation; none without a tune meter.
+    pub measured: Option<[f64; 2]>,
 }
 
 /// One subset of the data.
@@ -168,6 +181,7 @@ pub fn run(
     let numbers = Numbers {
         recording: recording.name.clone(),
         vars: reference.summary.iter().map(VarNumbers::of).collect(),
+        tunes: tune_numbers(&sampling.reduced.fit.tunes),
         subsets: subsets.numbers(),
         widths: subsets.widths(&names),
         runs: sampling.runs,
@@ -176,6 +190,12 @@ pub fn run(
         published,
     };
     Ok(Study { page, numbers })
+}
+
+/// The differences that a campaign holds, in words: what its studies of single pairs are made of.
+pub fn differences(campaign: &Campaign) -> Vec<String> {
+    let settings = settings::Settings::of(&campaign.recording, campaign.ring.correctors.len());
+    subsets::drawn(campaign).into_iter().map(|(kind, _)| settings.words(kind)).collect()
 }
 
 /// The var that is farthest from its design, in its error bars.
@@ -206,16 +226,24 @@ fn lead(sampling: &Sampling, subsets: &subsets::Subsets, reference: &Sampled) ->
     )
 }
 
+fn tune_numbers(tunes: &[FittedTune; 2]) -> [TuneNumbers; 2] {
+    let one = |plane, tune: &FittedTune| TuneNumbers {
+        plane,
+        model: tune.model,
+        measured: tune.measured.map(|(mean, sigma)| [mean, sigma]),
+    };
+    [one("x", &tunes[0]), one("y", &tunes[1])]
+}
+
 /// Tunes of the fitted ring beside the measured ones.
 fn tunes(tunes: &[FittedTune; 2]) -> String {
-    let one = |(plane, tune): (&str, &FittedTune)| {
+    let one = |tune: TuneNumbers| {
         let measured = tune
             .measured
-            .map_or_else(|| "not measured".into(), |(value, sigma)| format!("measured {value:.4} ± {sigma:.4}"));
-        format!("{plane} {:.4} ({measured})", tune.model)
+            .map_or_else(|| "not measured".into(), |[mean, sigma]| format!("measured {mean:.4} ± {sigma:.4}"));
+        format!("Q{} {:.4} ({measured})", tune.plane, tune.model)
     };
-    let both: Vec<String> = ["Qx", "Qy"].into_iter().zip(tunes).map(one).collect();
-    format!("Tunes of the fitted ring: {}.", both.join(", "))
+    format!("Tunes of the fitted ring: {}.", tune_numbers(tunes).map(one).join(", "))
 }
 
 /// Mean standard deviation of the focusing and of the defocusing vars, which come after them.

@@ -31,7 +31,8 @@ warnings.filterwarnings("ignore", message="AT tracking still assumes beta==1")  
 warnings.filterwarnings("ignore", message="The .* element is marked as 'Under Construction'")  # so is the standard
 
 ROOT = Path(__file__).resolve().parents[2]
-RINGS = ROOT / "tests/golden/rings"
+RINGS = {"ten-cells": ROOT / "recordings/ten-cells/ring.json", "odd": ROOT / "tests/golden/rings/odd.json",
+         "shifted": ROOT / "tests/golden/rings/shifted.json"}
 KICK = 2e-6  # rad: orbits small enough to be linear, even in the sextupoles here, and 1e-12 m is 5e-7 m/rad
 TUNE, RESPONSE = 1e-6, 1e-4  # tolerances [1, m/rad]
 
@@ -259,7 +260,7 @@ def bmad(case):
             parameters[found[1]] = found[2]
         elif found := re.fullmatch(rf"ring: line = \( (.*)\)", statement):
             order = [name.strip() for name in found[1].split(",")]
-        elif found := re.fullmatch(rf"({NAME}): overlay = \{{(.*)\}}, var = \{{kick\}}", statement):
+        elif found := re.fullmatch(rf"({NAME}): overlay = \{{(.*)\}}, var = \{{setting\}}", statement):
             overlays[found[1]] = found[2].split(", ")
         elif found := re.fullmatch(rf"({NAME}): (\w+)((?:, \w+ = [-+.e0-9]+)*)", statement):
             attributes = {k: float(v) for k, v in re.findall(r", (\w+) = ([-+.e0-9]+)", found[3])}
@@ -278,8 +279,8 @@ def bmad_axis(case, channel, elements, overlays):
     (name, plane), axis = channel, {"H": 0.0, "V": 0.0}
     kind = elements[name][0]
     own = {"H": "hkick", "V": "vkick"}[plane] if kind == "kicker" else "kick"
-    for target in overlays.get(knob(case, name, plane), [f"{name}[{own}]: (1.0) * kick"]):
-        element, attribute, factor = re.fullmatch(rf"({NAME})\[(\w+)\]: \((\S+)\) \* kick", target).groups()
+    for target in overlays.get(knob(case, name, plane), [f"{name}[{own}]: (1.0) * setting"]):
+        element, attribute, factor = re.fullmatch(rf"({NAME})\[(\w+)\]: \((\S+)\) \* setting", target).groups()
         assert element == name and attribute in ({"hkick", "vkick"} if kind == "kicker" else {"kick"}), target
         axis[{"hkick": "H", "vkick": "V"}.get(attribute, kind[0].upper())] += float(factor)
     return axis["H"], axis["V"]
@@ -334,8 +335,8 @@ def cases(orbitcal, folder):
         ("corrector_gain", "H_A4", 0.06), ("corrector_roll", "V_D3", 0.05), ("corrector_polarity", "H_B2", 1.0),
         ("bpm_gain", "x_E4", -0.08), ("bpm_roll", "y_C5", 0.04),
     ])
-    for path in sorted(RINGS.glob("*.json")):
-        yield Case(orbitcal, folder, path.stem, path, scattered(json.loads(path.read_text())))
+    for name, path in RINGS.items():
+        yield Case(orbitcal, folder, name, path, scattered(json.loads(path.read_text())))
 
 
 def main():

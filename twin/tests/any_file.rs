@@ -1,13 +1,16 @@
 //! Nothing that may stand in a machine file makes the twin panic.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use serde_json::{Map, Value, json};
-use twin::{CalibratedOptics, Hold, Machine, Optics, Plane, Rf, Ring, VariedRing, spurious_dispersion};
+use twin::{
+    CalibratedOptics, Drives, Effect, EffectKind, Hold, Machine, Optics, Plane, Rf, Ring, Signatures, VariedRing,
+    spurious_dispersion,
+};
 
 const TYPES: [&str; 8] = ["marker", "bpm", "corrector", "quadrupole", "sbend", "sextupole", "multipole", "solenoid"];
 const NAMES: [&str; 8] = ["A", "Q_A", "P_A", "ß_Δ 1", "_", "a_", "x_A", ","];
@@ -83,7 +86,7 @@ fn ask(ring: &Ring) -> bool {
     names.iter().for_each(|names| (1..names.len()).for_each(|i| assert!(!names[..i].contains(&names[i]), "{names:?}")));
     assert_eq!(names[1].len(), ring.read_monitors.len());
     let _ = spurious_dispersion(ring);
-    let _ = Machine::new(ring.clone(), Rf::FixedFrequency, &[]).map(|machine| machine.response());
+    ask_effects(ring);
     for hold in [Hold::Momentum { delta: 1e-3 }, Hold::Frequency { offset: 1e-4 }] {
         let Ok(optics) = Optics::of(ring, hold) else { continue };
         let (observers, sources, gradients) = (optics.read_monitors(), optics.correctors(), optics.quadrupoles());
@@ -99,6 +102,25 @@ fn ask(ring: &Ring) -> bool {
     assert_eq!(ring.by_parameter(&optics.pull_back(&weights)).len(), n);
     assert_eq!(optics.tune_slopes().len(), ring.quadrupoles.len());
     true
+}
+
+/// Readings with every effect at its first place, and their derivatives.
+fn ask_effects(ring: &Ring) {
+    let drives = Drives {
+        kick: DMatrix::from_element(2, ring.correctors.len(), 1e-4),
+        rf_offset: DVector::zeros(2),
+        time: DVector::from_vec(vec![-1.0, 1.0]),
+        nominal_kick: 1e-4,
+        orbit: vec![[1e-3; 2]; ring.elements.len()],
+    };
+    let site = |&kind: &EffectKind| kind.sites(ring).first().map(|&site| Effect { kind, site, amplitude: 1e-3 });
+    for effect in EffectKind::ALL.iter().filter_map(site).map(Some).chain([None]) {
+        let effects: Vec<Effect> = effect.into_iter().collect();
+        let Ok(machine) = Machine::new(ring.clone(), Rf::FixedFrequency, &effects) else { continue };
+        let _ = (machine.response(), machine.readings(&drives));
+        let Ok(signatures) = Signatures::of(&machine, &drives) else { continue };
+        assert_eq!(signatures.of_vars().len(), ring.parameters.len());
+    }
 }
 
 /// Good files and bad, stable rings and unstable ones: all three are met often.

@@ -26,7 +26,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
             recording.name,
             recording.rows.len(),
             recording.header.recorded_with,
-            recording.header.bpm_sigma * 1e6,
+            found.data.mean_noise() * 1e6,
         ),
         format!(
             "Probability that nothing{} is missing {}, that an effect of the library is {}, that something else is {}.",

@@ -23,7 +23,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             ]
         })
         .collect();
-    let expected = data.expected_noise * 1e6;
+    let expected = data.mean_noise() * 1e6;
     let text = match rows.len() {
         0 => format!("Every monitor that is read is in order; expected noise of a reading {expected:.0} µm."),
         _ => format!(

@@ -21,6 +21,7 @@ use crate::hypothesis::{Hypothesis, Term};
 use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
 use crate::{Diagnosis, Finding, Verdict};
 pub use case::{Case, Class};
+use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware};
 pub use unknown::{Unknown, UnknownKind};
@@ -161,8 +162,8 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
 /// others; of what the library does not hold, when its signal is taken out.
 fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<(f64, Vec<f64>), DataError> {
-    let data = Data::of(ring, recording)?;
-    let zero = DVector::zeros(ring.quadrupoles.len());
+    let data = Data::of(&Campaign::of(ring, recording)?)?;
+    let zero = DVector::zeros(data.units.len());
     let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
         let hypothesis = Hypothesis { given: given.to_vec(), ..Hypothesis::default() };
         Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))

@@ -115,7 +115,7 @@ impl UnknownKind {
             Self::QuadJump => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
             Self::OrbitDrift => correctors.map(Site::Corrector).collect(),
             Self::Hysteresis | Self::Leak => {
-                correctors.filter(|&at| was_set(campaign, ring, at)).map(Site::Corrector).collect()
+                correctors.filter(|&at| was_set(campaign, at)).map(Site::Corrector).collect()
             }
             Self::Octupole => {
                 let straights = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Marker);
@@ -193,10 +193,9 @@ impl Beyond for Unknown {
     }
 }
 
-/// True if the campaign sets this corrector; its rows name it by its label.
-fn was_set(campaign: &Recording, ring: &Ring, corrector: usize) -> bool {
-    let label = ring.label(ring.correctors[corrector].element);
-    campaign.rows.iter().any(|row| row.setting != 0.0 && row.corrector.as_deref() == Some(label))
+/// True if the campaign sets this corrector.
+fn was_set(campaign: &Recording, corrector: usize) -> bool {
+    campaign.rows.iter().any(|row| row.setting(corrector).is_some_and(|setting| setting != 0.0))
 }
 
 /// Index of the place among the read monitors, correctors, quadrupoles or elements, and of the neighbour that it concerns: the next

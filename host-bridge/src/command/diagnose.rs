@@ -7,14 +7,15 @@ use diagnosis::average::Vars;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
 use diagnosis::{Diagnosis, Finding, page};
+use inference::Recording;
 use serde::Serialize;
-use twin::{Measured, Ring};
+use twin::{Machine, Measured, Rf, Ring};
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
 use crate::cli::Diagnose;
 use crate::model_file;
 use crate::output::{self, fill, table};
-use crate::result::{Monitor, Var, monitors, vars_of};
+use crate::result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
@@ -27,6 +28,9 @@ struct DiagnosisResult {
     fit: Fits,
     vars_before: Vec<Var>,
     vars_after: Vec<Var>,
+    /// Of the machine that was found.
+    tunes: Option<Tunes>,
+    tunes_measured: TunesMeasured,
     next_measurement: Option<String>,
     /// Probability that nothing (more) is missing, that an effect of the library is, and that something else is.
     probabilities: Probabilities,
@@ -95,7 +99,6 @@ struct ScatterResult {
 impl From<DataError> for CommandError {
     fn from(error: DataError) -> Self {
         match error {
-            DataError::Stream(error) => error.into(),
             error @ DataError::TooLittle { .. } => Self::Input(error.to_string()),
             error => Self::Other(error.to_string()),
         }
@@ -109,7 +112,7 @@ impl From<DataError> for CommandError {
 pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     let outputs = [&options.common.json, &options.report, &options.model_out];
     check_outputs(outputs.map(Option::as_deref))?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let bar = progress(5, "", options.common.quiet);
     let made = Diagnosis::of(&ring, &recording, |what| {
@@ -118,7 +121,7 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     });
     bar.finish_and_clear();
     let diagnosis = made?;
-    let result = DiagnosisResult::of(&ring, &recording.name, &diagnosis)?;
+    let result = DiagnosisResult::of(&ring, &recording, &diagnosis)?;
     if let Some(path) = &options.report {
         let page = page::page(&diagnosis, &recording);
         let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
@@ -148,8 +151,8 @@ fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<(), Co
 }
 
 impl DiagnosisResult {
-    fn of(ring: &Ring, recording: &str, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
-        let failed = |error: twin::EffectError| CommandError::Other(format!("{recording}: {error}"));
+    fn of(ring: &Ring, recording: &Recording, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
+        let failed = |error: twin::EffectError| CommandError::Other(format!("{}: {error}", recording.name));
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;
         let (gain, error) = diagnosis.gain();
@@ -162,9 +165,9 @@ impl DiagnosisResult {
                 heldout_inside_95: score.inside[1],
             })
         };
-        let next = &found.next;
+        let (next, tunes) = (&found.next, tunes_of(ring, diagnosis));
         Ok(Self {
-            recording: recording.into(),
+            recording: recording.name.clone(),
             verdict: diagnosis.verdict.word(),
             sentence: diagnosis.sentence.clone(),
             findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
@@ -181,6 +184,8 @@ impl DiagnosisResult {
             },
             vars_before: vars(ring, &diagnosis.vars_before),
             vars_after: vars(ring, &diagnosis.vars_after),
+            tunes_measured: TunesMeasured::of_recording(recording, tunes.map(|tunes| [tunes.x, tunes.y])),
+            tunes,
             next_measurement: diagnosis.next_measurement.clone(),
             probabilities: Probabilities {
                 nothing_more: next.nothing,
@@ -216,6 +221,9 @@ impl fmt::Display for DiagnosisResult {
             after.heldout_rms_mm * 1e3,
         );
         write!(f, "{}", fill(&summary))?;
+        if let Some(tunes) = &self.tunes {
+            write!(f, "\ntunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
+        }
         self.next_measurement.as_ref().map_or(Ok(()), |next| write!(f, "\n\n{}", fill(next)))
     }
 }
@@ -254,6 +262,14 @@ impl FindingResult {
             gain,
         ]
     }
+}
+
+/// Tunes of the machine that was found; none if it is unstable.
+fn tunes_of(ring: &Ring, diagnosis: &Diagnosis) -> Option<Tunes> {
+    let ring = ring.with_vars(diagnosis.vars_after.mean.as_slice());
+    let machine = Machine::new(ring, Rf::FixedMomentum, &diagnosis.effects()).ok()?;
+    let tunes = machine.response().ok()?.tunes;
+    Some(Tunes { x: tunes.x, y: tunes.y })
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

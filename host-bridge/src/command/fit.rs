@@ -7,10 +7,10 @@ use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
-use crate::output;
 use crate::result::FitResult;
+use crate::{fit_page, output};
 
 /// Run it.
 ///
@@ -18,12 +18,17 @@ use crate::result::FitResult;
 /// [`CommandError`].
 pub fn run(options: &Fit) -> Result<(), CommandError> {
     check(options)?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let result = match options.method {
         Method::Map => by_steps(options, &ring, &recording)?,
         Method::Nuts => by_draws(options, &ring, &recording)?,
     };
+    if let Some(path) = &options.report {
+        let page = fit_page::page(&ring, &result);
+        let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
+        output::bytes(path, page.render().as_bytes())?;
+    }
     deliver(&options.common, &result)
 }
 
@@ -35,7 +40,7 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     if options.method == Method::Map && options.save_draws.is_some() {
         return Err(CommandError::Input("--save-draws needs --method nuts".into()));
     }
-    check_outputs([options.common.json.as_deref()])?;
+    check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)
 }
 

@@ -1,6 +1,7 @@
 //! The commands, one file each.
 
 pub mod challenge;
+pub mod check;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
@@ -17,12 +18,12 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::{BatchError, Recording, RecordingError, stream};
+use inference::{BatchError, Recording, RecordingError, stream, with_priors};
 use serde::Serialize;
 use training::Tables;
 use twin::{LatticeError, Ring};
 
-use crate::cli::{Common, Publishing};
+use crate::cli::{Common, Priors, Publishing};
 use crate::model_file::{self, ModelFileError};
 use crate::output::{self, OutputError};
 use crate::record::{EstimateRecord, Names};
@@ -99,6 +100,11 @@ impl From<twin::OrbitError> for CommandError {
 /// The machine that was asked for, or the built-in one.
 fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
     path.map_or_else(|| Ok(Ring::booster()), Ring::read)
+}
+
+/// The same with the priors that were asked for.
+fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeError> {
+    Ok(with_priors(&machine(path)?, priors.prior_width, priors.range))
 }
 
 /// The core's tables: those of a model file, or of the ring as designed.

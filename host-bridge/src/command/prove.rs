@@ -11,7 +11,7 @@ use diagnosis::data::{Data, DataError};
 use diagnosis::scan::candidates;
 use diagnosis::validation::tables::Tables;
 use diagnosis::validation::{Case, Class, Outcome, run as prove};
-use inference::Recording;
+use inference::{Campaign, Recording};
 use twin::Ring;
 
 use super::{CommandError, check_outputs, machine, progress, recording};
@@ -60,7 +60,7 @@ pub fn run(options: &Prove) -> Result<(), CommandError> {
 
 /// Cases of all classes; the number of a case fixes it, so that a longer run begins with the shorter one's.
 fn cases(options: &Prove, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
-    let data = Data::of(ring, template)?;
+    let data = Data::of(&Campaign::of(ring, template).map_err(DataError::from)?)?;
     let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
     let classes = [
         (Class::Empty, options.empty),

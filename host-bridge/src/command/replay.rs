@@ -3,7 +3,7 @@
 use estimator::Prior;
 use inference::stream::{self, Core};
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables};
+use super::{CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables};
 use crate::cli::Replay;
 use crate::record::Names;
 use crate::result::FitResult;
@@ -16,7 +16,7 @@ use crate::stop::Stop;
 /// [`CommandError`].
 pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let powered = recording.powered(&ring);
     let tables = tables(&powered, options.model_file.as_deref())?;
@@ -29,5 +29,5 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(&ring, &recording, &priors, &last, quality, timing)?)
+    deliver(&options.common, &FitResult::of_core(&ring, &recording, &priors, &last, quality, timing))
 }

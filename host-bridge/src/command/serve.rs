@@ -81,7 +81,7 @@ fn feed(
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(ring, recording, &priors, &last, quality, timing)?)
+    deliver(&options.common, &FitResult::of_core(ring, recording, &priors, &last, quality, timing))
 }
 
 /// A device goes by the tables that it has, whatever ring they are of.

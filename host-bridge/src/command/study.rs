@@ -2,7 +2,7 @@
 
 use studies::{self, Options};
 
-use super::{CommandError, check_outputs, machine, progress, recording};
+use super::{CommandError, check_outputs, machine_with, progress, recording};
 use crate::cli::Study;
 use crate::output;
 
@@ -12,7 +12,7 @@ use crate::output;
 /// [`CommandError`].
 pub fn run(options: &Study) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), Some(&options.report)])?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let bar = progress(1, "", options.common.quiet);
     let mut report = |what: &str, done: usize, total: usize| {

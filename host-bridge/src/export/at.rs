@@ -24,7 +24,7 @@ pub(super) fn value(lattice: &Lattice) -> Value {
         "energy": (particle.rest_energy + particle.kinetic_energy) * 1e9,
         "periodicity": 1,
         "particle": {"name": particle.name(), "rest_energy": particle.rest_energy * 1e9, "charge": charge(particle.name())},
-        "remarks": lattice.remarks,
+        "remarks": lattice.remarks_of("pyAT", lattice.not_acted_on()),
     });
     let elements: Vec<Value> = (0..lattice.elements.len()).map(|at| element(lattice, at)).collect();
     json!({"atjson": 1, "elements": elements, "properties": properties})

@@ -131,9 +131,9 @@ fn overlays(lattice: &Lattice, at: usize, element: &Element) -> String {
             _ => vec![("kick", y)],
         };
         let targets: Vec<String> = (targets.iter().filter(|(_, factor)| *factor != 0.0))
-            .map(|(word, factor)| format!("{}[{word}]: ({factor:?}) * kick", element.name))
+            .map(|(word, factor)| format!("{}[{word}]: ({factor:?}) * setting", element.name))
             .collect();
-        format!("{}: overlay = {{{}}}, var = {{kick}}\n", channel.knob, targets.join(", "))
+        format!("{}: overlay = {{{}}}, var = {{setting}}\n", channel.knob, targets.join(", "))
     };
     Lattice::channels_of(&lattice.correctors, at).filter(|channel| !channel.is_ideal()).map(one).collect()
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use serde::Deserialize;
-use twin::{Effect, Ring};
+use twin::{EffectText, Ring};
 
 use crate::output::unreadable;
 
@@ -18,7 +18,7 @@ pub struct Calibration {
     /// Names and factors of the params that were fitted.
     pub strengths: Vec<(String, f64)>,
     /// What was found beyond them, with its sentence.
-    pub findings: Vec<(Effect, String)>,
+    pub findings: Vec<(EffectText, String)>,
     /// Findings that are not certain, or that no effect of the library describes.
     pub open: Vec<String>,
 }
@@ -161,9 +161,9 @@ impl Calibration {
 
 impl Finding {
     /// The effect in the library that it names, if it names one.
-    fn effect(&self) -> Option<Effect> {
-        let at = self.at.as_deref().filter(|at| !at.is_empty()).map_or(String::new(), |at| format!("@{at}"));
-        format!("{}{at}={}", self.kind, self.amplitude.unwrap_or(1.0)).parse().ok()
+    fn effect(&self) -> Option<EffectText> {
+        let (place, amplitude) = (self.at.clone().unwrap_or_default(), self.amplitude.unwrap_or(1.0));
+        Some(EffectText { kind: self.kind.parse().ok()?, place, amplitude })
     }
 
     fn words(&self) -> String {
@@ -219,7 +219,7 @@ mod tests {
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": 1.0}]}"#),
-            "fit.json: expected a var B2 of AGS Booster (BNL), design model, found none"
+            "fit.json: expected a var A4 of AGS Booster (BNL), design model, found none"
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": -1.0}]}"#),

@@ -3,7 +3,10 @@
 
 use std::path::Path;
 
-use twin::{Effect, EffectError, EffectKind, Element, Kind, Machine, Misalignment, Particle, Plane, Rf, Ring};
+use twin::{
+    Class, CorrectorEffect, Effect, EffectError, Element, Kind, Machine, Misalignment, MonitorEffect, Particle, Plane,
+    Rf, Ring, Site,
+};
 
 use super::calibration::{Calibration, CalibrationError};
 use super::names::Names;
@@ -62,7 +65,7 @@ impl Channel {
 
     /// What is not ideal, in words.
     pub fn words(&self) -> String {
-        format!("{}: gain {:?}, roll {:?} rad", self.name, self.gain, self.roll)
+        format!("{}, gain {:?}, roll {:?} rad", self.name, self.gain, self.roll)
     }
 }
 
@@ -84,27 +87,34 @@ impl Lattice {
     /// # Errors
     /// [`ExportError`] if the result is of another ring.
     pub fn of(ring: &Ring, result: &Calibration, path: &Path) -> Result<Self, ExportError> {
-        let effects: Vec<Effect> = result.findings.iter().map(|(effect, _)| effect.clone()).collect();
+        let effects: Result<Vec<Effect>, _> = result.findings.iter().map(|(text, _)| text.resolve(ring)).collect();
+        let effects = effects?;
         let machine = Machine::new(ring.with_vars(&result.vars(ring, path)?), Rf::FixedMomentum, &effects)?;
         let mut lattice = Self::plain(machine.ring());
-        lattice.remarks.push(format!("{}: strengths from {}", lattice.machine, result.recording));
-        for (effect, sentence) in &result.findings {
+        let version = env!("CARGO_PKG_VERSION");
+        lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));
+        for (effect, (_, sentence)) in effects.iter().zip(&result.findings) {
             let included = lattice.apply(effect);
             lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
         }
         lattice.remarks.extend(result.open.iter().map(|open| format!("open, not in this file: {open}")));
+        lattice.remarks.iter_mut().for_each(|remark| *remark = one_line(remark));
         Ok(lattice)
     }
 
     /// A ring as it is.
     pub(super) fn plain(ring: &Ring) -> Self {
         let mut names = Names::new();
-        let (mut elements, mut position, mut remarks) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut elements, mut position, mut remarks, mut drifts) = (Vec::new(), Vec::new(), Vec::new(), 1..);
         for element in &ring.elements {
             position.push(elements.len());
-            let name = names.take(if element.name.is_empty() { "drift_1" } else { &element.name });
-            if !element.name.is_empty() && name != element.name {
-                remarks.push(format!("{:?} is called {name}", element.name));
+            let wanted = match element.name.as_str() {
+                "" => format!("drift_{}", drifts.next().expect("numbers do not end")),
+                name => name.into(),
+            };
+            let name = names.take(&wanted);
+            if name != wanted {
+                remarks.push(format!("{wanted:?} is called {name}"));
             }
             elements.extend(pieces(Element { name, ..element.clone() }, &mut names));
         }
@@ -137,8 +147,23 @@ impl Lattice {
     }
 
     /// Planes of the monitor or corrector at an element.
-    pub fn channels_of<'l>(channels: &'l [Channel], element: usize) -> impl Iterator<Item = &'l Channel> {
+    pub fn channels_of(channels: &[Channel], element: usize) -> impl Iterator<Item = &Channel> {
         channels.iter().filter(move |channel| channel.element == element)
+    }
+
+    /// The remarks, and one for each monitor or corrector that the format has no words for.
+    pub fn remarks_of<'l>(&'l self, format: &str, without_words: impl Iterator<Item = &'l Channel>) -> Vec<String> {
+        let without_words = without_words.map(|channel| format!("{format} does not act on {}", channel.words()));
+        self.remarks.iter().cloned().chain(without_words).collect()
+    }
+
+    /// Monitors that are not ideal, and correctors with a gain or planes of different rolls: what a format without knobs
+    /// cannot say.
+    pub fn not_acted_on(&self) -> impl Iterator<Item = &Channel> {
+        let monitors = self.monitors.iter().filter(|channel| !channel.is_ideal());
+        let is_beyond =
+            |channel: &&Channel| channel.gain != 1.0 || channel.roll != self.corrector_roll(channel.element);
+        monitors.chain(self.correctors.iter().filter(is_beyond))
     }
 
     /// Roll of the corrector at an element, if its planes are rolled alike, else 0 [rad].
@@ -148,35 +173,45 @@ impl Lattice {
         if rolls.all(|roll| roll == first) { first } else { 0.0 }
     }
 
-    /// Let a monitor or corrector have an effect; false if neither it nor the ring can.
+    /// Let a monitor or corrector have an effect, if the ring does not have it yet; false if neither can.
     fn apply(&mut self, effect: &Effect) -> bool {
-        let channels = match effect.kind {
-            EffectKind::BpmGain | EffectKind::BpmRoll => &mut self.monitors,
-            EffectKind::CorrectorGain | EffectKind::CorrectorPolarity => &mut self.correctors,
-            // the ring has them already
-            EffectKind::CorrectorRoll
-            | EffectKind::QuadRoll
-            | EffectKind::StrayGradient
-            | EffectKind::StraySkewGradient
-            | EffectKind::DipoleGradient
-            | EffectKind::DipoleEdge
-            | EffectKind::SextupoleError => return true,
-            EffectKind::BpmCubic
-            | EffectKind::BpmSwap
-            | EffectKind::CorrectorEven
-            | EffectKind::MomentumOffset
-            | EffectKind::FixedRfFrequency
-            | EffectKind::RadialLoop
-            | EffectKind::QuadDrift => return false,
-        };
-        let Some(channel) = channels.iter_mut().find(|channel| channel.name == effect.place) else { return false };
-        match effect.kind {
-            EffectKind::BpmRoll => channel.roll += effect.amplitude,
-            EffectKind::CorrectorPolarity => channel.gain = -channel.gain,
-            _ => channel.gain *= 1.0 + effect.amplitude,
+        match (effect.kind.class(), effect.site) {
+            (Class::Field(_), _) => true,
+            (Class::Monitor(how), Site::Monitor(at)) => self.distort(how, at, effect.amplitude),
+            (Class::Corrector(how), Site::Corrector(at)) => self.misset(how, at, effect.amplitude),
+            (Class::Monitor(_) | Class::Corrector(_) | Class::Hold(_) | Class::Drift(_), _) => false,
+        }
+    }
+
+    fn distort(&mut self, how: MonitorEffect, monitor: usize, amplitude: f64) -> bool {
+        match how {
+            MonitorEffect::Gain => self.monitors[monitor].gain *= 1.0 + amplitude,
+            MonitorEffect::Roll => {
+                let element = self.monitors[monitor].element;
+                let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);
+                planes.for_each(|channel| channel.roll += amplitude);
+            }
+            MonitorEffect::Cubic | MonitorEffect::Swap => return false,
         }
         true
     }
+
+    fn misset(&mut self, how: CorrectorEffect, corrector: usize, amplitude: f64) -> bool {
+        let channel = &mut self.correctors[corrector];
+        match how {
+            CorrectorEffect::Gain => channel.gain *= 1.0 + amplitude,
+            CorrectorEffect::Polarity => channel.gain = -channel.gain,
+            // the ring has it
+            CorrectorEffect::Roll => {}
+            CorrectorEffect::Even => return false,
+        }
+        true
+    }
+}
+
+/// A comment ends with its line, whatever the names in it hold.
+fn one_line(text: &str) -> String {
+    text.split(char::is_control).collect::<Vec<_>>().join(" ")
 }
 
 /// Monitors and correctors as thin elements with a drift behind them; markers likewise.

@@ -32,14 +32,8 @@ pub(super) fn text(lattice: &Lattice) -> String {
 }
 
 fn comments(lattice: &Lattice) -> String {
-    let mut text = String::new();
-    for remark in &lattice.remarks {
-        let _ = writeln!(text, "! {remark}");
-    }
-    for channel in lattice.monitors.iter().filter(|channel| channel.roll != 0.0) {
-        let _ = writeln!(text, "! no words for a monitor's roll: {}", channel.words());
-    }
-    text
+    let rolled = lattice.monitors.iter().filter(|channel| channel.roll != 0.0);
+    lattice.remarks_of("MAD-X", rolled).iter().map(|remark| format!("! {remark}\n")).collect()
 }
 
 /// Class and attributes.
@@ -101,8 +95,8 @@ fn corrector(lattice: &Lattice, at: usize) -> String {
         }
         _ => {
             let sum = |plane: usize| {
-                let terms = channels.iter().map(|channel| term(channel.axis()[plane], &channel.knob));
-                terms.collect::<Vec<_>>().join(" + ")
+                let terms = channels.iter().filter(|channel| channel.axis()[plane] != 0.0);
+                terms.map(|channel| term(channel.axis()[plane], &channel.knob)).collect::<Vec<_>>().join(" + ")
             };
             format!("kicker, hkick := {}, vkick := {}", sum(0), sum(1))
         }

@@ -20,7 +20,8 @@ pub(super) fn value(lattice: &Lattice) -> Value {
     }}});
     let names = lattice.elements.iter().map(|element| json!(element.name));
     let line: Vec<Value> = core::iter::once(begin).chain(names).collect();
-    let about = json!({"label": lattice.machine, "description": lattice.remarks.join("\n")});
+    let about =
+        json!({"label": lattice.machine, "description": lattice.remarks_of("PALS", lattice.not_acted_on()).join("\n")});
     let ring = json!({"ring": {"kind": "BeamLine", "periodic": true, "line": line, "MetaP": about}});
     let whole = json!({"lattice": {"kind": "Lattice", "branches": ["ring"]}});
     let elements = (0..lattice.elements.len()).map(|at| element(lattice, at));

@@ -13,6 +13,7 @@ pub(super) fn value(lattice: &Lattice) -> Value {
     let elements: Map<String, Value> = lattice.elements.iter().map(|e| (e.name.clone(), element(e))).collect();
     let names: Vec<&str> = lattice.elements.iter().map(|element| element.name.as_str()).collect();
     let knobs: Map<String, Value> = lattice.correctors.iter().map(|c| (c.knob.clone(), json!(0.0))).collect();
+    let monitors = lattice.monitors.iter().filter(|channel| !channel.is_ideal());
     json!({
         "__class__": "Line",
         "elements": elements,
@@ -20,7 +21,7 @@ pub(super) fn value(lattice: &Lattice) -> Value {
         "particle_ref": particle(lattice),
         "_var_management_data": {"var_values": knobs},
         "_var_manager": expressions(lattice),
-        "metadata": {"orbitcal": {"machine": lattice.machine, "remarks": lattice.remarks, "monitors": monitors(lattice)}},
+        "metadata": {"orbitcal": {"machine": lattice.machine, "remarks": lattice.remarks_of("Xsuite", monitors)}},
     })
 }
 
@@ -77,9 +78,4 @@ fn expressions(lattice: &Lattice) -> Vec<[String; 2]> {
         [kick(0, -1.0), kick(1, 1.0)]
     };
     lattice.elements.iter().enumerate().flat_map(of_element).flatten().collect()
-}
-
-/// Monitors that are not ideal, in words: Xsuite has no place for them in the line.
-fn monitors(lattice: &Lattice) -> Vec<String> {
-    lattice.monitors.iter().filter(|channel| !channel.is_ideal()).map(|channel| channel.words()).collect()
 }

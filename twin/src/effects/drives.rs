@@ -93,13 +93,11 @@ impl Machine {
 
 impl Ring {
     /// The columns of the read monitors, each in its own plane, of x and y at all monitors.
-    pub(super) fn own_planes(&self, [x, y]: &[DMatrix<f64>; 2]) -> DMatrix<f64> {
-        let column = |&at: &usize| match self.monitors[at].plane {
-            Plane::X => x.column(at),
-            Plane::Y => y.column(at),
-        };
-        let columns: Vec<_> = self.read_monitors.iter().map(column).collect();
-        DMatrix::from_columns(&columns)
+    pub(super) fn own_planes(&self, positions: &[DMatrix<f64>; 2]) -> DMatrix<f64> {
+        DMatrix::from_fn(positions[0].nrows(), self.read_monitors.len(), |frame, b| {
+            let at = self.read_monitors[b];
+            positions[self.monitors[at].plane.index()][(frame, at)]
+        })
     }
 }
 

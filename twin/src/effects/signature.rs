@@ -3,7 +3,7 @@
 //! Each class has its formula for it in its own file; one without a formula is a difference of two machines. An effect without an
 //! amplitude (a reversed corrector, exchanged monitors, a held frequency) has its whole change instead.
 
-use nalgebra::{DMatrix, DVector, RowDVector};
+use nalgebra::{DMatrix, DVector};
 
 use super::drives::{Drives, Seen};
 use super::field::{self, Thin};
@@ -83,10 +83,11 @@ impl<'m> Signatures<'m> {
         let seen = machine.seen(ring)?;
         let kick = machine.kicks(drives);
         let positions = drives.positions(&seen, &kick);
-        let row = |&at: &usize| seen.response[ring.monitors[at].plane.index()].row(at).into_owned();
-        let rows: Vec<RowDVector<f64>> = ring.read_monitors.iter().map(row).collect();
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
-        let response = DMatrix::from_rows(&rows);
+        let response = DMatrix::from_fn(observers.len(), sources.len() + 1, |b, c| {
+            let at = ring.read_monitors[b];
+            seen.response[ring.monitors[at].plane.index()][(at, c)]
+        });
         Ok(Self { machine, drives, optics, held, observers, sources, kick, positions, response })
     }
 
