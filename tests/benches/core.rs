@@ -27,7 +27,7 @@ struct Campaign {
 impl Campaign {
     fn read() -> Self {
         let ring = Ring::booster();
-        let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+        let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
         let wires = recording.rows.iter().map(|row| stream::wire(&recording, row)).collect::<Result<_, StreamError>>();
         Self { wires: wires.unwrap(), core: stream::estimator(&ring, &recording, 0.0).unwrap() }
     }
@@ -111,7 +111,13 @@ fn predicted() -> (Box<Green>, Box<Linearised>, Drive, Box<Prediction>) {
 
 fn linearise(tables: &Green, linearised: &mut Linearised) {
     let params: [f32; PARAMS] = core::array::from_fn(|i| 0.03 * (1.7 * i as f32).sin());
-    tables.linearise(black_box(&params), &[0.0; SUPPLIES], linearised).unwrap();
+    Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise(
+        tables,
+        black_box(&params),
+        &[0.0; SUPPLIES],
+        linearised,
+    )
+    .unwrap();
 }
 
 /// The surrogate at new gradients.

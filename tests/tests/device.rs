@@ -86,7 +86,7 @@ fn heard(bytes: &[u8]) -> Vec<Option<u8>> {
 
 fn paper_vars() -> (Ring, Recording) {
     let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
     (ring, recording)
 }
 

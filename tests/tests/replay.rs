@@ -2,7 +2,7 @@
 //! exact batch answer, and in another order.
 
 use inference::stream::{self, Core, Estimate, Setup};
-use inference::{BatchFit, Recording};
+use inference::{BatchFit, Campaign, Recording, TuneUse};
 use nalgebra::{DMatrix, DVector};
 use system_tests::{repository, truth};
 use twin::Ring;
@@ -16,7 +16,7 @@ struct Replayed {
 
 fn read(name: &str) -> (Ring, Recording) {
     let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings").join(name), &stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
     (ring, recording)
 }
 
@@ -103,7 +103,7 @@ fn faulty_monitors_are_found_and_the_others_left_alone() {
 fn the_core_agrees_with_the_exact_batch_fit() {
     for name in ["paper-vars", "random-vars"] {
         let mut run = replay(read(name));
-        let fit = BatchFit::of(&run.ring, &run.recording, |_| ()).unwrap();
+        let fit = BatchFit::of(&Campaign::of(&run.ring, &run.recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
         for i in 0..48 {
             let sigma = fit.covariance[(i, i)].sqrt();
             let shift = (f64::from(run.last.map_params[i]) - fit.map_params[i]) / sigma;
@@ -171,14 +171,12 @@ fn check_table(name: &str, run: &Replayed) {
 /// Tunes are known to their calibration error, 3e-4, of which a tune depends on all vars together: they narrow that one direction.
 #[test]
 fn tunes_narrow_what_orbits_leave_open() {
-    let ([with, without], ring) = ([replay(read("paper-vars")), without_tunes(read("paper-vars"))], Ring::booster());
+    let [with, without] = [replay(read("paper-vars")), without_tunes(read("paper-vars"))];
+    let vars: Vec<f64> = with.last.mean.iter().map(|var| f64::from(*var)).collect();
+    let ring = with.ring.with_vars(&vars);
     let optics = twin::Optics::of(&ring, twin::Hold::Momentum { delta: 0.0 }).unwrap();
-    let slopes: Vec<[f64; 2]> = optics
-        .quadrupoles()
-        .iter()
-        .zip(ring.gradients())
-        .map(|(gradient, k1)| optics.tune_slope(gradient).map(|slope| slope * k1))
-        .collect();
+    let slope = |(gradient, k1): (&twin::Gradient, f64)| optics.tune_slope(gradient).map(|slope| slope * k1);
+    let slopes: Vec<[f64; 2]> = optics.quadrupoles().iter().zip(ring.gradients()).map(slope).collect();
     for plane in [0, 1] {
         let sigma = |run: &Replayed| {
             let entry = |i: usize, j: usize| f64::from(run.core.covariance(i, j)) * slopes[i][plane] * slopes[j][plane];

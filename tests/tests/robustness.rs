@@ -53,7 +53,7 @@ impl Random {
 
 fn paper_vars() -> (Ring, Recording) {
     let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
     (ring, recording)
 }
 
@@ -549,7 +549,9 @@ impl Machine {
             intensity: None,
             valid: Mask::from_words(&ALL),
         };
-        self.surrogate.linearise(&self.params, &[0.0; SUPPLIES], &mut self.at).unwrap();
+        let surrogate = &*self.surrogate;
+        let linearise = Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise;
+        linearise(surrogate, &self.params, &[0.0; SUPPLIES], &mut self.at).unwrap();
         self.surrogate.predict(&self.at, &self.setup.calibration.drive(&frame).unwrap(), &mut self.prediction);
         for b in 0..MONITORS {
             let noise = f64::from(self.setup.noise.of(b)) * self.random.normal();
@@ -631,7 +633,7 @@ fn a_frame_without_beam_moves_nothing() {
             // then none of its readings is used, and no monitor is blamed
             if is_lost {
                 let last: Estimate = before.take().unwrap();
-                assert_eq!((estimate.accepted, estimate.rejected), (vec![false; 33], vec![true; 33]));
+                assert_eq!((&estimate.accepted, &estimate.rejected), (&vec![false; 33], &vec![true; 33]));
                 assert_eq!(estimate.health, last.health);
                 let shift = (0..48).map(|i| (estimate.map_params[i] - last.map_params[i]).abs() / last.params_sigma[i]);
                 assert!(shift.fold(0.0, f32::max) < 0.05);

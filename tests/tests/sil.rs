@@ -21,7 +21,7 @@ static IMAGE: LazyLock<Image> = LazyLock::new(|| Image::build().unwrap_or_else(|
 
 fn read(name: &str) -> (Ring, Recording) {
     let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings").join(name), &stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
     (ring, recording)
 }
 

@@ -53,7 +53,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     let mut publisher = Publisher::try_new(&arguments.service, PUBLISHER, &Names::of(&ring))?;
     let mut results = Vec::new();
     for (name, process_noise) in RECORDINGS {
-        let mut recording = Recording::read(&repository(name), &stream::layout(&ring))?;
+        let mut recording = Recording::read(&repository(name), &ring)?;
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
         let comparison = compare(&image, (&ring, &recording), process_noise, true, |record| {
