@@ -9,7 +9,7 @@ use twin::EffectText;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
-use crate::source::link::Address;
+use crate::source::address::Address;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
 #[derive(Debug, Parser)]
