@@ -9,11 +9,11 @@ use twin::EffectText;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
-use crate::source::link::Address;
+use crate::source::address::Address;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
 #[derive(Debug, Parser)]
-#[command(name = "orbitcal", version, about)]
+#[command(name = "orbitcal", version, max_term_width = 80)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
@@ -23,25 +23,25 @@ pub struct Cli {
 /// What the program can do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Is a recording readable, what does it hold, and what can be done with it
+    /// Say what a recording holds, and what can be done with it
     Check(Check),
-    /// Stream a recording through the core as wire bytes, publish every estimate, print the final table
+    /// Stream a recording through the core and publish every estimate
     Replay(Replay),
-    /// Subscribe to published estimates and show them live
+    /// Show published estimates live, from another process
     Watch(Watch),
     /// Orbit response, tunes and dispersion of the twin
     Response(Response),
-    /// All frames of a recording at once, with the exact twin; by Gauss-Newton or by NUTS
+    /// Fit all frames of a recording at once, with the exact twin
     Fit(Fit),
-    /// The published studies of a recording as one report: priors, subsets, correlations, predictions, Laplace against NUTS
+    /// The published studies of a recording, as one report
     Study(Study),
-    /// What is missing in the model of a recording, in a sentence, with proof on held-out frames
+    /// Find what the model of a recording lacks, with proof on held-out frames
     Diagnose(Diagnose),
     /// The calibrated ring as a lattice file of another code
     Export(Export),
-    /// Diagnose every recording below a folder and score it against the truth.json beside it
+    /// Diagnose the recordings below a folder, score them by their truth.json
     Challenge(Challenge),
-    /// Diagnose simulated blind campaigns and count how often it is right
+    /// Diagnose simulated blind campaigns, count how often it is right
     Prove(Prove),
     /// Publish the estimates of a device
     Serve(Serve),

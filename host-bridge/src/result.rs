@@ -1,21 +1,27 @@
 //! The result of a recording, the same from the core and from the batch fit: as JSON and as a table.
 
+mod monitor;
+mod tunes;
+mod var;
+
 use core::fmt;
 
 use comfy_table::{CellAlignment, Table};
-use estimator::{FitQuality, Health, Marginal, MonitorState, Prior};
+use estimator::{FitQuality, Marginal};
 use inference::nuts::{NutsRun, UNMIXED};
-use inference::recording::Row;
-use inference::{BatchFit, Campaign, FittedTune, Lack, Meter, Recording, Reduced, Summary};
+use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
 use serde::Serialize;
 use studies::Sampled;
-use twin::{Hold, Optics, Ring};
+use twin::Ring;
+
+pub use monitor::{Monitor, faults, monitors, word};
+pub use tunes::{TuneMeasured, Tunes, TunesMeasured};
+use tunes::{measured, tunes};
+use var::covariance;
+pub use var::{Var, vars_of};
 
 use crate::output::{fill, table};
 use crate::record::EstimateRecord;
-
-/// Standard deviations between a measured tune and the model's that noise does not explain.
-const TUNES_DISAGREE: f64 = 4.0;
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
 #[derive(Debug, Clone, Serialize)]
@@ -50,55 +56,6 @@ pub struct FitResult {
     pub notes: Vec<String>,
 }
 
-/// One quadrupole factor: mean, standard deviation and quantiles of its truncated posterior [1].
-#[derive(Debug, Clone, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct Var {
-    pub name: String,
-    pub mean: f64,
-    pub sigma: f64,
-    pub q025: f64,
-    pub q16: f64,
-    pub q84: f64,
-    pub q975: f64,
-    /// At a bound of the prior's range.
-    pub clipped: bool,
-}
-
-/// Tunes of the twin at the means.
-#[derive(Debug, Clone, Copy, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct Tunes {
-    pub x: f64,
-    pub y: f64,
-}
-
-/// Tunes as the meter measured them, with the model's integer parts; none without enough readings of it.
-#[derive(Debug, Clone, Copy, Default, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct TunesMeasured {
-    pub x: Option<TuneMeasured>,
-    pub y: Option<TuneMeasured>,
-}
-
-/// Mean of what the meter says of one tune, and its standard deviation, the meter's calibration included.
-#[derive(Debug, Clone, Copy, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct TuneMeasured {
-    pub mean: f64,
-    pub sigma: f64,
-}
-
-/// State of one monitor.
-#[derive(Debug, Clone, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct Monitor {
-    pub name: String,
-    pub state: &'static str,
-    pub sigma_mm: f64,
-    pub rejected: u32,
-}
-
 /// Time from wire bytes to estimate [us].
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
@@ -120,57 +77,18 @@ pub struct Sampling {
     pub seconds: f64,
 }
 
-impl Var {
-    /// Moments and quantiles of draws; the sampler's coordinates never reach a bound.
-    fn of_draws(summary: &Summary) -> Self {
-        let Summary { name, mean, sd, q025, q16, q84, q975, .. } = summary.clone();
-        Self { name, mean, sigma: sd, q025, q16, q84, q975, clipped: false }
-    }
-
-    /// Moments and quantiles of a marginal of `ln var`.
-    fn of_marginal(name: String, marginal: &Marginal, clipped: bool) -> Self {
-        let (mean, sigma) = marginal.moments();
-        let quantile = |p| f64::from(marginal.quantile(p));
-        Self {
-            name,
-            mean: f64::from(mean),
-            sigma: f64::from(sigma),
-            q025: quantile(0.025),
-            q16: quantile(0.16),
-            q84: quantile(0.84),
-            q975: quantile(0.975),
-            clipped,
-        }
-    }
-
-    fn cells(&self) -> [String; 4] {
-        let mark = if self.clipped { "*" } else { "" };
-        [
-            format!("{}{mark}", self.name),
-            format!("{:.4}", self.mean),
-            format!("{:.2}", 100.0 * self.sigma),
-            format!("{:.4}..{:.4}", self.q025, self.q975),
-        ]
-    }
-}
-
 impl FitResult {
-    /// What a core says after its last frame, here or on a device; with the prior of each param.
+    /// What a core says after its last frame, here or on a device.
     pub fn of_core(
         ring: &Ring,
         recording: &Recording,
-        priors: &[Prior],
         last: &EstimateRecord,
         quality: FitQuality,
         timing: Timing,
     ) -> Self {
-        let marginal = |(i, Prior { lower, upper, .. }): (usize, &Prior)| Marginal {
-            mean: last.centre[i],
-            sigma: last.params_sigma[i],
-            lower: *lower,
-            upper: *upper,
-        };
-        let marginals = priors.iter().enumerate().map(marginal);
+        let prior = Prior::of(ring);
+        let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), last.params_sigma[i].into());
+        let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
         let (n, tunes) = (vars.len(), tunes(ring, &vars));
@@ -304,50 +222,6 @@ impl fmt::Display for FitResult {
     }
 }
 
-impl TunesMeasured {
-    /// What the meter says of a recording, with the integer parts of the model's.
-    pub fn of_recording(recording: &Recording, model: Option<[f64; 2]>) -> Self {
-        let time = recording.times();
-        let one = |plane: usize| {
-            // an RF offset moves the tune
-            let tune = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
-            let tunes: Vec<f64> = recording.rows.iter().map(tune).collect();
-            let meter = Meter::of(tunes.iter().zip(&time))?;
-            Some(TuneMeasured { mean: meter.near(model.map_or(0.0, |tunes| tunes[plane])), sigma: meter.sigma })
-        };
-        Self { x: one(0), y: one(1) }
-    }
-
-    /// What is wrong with the model's, if anything is.
-    fn remark(&self, model: &Tunes) -> Option<String> {
-        let away = |plane: &str, measured: Option<TuneMeasured>, model: f64| {
-            let pull = measured.map(|tune| (tune.mean - model) / tune.sigma)?;
-            (pull.abs() > TUNES_DISAGREE).then(|| format!("tune {plane} by {pull:+.1} standard deviations"))
-        };
-        let both = [away("x", self.x, model.x), away("y", self.y, model.y)];
-        let both: Vec<String> = both.into_iter().flatten().collect();
-        (!both.is_empty()).then(|| {
-            format!("measured tunes differ from the model's, {}: a wrong kick constant does that", both.join(" and "))
-        })
-    }
-}
-
-impl fmt::Display for TunesMeasured {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let word = |tune: Option<TuneMeasured>| {
-            tune.map_or_else(|| "-".into(), |tune| format!("{:.4} ± {:.4}", tune.mean, tune.sigma))
-        };
-        match (self.x, self.y) {
-            (None, None) => f.write_str("not measured"),
-            (x, y) => write!(f, "measured {}, {}", word(x), word(y)),
-        }
-    }
-}
-
-fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
-    tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
-}
-
 /// What a recording lacks to say anything, by what was read and what was moved.
 pub fn lack(recording: &Recording) -> Option<Lack> {
     let is_read = recording.rows.iter().any(|row| row.reading.iter().any(Option::is_some));
@@ -380,68 +254,5 @@ impl Sampling {
                 self.rhat_max
             )
         })
-    }
-}
-
-/// Vars from means and standard deviations of `ln var`, truncated to the prior's range.
-pub fn vars_of(ring: &Ring, mean: &[f64], sigma: &[f64]) -> Vec<Var> {
-    let prior = inference::Prior::of(ring);
-    let var = |(i, name)| Var::of_marginal(name, &prior.marginal(i, mean[i], sigma[i]), false);
-    ring.var_names().into_iter().enumerate().map(var).collect()
-}
-
-/// Covariance of the vars, `mean_i mean_j` times that of their logarithms.
-fn covariance(vars: &[Var], of_params: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {
-    let row = |i: usize| (0..vars.len()).map(|j| vars[i].mean * vars[j].mean * of_params(i, j)).collect();
-    (0..vars.len()).map(row).collect()
-}
-
-/// Tunes of the twin at the means; none if that ring is unstable.
-fn tunes(ring: &Ring, vars: &[Var]) -> Option<Tunes> {
-    let means: Vec<f64> = vars.iter().map(|v| v.mean).collect();
-    let ring = ring.with_vars(&means);
-    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
-    Some(Tunes { x: tunes.x, y: tunes.y })
-}
-
-/// State of the monitors of a ring.
-pub fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
-    let monitor = |(name, health): (String, &Health)| Monitor {
-        name,
-        state: word(health.state),
-        sigma_mm: f64::from(health.noise) * 1e3,
-        rejected: health.rejected,
-    };
-    ring.monitor_names().into_iter().zip(health).map(monitor).collect()
-}
-
-/// The word for a state in tables and JSON.
-pub fn word(state: MonitorState) -> &'static str {
-    match state {
-        MonitorState::Ok => "ok",
-        MonitorState::Noisy => "noisy",
-        MonitorState::Jumps => "jumps",
-        MonitorState::Dead => "dead",
-    }
-}
-
-/// The monitors that are not ok, in words.
-pub fn faults(monitors: &[Monitor]) -> String {
-    let fault =
-        |m: &Monitor| format!("{} {} ({:.2} mm, {} readings rejected)", m.name, m.state, m.sigma_mm, m.rejected);
-    let faults: Vec<String> = monitors.iter().filter(|m| m.state != word(MonitorState::Ok)).map(fault).collect();
-    if faults.is_empty() { "all ok".into() } else { faults.join("; ") }
-}
-
-impl EstimateRecord {
-    /// State of its monitors.
-    fn monitors(&self) -> Vec<Monitor> {
-        let monitor = |b: usize| Monitor {
-            name: self.names.monitors[b].clone(),
-            state: word(self.monitor_state[b]),
-            sigma_mm: f64::from(self.monitor_sigma[b]) * 1e3,
-            rejected: self.monitor_rejected[b],
-        };
-        (0..self.reading.len()).map(monitor).collect()
     }
 }

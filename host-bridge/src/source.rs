@@ -1,5 +1,6 @@
 //! Where estimates come from: the core in this process fed by a recording, or a device on a line.
 
+pub mod address;
 pub mod device;
 pub mod link;
 pub mod replay;

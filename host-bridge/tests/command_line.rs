@@ -102,10 +102,14 @@ fn a_reader_of_stdout_may_leave() {
 
 #[test]
 fn nothing_is_wider_than_eighty_columns() {
-    for arguments in [&["replay", RECORDING, "--no-publish"][..], &["response", "--effect", "quad_roll@D8=0.01"]] {
+    let commands = ["check", "replay", "watch", "response", "fit", "study", "diagnose", "export", "challenge", "serve"];
+    let help: Vec<[&str; 2]> = commands.iter().map(|command| [*command, "--help"]).collect();
+    let results: [&[&str]; 3] =
+        [&["replay", RECORDING, "--no-publish"], &["response", "--effect", "quad_roll@D8=0.01"], &["--help"]];
+    for arguments in results.into_iter().chain(help.iter().map(<[&str; 2]>::as_slice)) {
         let output = orbitcal(arguments);
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success() && !text.is_empty());
+        assert!(output.status.success() && !text.is_empty(), "{arguments:?}");
         assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
     }
 }

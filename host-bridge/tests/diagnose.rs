@@ -126,9 +126,9 @@ fn bad_recordings_invent_no_effect() {
         );
     }
     let folder = folder();
-    let answer = diagnose(&altered(folder.path(), no_baseline));
+    let result = diagnose(&altered(folder.path(), no_baseline));
     let at = result["findings"][0]["at"].as_str();
-    assert!(result["verdict"] == "consistent" || at == Some("x_E6"), "{answer:#}");
+    assert!(result["verdict"] == "consistent" || at == Some("x_E6"), "{result:#}");
 }
 
 #[test]

@@ -28,7 +28,7 @@ pub fn study(sampling: &mut Sampling, reference: &Sampled, var: usize) -> Result
         .compared(Reference::Level(0.0));
     let alike = likeness(&measured, &made);
     let verdict = if alike > 0.9 {
-        "Yes: it is there in readings that the twin alone has made. Posterior covariances follow from how responses depend on \
+        "The pattern is the method's: it is there in readings that the twin alone has made. Posterior covariances follow from how responses depend on \
          neighbouring quadrupoles, from the settings and from the weights, and hardly from the readings themselves, so that this \
          pattern says nothing for or against errors of the machine."
     } else {
@@ -39,7 +39,7 @@ pub fn study(sampling: &mut Sampling, reference: &Sampled, var: usize) -> Result
         text: vec![format!(
             "Posterior correlations of all frames, and the same after every reading was replaced by a simulated one: the twin at the \
              posterior mean, the same settings and read-backs, fresh noise. Entries off the diagonal correlate with {alike:.3} between the two; the \
-             largest difference is {:.2}, of which {:.2} is the sampler's own (three Monte Carlo errors). Is the long oscillation along the ring beam dynamics? {verdict}",
+             largest difference is {:.2}, of which {:.2} is the sampler's own (three Monte Carlo errors). {verdict}",
             largest_difference(&measured, &made),
             3.0 * (2.0 / reference.smallest_ess()).sqrt()
         )],

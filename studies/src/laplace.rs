@@ -78,7 +78,7 @@ pub fn study(sampling: &Sampling, reference: &Sampled) -> Result<(Section, Vec<C
                 with the core's tables in f64, and twin that of the exact twin, both in coordinates without bounds. The reference is NUTS \
                 on the twin. Joint test: squared Mahalanobis distances of the reference's draws under each Gaussian, which follow \
                 chi-square with one degree of freedom a var if the Gaussian is the posterior. The core counts measured tunes as readings, \
-                the others, as in the published analysis, do not.";
+                the others do not.";
     let section = Section {
         heading: "Laplace against NUTS".into(),
         text: core::iter::once(what.into()).chain(why).collect(),

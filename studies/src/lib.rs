@@ -263,3 +263,39 @@ impl VarNumbers {
         Self { name, mean, sigma: sd, q025, q16, q84, q975 }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Only `paper-vars` is of the published campaign; any other recording is spoken of by its own settings and vars.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes unoptimised; the release tests run it")]
+    fn a_study_speaks_of_what_is_in_the_recording() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
+        let ring = Ring::read(&folder.join("ring.json")).unwrap();
+        let recording = Recording::read(&folder.join("plain"), &ring).unwrap();
+        let options = Options { nuts: NutsSettings { chains: 2, warm_up: 50, draws: 50, seed: 1 } };
+        let (mut last, mut totals) = ((0, 0), Vec::new());
+        let mut progress = |_: &str, done, total| {
+            last = (done, total);
+            totals.push(total);
+        };
+        let Study { page, numbers } = run(&ring, &recording, options, &mut progress).unwrap();
+        let text: Vec<&String> =
+            page.sections.iter().flat_map(|s| core::iter::once(&s.heading).chain(&s.text)).collect();
+        let captions = page.sections.iter().flat_map(|s| s.figures.iter().map(|(caption, _)| caption));
+        let tables = page.sections.iter().flat_map(|s| &s.tables).flat_map(|t| t.header.iter().chain([&t.caption]));
+        for text in text.into_iter().chain(captions).chain(tables).chain([&page.lead]) {
+            for foreign in ["22 A", "published", "D8", "paper"] {
+                assert!(!text.contains(foreign), "{foreign}: {text}");
+            }
+        }
+        assert!(numbers.published.is_empty());
+        let kinds: Vec<&str> = numbers.widths.iter().map(|widths| widths.kind.as_str()).collect();
+        assert_eq!(kinds, ["0 to ±2 A", "0 to +2 A", "0 to -2 A", "-2 A to +2 A"]);
+        assert_eq!(last.0, last.1, "progress ends at the whole");
+        totals.retain(|total| *total > 1);
+        assert!(totals.iter().all(|total| *total == last.1), "the whole is known from the start");
+    }
+}

@@ -1,6 +1,5 @@
 //! `orbitcal replay`: recording to wire bytes to core to shared memory, frame by frame.
 
-use estimator::Prior;
 use inference::stream::{self, Core};
 
 use super::{CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables};
@@ -21,7 +20,6 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let powered = recording.powered(&ring);
     let tables = tables(&powered, options.model_file.as_deref())?;
     let core = Core::with_tables(tables, stream::setup(&powered, &recording, options.process_noise)?)?;
-    let priors: Vec<Prior> = (0..powered.parameters.len()).map(|i| core.prior(i)).collect();
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
@@ -29,5 +27,5 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(&ring, &recording, &priors, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(&ring, &recording, &last, quality, timing))
 }

@@ -1,6 +1,6 @@
 //! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
 
-use estimator::{Prior, Tables as _};
+use estimator::Tables as _;
 use inference::{Recording, stream};
 use training::LINE;
 use twin::Ring;
@@ -65,7 +65,6 @@ fn feed(
     let setup = stream::setup(&powered, recording, options.process_noise)?;
     let CoreModel::Green = options.model;
     let tables = tables(&powered, options.model_file.as_deref())?;
-    let priors: Vec<Prior> = (0..powered.parameters.len()).map(|i| setup.priors[tables.prior_group(i)]).collect();
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {
         // restarted already: there are no frames of somebody before us that they would have to describe
@@ -81,7 +80,7 @@ fn feed(
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(ring, recording, &priors, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(ring, recording, &last, quality, timing))
 }
 
 /// A device goes by the tables that it has, whatever ring they are of.

@@ -176,8 +176,8 @@ fn unwell(record: &EstimateRecord, width: usize, height: usize) -> Vec<String> {
     }
     let told = |count: usize| {
         let left_out = unwell.len() - count;
-        let rest = if left_out == 0 { String::new() } else { format!("and {left_out} more monitors not ok") };
-        lines(&unwell[..count].iter().cloned().chain([rest]).collect::<Vec<_>>().join(", "), width)
+        let rest = (left_out > 0).then(|| format!("and {left_out} more monitors not ok"));
+        lines(&unwell[..count].iter().cloned().chain(rest).collect::<Vec<_>>().join(", "), width)
     };
     (0..=unwell.len()).rev().map(told).find(|lines| lines.len() <= height).unwrap_or_default()
 }
@@ -250,7 +250,7 @@ mod tests {
         assert!(text.contains("seen 20  lost 0  restarts 1"), "{text}");
         assert!(text.contains("from control room: AGS Booster"), "{text}");
         assert!(text.contains("F7 0.9580  0.30 -14.0"), "{text}");
-        assert!(text.contains("x_A6 noisy 0.61 mm (14 rejected)"), "{text}");
+        assert!(text.contains("x_A6 noisy 0.61 mm (14 rejected) "), "{text}");
         for name in twin::Ring::booster().var_names() {
             assert!(text.contains(&format!("{name} ")), "{name} is missing:\n{text}");
         }

@@ -1,0 +1,89 @@
+//! Tunes in a result: the model's, and beside them the measured ones.
+
+use core::fmt;
+
+use inference::recording::Row;
+use inference::{FittedTune, Meter, Recording};
+use serde::Serialize;
+use twin::{Hold, Optics, Ring};
+
+use super::Var;
+
+/// Standard deviations between a measured tune and the model's that noise does not explain.
+const DISAGREE: f64 = 4.0;
+
+/// Tunes of the twin at the means.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Tunes {
+    pub x: f64,
+    pub y: f64,
+}
+
+/// Tunes as the meter measured them, with the model's integer parts; none without enough readings of it.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct TunesMeasured {
+    pub x: Option<TuneMeasured>,
+    pub y: Option<TuneMeasured>,
+}
+
+/// Mean of what the meter says of one tune, and its standard deviation, the meter's calibration included.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct TuneMeasured {
+    pub mean: f64,
+    pub sigma: f64,
+}
+
+impl TunesMeasured {
+    /// What the meter says of a recording, with the integer parts of the model's.
+    pub fn of_recording(recording: &Recording, model: Option<[f64; 2]>) -> Self {
+        let time = recording.times();
+        let one = |plane: usize| {
+            // an RF offset moves the tune
+            let tune = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
+            let tunes: Vec<f64> = recording.rows.iter().map(tune).collect();
+            let meter = Meter::of(tunes.iter().zip(&time))?;
+            Some(TuneMeasured { mean: meter.near(model.map_or(0.0, |tunes| tunes[plane])), sigma: meter.sigma })
+        };
+        Self { x: one(0), y: one(1) }
+    }
+
+    /// What is wrong with the model's, if anything is.
+    pub(super) fn remark(&self, model: &Tunes) -> Option<String> {
+        let away = |plane: &str, measured: Option<TuneMeasured>, model: f64| {
+            let pull = measured.map(|tune| (tune.mean - model) / tune.sigma)?;
+            (pull.abs() > DISAGREE).then(|| format!("tune {plane} by {pull:+.1} standard deviations"))
+        };
+        let both = [away("x", self.x, model.x), away("y", self.y, model.y)];
+        let both: Vec<String> = both.into_iter().flatten().collect();
+        (!both.is_empty()).then(|| {
+            format!("measured tunes differ from the model's, {}: a wrong kick constant does that", both.join(" and "))
+        })
+    }
+}
+
+impl fmt::Display for TunesMeasured {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let word = |tune: Option<TuneMeasured>| {
+            tune.map_or_else(|| "-".into(), |tune| format!("{:.4} ± {:.4}", tune.mean, tune.sigma))
+        };
+        match (self.x, self.y) {
+            (None, None) => f.write_str("not measured"),
+            (x, y) => write!(f, "measured {}, {}", word(x), word(y)),
+        }
+    }
+}
+
+pub(super) fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
+    tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
+}
+
+/// Tunes of the twin at the means; none if that ring is unstable.
+pub(super) fn tunes(ring: &Ring, vars: &[Var]) -> Option<Tunes> {
+    let means: Vec<f64> = vars.iter().map(|v| v.mean).collect();
+    let ring = ring.with_vars(&means);
+    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
+    Some(Tunes { x: tunes.x, y: tunes.y })
+}
