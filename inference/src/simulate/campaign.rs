@@ -266,7 +266,7 @@ mod tests {
             let truth = Truth { vars: &[1.0; 48], effects, ..Truth::default() };
             readings(&campaign(&few, &ring, &truth, &hardware, seed).unwrap())
         };
-        let (plain, gain) = (made(&[], 7), made(&["bpm_gain@x_E4=0.1".parse().unwrap()], 7));
+        let (plain, gain) = (made(&[], 7), made(&[Effect::parse("bpm_gain@x_E4=0.1", &ring).unwrap()], 7));
         let e4 = ring.monitor_names().iter().position(|name| name == "x_E4").unwrap();
         let change = &gain - &plain;
         for (b, column) in change.column_iter().enumerate() {
