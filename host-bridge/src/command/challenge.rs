@@ -119,7 +119,7 @@ impl Scored {
 impl Scored {
     /// What was concealed, and how much an oracle gains that knows it [nat].
     fn truth(&self) -> String {
-        let gain = self.oracle_gain.map_or_else(String::new, |gain| format!(" (oracle {gain:.1})"));
+        let gain = self.oracle_gain.map_or_else(String::new, |gain| format!(" (oracle gain {gain:.1})"));
         if self.truth.is_empty() { "nothing".into() } else { self.truth.join(" + ") + &gain }
     }
 }
@@ -148,21 +148,25 @@ impl ChallengeResult {
 
 impl fmt::Display for ChallengeResult {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table =
-            table(["recording", "found, and the truth below", "grade", "pull", "NEES/var", "held-out", "s"]);
+        let mut table = table(["recording", "verdict", "grade", "pull", "NEES/var", "held-out", "s"]);
         for scored in &self.recordings {
             let pulls: Vec<String> = scored.amplitude_pulls.iter().map(|p| format!("{p:+.1}")).collect();
             table.add_row([
                 scored.recording.clone(),
-                format!("{}: {}\ntruth: {}", scored.verdict.word(), scored.found.join(" + "), scored.truth()),
+                scored.verdict.word().into(),
                 format!("{:?}", scored.grade).to_lowercase(),
                 pulls.join(" "),
-                format!("{:.2}\n{:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
-                format!("{:.1}\n± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
+                format!("{:.2}, {:.2}", scored.nees_per_var_before, scored.nees_per_var_after),
+                format!("{:.1} ± {:.1}", scored.elpd_gain[0], scored.elpd_gain[1]),
                 format!("{:.1}", scored.seconds),
             ]);
         }
-        writeln!(f, "{table}")?;
+        writeln!(f, "{table}\n")?;
+        for scored in &self.recordings {
+            let found = if scored.found.is_empty() { "nothing".into() } else { scored.found.join(" + ") };
+            writeln!(f, "{}", fill(&format!("{}: found {found}; concealed {}", scored.recording, scored.truth())))?;
+        }
+        writeln!(f)?;
         let summary = format!(
             "{} right, {} in part, {} undecided with the truth listed, {} left open, {} missed, {} wrong; amplitudes: sum of \
              squared pulls {:.1} of {}",
@@ -180,7 +184,8 @@ impl fmt::Display for ChallengeResult {
             "{}\n{}",
             fill(&summary),
             fill(
-                "NEES, normalised estimation error squared of the vars: before and after what was found is in the model."
+                "NEES, normalised estimation error squared of the vars: before and after what was found is in the model. Oracle gain: \
+                 of ln posterior [nat] when kind, place and size are given."
             )
         )
     }

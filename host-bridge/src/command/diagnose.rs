@@ -199,10 +199,14 @@ impl DiagnosisResult {
     }
 }
 
+/// What the columns of the table hold.
+const COLUMNS: &str = "gain: of ln evidence over the fit without it [nat]; P: probability among all causes that compete with it; \
+                       held-out: gain of log predictive density [nat].";
+
 impl fmt::Display for DiagnosisResult {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}: {}\n\n{}\n", self.recording, self.verdict, fill(&self.sentence))?;
-        let mut table = table(["effect", "at", "s/m", "amplitude", "ln evidence", "probability", "held-out gain"]);
+        let mut table = table(["effect", "at", "s/m", "amplitude", "gain", "P", "held-out"]);
         for finding in &self.findings {
             table.add_row(finding.row(""));
             finding.alternatives.iter().take(5).for_each(|other| {
@@ -210,7 +214,7 @@ impl fmt::Display for DiagnosisResult {
             });
         }
         if !self.findings.is_empty() {
-            writeln!(f, "{table}\n")?;
+            writeln!(f, "{table}\n{}\n", fill(COLUMNS))?;
         }
         let Fits { before, after, elpd_gain, elpd_gain_se, .. } = &self.fit;
         let summary = format!(
