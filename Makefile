@@ -36,7 +36,7 @@ test: setup ## format, lint, tests in debug and release, docs, and the core for 
 	cargo build --locked --release -p firmware-sim --lib --target $(TARGET) # the core with its log lines, and the loop
 	cargo clippy --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET) -- -D warnings
 
-firmware: toolchain ## the image for the chip; PART=stm32h743 links it for that part instead of the emulated board
+firmware: toolchain ## the image for the chip; MACHINE=FILE makes it for another machine, PART=stm32h743 links it for that part
 	cargo build --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET)
 
 sil: setup ## recordings through the image in the emulator, beside the core in process; numbers in target/sil.json
