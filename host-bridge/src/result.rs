@@ -234,7 +234,7 @@ impl Sampling {
     fn of(sampled: &Sampled, run: &NutsRun) -> Self {
         let smallest = |ess: fn(&Summary) -> f64| sampled.summary.iter().map(ess).fold(f64::INFINITY, f64::min);
         Self {
-            rhat_max: sampled.summary.iter().map(|s| s.r_hat).fold(0.0, f64::max),
+            rhat_max: sampled.largest_r_hat(),
             ess_min: smallest(|s| s.ess_bulk.min(s.ess_tail)),
             divergences: run.draws.divergences(),
             draws: run.draws.chains.iter().map(|chain| chain.draws.len()).sum(),
@@ -245,9 +245,7 @@ impl Sampling {
 
     /// What is wrong with the sampling, if anything is.
     fn remark(&self) -> Option<String> {
-        // not a number where a chain has not moved at all
-        let has_mixed = self.rhat_max <= UNMIXED;
-        (!has_mixed).then(|| {
+        (self.rhat_max > UNMIXED).then(|| {
             format!(
                 "R-hat is {:.3}, above {UNMIXED}: the chains do not agree yet. Sample longer (--warm-up, --draws) before \
                  you use these numbers",

@@ -36,6 +36,12 @@ impl Sampled {
         self.summary.iter().map(|s| s.ess_bulk.min(s.ess_tail)).fold(f64::INFINITY, f64::min)
     }
 
+    /// Largest R-hat of a var; infinite where a chain has not moved, which has none.
+    pub fn largest_r_hat(&self) -> f64 {
+        let each = self.summary.iter().map(|s| if s.r_hat.is_nan() { f64::INFINITY } else { s.r_hat });
+        each.fold(0.0, f64::max)
+    }
+
     /// 68 % and 95 % bands of each var.
     pub fn band(&self, label: &str) -> Band {
         Band {

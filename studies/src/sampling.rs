@@ -88,7 +88,7 @@ impl<'p> Sampling<'p> {
         let sampled = Sampled::of(&run.draws);
         self.runs.push(RunNumbers {
             name: name.to_owned(),
-            rhat_max: sampled.summary.iter().map(|s| s.r_hat).fold(0.0, f64::max),
+            rhat_max: sampled.largest_r_hat(),
             ess_min: sampled.smallest_ess(),
             divergences: run.draws.divergences(),
             draws: settings.chains * settings.draws,
@@ -137,7 +137,7 @@ pub(crate) fn section(runs: &[RunNumbers]) -> Section {
     };
     let header = ["posterior", "largest R-hat", "smallest ESS", "divergences", "draws", "time [s]"];
     let unmixed: Vec<&str> =
-        runs.iter().filter(|run| !(run.rhat_max <= nuts::UNMIXED)).map(|run| run.name.as_str()).collect();
+        runs.iter().filter(|run| run.rhat_max > nuts::UNMIXED).map(|run| run.name.as_str()).collect();
     let verdict = if unmixed.is_empty() {
         format!("All are below {}, as those of chains that have mixed.", nuts::UNMIXED)
     } else {

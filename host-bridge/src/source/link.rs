@@ -124,7 +124,7 @@ fn triangle(estimate: &Estimate) -> usize {
 enum Event {
     Heard(Heard),
     /// A reply that is no part of an estimate.
-    Other(Reply),
+    Other(Box<Reply>),
 }
 
 impl Heard {
@@ -219,8 +219,10 @@ impl<L: Read + Write> Link<L> {
                 expected: "an estimate and its covariance",
                 found: format!("only the estimate of frame {}", estimate.sequence),
             }),
-            Event::Other(Reply::Refused { why, .. }) => Err(LinkError::Refused { what: "a frame", why }),
-            Event::Other(other) => Err(unexpected("an estimate", &other)),
+            Event::Other(other) => Err(match *other {
+                Reply::Refused { why, .. } => LinkError::Refused { what: "a frame", why },
+                other => unexpected("an estimate", &other),
+            }),
         }
     }
 
@@ -235,8 +237,11 @@ impl<L: Read + Write> Link<L> {
         loop {
             match self.gather(deadline, LULL)? {
                 Event::Heard(heard) => return Ok(heard),
-                Event::Other(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "a packet", why }),
-                Event::Other(_) => {} // a reply to somebody else
+                Event::Other(other) => {
+                    if let Reply::Refused { why, .. } = *other {
+                        return Err(LinkError::Refused { what: "a packet", why });
+                    } // else a reply to somebody else
+                }
             }
         }
     }
@@ -259,7 +264,7 @@ impl<L: Read + Write> Link<L> {
                         return Ok(Event::Heard(whole.heard()));
                     }
                 }
-                Ok(other) => return Ok(Event::Other(other)),
+                Ok(other) => return Ok(Event::Other(Box::new(other))),
                 Err(error @ LinkError::Reply(_)) => return Err(error),
                 // no more will come of it
                 Err(error) => return self.coming.take().map(|coming| Event::Heard(coming.heard())).ok_or(error),
