@@ -20,7 +20,7 @@ pub enum Cause {
     /// An effect of the library.
     Effect(Term),
     /// Something else.
-    Unknown(Discrepancy),
+    Unmodelled(Discrepancy),
 }
 
 /// One cause that competes for a slot.
@@ -42,7 +42,7 @@ pub struct Alternative {
 
 /// One effect, given the others: who competes for it.
 #[derive(Debug, Clone)]
-pub struct Slot {
+pub struct Competition {
     /// Most likely first; those of any weight.
     pub alternatives: Vec<Alternative>,
     /// Probability that nothing fills it.
@@ -60,7 +60,7 @@ impl Cause {
     pub fn term(&self) -> Option<&Term> {
         match self {
             Self::Effect(term) => Some(term),
-            Self::Unknown(_) => None,
+            Self::Unmodelled(_) => None,
         }
     }
 }
@@ -93,11 +93,11 @@ impl Alternative {
     }
 
     /// Something without a class.
-    pub(super) fn unknown(discrepancy: Discrepancy) -> Self {
+    pub(super) fn unmodelled(discrepancy: Discrepancy) -> Self {
         Self {
             amplitude: (discrepancy.size, 0.0),
             log_gain: discrepancy.log_bayes,
-            cause: Cause::Unknown(discrepancy),
+            cause: Cause::Unmodelled(discrepancy),
             probability: 0.0,
             adapting: DVector::zeros(0),
             fitted: None,
@@ -118,7 +118,7 @@ impl Alternative {
 /// Probability below which an alternative that was not refitted is not listed.
 const LISTED: f64 = 1e-4;
 
-impl Slot {
+impl Competition {
     /// Normalise posterior weights (`ln`, "nothing" having 0).
     pub(super) fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());

@@ -6,7 +6,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::alternatives::{Cause, DECISIVE, Slot};
+use super::alternatives::{Cause, DECISIVE, Competition};
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
 use super::search::Found;
@@ -26,25 +26,25 @@ impl Vars {
         Self { mean: DVector::from_column_slice(&fitted.params), covariance: fitted.covariance() }
     }
 
-    /// Those of all that may fill the least certain slot.
+    /// Those of all that may fill the least certain competition.
     pub fn averaged(found: &Found) -> Self {
-        let certainty = |slot: &&Slot| slot.alternatives.first().map_or(slot.nothing, |a| a.probability);
-        let least = found.slots.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
-        Self::over(least.filter(|slot| certainty(slot) < DECISIVE).unwrap_or(&found.next))
+        let certainty = |competition: &&Competition| competition.alternatives.first().map_or(competition.nothing, |a| a.probability);
+        let least = found.competitions.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
+        Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
 
-    fn over(slot: &Slot) -> Self {
-        let plain = Self::of(&slot.without);
-        let (vars, units) = (plain.mean.len(), &slot.without.units);
-        let mut parts = vec![(slot.nothing, plain.clone())];
-        for alternative in &slot.alternatives {
+    fn over(competition: &Competition) -> Self {
+        let plain = Self::of(&competition.without);
+        let (vars, units) = (plain.mean.len(), &competition.without.units);
+        let mut parts = vec![(competition.nothing, plain.clone())];
+        for alternative in &competition.alternatives {
             let part = match (&alternative.fitted, &alternative.cause) {
                 (Some(fitted), _) => Self::of(fitted),
-                (None, Cause::Unknown(Discrepancy { adapted: Some(adapted), .. })) => Self {
+                (None, Cause::Unmodelled(Discrepancy { adapted: Some(adapted), .. })) => Self {
                     mean: &plain.mean + units.step(&adapted.step),
                     covariance: units.covariance(&adapted.covariance),
                 },
-                (None, Cause::Unknown(_)) => plain.clone(),
+                (None, Cause::Unmodelled(_)) => plain.clone(),
                 (None, Cause::Effect(_)) => {
                     // to first order: the fit moves along with the amplitude, and shares its uncertainty
                     let shift = units.step(&alternative.adapting);

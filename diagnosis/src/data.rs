@@ -156,7 +156,7 @@ impl Data {
         };
         data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, 0.0)).collect();
         data.check(recording)?;
-        data.straighten(&design)?;
+        data.linearise_about(&design)?;
         Ok(data)
     }
 
@@ -167,10 +167,10 @@ impl Data {
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn straighten(&mut self, machine: &Machine) -> Result<f64, EffectError> {
-        let beyond = self.beyond(machine)?;
+    pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
+        let higher = self.higher_orders(machine)?;
         let slopes = Signatures::of(machine, &self.drives)?.of_quadrupoles();
-        let (mut readings, mut tunes) = (&self.recorded - beyond, self.recorded_tunes.clone());
+        let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
             let Some(supply) = quadrupole.supply else { continue };
             let off = &self.fluctuation[supply];
@@ -199,7 +199,7 @@ impl Data {
     }
 
     /// What the exact orbits of a machine have beyond first order in kicks and RF offset, rows frames; repeats share it [m].
-    fn beyond(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
+    fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
         let tracked = Tracked::of(machine.clone(), self.drives.nominal_kick)?;
         let settings = Settings::of(&self.drives);
         let drives = settings.means(&self.drives);
@@ -208,12 +208,12 @@ impl Data {
             tracked.cycle(&Cycle { kick, strength, rf_offset, time: 0.0 })
         };
         let (plain, _) = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
-        let mut beyond = -machine.readings(&drives)?.0;
-        for (i, mut row) in beyond.row_iter_mut().enumerate() {
+        let mut higher = -machine.readings(&drives)?.0;
+        for (i, mut row) in higher.row_iter_mut().enumerate() {
             let (exact, _) = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
             row.iter_mut().zip(exact.iter().zip(&plain)).for_each(|(to, (exact, plain))| *to += exact - plain);
         }
-        Ok(beyond.select_rows(&settings.of_frame))
+        Ok(higher.select_rows(&settings.of_frame))
     }
 
     /// The same recording with a known signal taken out of its readings and tunes, rows frames.
@@ -294,8 +294,8 @@ impl Data {
             }
             Err(DataError::TooLittle { recording: recording.name.clone(), what, expected, found })
         };
-        let speaking = |channel: &&Channel| channel.frames.len() > channel.basis.ncols();
-        enough("monitors with readings", LEAST, self.channels.iter().filter(speaking).count())?;
+        let active = |channel: &&Channel| channel.frames.len() > channel.basis.ncols();
+        enough("monitors with readings", LEAST, self.channels.iter().filter(active).count())?;
         enough("correctors that were moved", LEAST, self.driven_correctors().len())
     }
 
@@ -306,7 +306,7 @@ impl Data {
     }
 
     /// Monitors that have readings which count, by index.
-    pub fn speaking_monitors(&self) -> Vec<usize> {
+    pub fn active_monitors(&self) -> Vec<usize> {
         (0..self.channels.len()).filter(|&b| self.channels[b].frames.len() > self.channels[b].basis.ncols()).collect()
     }
 

@@ -54,18 +54,18 @@ const DEPENDENT: f64 = 1e-8;
 /// Highest power of the position in what a monitor may read.
 const POWERS: usize = 5;
 
-/// Sums of one monitor's whitened numbers over cells (settings or stretches of time).
-struct Cells {
+/// Sums of one monitor's whitened numbers over sums (settings or stretches of time).
+struct Sums {
     /// `E^T S^-1 E`.
     gram: DMatrix<f64>,
-    /// `E^T S^(-1/2) J`, rows cells.
+    /// `E^T S^(-1/2) J`, rows sums.
     cross: DMatrix<f64>,
     /// `E^T S^(-1/2) r`.
     pull: DVector<f64>,
 }
 
 /// Everything that a scan needs of a fit.
-struct Bench<'f> {
+struct Linearised<'f> {
     fitted: &'f Fitted,
 }
 
@@ -75,16 +75,16 @@ struct Bench<'f> {
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = fitted.data(data);
-    let bench = Bench { fitted };
+    let linearised = Linearised { fitted };
     let settings = Settings::of(&data.drives);
     let monitors = data.readings.ncols();
-    let cells: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &settings.indicator())).collect();
+    let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &settings.indicator())).collect();
     let stretches = stretches(data);
-    let steps: Vec<Cells> = (0..monitors).map(|b| data.cells(b, fitted, &stretches)).collect();
+    let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &stretches)).collect();
     // monitors known to be faulty scatter as they like
     let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
-    let speaking: Vec<usize> = data.speaking_monitors().into_iter().filter(healthy).collect();
-    if speaking.is_empty() {
+    let active: Vec<usize> = data.active_monitors().into_iter().filter(healthy).collect();
+    if active.is_empty() {
         return Ok(Vec::new());
     }
     let (machine, drives) = fitted.machine(data)?;
@@ -92,88 +92,88 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let miss = data.miss(&predicted);
     let signatures = Signatures::of(&machine, &drives)?;
     let mut all = Vec::new();
-    for &b in &speaking {
-        all.push(bench.judge(Location::Monitor(b), &cells[b], speaking.len()));
-        all.push(bench.judge(Location::MonitorInTime(b), &steps[b], speaking.len()));
-        let gains = data.cells(b, fitted, &scaled(&stretches, &predicted.column(b)));
-        all.push(bench.judge(Location::GainInTime(b), &gains, speaking.len()));
+    for &b in &active {
+        all.push(linearised.judge(Location::Monitor(b), &sums[b], active.len()));
+        all.push(linearised.judge(Location::MonitorInTime(b), &steps[b], active.len()));
+        let gains = data.sums(b, fitted, &scaled(&stretches, &predicted.column(b)));
+        all.push(linearised.judge(Location::GainInTime(b), &gains, active.len()));
         let orbit = signatures.around(b);
-        let elsewhere = data.cells(b, fitted, &independent(orbit.clone()));
-        all.push(bench.judge(Location::MonitorElsewhere(b), &elsewhere, speaking.len()));
-        let curve = data.cells(b, fitted, &independent(powers(&orbit.column(0))));
-        all.push(bench.judge(Location::MonitorCurve(b), &curve, speaking.len()));
+        let elsewhere = data.sums(b, fitted, &independent(orbit.clone()));
+        all.push(linearised.judge(Location::MonitorElsewhere(b), &elsewhere, active.len()));
+        let curve = data.sums(b, fitted, &independent(powers(&orbit.column(0))));
+        all.push(linearised.judge(Location::MonitorCurve(b), &curve, active.len()));
     }
     let driven = data.driven_correctors();
     for &c in &driven {
         let of_corrector = settings.of_corrector(c);
-        all.push(bench.judge(Location::Corrector(c), &blocks(&cells, &speaking, &of_corrector), driven.len()));
+        all.push(linearised.judge(Location::Corrector(c), &blocks(&sums, &active, &of_corrector), driven.len()));
         let patterns = independent(signatures.beside(c));
-        let beside = patterned(&cells, &speaking, &settings.strength(c), &patterns);
-        all.push(bench.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
+        let beside = patterned(&sums, &active, &settings.strength(c), &patterns);
+        all.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
     for (quadrupole, plane, pattern) in patterns {
-        all.push(bench.judge(Location::Ring(quadrupole, plane), &weighted(&cells, &speaking, &pattern), sites));
+        all.push(linearised.judge(Location::Ring(quadrupole, plane), &weighted(&sums, &active, &pattern), sites));
     }
     let of_vars = signatures.of_vars();
     for (q, signature) in of_vars.iter().enumerate() {
-        let pattern = data.stepped(signature, fitted, &stretches, &speaking);
-        all.push(bench.judge(Location::QuadrupoleInTime(q), &pattern, of_vars.len()));
+        let pattern = data.stepped(signature, fitted, &stretches, &active);
+        all.push(linearised.judge(Location::QuadrupoleInTime(q), &pattern, of_vars.len()));
     }
-    let tunes: Vec<Cells> =
-        [0, 1].into_iter().filter_map(|plane| data.tune_cells(plane, &miss, fitted, &stretches)).collect();
-    all.push(bench.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
-    all.push(bench.judge_held(Location::Time, &some(&steps, &speaking)));
-    all.push(bench.judge_held(Location::Everywhere, &some(&cells, &speaking)));
+    let tunes: Vec<Sums> =
+        [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &miss, fitted, &stretches)).collect();
+    all.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
+    all.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
+    all.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
     Ok(all)
 }
 
-fn some<'c>(cells: &'c [Cells], monitors: &[usize]) -> Vec<&'c Cells> {
-    monitors.iter().map(|&b| &cells[b]).collect()
+fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {
+    monitors.iter().map(|&b| &sums[b]).collect()
 }
 
-impl Bench<'_> {
+impl Linearised<'_> {
     /// Projected pull and Gram matrix of some numbers.
-    fn project(&self, cells: &Cells) -> (DVector<f64>, DMatrix<f64>) {
-        let taken = self.fitted.free.solve(&cells.cross.transpose());
-        let pull = &cells.pull - taken.tr_mul(&self.fitted.slope);
-        (pull, &cells.gram - &cells.cross * taken)
+    fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
+        let taken = self.fitted.free.solve(&sums.cross.transpose());
+        let pull = &sums.pull - taken.tr_mul(&self.fitted.slope);
+        (pull, &sums.gram - &sums.cross * taken)
     }
 
-    fn judge(&self, at: Location, cells: &Cells, sites: usize) -> Discrepancy {
-        let (pull, gram) = self.project(cells);
+    fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
+        let (pull, gram) = self.project(sums);
         let logs = SIZES.map(|size| marginal(&pull, &gram, size));
-        self.conclude(Discrepancy::of(at, logs, sites), &[cells])
+        self.conclude(Discrepancy::of(at, logs, sites), &[sums])
     }
 
     /// Many monitors with one size, the fit's own unknowns held: less than the truth, as they would adapt.
-    fn judge_held(&self, at: Location, each: &[&Cells]) -> Discrepancy {
+    fn judge_held(&self, at: Location, each: &[&Sums]) -> Discrepancy {
         let mut logs = [0.0; SIZES.len()];
-        for cells in each {
-            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&cells.pull, &cells.gram, size));
+        for sums in each {
+            logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&sums.pull, &sums.gram, size));
         }
         self.conclude(Discrepancy::of(at, logs, 1), each)
     }
 
     /// With what the fit's unknowns become.
-    fn conclude(&self, found: Discrepancy, each: &[&Cells]) -> Discrepancy {
+    fn conclude(&self, found: Discrepancy, each: &[&Sums]) -> Discrepancy {
         let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
         Discrepancy { adapted, ..found }
     }
 
     /// With `C = Z^T J` and `K = (Z^T Z + 1/omega^2)^-1`: covariance `(1 + J^T J - sum of C^T K C)^-1`, step `-cov sum of C^T K Z^T r`.
-    fn adapted(&self, each: &[&Cells], size: f64) -> Option<Adapted> {
+    fn adapted(&self, each: &[&Sums], size: f64) -> Option<Adapted> {
         let lower = self.fitted.factor.l();
         let mut information = &lower * lower.transpose();
         // all vars free here, as one at a bound may come off it
         let mut slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u;
-        for cells in each {
-            let mut gram = cells.gram.clone();
+        for sums in each {
+            let mut gram = sums.gram.clone();
             (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0 / (size * size));
             let factor = gram.cholesky()?;
-            information -= cells.cross.transpose() * factor.solve(&cells.cross);
-            slope -= cells.cross.tr_mul(&factor.solve(&cells.pull));
+            information -= sums.cross.transpose() * factor.solve(&sums.cross);
+            slope -= sums.cross.tr_mul(&factor.solve(&sums.pull));
         }
         let factor = information.cholesky()?;
         Some(Adapted { step: factor.solve(&slope), covariance: factor.inverse() })
@@ -254,41 +254,41 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
 }
 
 /// One number for each setting that all monitors see by a pattern.
-fn weighted(cells: &[Cells], monitors: &[usize], pattern: &DVector<f64>) -> Cells {
-    let first = &cells[monitors[0]];
-    let mut sum = Cells::none(first.cross.nrows(), first.cross.ncols());
+fn weighted(sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
+    let first = &sums[monitors[0]];
+    let mut sum = Sums::none(first.cross.nrows(), first.cross.ncols());
     for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
-        sum.gram += &cells[b].gram * (pattern[b] * pattern[b]);
-        sum.cross += &cells[b].cross * pattern[b];
-        sum.pull += &cells[b].pull * pattern[b];
+        sum.gram += &sums[b].gram * (pattern[b] * pattern[b]);
+        sum.cross += &sums[b].cross * pattern[b];
+        sum.pull += &sums[b].pull * pattern[b];
     }
     sum
 }
 
 /// One number for each pattern over the monitors (one a column), in proportion to `setting`.
-fn patterned(cells: &[Cells], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Cells {
-    let mut sum = Cells::none(patterns.ncols(), cells[monitors[0]].cross.ncols());
+fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
+    let mut sum = Sums::none(patterns.ncols(), sums[monitors[0]].cross.ncols());
     for &b in monitors {
         let seen = patterns.row(b).transpose();
-        sum.gram += &seen * seen.transpose() * setting.dot(&(&cells[b].gram * setting));
-        sum.cross += &seen * setting.tr_mul(&cells[b].cross);
-        sum.pull += &seen * setting.dot(&cells[b].pull);
+        sum.gram += &seen * seen.transpose() * setting.dot(&(&sums[b].gram * setting));
+        sum.cross += &seen * setting.tr_mul(&sums[b].cross);
+        sum.pull += &seen * setting.dot(&sums[b].pull);
     }
     sum
 }
 
 /// One number for each monitor and each of some settings.
-fn blocks(cells: &[Cells], monitors: &[usize], settings: &[usize]) -> Cells {
-    let (m, p) = (settings.len(), cells[monitors[0]].cross.ncols());
+fn blocks(sums: &[Sums], monitors: &[usize], settings: &[usize]) -> Sums {
+    let (m, p) = (settings.len(), sums[monitors[0]].cross.ncols());
     let n = m * monitors.len();
-    let mut all = Cells { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
+    let mut all = Sums { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
     for (k, &b) in monitors.iter().enumerate() {
         for (i, &one) in settings.iter().enumerate() {
             for (j, &other) in settings.iter().enumerate() {
-                all.gram[(k * m + i, k * m + j)] = cells[b].gram[(one, other)];
+                all.gram[(k * m + i, k * m + j)] = sums[b].gram[(one, other)];
             }
-            all.cross.row_mut(k * m + i).copy_from(&cells[b].cross.row(one));
-            all.pull[k * m + i] = cells[b].pull[one];
+            all.cross.row_mut(k * m + i).copy_from(&sums[b].cross.row(one));
+            all.pull[k * m + i] = sums[b].pull[one];
         }
     }
     all
@@ -296,11 +296,11 @@ fn blocks(cells: &[Cells], monitors: &[usize], settings: &[usize]) -> Cells {
 
 impl Data {
     /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
-    fn cells(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Cells {
+    fn sums(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Sums {
         let whitened = self.whiten_columns(b, indicator);
         let (start, n) = (self.start(b), self.frames(b).len());
         let back = whitened.transpose();
-        Cells {
+        Sums {
             gram: &back * &whitened,
             cross: &back * fitted.jacobian.rows(start, n),
             pull: back * fitted.residual.rows(start, n),
@@ -309,13 +309,13 @@ impl Data {
 
     /// Sums of one tune's numbers over the columns of `indicator`, its mean left alone, in units that make its noise as large as
     /// that of a monitor; none if the tune meter says too little.
-    fn tune_cells(
+    fn tune_sums(
         &self,
         plane: usize,
         miss: &DMatrix<f64>,
         fitted: &Fitted,
         indicator: &DMatrix<f64>,
-    ) -> Option<Cells> {
+    ) -> Option<Sums> {
         let noise = self.tune_noise(plane)?;
         let miss = miss.column(self.readings.ncols() + plane);
         let frames = self.tune_frames(plane);
@@ -325,7 +325,7 @@ impl Data {
         };
         let columns = centred(indicator.select_rows(&frames)) / self.mean_noise();
         let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
-        Some(Cells {
+        Some(Sums {
             gram: columns.tr_mul(&columns),
             cross: DMatrix::zeros(columns.ncols(), fitted.jacobian.ncols()),
             pull: columns.tr_mul(&miss).column(0).into_owned(),
@@ -339,22 +339,22 @@ impl Data {
         fitted: &Fitted,
         stretches: &DMatrix<f64>,
         monitors: &[usize],
-    ) -> Cells {
-        let mut sum = Cells::none(stretches.ncols(), fitted.jacobian.ncols());
+    ) -> Sums {
+        let mut sum = Sums::none(stretches.ncols(), fitted.jacobian.ncols());
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
         for &b in monitors {
             let mut columns = stretches.clone();
             columns.row_iter_mut().enumerate().for_each(|(i, mut row)| row *= signature.readings[(i, b)] / rms);
-            let cells = self.cells(b, fitted, &columns);
-            sum.gram += cells.gram;
-            sum.cross += cells.cross;
-            sum.pull += cells.pull;
+            let sums = self.sums(b, fitted, &columns);
+            sum.gram += sums.gram;
+            sum.cross += sums.cross;
+            sum.pull += sums.pull;
         }
         sum
     }
 }
 
-impl Cells {
+impl Sums {
     fn none(numbers: usize, unknowns: usize) -> Self {
         let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
         Self { gram, cross, pull: DVector::zeros(numbers) }

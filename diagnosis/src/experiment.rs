@@ -37,7 +37,7 @@ const RF_STEP: f64 = 4e-4;
 const EARLIER: f64 = 0.5;
 
 /// Derivatives of one campaign.
-struct Campaign {
+struct Derivatives {
     jacobian: DMatrix<f64>,
     one: DVector<f64>,
     other: Option<DVector<f64>>,
@@ -50,13 +50,13 @@ impl Menu {
     /// [`FitError`].
     pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
         let (machine, drives) = fitted.machine(data)?;
-        let present = Campaign::of(data, &machine, &drives, one.0, other, 1.0)?;
+        let present = Derivatives::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is no proposal
-            let Ok(new) = Campaign::of(data, &machine, &drives, one.0, other, weight) else { continue };
+            let Ok(new) = Derivatives::of(data, &machine, &drives, one.0, other, weight) else { continue };
             proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, free) });
         }
         proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
@@ -64,7 +64,7 @@ impl Menu {
     }
 }
 
-impl Campaign {
+impl Derivatives {
     /// `weight`: how much larger the cause is than now.
     fn of(
         data: &Data,
@@ -139,7 +139,7 @@ fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
 }
 
 /// Expected `ln` Bayes factor of the first cause over the other.
-fn separation(campaigns: &[&Campaign], amplitude: f64, free: [bool; 2]) -> f64 {
+fn separation(campaigns: &[&Derivatives], amplitude: f64, free: [bool; 2]) -> f64 {
     let p = campaigns[0].jacobian.ncols();
     let mut normal = DMatrix::identity(p, p);
     let (mut with_one, mut with_other) = (DVector::zeros(p), DVector::zeros(p));

@@ -277,7 +277,7 @@ impl Fitted {
         let data = self.data(data);
         let miss = data.miss(&self.predicted(data)?);
         let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
-        for b in data.speaking_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
+        for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
             let own = data.about_baseline(b, &miss.column(b).into_owned());
             sum += own.norm_squared() / data.expected_noise[b].powi(2);
             freedom += own.len() as f64 - 1.0;

@@ -28,7 +28,7 @@ use inference::recording::Recording;
 pub type Fold = Vec<usize>;
 
 /// Standard errors by which held-out frames have to be predicted better.
-pub const PROVEN: f64 = 2.0;
+pub const VALIDATED: f64 = 2.0;
 /// Folds at most.
 const FOLDS: usize = 5;
 
@@ -157,7 +157,7 @@ fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
         let shared = [kept.len(), out.len()].map(|n| DMatrix::from_element(n, 1, TUNE_CALIBRATION));
         Some(Column { index: all.readings.ncols() + plane, kept, out, variance: noise * noise, shared })
     };
-    let monitors = all.speaking_monitors().into_iter().map(monitor);
+    let monitors = all.active_monitors().into_iter().map(monitor);
     monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
 }
 

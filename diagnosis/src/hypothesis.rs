@@ -145,10 +145,10 @@ impl Hypothesis {
 /// The members of a family that the data can say anything about.
 pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
     let driven = data.driven_correctors();
-    let speaking: Vec<usize> = data.speaking_monitors().into_iter().map(|b| data.ring.read_monitors[b]).collect();
+    let active: Vec<usize> = data.active_monitors().into_iter().map(|b| data.ring.read_monitors[b]).collect();
     let tells = |site: &Site| match site {
-        Site::Monitor(at) => speaking.contains(at),
-        Site::MonitorPair(one, other) => speaking.contains(one) && speaking.contains(other),
+        Site::Monitor(at) => active.contains(at),
+        Site::MonitorPair(one, other) => active.contains(one) && active.contains(other),
         Site::Corrector(at) => driven.contains(at),
         Site::Ring | Site::Quadrupole(_) | Site::Element(_) => true,
     };

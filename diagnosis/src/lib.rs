@@ -80,12 +80,12 @@ impl Diagnosis {
         progress("held-out frames");
         let folds = heldout::by_repeat(recording);
         let before = Score::of(data, &found.null, &folds)?;
-        let after = if found.slots.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
+        let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
         let gains = verdict::gains(data, &found, &before, &after, &folds)?;
         let verdict = Verdict::of(&found, &gains);
         let findings = verdict::findings(data, &found, &gains, verdict)?;
         progress("held-out correctors");
-        let whole = !found.slots.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
+        let whole = !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {
             let folds = heldout::by_corrector(recording);
             let scored = |fitted| Score::of(data, fitted, &folds).ok();
@@ -121,6 +121,6 @@ impl Diagnosis {
 
     /// Gain of held-out log predictive density by all effects, and its standard error.
     pub fn gain(&self) -> (f64, f64) {
-        if self.found.slots.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
+        if self.found.competitions.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
     }
 }

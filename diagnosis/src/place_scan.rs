@@ -1,7 +1,7 @@
 //! Where along the ring a gradient sits: the `ln` Bayes factor of a thin one at every place, all unknowns of a fit adapting.
 //!
-//! The ring is cut into cells with one trial gradient in the middle of each, and into finer ones where the gradient may be.
-//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the cell. It is that
+//! The ring is cut into segments with one trial gradient in the middle of each, and into finer ones where the gradient may be.
+//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It is that
 //! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
 
 use nalgebra::{DMatrix, DVector};
@@ -10,9 +10,9 @@ use twin::{Signatures, Thin};
 
 use super::data::Data;
 use super::fit::{FitError, Fitted};
-use super::scan::{BATCH, Projection, Score};
+use super::scan::{BATCH, Projection, SignatureScore};
 
-/// Longest cell [m], and longest where the gradient may be.
+/// Longest segment [m], and longest where the gradient may be.
 const STEP: f64 = 0.5;
 const FINE: f64 = 0.05;
 /// How far behind the first a place may be to be looked at more finely [nat], and as a share of the first: where nothing is,
@@ -22,7 +22,7 @@ const BEHIND_SHARE: f64 = 0.5;
 
 /// A piece of the ring with one trial gradient.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Cell {
+pub struct Segment {
     /// Its middle along the beam [m].
     pub s: f64,
     /// Its length [m].
@@ -45,7 +45,7 @@ pub struct PlaceScan {
     /// Normal or skew.
     pub kind: Thin,
     /// Where, along the beam.
-    pub cells: Vec<Cell>,
+    pub segments: Vec<Segment>,
     /// `ln` Bayes factor over none, at each.
     pub log_bayes: Vec<f64>,
     /// Most likely amplitude at each [1/m].
@@ -59,24 +59,24 @@ impl PlaceScan {
     /// [`FitError`].
     pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
-        let bench = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
+        let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
         let (machine, drives) = fitted.machine(data)?;
         let signatures = Signatures::of(&machine, &drives)?;
         let scale = kind.kind().prior_scale().unwrap_or(1.0);
-        let judge = |cells: Vec<Cell>| -> Self {
-            let column = |cell: &Cell| data.signature(&signatures.of_thin(cell.place, kind)) * scale;
-            let of_batch = |batch: &[Cell]| {
+        let judge = |segments: Vec<Segment>| -> Self {
+            let column = |segment: &Segment| data.signature(&signatures.of_thin(segment.place, kind)) * scale;
+            let of_batch = |batch: &[Segment]| {
                 let columns: Vec<DVector<f64>> = batch.iter().map(column).collect();
-                bench.score(DMatrix::from_columns(&columns)).scores
+                projection.score(DMatrix::from_columns(&columns)).scores
             };
-            let scores: Vec<Score> = cells.chunks(BATCH).flat_map(of_batch).collect();
-            let judged = scores.into_iter().map(Score::of_amplitude);
+            let scores: Vec<SignatureScore> = segments.chunks(BATCH).flat_map(of_batch).collect();
+            let judged = scores.into_iter().map(SignatureScore::of_amplitude);
             let (amplitude, log_bayes) = judged.map(|(amplitude, log_bayes)| (amplitude * scale, log_bayes)).unzip();
-            Self { kind, cells, log_bayes, amplitude }
+            Self { kind, segments, log_bayes, amplitude }
         };
-        let coarse = judge(cells(data));
-        let finer = judge(coarse.likely().flat_map(|i| coarse.cells[i].split()).collect());
+        let coarse = judge(segments(data));
+        let finer = judge(coarse.likely().flat_map(|i| coarse.segments[i].split()).collect());
         Ok(coarse.with(finer))
     }
 
@@ -84,36 +84,36 @@ impl PlaceScan {
     fn likely(&self) -> impl Iterator<Item = usize> + '_ {
         let first = self.log_bayes[self.peak()];
         let limit = first - BEHIND.min(BEHIND_SHARE * first.abs());
-        (0..self.cells.len()).filter(move |&i| self.log_bayes[i] > limit)
+        (0..self.segments.len()).filter(move |&i| self.log_bayes[i] > limit)
     }
 
-    /// The same with the likely cells replaced by finer ones.
+    /// The same with the likely segments replaced by finer ones.
     fn with(&self, finer: Self) -> Self {
         let likely: Vec<usize> = self.likely().collect();
-        let kept = (0..self.cells.len()).filter(|i| !likely.contains(i));
-        let of = |one: &Self, i: usize| (one.cells[i], one.log_bayes[i], one.amplitude[i]);
+        let kept = (0..self.segments.len()).filter(|i| !likely.contains(i));
+        let of = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
         let mut all: Vec<_> = kept.map(|i| of(self, i)).collect();
-        all.extend((0..finer.cells.len()).map(|i| of(&finer, i)));
+        all.extend((0..finer.segments.len()).map(|i| of(&finer, i)));
         all.sort_by(|one, other| one.0.s.total_cmp(&other.0.s));
-        let mut joined = Self { cells: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
-        for (cell, log_bayes, amplitude) in all {
-            joined.cells.push(cell);
+        let mut joined = Self { segments: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
+        for (segment, log_bayes, amplitude) in all {
+            joined.segments.push(segment);
             joined.log_bayes.push(log_bayes);
             joined.amplitude.push(amplitude);
         }
         joined
     }
 
-    /// The most likely cell.
+    /// The most likely segment.
     pub fn peak(&self) -> usize {
-        (0..self.cells.len()).max_by(|&i, &j| self.log_bayes[i].total_cmp(&self.log_bayes[j])).unwrap_or(0)
+        (0..self.segments.len()).max_by(|&i, &j| self.log_bayes[i].total_cmp(&self.log_bayes[j])).unwrap_or(0)
     }
 
     /// The shortest stretches of the ring that hold a share of the posterior, in beam order.
     pub fn credible(&self, share: f64) -> Vec<Interval> {
         let largest = self.log_bayes[self.peak()];
-        let weight = |i: usize| (self.log_bayes[i] - largest).exp() * self.cells[i].length;
-        let mut order: Vec<usize> = (0..self.cells.len()).collect();
+        let weight = |i: usize| (self.log_bayes[i] - largest).exp() * self.segments[i].length;
+        let mut order: Vec<usize> = (0..self.segments.len()).collect();
         order.sort_by(|&i, &j| self.log_bayes[j].total_cmp(&self.log_bayes[i]));
         let wanted = share * order.iter().map(|&i| weight(i)).sum::<f64>();
         let (mut held, mut inside) = (0.0, vec![false; order.len()]);
@@ -130,8 +130,8 @@ impl PlaceScan {
     /// Neighbours joined, across the start of the ring too.
     fn stretches(&self, inside: &[bool]) -> Vec<Interval> {
         let mut all: Vec<Interval> = Vec::new();
-        for (i, cell) in self.cells.iter().enumerate().filter(|(i, _)| inside[*i]) {
-            let (from_m, to_m) = (cell.s - 0.5 * cell.length, cell.s + 0.5 * cell.length);
+        for (i, segment) in self.segments.iter().enumerate().filter(|(i, _)| inside[*i]) {
+            let (from_m, to_m) = (segment.s - 0.5 * segment.length, segment.s + 0.5 * segment.length);
             match all.last_mut().filter(|_| inside[i - 1]) {
                 Some(last) => last.to_m = to_m,
                 None => all.push(Interval { from_m, to_m }),
@@ -145,27 +145,27 @@ impl PlaceScan {
     }
 }
 
-impl Cell {
+impl Segment {
     /// Finer ones in its place.
-    fn split(self) -> Vec<Cell> {
+    fn split(self) -> Vec<Segment> {
         let start = self.s - 0.5 * self.length;
         cut(self.place.element, start, self.place.depth - 0.5 * self.length, self.length, FINE)
     }
 }
 
 /// The whole ring.
-fn cells(data: &Data) -> Vec<Cell> {
+fn segments(data: &Data) -> Vec<Segment> {
     let elements = data.ring.elements.iter().enumerate().filter(|(_, element)| element.length > 0.0);
     elements.flat_map(|(at, element)| cut(at, element.s, 0.0, element.length, STEP)).collect()
 }
 
 /// Equal pieces, at most so long, of a part of an element that begins at `s`, `depth` from its entrance.
-fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Cell> {
+fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Segment> {
     let count = (length / step).ceil().max(1.0);
     let piece = length / count;
     let one = |i: usize| {
         let middle = (i as f64 + 0.5) * piece;
-        Cell { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
+        Segment { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
     };
     (0..count as usize).map(one).collect()
 }
@@ -192,22 +192,22 @@ mod tests {
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;
-            data.straighten(&machine).unwrap();
+            data.linearise_about(&machine).unwrap();
             let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
-            let along = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
+            let scan = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
-            let peak = along.peak();
-            let credible = along.credible(0.95);
+            let peak = scan.peak();
+            let credible = scan.credible(0.95);
             let width: f64 = credible.iter().map(|one| one.to_m - one.from_m).sum();
             println!(
                 "{place} s {truth:.2}: peak {:.2}, {width:.2} m, {:.4} /m",
-                along.cells[peak].s, along.amplitude[peak]
+                scan.segments[peak].s, scan.amplitude[peak]
             );
             assert!(credible.iter().any(|one| (one.from_m - 1.0..one.to_m + 1.0).contains(&truth)), "{credible:?}");
             assert!(width < widest, "{credible:?}");
             // some three standard deviations
-            assert!((along.amplitude[peak] - amplitude).abs() < 0.3 * amplitude, "{}", along.amplitude[peak]);
-            let whole: f64 = along.cells.iter().map(|cell| cell.length).sum();
+            assert!((scan.amplitude[peak] - amplitude).abs() < 0.3 * amplitude, "{}", scan.amplitude[peak]);
+            let whole: f64 = scan.segments.iter().map(|segment| segment.length).sum();
             assert!((whole - ring.circumference).abs() < 1e-6, "{whole}");
         }
     }
@@ -215,9 +215,9 @@ mod tests {
     #[test]
     fn a_stretch_may_cross_the_start_of_the_ring() {
         let place = Place { element: 0, depth: 0.0 };
-        let cells: Vec<Cell> = (0..10).map(|i| Cell { s: i as f64 + 0.5, length: 1.0, place }).collect();
+        let segments: Vec<Segment> = (0..10).map(|i| Segment { s: i as f64 + 0.5, length: 1.0, place }).collect();
         let log_bayes = (0..10).map(|i| if [0, 1, 9].contains(&i) { 0.0 } else { -50.0 }).collect();
-        let along = PlaceScan { kind: Thin::Normal, cells, log_bayes, amplitude: vec![0.0; 10] };
-        assert_eq!(along.credible(0.95), [Interval { from_m: 9.0, to_m: 2.0 }]);
+        let scan = PlaceScan { kind: Thin::Normal, segments, log_bayes, amplitude: vec![0.0; 10] };
+        assert_eq!(scan.credible(0.95), [Interval { from_m: 9.0, to_m: 2.0 }]);
     }
 }

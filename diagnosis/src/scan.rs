@@ -44,7 +44,7 @@ pub struct Projection {
 
 /// What the data say of one signature.
 #[derive(Debug, Clone, Copy)]
-pub struct Score {
+pub struct SignatureScore {
     /// `d P r`.
     pub pull: f64,
     /// `d P d`.
@@ -54,7 +54,7 @@ pub struct Score {
 /// Scores of some signatures, and how the fit's unknowns imitate each.
 pub struct Scored {
     /// One for each.
-    pub scores: Vec<Score>,
+    pub scores: Vec<SignatureScore>,
     /// Rows unknowns, columns signatures.
     pub taken: DMatrix<f64>,
 }
@@ -94,20 +94,20 @@ impl Projection {
         columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
     }
 
-    /// Score whitened signatures, one a column, in units of their prior standard deviations.
+    /// SignatureScore whitened signatures, one a column, in units of their prior standard deviations.
     pub fn score(&self, columns: DMatrix<f64>) -> Scored {
         let shared = &self.back * &columns;
         let taken = self.factor.solve(&shared);
         let one = |i: usize| {
             let (column, taken) = (columns.column(i), taken.column(i));
             let pull = column.dot(&self.residual) - taken.dot(&self.slope);
-            Score { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
+            SignatureScore { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
         };
         Scored { scores: (0..columns.ncols()).map(one).collect(), taken }
     }
 }
 
-impl Score {
+impl SignatureScore {
     /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
     pub fn of_amplitude(self) -> (f64, f64) {
         let Self { pull, power } = self;
@@ -140,11 +140,11 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
     let signatures = Signatures::of(&machine, &drives)?;
-    let bench = Projection::of(fitted);
+    let projection = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
     for batch in terms.chunks(BATCH) {
         let columns: Vec<DVector<f64>> = batch.iter().map(|term| whitened(data, &signatures, term)).collect();
-        let scored = bench.score(DMatrix::from_columns(&columns));
+        let scored = projection.score(DMatrix::from_columns(&columns));
         for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
             let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
             let adapting = -scored.taken.column(i);
@@ -227,8 +227,8 @@ pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) ->
         .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, term.site)?)))
         .collect::<Result<_, FitError>>()?;
     let columns = DMatrix::from_columns(&columns);
-    let bench = Projection::of(fitted);
-    let pulls = bench.pulls(&columns);
-    let gram = bench.gram(&columns);
+    let projection = Projection::of(fitted);
+    let pulls = projection.pulls(&columns);
+    let gram = projection.gram(&columns);
     Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pulls, &gram, width)).collect())
 }

@@ -40,7 +40,7 @@ pub enum TrueCause {
     /// One of the library that needs a place which the key leaves to the recording's header, as for a radial loop.
     Kind(EffectKind),
     /// Something that the library does not hold.
-    Unknown {
+    Unmodelled {
         /// What it is.
         what: String,
         /// The name of its place.
@@ -131,7 +131,7 @@ impl Truth {
         let listed = |truth: &TrueEffect| {
             effects.iter().any(|f| truth.is(f) || f.alternatives.iter().any(|other| truth.is(other)))
         };
-        let library = self.effects.iter().all(|effect| !effect.is_unknown());
+        let library = self.effects.iter().all(|effect| !effect.is_unmodelled());
         match diagnosis.verdict {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
             Verdict::Consistent => Grade::Missed,
@@ -159,7 +159,7 @@ impl Truth {
         let listed = |truth: &TrueEffect, f: &Finding| truth.is(f) || f.alternatives.iter().any(|a| truth.is(a));
         let together = |truth: &TrueEffect, f: &Finding| {
             let is_one = truth.is(f) || f.alternatives.iter().any(|a| a.inseparable && truth.is(a));
-            is_one && f.probability < DECISIVE && f.together() >= DECISIVE && f.is_proven()
+            is_one && f.probability < DECISIVE && f.together() >= DECISIVE && f.is_validated()
         };
         let fate = |truth: &TrueEffect| match diagnosis.verdict {
             Verdict::Identified if findings.iter().any(|f| truth.is(f)) => Fate::Named,
@@ -195,7 +195,7 @@ impl Entry {
     fn resolve(self, ring: &Ring) -> Result<TrueEffect, EffectError> {
         let Self { kind, at, amplitude, what } = self;
         let cause = match kind.parse::<EffectKind>() {
-            Err(_) => TrueCause::Unknown { what: what.unwrap_or(kind), at },
+            Err(_) => TrueCause::Unmodelled { what: what.unwrap_or(kind), at },
             Ok(kind) => match Term::at(kind, &at, ring) {
                 Ok(term) => TrueCause::Effect(term),
                 Err(_) if at.is_empty() => TrueCause::Kind(kind),
@@ -212,14 +212,14 @@ impl TrueEffect {
         match (&self.cause, finding.term()) {
             (TrueCause::Effect(term), Some(found)) => term == found,
             (TrueCause::Kind(kind), Some(found)) => *kind == found.kind,
-            (TrueCause::Unknown { at, .. }, None) => *at == finding.at,
-            (TrueCause::Effect(_) | TrueCause::Kind(_), None) | (TrueCause::Unknown { .. }, Some(_)) => false,
+            (TrueCause::Unmodelled { at, .. }, None) => *at == finding.at,
+            (TrueCause::Effect(_) | TrueCause::Kind(_), None) | (TrueCause::Unmodelled { .. }, Some(_)) => false,
         }
     }
 
     /// True for something that the library does not hold.
-    pub fn is_unknown(&self) -> bool {
-        matches!(self.cause, TrueCause::Unknown { .. })
+    pub fn is_unmodelled(&self) -> bool {
+        matches!(self.cause, TrueCause::Unmodelled { .. })
     }
 
     /// Its kind in the library.
@@ -227,7 +227,7 @@ impl TrueEffect {
         match self.cause {
             TrueCause::Effect(term) => Some(term.kind),
             TrueCause::Kind(kind) => Some(kind),
-            TrueCause::Unknown { .. } => None,
+            TrueCause::Unmodelled { .. } => None,
         }
     }
 
@@ -236,8 +236,8 @@ impl TrueEffect {
         let what = match &self.cause {
             TrueCause::Effect(term) => term.label(ring),
             TrueCause::Kind(kind) => kind.word().into(),
-            TrueCause::Unknown { what, at } if at.is_empty() => what.clone(),
-            TrueCause::Unknown { what, at } => format!("{what}@{at}"),
+            TrueCause::Unmodelled { what, at } if at.is_empty() => what.clone(),
+            TrueCause::Unmodelled { what, at } => format!("{what}@{at}"),
         };
         format!("{what}{}", self.amplitude.map_or(String::new(), |a| format!("={a:.4}")))
     }
@@ -260,10 +260,10 @@ mod tests {
         assert_eq!(of(r#"{"kind":"radial_loop","amplitude":0.8}"#).cause, TrueCause::Kind(EffectKind::RadialLoop));
         let crosstalk = of(r#"{"kind":"unknown","at":"x_D2","amplitude":0.1,"what":"bpm_crosstalk"}"#);
         assert_eq!(
-            (crosstalk.is_unknown(), crosstalk.label(&Ring::booster()).as_str()),
+            (crosstalk.is_unmodelled(), crosstalk.label(&Ring::booster()).as_str()),
             (true, "bpm_crosstalk@x_D2=0.1000")
         );
-        assert!(of(r#"{"kind":"var_step","at":"C3"}"#).is_unknown());
+        assert!(of(r#"{"kind":"var_step","at":"C3"}"#).is_unmodelled());
         assert!(resolved(r#"{"kind":"bpm_gain","at":"x_E99"}"#).is_err());
     }
 }

@@ -6,7 +6,7 @@
 //! order for the rest.
 //!
 //! Forward: the best candidate is taken up as long as "one more" is clearly more likely than "no more". Backward: each is taken out
-//! again and all candidates compete for its slot, given the others; one that need not be there is dropped. Where something
+//! again and all candidates compete for its competition, given the others; one that need not be there is dropped. Where something
 //! without a class is the most likely, one more effect is still tried: two strong ones may need each other.
 
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use nalgebra::DVector;
 use twin::EffectKind;
 
-use super::alternatives::{Alternative, Slot};
+use super::alternatives::{Alternative, Competition};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::fit::{FitError, Fitted};
@@ -27,8 +27,8 @@ use inference::bounded::softplus;
 const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Share of what the library does not hold.
-const UNKNOWN: f64 = 0.15;
-/// Rounds of competition for all slots, and the gain of `ln` posterior that is worth another one.
+const UNMODELLED: f64 = 0.15;
+/// Rounds of competition for all competitions, and the gain of `ln` posterior that is worth another one.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
 /// Effects at most.
@@ -54,15 +54,15 @@ pub struct Found {
     /// The fit with all that were taken up.
     pub best: Fitted,
     /// One for each effect of `best`, in its order.
-    pub slots: Vec<Slot>,
+    pub competitions: Vec<Competition>,
     /// Who would be next.
-    pub next: Slot,
+    pub next: Competition,
 }
 
 impl Found {
     /// Probability that nothing is missing.
     pub fn nothing(&self) -> f64 {
-        self.slots.iter().fold(self.next.nothing, |least, slot| least.min(slot.nothing))
+        self.competitions.iter().fold(self.next.nothing, |least, competition| least.min(competition.nothing))
     }
 }
 
@@ -80,13 +80,13 @@ fn log_prior(terms: &[Term]) -> Vec<f64> {
 }
 
 /// The price of a first search: what a `ln` Bayes factor has to exceed for even odds, of each candidate.
-pub fn prices(terms: &[Term]) -> Vec<f64> {
-    log_prior(terms).into_iter().map(|prior| -(prior + ((1.0 - UNKNOWN) * ODDS).ln())).collect()
+pub fn corrections(terms: &[Term]) -> Vec<f64> {
+    log_prior(terms).into_iter().map(|prior| -(prior + ((1.0 - UNMODELLED) * ODDS).ln())).collect()
 }
 
 /// The same of something without a class.
-pub fn price_of(discrepancy: &Discrepancy) -> f64 {
-    -(UNKNOWN * ODDS / (SORTS * discrepancy.sites) as f64).ln()
+pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
+    -(UNMODELLED * ODDS / (SORTS * discrepancy.sites) as f64).ln()
 }
 
 /// The candidates of a recording, and what they are worth beforehand.
@@ -111,7 +111,7 @@ impl Search {
         let mut found = self.without_effects(data)?;
         // effects can put each other out, so that there may be more steps than effects
         for _ in 0..2 * MOST {
-            if found.slots.len() >= MOST || !found.next.is_suspicious() {
+            if found.competitions.len() >= MOST || !found.next.is_suspicious() {
                 break;
             }
             let Some(leader) = found.next.leader() else { break };
@@ -119,7 +119,7 @@ impl Search {
             let Ok(further) = self.further(&found, leader) else { break };
             // back where it was: one effect has put another out
             let gained = self.log_posterior(&further.best) - self.log_posterior(&found.best);
-            if further.slots.len() <= found.slots.len() && gained < BETTER {
+            if further.competitions.len() <= found.competitions.len() && gained < BETTER {
                 break;
             }
             // something without a class may say it better than one more effect, but not than two that need each other
@@ -134,39 +134,39 @@ impl Search {
     /// Nothing but vars, and the ordinary scatter of a family if there is any.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let zero = DVector::zeros(data.units.len());
-        let mut null = straighten(&mut data, &Hypothesis::default(), &zero)?;
-        let mut next = self.slot(&data, &null)?;
+        let mut null = fit_linearised(&mut data, &Hypothesis::default(), &zero)?;
+        let mut next = self.one_more(&data, &null)?;
         if let Ok(Some(scatter)) = scatter(&data, &null, &next) {
             let mut scattered = data.clone();
-            if let Ok(fitted) = straighten(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero) {
+            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero) {
                 (data, null) = (scattered, fitted);
-                next = self.slot(&data, &null)?;
+                next = self.one_more(&data, &null)?;
             }
         }
-        Ok(Found { data, best: null.clone(), null, slots: Vec::new(), next })
+        Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
     }
 
     /// One more effect.
     fn further(&self, found: &Found, leader: Fitted) -> Result<Found, FitError> {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
-        let (mut best, mut slots) = self.settle(&data, leader, &found.next)?;
+        let (mut best, mut competitions) = self.settle(&data, leader, &found.next)?;
         // orbits that the effects have changed are curved in another way; without them the readings would be curved as before, by
         // less than what decides where there is so much to straighten
-        if data.straighten(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
-            best = straighten(&mut data, &best.hypothesis, &best.u)?;
+        if data.linearise_about(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
+            best = fit_linearised(&mut data, &best.hypothesis, &best.u)?;
             null = Fitted::of(&data, &null.hypothesis, &null.u)?;
-            slots = (0..slots.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
+            competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
         } else {
             data = found.data.clone();
         }
-        let next = self.slot(&data, &best)?;
-        Ok(Found { data, null, best, slots, next })
+        let next = self.one_more(&data, &best)?;
+        Ok(Found { data, null, best, competitions, next })
     }
 
     /// `ln` posterior of the effects of a fit, with or without something beside them.
     fn log_weight(&self, found: &Found) -> f64 {
-        let odds: f64 = (0..found.slots.len()).map(|i| ((1.0 - UNKNOWN) * odds(i)).ln()).sum();
+        let odds: f64 = (0..found.competitions.len()).map(|i| ((1.0 - UNMODELLED) * odds(i)).ln()).sum();
         self.log_posterior(&found.best) - found.null.log_evidence + odds + softplus(found.next.log_odds)
     }
 
@@ -176,63 +176,63 @@ impl Search {
         fitted.log_evidence + fitted.hypothesis.terms.iter().map(prior_of).sum::<f64>()
     }
 
-    /// Let all candidates compete for each slot, given the others, until the best one is in each; what then need not be there is
-    /// taken out. The last effect of the fit has just won the competition for its slot.
-    fn settle(&self, data: &Data, fitted: Fitted, won: &Slot) -> Result<(Fitted, Vec<Slot>), FitError> {
-        let (mut best, mut slots) = self.compete(data, fitted, Some(won))?;
+    /// Let all candidates compete for each competition, given the others, until the best one is in each; what then need not be there is
+    /// taken out. The last effect of the fit has just won the competition for its competition.
+    fn settle(&self, data: &Data, fitted: Fitted, won: &Competition) -> Result<(Fitted, Vec<Competition>), FitError> {
+        let (mut best, mut competitions) = self.compete(data, fitted, Some(won))?;
         while let Some(idle) =
-            slots.iter().filter(|slot| !slot.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
-            && slots.len() > 1
+            competitions.iter().filter(|competition| !competition.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
+            && competitions.len() > 1
         {
-            (best, slots) = self.compete(data, idle.without.clone(), None)?;
+            (best, competitions) = self.compete(data, idle.without.clone(), None)?;
         }
-        Ok((best, slots))
+        Ok((best, competitions))
     }
 
-    /// The competition for every slot, again where a better one has got into one of them.
-    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Slot>) -> Result<(Fitted, Vec<Slot>), FitError> {
+    /// The competition for every competition, again where a better one has got into one of them.
+    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Competition>) -> Result<(Fitted, Vec<Competition>), FitError> {
         let mut best = fitted;
         let last = best.hypothesis.terms.len() - 1;
-        let mut slots = Vec::new();
+        let mut competitions = Vec::new();
         for round in 0.. {
             let mut changed = false;
-            slots.clear();
+            competitions.clear();
             for i in 0..=last {
                 let known = won.filter(|_| round == 0 && i == last && !changed);
-                let slot = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
+                let competition = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
                 // the same effects may have been fitted better from elsewhere
-                if let Some(other) = slot.leader()
+                if let Some(other) = competition.leader()
                     && self.log_posterior(&other) > self.log_posterior(&best) + BETTER
                     && round < ROUNDS
                 {
                     (best, changed) = (other, true);
                 }
-                slots.push(slot);
+                competitions.push(competition);
             }
             if !changed {
                 break;
             }
         }
-        Ok((best, slots))
+        Ok((best, competitions))
     }
 
     /// The competition for one of the effects of a fit.
-    fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Slot, FitError> {
+    fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
         let rest = super::heldout::reduced(data, fitted, term)?;
         let present = Alternative::exact(data, &rest, fitted.clone(), term);
         self.competition(data, &rest, Some(present))
     }
 
     /// The competition for one more effect beside those of a fit.
-    fn slot(&self, data: &Data, fitted: &Fitted) -> Result<Slot, FitError> {
+    fn one_more(&self, data: &Data, fitted: &Fitted) -> Result<Competition, FitError> {
         self.competition(data, fitted, None)
     }
 
     /// The same, where one of the candidates has been fitted already.
-    fn competition(&self, data: &Data, fitted: &Fitted, present: Option<Alternative>) -> Result<Slot, FitError> {
+    fn competition(&self, data: &Data, fitted: &Fitted, present: Option<Alternative>) -> Result<Competition, FitError> {
         let odds = odds(fitted.hypothesis.terms.len());
         let scanned = scan(fitted.data(data), fitted, &self.terms)?;
-        let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNKNOWN) * odds).ln();
+        let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNMODELLED) * odds).ln();
         let leaders = self.leaders(data, fitted, &scanned)?;
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
         let mut least = f64::INFINITY;
@@ -254,11 +254,11 @@ impl Search {
             weights.push((alternative, weight));
         }
         for discrepancy in discrepancy::scan(data, fitted)? {
-            let prior = (UNKNOWN * odds / (SORTS * discrepancy.sites) as f64).ln();
+            let prior = (UNMODELLED * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
-            weights.push((Alternative::unknown(discrepancy), weight));
+            weights.push((Alternative::unmodelled(discrepancy), weight));
         }
-        Ok(Slot::of(weights, fitted.clone(), scanned))
+        Ok(Competition::of(weights, fitted.clone(), scanned))
     }
 
     /// The candidates that are worth an exact fit. Where the fit is far off, its vars are bent out of shape and mislead: those
@@ -287,7 +287,7 @@ impl Search {
 }
 
 /// Fit, and straighten the readings by the machine that was found, until that changes them no more.
-fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
+fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
     if !fitted.is_gross() {
         data.trim(&fitted.residual);
@@ -295,7 +295,7 @@ fn straighten(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) ->
     }
     for _ in 0..PASSES {
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = data.straighten(&fitted.machine(data)?.0) else { break };
+        let Ok(moved) = data.linearise_about(&fitted.machine(data)?.0) else { break };
         let Ok(again) = Fitted::of(data, hypothesis, &fitted.u) else { break };
         fitted = again;
         if moved < CURVED {
@@ -329,7 +329,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
 }
 
 /// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
-fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatter>>, FitError> {
+fn scatter(data: &Data, fitted: &Fitted, next: &Competition) -> Result<Option<Vec<Scatter>>, FitError> {
     let single = next.log_odds;
     let mut best: Option<(Scatter, f64)> = None;
     for &(kind, name, widths) in &FAMILIES {
@@ -341,8 +341,8 @@ fn scatter(data: &Data, fitted: &Fitted, next: &Slot) -> Result<Option<Vec<Scatt
             }
         }
     }
-    let price = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
-    Ok(best.filter(|(_, log_bayes)| *log_bayes > price && *log_bayes - price > single).map(|(one, _)| vec![one]))
+    let correction = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
+    Ok(best.filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single).map(|(one, _)| vec![one]))
 }
 
 /// Widths that are tried of each family.

@@ -3,11 +3,11 @@
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
-use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Slot};
+use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Competition};
 use super::data::Data;
 use super::experiment::Menu;
 use super::fit::FitError;
-use super::heldout::{Fold, PROVEN, Score};
+use super::heldout::{Fold, VALIDATED, Score};
 use super::hypothesis::{Scatter, Term};
 use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
@@ -28,7 +28,7 @@ pub enum Verdict {
 }
 
 /// Unit of something without a class [m], read in mm.
-const UNKNOWN: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
+const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 /// Alternatives that the sentence names.
@@ -47,26 +47,26 @@ impl Verdict {
         }
     }
 
-    /// From the competition for each slot, and the held-out gain of each effect.
+    /// From the competition for each competition, and the held-out gain of each effect.
     pub fn of(found: &Found, gains: &[(f64, f64)]) -> Self {
         let next = &found.next;
         if next.unknown() > SUSPICIOUS {
             return Self::Unexplained;
         }
-        if found.slots.is_empty() {
+        if found.competitions.is_empty() {
             return match (next.is_suspicious(), next.unknown() > next.library()) {
                 (false, _) => Self::Consistent,
                 (true, true) => Self::Unexplained,
                 (true, false) => Self::Ambiguous,
             };
         }
-        let decided = |(slot, term): (&Slot, &Term)| {
+        let decided = |(competition, term): (&Competition, &Term)| {
             let is_it = |a: &&Alternative| a.term() == Some(term);
-            slot.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
+            competition.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
         };
-        let proven = gains.iter().all(|(gain, error)| *gain > PROVEN * error);
+        let validated = gains.iter().all(|(gain, error)| *gain > VALIDATED * error);
         let whole = !next.is_suspicious();
-        if found.slots.iter().zip(&found.best.hypothesis.terms).all(decided) && proven && whole {
+        if found.competitions.iter().zip(&found.best.hypothesis.terms).all(decided) && validated && whole {
             Self::Identified
         } else {
             Self::Ambiguous
@@ -91,7 +91,7 @@ pub struct Finding {
     pub phrase: String,
     /// `ln` evidence over the fit without it.
     pub log_evidence_gain: f64,
-    /// Posterior probability among all that compete for its slot.
+    /// Posterior probability among all that compete for its competition.
     pub probability: f64,
     /// Gain of held-out log predictive density, and its standard error; none if it is not in the model.
     pub heldout: Option<(f64, f64)>,
@@ -111,7 +111,7 @@ impl Finding {
                 term.position(ring),
                 term.kind.phrase(ring, term.site, Measured { value: amplitude, sigma }),
             ),
-            Cause::Unknown(one) => (one.at.label(data), one.at.position(data), one.at.phrase(data)),
+            Cause::Unmodelled(one) => (one.at.label(data), one.at.position(data), one.at.phrase(data)),
         };
         Self {
             cause: alternative.cause.clone(),
@@ -129,16 +129,16 @@ impl Finding {
     }
 
     /// The first of a competition, with the others below it.
-    fn of_slot(data: &Data, slot: &Slot, first: usize) -> Result<Self, FitError> {
+    fn of_competition(data: &Data, competition: &Competition, first: usize) -> Result<Self, FitError> {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
-        let others: Vec<&Alternative> = slot.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
-        let finding = Self::of(data, &slot.alternatives[first]);
+        let others: Vec<&Alternative> = competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
+        let finding = Self::of(data, &competition.alternatives[first]);
         let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
-        if let Cause::Effect(term) = &slot.alternatives[first].cause {
+        if let Cause::Effect(term) = &competition.alternatives[first].cause {
             let effects: Vec<(usize, &Term)> =
                 others.iter().enumerate().filter_map(|(i, a)| Some((i, a.term()?))).collect();
             let terms: Vec<&Term> = effects.iter().map(|(_, term)| *term).collect();
-            let separations = separations(data, &slot.without, (term, finding.amplitude.0), &terms)?;
+            let separations = separations(data, &competition.without, (term, finding.amplitude.0), &terms)?;
             for ((i, _), separation) in effects.iter().zip(separations) {
                 alternatives[*i].inseparable = separation < (DECISIVE / (1.0 - DECISIVE)).ln();
             }
@@ -163,12 +163,12 @@ impl Finding {
 
     /// Unit of the amplitude; of something unknown, the rms of what it does to the readings.
     pub fn unit(&self) -> Unit {
-        self.term().map_or(UNKNOWN, |term| term.kind.unit())
+        self.term().map_or(UNMODELLED, |term| term.kind.unit())
     }
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
-    pub fn is_proven(&self) -> bool {
-        self.heldout.is_some_and(|(gain, error)| gain > PROVEN * error)
+    pub fn is_validated(&self) -> bool {
+        self.heldout.is_some_and(|(gain, error)| gain > VALIDATED * error)
     }
 
     /// Probability of this cause and of all that cannot be told from it.
@@ -188,10 +188,10 @@ pub fn gains(
     after: &Score,
     folds: &[Fold],
 ) -> Result<Vec<(f64, f64)>, FitError> {
-    if found.slots.len() == 1 {
+    if found.competitions.len() == 1 {
         return Ok(vec![after.gain_over(before)]);
     }
-    found.slots.iter().map(|slot| Ok(after.gain_over(&Score::of(data, &slot.without, folds)?))).collect()
+    found.competitions.iter().map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?))).collect()
 }
 
 /// One finding for each effect, strongest first; of what is not in the model, the most likely.
@@ -200,16 +200,16 @@ pub fn gains(
 /// [`FitError`].
 pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Result<Vec<Finding>, FitError> {
     let mut all: Vec<Finding> = Vec::new();
-    for (index, ((slot, term), &gain)) in found.slots.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
+    for (index, ((competition, term), &gain)) in found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
         let is_it = |a: &Alternative| a.term() == Some(term);
-        let Some(first) = slot.alternatives.iter().position(is_it) else { continue };
+        let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
             // without a scan there is no interval, and the finding stands
             Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
-        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_slot(data, slot, first)? });
+        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_competition(data, competition, first)? });
     }
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match verdict {
@@ -220,7 +220,7 @@ pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdi
         _ => None,
     };
     if let Some(first) = open {
-        all.push(Finding::of_slot(data, &found.next, first)?);
+        all.push(Finding::of_competition(data, &found.next, first)?);
     }
     Ok(all)
 }
@@ -307,14 +307,14 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     if verdict != Verdict::Ambiguous {
         return Ok(None);
     }
-    let undecided = |slot: &&Slot| slot.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
+    let undecided = |competition: &&Competition| competition.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
     let open = Some(&found.next).filter(|next| next.is_suspicious());
-    let slot = open.or(found.slots.iter().find(undecided)).or(found.slots.first()).unwrap_or(&found.next);
-    let effects = slot.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
+    let competition = open.or(found.competitions.iter().find(undecided)).or(found.competitions.first()).unwrap_or(&found.next);
+    let effects = competition.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
-    let rival = leaders.get(1).filter(|(a, _)| a.probability > slot.nothing);
-    let menu = Menu::of(data, &slot.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
+    let rival = leaders.get(1).filter(|(a, _)| a.probability > competition.nothing);
+    let menu = Menu::of(data, &competition.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
     let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label(&data.ring));
     Ok(Some((menu, [one.label(&data.ring), against])))
 }

@@ -5,7 +5,7 @@ use diagnosis::fit::Fitted;
 use diagnosis::hypothesis::{Hypothesis, Term};
 use diagnosis::scan::{candidates, scan};
 use diagnosis::score::{Grade, Truth};
-use diagnosis::validation::{Case, Class, Unknown, UnknownKind};
+use diagnosis::validation::{Case, Class, Unmodelled, UnmodelledKind};
 use diagnosis::{Diagnosis, Verdict, data::Data, sample};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
@@ -139,25 +139,25 @@ fn physics_beyond_the_library_is_not_named() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let hardware = Hardware::shipped(&ring, &template);
     let vars = simulate::vars(&ring, 0.03, true, 3).unwrap();
-    use UnknownKind::{Crosstalk, Leak, OrbitDrift, QuadJump, Saturation};
+    use UnmodelledKind::{Crosstalk, Leak, OrbitDrift, QuadJump, Saturation};
     for kind in [QuadJump, OrbitDrift, Leak, Crosstalk, Saturation] {
         // crosstalk between monitors that see the orbit nearly alike is a gain (the next one after D2 does not), and a limit matters
         // only where the orbit is large
-        let seen = |unknown: &Unknown| match kind {
-            Crosstalk => unknown.site.name(&ring) == "x_D2",
-            Saturation => unknown.site.name(&ring) == "x_F2",
+        let seen = |one: &Unmodelled| match kind {
+            Crosstalk => one.site.name(&ring) == "x_D2",
+            Saturation => one.site.name(&ring) == "x_F2",
             _ => true,
         };
-        let mut unknown = (3..500).map(|seed| Unknown::of(kind, &ring, &template, seed)).find(seen).unwrap();
-        unknown.size = kind.sizes()[1];
-        let truth = simulate::Truth { vars: &vars, effects: &[], beyond: &[&unknown] };
+        let mut unmodelled = (3..500).map(|seed| Unmodelled::of(kind, &ring, &template, seed)).find(seen).unwrap();
+        unmodelled.size = kind.sizes()[1];
+        let truth = simulate::Truth { vars: &vars, effects: &[], beyond: &[&unmodelled] };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 3).unwrap();
         let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
         let open = matches!(diagnosis.verdict, Verdict::Unexplained | Verdict::Ambiguous);
         assert!(open, "{kind:?}: {} {}", diagnosis.verdict.word(), diagnosis.sentence);
         if matches!(kind, Leak | Crosstalk | Saturation) {
             let at = &diagnosis.findings.last().unwrap().at;
-            assert_eq!(*at, unknown.site.name(&ring), "{kind:?}: {}", diagnosis.sentence);
+            assert_eq!(*at, unmodelled.site.name(&ring), "{kind:?}: {}", diagnosis.sentence);
             let key = ring.var_names().into_iter().zip(vars.iter().copied()).collect();
             let truth = Truth { effects: Vec::new(), vars: key, oracle_gain: None };
             let nees = truth.nees(&ring.var_names(), &diagnosis.vars_after);

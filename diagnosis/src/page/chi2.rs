@@ -7,7 +7,7 @@ use report::{Axes, Figure, Reference, Section, Series, Table};
 
 /// Stretches of time.
 const STRETCHES: usize = 8;
-/// Distance of two markers of a name, in slots.
+/// Distance of two markers of a name, as a share of the distance of two names.
 const APART: f64 = 0.17;
 /// Chi-square from which on the axis is logarithmic.
 const LOGARITHMIC: f64 = 8.0;
@@ -35,7 +35,7 @@ impl Chi2 {
 
 /// By monitor, by corrector, by sign of the kick, by time.
 pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
-    let (monitors, correctors) = (data.speaking_monitors(), data.driven_correctors());
+    let (monitors, correctors) = (data.active_monitors(), data.driven_correctors());
     let (monitor_names, corrector_names) = (data.ring.monitor_names(), data.ring.corrector_names());
     let by_monitor = by(residuals, &monitors, |one| Some(one.monitor));
     let by_corrector = by(residuals, &correctors, |one| one.kick.map(|(corrector, _)| corrector));

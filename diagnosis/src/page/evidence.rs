@@ -5,7 +5,7 @@ use crate::fit::FitError;
 use crate::Diagnosis;
 use crate::discrepancy;
 use crate::scan::scan;
-use crate::search::{price_of, prices};
+use crate::search::{correction_of, corrections};
 use report::{Axes, Figure, Ranked, Section};
 
 /// Causes shown.
@@ -16,24 +16,24 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let found = &diagnosis.found;
     let (null, data) = (&found.null, &found.data);
     let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term).collect();
-    let scanned = match found.slots.len() {
+    let scanned = match found.competitions.len() {
         0 => found.next.scanned.clone(),
-        1 => found.slots[0].scanned.clone(),
+        1 => found.competitions[0].scanned.clone(),
         _ => scan(null.data(data), null, &terms)?,
     };
     let count = scanned.len();
-    let library = scanned.into_iter().zip(prices(&terms)).map(|(candidate, price)| {
+    let library = scanned.into_iter().zip(corrections(&terms)).map(|(candidate, correction)| {
         let (kind, names) = (candidate.term.kind.word().replace('_', " "), candidate.term.site.names(&data.ring));
         let place = names.join(", ");
-        Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, price: Some(price) }
+        Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, price: Some(correction) }
     });
     let discrepancies = discrepancy::scan(data, null)?;
     let sites = discrepancies.len();
-    let unclassed = discrepancies.iter().map(|one| {
-        let label = format!("unclassed: {}", one.at.short(data));
-        Ranked { label, group: 1, value: one.log_bayes, price: Some(price_of(one)) }
+    let unmodelled = discrepancies.iter().map(|one| {
+        let label = format!("unmodelled: {}", one.at.short(data));
+        Ranked { label, group: 1, value: one.log_bayes, price: Some(correction_of(one)) }
     });
-    let mut all: Vec<Ranked> = library.chain(unclassed).collect();
+    let mut all: Vec<Ranked> = library.chain(unmodelled).collect();
     all.sort_by(|one, other| other.value.total_cmp(&one.value));
     all.truncate(LEADING);
     let axes = Axes::new(

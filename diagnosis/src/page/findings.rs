@@ -30,7 +30,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         ),
         format!(
             "Probability that nothing{} is missing {}, that an effect of the library is {}, that something else is {}.",
-            if found.slots.is_empty() { "" } else { " more" },
+            if found.competitions.is_empty() { "" } else { " more" },
             percent(next.nothing),
             percent(next.library()),
             percent(next.unknown()),

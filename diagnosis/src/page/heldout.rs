@@ -17,7 +17,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             tables.push(scores("All frames of every fifth corrector left out at a time.", before, after));
             ""
         }
-        None if diagnosis.found.slots.is_empty() => "",
+        None if diagnosis.found.competitions.is_empty() => "",
         None => {
             " Whole correctors were not held out: an effect that belongs to one corrector is not seen in the others."
         }

@@ -28,7 +28,7 @@ pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, FitErr
     let found = &diagnosis.found;
     let data = &found.data;
     let mut residuals = vec![Residuals::of("before", data, &found.null)];
-    if !found.slots.is_empty() {
+    if !found.competitions.is_empty() {
         residuals.push(Residuals::of("after", data, &found.best));
     }
     let sections: Vec<Section> = vec![

@@ -1,4 +1,4 @@
-//! Where along the beam a gradient would sit.
+//! Where scan the beam a gradient would sit.
 
 use twin::{Element, Ring, Thin};
 
@@ -19,11 +19,11 @@ const AROUND: f64 = 0.5;
 /// The scans for normal and skew gradients.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut section = Section {
-        heading: "The scan along the ring".into(),
+        heading: "The scan scan the ring".into(),
         text: vec![
             "ln Bayes factor of one thin gradient at every place of the ring, given all other findings, vars adapting, to first \
              order. Below zero the readings speak against a gradient there; a flat curve means that they cannot tell. The credible interval has a \
-             prior uniform along the beam, and assumes one thin gradient in a model that is otherwise true."
+             prior uniform scan the beam, and assumes one thin gradient in a model that is otherwise true."
                 .into(),
         ],
         ..Section::default()
@@ -32,22 +32,22 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     for (kind, word, symbol) in [(Thin::Normal, "normal", "K1L"), (Thin::Skew, "skew", "K1sL")] {
         let terms = &found.best.hypothesis.terms;
         let own = terms.iter().position(|term| term.kind.thin() == Some(kind));
-        let along = PlaceScan::of(&found.data, &found.best, own, kind)?;
+        let scan = PlaceScan::of(&found.data, &found.best, own, kind)?;
         let settled = matches!(diagnosis.verdict, Verdict::Identified | Verdict::Ambiguous);
-        let interval = own.filter(|_| settled).map(|_| along.credible(SHARE));
+        let interval = own.filter(|_| settled).map(|_| scan.credible(SHARE));
         if let (Some(own), Some(interval)) = (own, &interval) {
-            section.text.push(stated(&along, interval, word, symbol, &terms[own].label(&found.data.ring)));
+            section.text.push(stated(&scan, interval, word, symbol, &terms[own].label(&found.data.ring)));
         }
-        section.figures.push(figure(diagnosis, &along, word));
+        section.figures.push(figure(diagnosis, &scan, word));
         if let Some(interval) = &interval {
-            section.figures.push(density(&along, interval, found.data.ring.circumference, word));
+            section.figures.push(density(&scan, interval, found.data.ring.circumference, word));
         }
     }
     Ok(section)
 }
 
-fn stated(along: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
-    let peak = along.peak();
+fn stated(scan: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
+    let peak = scan.peak();
     let list = if interval.len() > STRETCHES {
         let whole: f64 = interval.iter().map(|one| (one.to_m - one.from_m).max(0.0)).sum();
         format!("{} stretches of the ring, {whole:.0} m in all", interval.len())
@@ -58,20 +58,20 @@ fn stated(along: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, la
     format!(
         "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {} /m; 95 % credible interval of its \
          place: {}.",
-        along.cells[peak].s,
-        signed(along.amplitude[peak], 4),
+        scan.segments[peak].s,
+        signed(scan.amplitude[peak], 4),
         list
     )
 }
 
-fn figure(diagnosis: &Diagnosis, along: &PlaceScan, word: &str) -> (String, Figure) {
-    let s: Vec<f64> = along.cells.iter().map(|cell| cell.s).collect();
-    let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), along.log_bayes.clone())];
+fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figure) {
+    let s: Vec<f64> = scan.segments.iter().map(|segment| segment.s).collect();
+    let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), scan.log_bayes.clone())];
     let height = |at: f64| {
         let nearest = (0..s.len()).min_by(|&i, &j| (s[i] - at).abs().total_cmp(&(s[j] - at).abs()));
-        nearest.map_or(f64::NAN, |i| along.log_bayes[i])
+        nearest.map_or(f64::NAN, |i| scan.log_bayes[i])
     };
-    let acts_alike = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(along.kind));
+    let acts_alike = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(scan.kind));
     let marks = diagnosis.findings.iter().flat_map(|finding| {
         core::iter::once((finding, true)).chain(finding.alternatives.iter().map(|other| (other, false)))
     });
@@ -87,13 +87,13 @@ fn figure(diagnosis: &Diagnosis, along: &PlaceScan, word: &str) -> (String, Figu
             series.push(Series::points(label, x, y));
         }
     }
-    let title = format!("A thin {word} gradient along the ring");
+    let title = format!("A thin {word} gradient scan the ring");
     let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
-    let peak = along.peak();
+    let peak = scan.peak();
     let caption = format!(
         "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}.",
-        along.cells[peak].s,
-        nearest(&diagnosis.found.data.ring, along.cells[peak].s),
+        scan.segments[peak].s,
+        nearest(&diagnosis.found.data.ring, scan.segments[peak].s),
         if series.len() > 1 {
             "; markers are findings and alternatives that act like one, at the height of the curve"
         } else {
@@ -111,14 +111,14 @@ fn nearest(ring: &Ring, s: f64) -> &str {
 }
 
 /// The posterior of the place, as far as it matters: all of it, and what the interval holds.
-fn density(along: &PlaceScan, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
-    let peak = along.peak();
-    let (middle, largest) = (along.cells[peak].s, along.log_bayes[peak]);
-    let weight = |i: usize| (along.log_bayes[i] - largest).exp();
-    let sum: f64 = (0..along.cells.len()).map(|i| weight(i) * along.cells[i].length).sum();
+fn density(scan: &PlaceScan, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
+    let peak = scan.peak();
+    let (middle, largest) = (scan.segments[peak].s, scan.log_bayes[peak]);
+    let weight = |i: usize| (scan.log_bayes[i] - largest).exp();
+    let sum: f64 = (0..scan.segments.len()).map(|i| weight(i) * scan.segments[i].length).sum();
     // unrolled about the peak: the ring begins anywhere
-    let s = |i: usize| along.cells[i].s - circumference * ((along.cells[i].s - middle) / circumference).round();
-    let mut order: Vec<usize> = (0..along.cells.len()).collect();
+    let s = |i: usize| scan.segments[i].s - circumference * ((scan.segments[i].s - middle) / circumference).round();
+    let mut order: Vec<usize> = (0..scan.segments.len()).collect();
     order.sort_by(|&i, &j| s(i).total_cmp(&s(j)));
     let counts = |i: &&usize| weight(**i) > NEGLIGIBLE;
     let (from, to) = (order.iter().find(counts), order.iter().rev().find(counts));
@@ -132,12 +132,12 @@ fn density(along: &PlaceScan, interval: &[Interval], circumference: f64, word: &
     };
     let x: Vec<f64> = order.iter().map(|&i| s(i)).collect();
     let all: Vec<f64> = order.iter().map(|&i| weight(i) / sum).collect();
-    let held = order.iter().zip(&all).map(|(&i, &y)| if inside(along.cells[i].s) { y } else { f64::NAN }).collect();
+    let held = order.iter().zip(&all).map(|(&i, &y)| if inside(scan.segments[i].s) { y } else { f64::NAN }).collect();
     let series = [Series::line("posterior", x.clone(), all), Series::line("95 % credible interval", x, held)];
     let axes =
         Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
     let caption = format!(
-        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring."
+        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform scan the ring."
     );
     (caption, Figure::densities(&axes, &series))
 }

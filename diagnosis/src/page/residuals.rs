@@ -70,7 +70,7 @@ const MOST: f64 = 12.0;
 
 /// Maps before and after.
 pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
-    let (monitors, correctors) = (data.speaking_monitors(), data.driven_correctors());
+    let (monitors, correctors) = (data.active_monitors(), data.driven_correctors());
     let pick = |names: Vec<String>, of: &[usize]| -> Vec<String> { of.iter().map(|&i| names[i].clone()).collect() };
     let rows = pick(data.ring.monitor_names(), &monitors);
     let columns = pick(data.ring.corrector_names(), &correctors);

@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use serde::{Deserialize, Serialize};
 use twin::{Effect, EffectKind, Ring};
 
-use super::unknown::{Unknown, UnknownKind};
+use super::unmodelled::{Unmodelled, UnmodelledKind};
 use crate::hypothesis::Term;
 use crate::score::{TrueCause, TrueEffect, Truth};
 use inference::recording::Recording;
@@ -38,7 +38,7 @@ pub struct Case {
     /// Effects of the library.
     pub effects: Vec<Effect>,
     /// Effects beyond it.
-    pub beyond: Vec<Unknown>,
+    pub unmodelled: Vec<Unmodelled>,
     /// Seed of the machine's hardware and noise.
     pub seed: u64,
 }
@@ -72,10 +72,10 @@ impl Case {
             Class::Single => vec![effect(index)],
             Class::Pair => vec![effect(index), effect(7 * index + 3)],
         };
-        let kind = UnknownKind::ALL[index % UnknownKind::ALL.len()];
-        let beyond =
-            if class == Class::Unknown { vec![Unknown::of(kind, ring, template, stream())] } else { Vec::new() };
-        Self { index, class, vars, effects, beyond, seed: stream() }
+        let kind = UnmodelledKind::ALL[index % UnmodelledKind::ALL.len()];
+        let unmodelled =
+            if class == Class::Unknown { vec![Unmodelled::of(kind, ring, template, stream())] } else { Vec::new() };
+        Self { index, class, vars, effects, unmodelled, seed: stream() }
     }
 
     /// The answer key.
@@ -84,12 +84,12 @@ impl Case {
             cause: TrueCause::Effect((*effect).into()),
             amplitude: (!effect.kind.is_switch()).then_some(effect.amplitude),
         });
-        let beyond = self.beyond.iter().map(|unknown| TrueEffect {
-            cause: TrueCause::Unknown { what: unknown.kind.word().into(), at: unknown.site.name(ring) },
-            amplitude: Some(unknown.size),
+        let unmodelled = self.unmodelled.iter().map(|one| TrueEffect {
+            cause: TrueCause::Unmodelled { what: one.kind.word().into(), at: one.site.name(ring) },
+            amplitude: Some(one.size),
         });
         Truth {
-            effects: library.chain(beyond).collect(),
+            effects: library.chain(unmodelled).collect(),
             vars: ring.var_names().into_iter().zip(self.vars.iter().copied()).collect(),
             oracle_gain: None,
         }

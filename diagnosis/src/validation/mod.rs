@@ -7,7 +7,7 @@
 
 pub mod case;
 pub mod tables;
-pub mod unknown;
+pub mod unmodelled;
 
 use std::time::Instant;
 
@@ -24,7 +24,7 @@ pub use case::{Case, Class};
 use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware};
-pub use unknown::{Unknown, UnknownKind};
+pub use unmodelled::{Unmodelled, UnmodelledKind};
 
 /// What became of one case.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -76,7 +76,7 @@ impl Made {
     fn of(effect: &TrueEffect, ring: &Ring) -> Self {
         let kind = match &effect.cause {
             TrueCause::Effect(Term { kind, .. }) | TrueCause::Kind(kind) => kind.word().into(),
-            TrueCause::Unknown { what, .. } => what.clone(),
+            TrueCause::Unmodelled { what, .. } => what.clone(),
         };
         let scale = effect.kind().and_then(EffectKind::prior_scale);
         let size = scale.zip(effect.amplitude).map(|(scale, amplitude)| (amplitude / scale).abs());
@@ -90,7 +90,7 @@ impl Made {
 /// [`DataError`] if the simulated campaign cannot be diagnosed.
 pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outcome>, DataError> {
     let hardware = Hardware::shipped(ring, template);
-    let beyond: Vec<&dyn Beyond> = case.beyond.iter().map(|unknown| unknown as &dyn Beyond).collect();
+    let beyond: Vec<&dyn Beyond> = case.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
     let truth = simulate::Truth { vars: &case.vars, effects: &case.effects, beyond: &beyond };
     let plain = simulate::Truth { effects: &[], beyond: &[], ..truth };
     let simulated = |truth| simulate::campaign(template, ring, &truth, &hardware, case.seed);
@@ -133,7 +133,7 @@ fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
         _ if diagnosis.verdict == Verdict::Consistent => ("nothing".into(), nothing, key.effects.is_empty()),
         _ => {
             let unknown = diagnosis.found.next.unknown();
-            ("unknown".into(), unknown, key.effects.iter().any(TrueEffect::is_unknown))
+            ("unknown".into(), unknown, key.effects.iter().any(TrueEffect::is_unmodelled))
         }
     }
 }
@@ -169,7 +169,7 @@ fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) 
         Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
     };
     let nothing = best(&data, &[])?;
-    if !case.beyond.is_empty() {
+    if !case.unmodelled.is_empty() {
         let cleaned = data.less(&signal(recording, without), &tunes(recording, without));
         let gain = best(&cleaned, &[])? - nothing;
         return Ok((gain, vec![gain]));

@@ -25,7 +25,7 @@ use inference::simulate::Beyond;
 
 /// The kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UnknownKind {
+pub enum UnmodelledKind {
     /// A corrector remembers its previous setting.
     Hysteresis,
     /// A quadrupole changes at once in mid-campaign.
@@ -48,9 +48,9 @@ pub enum UnknownKind {
 
 /// One of them: where, and how large.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Unknown {
+pub struct Unmodelled {
     /// What happens.
-    pub kind: UnknownKind,
+    pub kind: UnmodelledKind,
     /// Where.
     pub site: Site,
     /// How much, with its sign; the unit is that of the kind.
@@ -63,7 +63,7 @@ pub struct Unknown {
     when: f64,
 }
 
-impl UnknownKind {
+impl UnmodelledKind {
     /// Every kind.
     pub const ALL: [Self; 9] = [
         Self::Hysteresis,
@@ -125,17 +125,17 @@ impl UnknownKind {
     }
 }
 
-impl Unknown {
+impl Unmodelled {
     /// One of a kind, of random place, size and sign.
     ///
     /// # Panics
     /// If the ring or the campaign has no place for it.
-    pub fn of(kind: UnknownKind, ring: &Ring, campaign: &Recording, seed: u64) -> Self {
+    pub fn of(kind: UnmodelledKind, ring: &Ring, campaign: &Recording, seed: u64) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let sites = kind.sites(ring, campaign);
         let site = *sites.choose(&mut random).expect("a ring has places of every kind");
         let [weak, strong] = kind.sizes().map(f64::ln);
-        let sign = if kind != UnknownKind::Saturation && random.random_bool(0.5) { -1.0 } else { 1.0 };
+        let sign = if kind != UnmodelledKind::Saturation && random.random_bool(0.5) { -1.0 } else { 1.0 };
         let size = sign * random.random_range(weak..=strong).exp();
         let [index, next] = indices(kind, ring, site);
         Self { kind, site, size, index, next, when: random.random_range(-0.5..=0.5) }
@@ -145,7 +145,7 @@ impl Unknown {
     pub fn any(ring: &Ring, campaign: &Recording, seed: u64) -> Self {
         let mut streams = inference::simulate::seeds(seed);
         let mut stream = || streams.next().expect("seeds do not end");
-        let kind = UnknownKind::ALL.choose(&mut StdRng::seed_from_u64(stream())).expect("there are some");
+        let kind = UnmodelledKind::ALL.choose(&mut StdRng::seed_from_u64(stream())).expect("there are some");
         Self::of(*kind, ring, campaign, stream())
     }
 
@@ -155,9 +155,9 @@ impl Unknown {
     }
 }
 
-impl Beyond for Unknown {
+impl Beyond for Unmodelled {
     fn alter_ring(&self, ring: &mut Ring) {
-        if self.kind == UnknownKind::Octupole {
+        if self.kind == UnmodelledKind::Octupole {
             ring.elements[self.index].kind = Kind::Octupole { k3l: self.size };
         }
     }
@@ -165,12 +165,12 @@ impl Beyond for Unknown {
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
         let late = |cycle: &&mut Cycle| cycle.time >= self.when;
         match self.kind {
-            UnknownKind::Hysteresis => remember(cycles, self.index, self.size),
-            UnknownKind::QuadJump => {
+            UnmodelledKind::Hysteresis => remember(cycles, self.index, self.size),
+            UnmodelledKind::QuadJump => {
                 cycles.iter_mut().filter(late).for_each(|c| c.strength[self.index] += self.size.ln_1p());
             }
-            UnknownKind::Leak => cycles.iter_mut().for_each(|c| c.kick[self.next] += self.size * c.kick[self.index]),
-            UnknownKind::OrbitDrift => {
+            UnmodelledKind::Leak => cycles.iter_mut().for_each(|c| c.kick[self.next] += self.size * c.kick[self.index]),
+            UnmodelledKind::OrbitDrift => {
                 cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.wander(c.time));
             }
             _ => {}
@@ -179,10 +179,10 @@ impl Beyond for Unknown {
 
     fn alter_readings(&self, cycles: &[Cycle], readings: &mut DMatrix<f64>) {
         let read = |time: f64, x: f64, neighbour: f64| match self.kind {
-            UnknownKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
-            UnknownKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
-            UnknownKind::Crosstalk => x + self.size * neighbour,
-            UnknownKind::BpmWander => x + self.size * self.wander(time),
+            UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
+            UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
+            UnmodelledKind::Crosstalk => x + self.size * neighbour,
+            UnmodelledKind::BpmWander => x + self.size * self.wander(time),
             _ => x,
         };
         if self.index < readings.ncols() && self.next < readings.ncols() {
@@ -200,16 +200,16 @@ fn was_set(campaign: &Recording, corrector: usize) -> bool {
 
 /// Index of the place among the read monitors, correctors, quadrupoles or elements, and of the neighbour that it concerns: the next
 /// read monitor of the same plane, or the next corrector, the last one's being the first.
-fn indices(kind: UnknownKind, ring: &Ring, site: Site) -> [usize; 2] {
+fn indices(kind: UnmodelledKind, ring: &Ring, site: Site) -> [usize; 2] {
     let after = |index: usize, planes: Vec<Plane>| {
         let mut others = (index + 1..planes.len()).chain(0..index);
         others.find(|&i| planes[i] == planes[index]).unwrap_or(index)
     };
     match (kind, site) {
-        (UnknownKind::Leak, Site::Corrector(at)) => [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())],
+        (UnmodelledKind::Leak, Site::Corrector(at)) => [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())],
         (_, Site::Monitor(at)) => {
             let index = ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors");
-            let is_shared = kind == UnknownKind::Crosstalk;
+            let is_shared = kind == UnmodelledKind::Crosstalk;
             [index, if is_shared { after(index, ring.monitors_read().map(|m| m.plane).collect()) } else { index }]
         }
         (_, Site::Corrector(at) | Site::Quadrupole(at) | Site::Element(at)) => [at, at],
@@ -238,7 +238,7 @@ mod tests {
     use inference::simulate::{Truth, campaign};
 
     /// Readings with the unknown less those without, rows frames.
-    fn change(unknown: &Unknown, ring: &Ring, recording: &Recording) -> DMatrix<f64> {
+    fn change(unknown: &Unmodelled, ring: &Ring, recording: &Recording) -> DMatrix<f64> {
         let beyond: &dyn Beyond = unknown;
         let made = |beyond: &[&dyn Beyond]| {
             let truth = Truth { vars: &[1.0; 48], beyond, ..Truth::default() };
@@ -250,9 +250,9 @@ mod tests {
     #[test]
     fn every_kind_moves_readings_and_keeps_the_beam() {
         let (ring, recording) = template();
-        for kind in UnknownKind::ALL {
+        for kind in UnmodelledKind::ALL {
             for seed in 0..2 {
-                let unknown = Unknown::of(kind, &ring, &recording, seed);
+                let unknown = Unmodelled::of(kind, &ring, &recording, seed);
                 let change = change(&unknown, &ring, &recording);
                 let moved = change.column_iter().filter(|column| column.abs().max() > 1e-9).count();
                 println!(
@@ -264,7 +264,7 @@ mod tests {
                 );
                 let of_a_monitor = matches!(unknown.site, Site::Monitor(_));
                 // a limit may be out of reach of the orbit
-                let least = if kind == UnknownKind::Saturation { 0 } else { 1 };
+                let least = if kind == UnmodelledKind::Saturation { 0 } else { 1 };
                 assert!(moved >= least && (moved <= 1) == of_a_monitor, "{unknown:?}: {moved} monitors");
             }
         }
@@ -286,7 +286,7 @@ mod tests {
         let names = ring.monitor_names();
         let next = |name: &str| {
             let site = Site::Monitor(Site::monitor(&ring, name).unwrap());
-            &names[indices(UnknownKind::Crosstalk, &ring, site)[1]]
+            &names[indices(UnmodelledKind::Crosstalk, &ring, site)[1]]
         };
         assert_eq!((next("x_A6").as_str(), next("x_F8").as_str(), next("y_F7").as_str()), ("x_A8", "x_A6", "y_A1"));
     }
@@ -294,12 +294,12 @@ mod tests {
     #[test]
     fn a_draw_is_within_its_sizes_and_depends_on_its_seed() {
         let (ring, recording) = template();
-        let drawn: Vec<Unknown> = (0..200).map(|seed| Unknown::any(&ring, &recording, seed)).collect();
+        let drawn: Vec<Unmodelled> = (0..200).map(|seed| Unmodelled::any(&ring, &recording, seed)).collect();
         for unknown in &drawn {
             let [weak, strong] = unknown.kind.sizes();
             assert!((weak..=strong * 1.000_001).contains(&unknown.size.abs()), "{unknown:?}");
         }
-        assert!(UnknownKind::ALL.iter().all(|kind| drawn.iter().any(|unknown| unknown.kind == *kind)));
-        assert_eq!(drawn[4], Unknown::any(&ring, &recording, 4));
+        assert!(UnmodelledKind::ALL.iter().all(|kind| drawn.iter().any(|unknown| unknown.kind == *kind)));
+        assert_eq!(drawn[4], Unmodelled::any(&ring, &recording, 4));
     }
 }
