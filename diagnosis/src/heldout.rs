@@ -34,11 +34,11 @@ const FOLDS: usize = 5;
 
 /// One repeat of every setting in each fold.
 pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
-    let mut seen: BTreeMap<(Vec<(usize, u64)>, u64), (usize, usize)> = BTreeMap::new();
+    let mut seen: BTreeMap<_, (usize, usize)> = BTreeMap::new();
     let mut folds = vec![Fold::new(); FOLDS];
     for (i, row) in recording.rows.iter().enumerate() {
-        let correctors = row.correctors.iter().map(|(corrector, setting)| (*corrector, setting.to_bits())).collect();
-        let key = (correctors, row.rf_offset.to_bits());
+        let set = row.correctors.iter().map(|(corrector, setting)| (*corrector, setting.to_bits()));
+        let key = (set.collect::<Vec<_>>(), row.rf_offset.to_bits());
         let settings = seen.len();
         let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
         // settings begin in different folds, so that one that is never repeated does not fall in with all others

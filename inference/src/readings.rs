@@ -183,7 +183,7 @@ impl Readings {
     pub fn gather(&self, gradient: &[f64]) -> Vec<f64> {
         let mut gathered = vec![0.0; self.dimension];
         for (parameter, slope) in self.parameters.iter().zip(gradient) {
-            parameter.into_iter().for_each(|parameter| gathered[*parameter] += slope);
+            parameter.iter().for_each(|parameter| gathered[*parameter] += slope);
         }
         gathered
     }
@@ -234,7 +234,7 @@ impl Readings {
     fn gather_columns(&self, of_quadrupoles: &DMatrix<f64>) -> DMatrix<f64> {
         let mut gathered = DMatrix::zeros(of_quadrupoles.nrows(), self.dimension);
         for (parameter, column) in self.parameters.iter().zip(of_quadrupoles.column_iter()) {
-            parameter.into_iter().for_each(|&parameter| gathered.column_mut(parameter).axpy(1.0, &column, 1.0));
+            parameter.iter().for_each(|&parameter| gathered.column_mut(parameter).axpy(1.0, &column, 1.0));
         }
         gathered
     }
