@@ -36,7 +36,7 @@ fn link(argument: &str) {
 }
 
 /// The machine of the image, and its tables. A path is taken from the workspace's folder, where `make` runs.
-fn machine() -> Result<(Ring, Tables), Box<dyn std::error::Error>> {
+fn machine() -> Result<(Ring, Tables), Box<dyn core::error::Error>> {
     let ring = match env::var_os("MACHINE").filter(|file| !file.is_empty()) {
         Some(file) => {
             let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(file);

@@ -444,7 +444,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         let mut pull = gaussian.pull(&self.map_params);
         // Each sweep minimises over one param at a time; the error falls by the coupling, about a half, each sweep.
         for _ in 0..30 {
-            if !self.sweep(gaussian, &mut pull, &bounded) {
+            if !self.sweep(gaussian, &mut pull, bounded) {
                 break;
             }
         }

@@ -78,9 +78,9 @@ pub fn check(
                 }
             }
         }
-        for plane in 0..2 {
-            let miss = core.tunes[plane] - exact.tunes[plane];
-            errors[plane].tune = errors[plane].tune.max((miss - miss.round()).abs());
+        for (errors, (ours, exact)) in errors.iter_mut().zip(core.tunes.iter().zip(exact.tunes)) {
+            let miss = ours - exact;
+            errors.tune = errors.tune.max((miss - miss.round()).abs());
         }
     }
     [0, 1].map(|plane| SurrogateError {

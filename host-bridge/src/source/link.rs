@@ -122,7 +122,8 @@ fn triangle(estimate: &Estimate) -> usize {
 
 /// What a line brings.
 enum Event {
-    Heard(Heard),
+    /// An estimate.
+    Heard(Box<Heard>),
     /// A reply that is no part of an estimate.
     Other(Box<Reply>),
 }
@@ -214,10 +215,10 @@ impl<L: Read + Write> Link<L> {
         self.send(&Request::Covariance)?;
         self.write(wire)?;
         match self.gather(Instant::now() + PATIENCE, PATIENCE)? {
-            Event::Heard(heard @ Heard { covariance: Some(_), .. }) => Ok(heard),
-            Event::Heard(Heard { estimate, .. }) => Err(LinkError::Unexpected {
+            Event::Heard(heard) if heard.covariance.is_some() => Ok(*heard),
+            Event::Heard(heard) => Err(LinkError::Unexpected {
                 expected: "an estimate and its covariance",
-                found: format!("only the estimate of frame {}", estimate.sequence),
+                found: format!("only the estimate of frame {}", heard.estimate.sequence),
             }),
             Event::Other(other) => Err(match *other {
                 Reply::Refused { why, .. } => LinkError::Refused { what: "a frame", why },
@@ -236,7 +237,7 @@ impl<L: Read + Write> Link<L> {
         let deadline = Instant::now() + LULL;
         loop {
             match self.gather(deadline, LULL)? {
-                Event::Heard(heard) => return Ok(heard),
+                Event::Heard(heard) => return Ok(*heard),
                 Event::Other(other) => {
                     if let Reply::Refused { why, .. } = *other {
                         return Err(LinkError::Refused { what: "a packet", why });
@@ -253,7 +254,7 @@ impl<L: Read + Write> Link<L> {
                 Ok(Reply::Estimate(reply)) => {
                     let estimate = Estimate::of_answer(&reply).ok_or(LinkError::Reply(FrameError::Malformed))?;
                     if let Some(former) = self.coming.replace(Coming::new(estimate)) {
-                        return Ok(Event::Heard(former.heard()));
+                        return Ok(Event::Heard(Box::new(former.heard())));
                     }
                 }
                 Ok(Reply::Covariance { sequence, first, entries }) => {
@@ -261,13 +262,13 @@ impl<L: Read + Write> Link<L> {
                         coming.add(sequence, first, &entries);
                     }
                     if let Some(whole) = self.coming.take_if(|coming| coming.is_whole()) {
-                        return Ok(Event::Heard(whole.heard()));
+                        return Ok(Event::Heard(Box::new(whole.heard())));
                     }
                 }
                 Ok(other) => return Ok(Event::Other(Box::new(other))),
                 Err(error @ LinkError::Reply(_)) => return Err(error),
                 // no more will come of it
-                Err(error) => return self.coming.take().map(|coming| Event::Heard(coming.heard())).ok_or(error),
+                Err(error) => return self.coming.take().map(|coming| Event::Heard(Box::new(coming.heard()))).ok_or(error),
             }
         }
     }
