@@ -9,19 +9,23 @@ use diagnosis::validation::{Case, Class, Unmodelled, UnmodelledKind};
 use diagnosis::{Diagnosis, Verdict, data::Data, sample};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
-use inference::{Recording, stream};
+use inference::{Campaign, Recording};
 use nalgebra::DVector;
 use system_tests::repository;
 use twin::{Effect, EffectKind, Machine, Rf, Ring};
 
 fn read(name: &str) -> Recording {
-    Recording::read(&repository("recordings").join(name), &stream::layout(&Ring::booster())).unwrap()
+    Recording::read(&repository("recordings").join(name), &Ring::booster()).unwrap()
+}
+
+fn whitened(recording: &Recording) -> Data {
+    Data::of(&Campaign::of(&Ring::booster(), recording).unwrap()).unwrap()
 }
 
 /// A blind campaign; none if its machine keeps no beam.
 fn tracked(effects: &[Effect], seed: u64) -> Option<Recording> {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
-    let vars = simulate::vars(&ring, 0.03, true, seed).unwrap();
+    let vars = simulate::vars(&ring, true, seed).unwrap();
     let truth = simulate::Truth { vars: &vars, effects, beyond: &[] };
     simulate::campaign(&template, &ring, &truth, &Hardware::shipped(&ring, &template), seed).ok()
 }
@@ -67,7 +71,7 @@ fn concealed_effects_are_found_and_only_those() {
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn every_kind_is_found_when_it_is_strong() {
     let ring = Ring::booster();
-    let data = Data::of(&ring, &simulated(&[], 5)).unwrap();
+    let data = whitened(&simulated(&[], 5));
     let null = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
     let scanned = scan(&data, &null, &candidates(&data, Some(&loop_on))).unwrap();
@@ -171,7 +175,7 @@ fn physics_beyond_the_library_is_not_named() {
 #[test]
 fn cases_are_fixed_by_their_number() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
-    let data = Data::of(&ring, &template).unwrap();
+    let data = whitened(&template);
     let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
     let draw = |index| Case::draw(&ring, &template, &terms, Class::Pair, index, 1);
     assert_eq!(draw(7).effects, draw(7).effects);
@@ -186,7 +190,7 @@ fn cases_are_fixed_by_their_number() {
 fn the_amplitude_is_that_of_nuts() {
     let ring = Ring::booster();
     for (name, kind, place) in [("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")] {
-        let data = Data::of(&ring, &read(&format!("concealed/{name}"))).unwrap();
+        let data = whitened(&read(&format!("concealed/{name}")));
         let hypothesis = Hypothesis::default().with(Term::at(kind, place, &ring).unwrap());
         let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
@@ -216,7 +220,7 @@ fn the_amplitude_is_that_of_nuts() {
 fn the_extended_machine_is_that_of_the_findings() {
     let ring = Ring::booster();
     let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", &ring).unwrap());
-    let data = Data::of(&ring, &read("concealed/open-02")).unwrap();
+    let data = whitened(&read("concealed/open-02"));
     let (machine, _) = hypothesis.machine(&data, &[0.0; 48], &[-1.0]).unwrap();
     let strength: Vec<f64> = data.supplies.iter().map(|s| s.exp()).collect();
     let gain = Effect::parse("bpm_gain@x_E6=-0.08", &ring).unwrap();

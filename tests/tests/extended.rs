@@ -1,9 +1,8 @@
 //! A machine with physics beyond its design, through the core: by the design's tables, and by a model file that knows of it.
 
 use host_bridge::model_file;
-use inference::map::{Drive, first_family};
 use inference::stream::{self, Core};
-use inference::{Recording, simulate};
+use inference::{Drive, Recording, simulate, with_priors};
 use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
@@ -13,18 +12,19 @@ use twin::{Cycle, Effect, Machine, Rf, Ring, Tracked};
 
 /// The frames of `paper-vars`, with the exact orbits of a machine, each cycle by itself, baselines and 0.15 mm of noise.
 fn recorded(ring: &Ring, vars: &[f64], effects: &[Effect]) -> Recording {
-    let mut recording = Recording::read(&repository("recordings/paper-vars"), &stream::layout(ring)).unwrap();
+    let mut recording = Recording::read(&repository("recordings/paper-vars"), ring).unwrap();
     let machine = Machine::new(ring.clone(), Rf::FixedMomentum, effects).unwrap();
-    let machine = Tracked::of(machine, 22.0 * recording.header.kick_per_ampere).unwrap();
+    let machine = Tracked::of(machine, recording.nominal_kick()).unwrap();
     let mut random = StdRng::seed_from_u64(1);
     let mut normal = |width: f64| Normal::new(0.0, width).unwrap().sample(&mut random);
     let baseline: Vec<f64> = ring.read_monitors.iter().map(|_| normal(2e-3)).collect();
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording, row)).collect();
+    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
     for (row, drive) in recording.rows.iter_mut().zip(drives) {
-        let strength = |q: usize| vars[q].ln() + drive.strength[usize::from(q >= first_family(ring))];
+        let params: Vec<f64> = vars.iter().map(|var| var.ln()).collect();
+        let factors = ring.strengths(&params, drive.strength.as_slice());
         let cycle = Cycle {
             kick: drive.kick.as_slice().to_vec(),
-            strength: (0..vars.len()).map(strength).collect(),
+            strength: factors.iter().map(|factor| factor.ln()).collect(),
             rf_offset: drive.rf_offset,
             time: 0.0,
         };
@@ -57,7 +57,7 @@ fn answer(mut core: Core, recording: &Recording, truth: &[f64]) -> Answer {
 
 /// By the design's tables, and by a model file of the effects, made at the vars of a first pass with them.
 fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -> [Answer; 2] {
-    let setup = stream::setup(recording, 0.0).unwrap();
+    let setup = stream::setup(ring, recording, 0.0).unwrap();
     let design = answer(Core::try_new(ring, setup).unwrap(), recording, truth);
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {
@@ -73,7 +73,7 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
 #[test]
 fn a_model_with_the_missing_physics_describes_the_machine() {
     let ring = Ring::booster();
-    let vars = simulate::vars(&ring, 0.02, true, 3).unwrap();
+    let vars = simulate::vars(&with_priors(&ring, Some(0.02), None), true, 3).unwrap();
     for effect in ["quad_roll@F2=-0.018", "fixed_rf_frequency", "bpm_gain@x_E6=-0.076", "stray_gradient@SLOT_A3=-0.026"]
     {
         let effects = [Effect::parse(effect, &ring).unwrap()];

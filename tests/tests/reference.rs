@@ -6,28 +6,33 @@ use estimator::Marginal;
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::simulate::{self, Instruments};
 use inference::stream::{self, Core};
-use inference::{Campaign, Posterior, Readings, Recording, ResponseModel, Width};
+use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width};
 use nalgebra::DMatrix;
 use studies::{self, Kind, Options, Sampled, Subset};
 use system_tests::repository;
 use twin::Ring;
 
-const WIDTH: Width = Width::Lognormal(0.03);
-
 fn read(name: &str) -> (Ring, Recording) {
     let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings").join(name), &stream::layout(&ring)).unwrap();
+    let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
     (ring, recording)
 }
 
-fn posterior(campaign: &Campaign, model: ResponseModel) -> Posterior {
-    let readings = Readings::of_frames(campaign, &model);
-    Posterior { model, readings, width: WIDTH }
+fn reduced(ring: &Ring, recording: &Recording) -> Reduced {
+    let campaign = Campaign::of(ring, recording).unwrap();
+    let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
+    Reduced::of(campaign, fit).unwrap()
 }
 
-fn sample(campaign: &Campaign, posterior: Posterior, settings: NutsSettings) -> NutsRun {
-    let laplace = posterior.laplace(&campaign.fit.map_params).unwrap();
-    nuts::sample(Arc::new(posterior), Arc::new(laplace), &campaign.ring.var_names(), settings, |_| ()).unwrap()
+fn posterior(reduced: &Reduced, model: ResponseModel) -> Posterior {
+    let readings = Readings::of_frames(reduced, &model, TuneUse::Readings);
+    Posterior::new(model, readings, reduced.campaign.prior.clone())
+}
+
+fn sample(reduced: &Reduced, posterior: Posterior, settings: NutsSettings) -> NutsRun {
+    let laplace = posterior.laplace(&reduced.fit.map_params).unwrap();
+    let names = reduced.campaign.ring.var_names();
+    nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |_| ()).unwrap()
 }
 
 /// Twin and surrogate, all frames and the paper's pairs, both priors: in the coordinates that the sampler's are made of, a
@@ -35,13 +40,14 @@ fn sample(campaign: &Campaign, posterior: Posterior, settings: NutsSettings) -> 
 #[test]
 fn the_gradient_is_that_of_the_density() {
     let (ring, recording) = read("paper-vars");
-    let campaign = Campaign::of(&ring, &recording, |_| ()).unwrap();
-    let pairs = Subset::draw(&campaign, Kind::MinusToPlus, 1).pairs;
+    let reduced = reduced(&ring, &recording);
+    let pairs = Subset::draw(&reduced, Kind::MinusToPlus, 1).pairs;
     for model in [ResponseModel::twin(&ring).unwrap(), ResponseModel::green(&ring).unwrap()] {
-        let modes = [Readings::of_frames(&campaign, &model), Readings::of_pairs(&campaign, &model, &pairs)];
-        for (readings, width) in modes.into_iter().zip([WIDTH, Width::Loguniform]) {
-            let posterior = Posterior { model: model.clone(), readings, width };
-            let laplace = posterior.laplace(&campaign.fit.map_params).unwrap();
+        let frames = Readings::of_frames(&reduced, &model, TuneUse::Readings);
+        let modes = [frames, Readings::of_pairs(&reduced, &model, &pairs)];
+        for (readings, width) in modes.into_iter().zip([Width::Lognormal(0.03), Width::Loguniform]) {
+            let posterior = Posterior::new(model.clone(), readings, Prior::of_width(&ring, width));
+            let laplace = posterior.laplace(&reduced.fit.map_params).unwrap();
             let z: Vec<f64> = (0..48).map(|i| 0.33 * f64::sin(1.7 * f64::from(i))).collect();
             let u = laplace.unbounded(&z);
             let (_, gradient) = posterior.of_unbounded(u.as_slice()).unwrap();
@@ -56,7 +62,7 @@ fn the_gradient_is_that_of_the_density() {
                 let h = 2e-4;
                 let difference = (8.0 * (value(h) - value(-h)) - value(2.0 * h) + value(-2.0 * h)) / (12.0 * h);
                 let error = (slope - difference).abs() / slope.abs().max(typical);
-                assert!(error < 1e-6, "{} {:?}, {i}: {slope} {difference}", model.word(), posterior.width);
+                assert!(error < 1e-6, "{} {:?}, {i}: {slope} {difference}", model.word(), width);
             }
         }
     }
@@ -68,12 +74,12 @@ fn the_gradient_is_that_of_the_density() {
 fn the_reduced_density_has_the_batch_fits_maximum() {
     for name in ["paper-vars", "random-vars"] {
         let (ring, recording) = read(name);
-        let campaign = Campaign::of(&ring, &recording, |_| ()).unwrap();
-        let posterior = posterior(&campaign, ResponseModel::twin(&ring).unwrap());
-        let (value, gradient) = posterior.of_params(&campaign.fit.map_params).unwrap();
+        let reduced = reduced(&ring, &recording);
+        let (posterior, fit) = (posterior(&reduced, ResponseModel::twin(&ring).unwrap()), &reduced.fit);
+        let (value, gradient) = posterior.of_params(&fit.map_params).unwrap();
         // a Newton step from the batch fit's MAP, in its own error bars
-        let step = &campaign.fit.covariance * nalgebra::DVector::from_vec(gradient);
-        let moved = (0..48).map(|i| step[i].abs() / campaign.fit.covariance[(i, i)].sqrt()).fold(0.0, f64::max);
+        let step = &fit.covariance * nalgebra::DVector::from_vec(gradient);
+        let moved = (0..48).map(|i| step[i].abs() / fit.covariance[(i, i)].sqrt()).fold(0.0, f64::max);
         assert!(moved < 0.02, "{name}: {moved:.4} at {value}");
     }
 }
@@ -83,8 +89,8 @@ fn the_reduced_density_has_the_batch_fits_maximum() {
 #[cfg_attr(debug_assertions, ignore = "a minute unoptimised; the release tests run it")]
 fn the_core_is_the_posterior_that_nuts_finds() {
     let (ring, recording) = read("paper-vars");
-    let campaign = Campaign::of(&ring, &recording, |_| ()).unwrap();
-    let run = sample(&campaign, posterior(&campaign, ResponseModel::twin(&ring).unwrap()), NutsSettings::default());
+    let reduced = reduced(&ring, &recording);
+    let run = sample(&reduced, posterior(&reduced, ResponseModel::twin(&ring).unwrap()), NutsSettings::default());
     let reference = Sampled::of(&run.draws);
     assert_eq!(run.draws.divergences(), 0, "{:?}", run.divergences);
     for s in &reference.summary {
@@ -131,7 +137,7 @@ fn simulated(count: usize, tune_cut: bool, seed: u64) -> impl Iterator<Item = (R
     let (ring, recording) = read("paper-vars");
     let instruments = Instruments::healthy(&ring, &recording).unwrap();
     simulate::seeds(seed).take(count).map(move |seed| {
-        let vars = simulate::vars(&ring, 0.03, tune_cut, seed).unwrap();
+        let vars = simulate::vars(&ring, tune_cut, seed).unwrap();
         let made = simulate::like(&recording, &ring, &vars, &instruments, seed).unwrap();
         (ring.clone(), made, vars)
     })
@@ -148,7 +154,7 @@ fn error_bars_of_the_core_cover_a_hundred_simulated_truths() {
             let (mut core, mut last) = (fresh.clone(), None);
             stream::replay(&mut core, &made, |_, estimate| last = Some(estimate.clone())).unwrap();
             let marginals: Vec<Marginal> =
-                (0..48).map(|i| last.as_ref().unwrap().marginal(i, &core.setup.prior).unwrap()).collect();
+                (0..48).map(|i| last.as_ref().unwrap().marginal(i, &core.prior(i)).unwrap()).collect();
             for (inside, tail) in inside.iter_mut().zip([0.16, 0.025]) {
                 let covers = |(m, var): &(&Marginal, &f64)| {
                     (f64::from(m.quantile(tail))..f64::from(m.quantile(1.0 - tail))).contains(*var)
@@ -169,8 +175,8 @@ fn error_bars_of_nuts_cover_ten_simulated_truths() {
     for tune_cut in [false, true] {
         let mut inside = [Vec::new(), Vec::new()];
         for (ring, made, vars) in simulated(10, tune_cut, 11) {
-            let campaign = Campaign::of(&ring, &made, |_| ()).unwrap();
-            let run = sample(&campaign, posterior(&campaign, ResponseModel::twin(&ring).unwrap()), settings);
+            let reduced = reduced(&ring, &made);
+            let run = sample(&reduced, posterior(&reduced, ResponseModel::twin(&ring).unwrap()), settings);
             let summary = run.draws.summary();
             let count = |low: fn(&inference::Summary) -> f64, high: fn(&inference::Summary) -> f64| {
                 summary.iter().zip(&vars).filter(|(s, var)| (low(s)..high(s)).contains(*var)).count() as f64 / 48.0

@@ -5,12 +5,13 @@ use training::rooms::large;
 use twin::Ring;
 
 use super::StreamError;
+use crate::campaign::TUNE_CALIBRATION;
 use crate::recording::Recording;
 
-/// Read-back above which a corrector counts as powered [A]: 50 times its scatter, a twentieth of its setting.
+/// Largest read-back above which a corrector counts as powered [A]: 50 times its scatter. A twentieth of the largest setting where
+/// that is less.
 const POWERED: f32 = 1.0;
-/// Calibration error of a tune meter [1], of the order of its resolution.
-pub const TUNE_CALIBRATION: f32 = 3e-4;
+const SHARE: f64 = 0.05;
 
 /// What is known beforehand: [`estimator::Setup`] for a ring of any size.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,6 +36,13 @@ pub struct Setup {
     pub tune_calibration: Option<f32>,
 }
 
+/// Read-back above which a corrector counts as powered [A].
+fn powered(recording: &Recording) -> f32 {
+    let settings = recording.rows.iter().flat_map(|row| &row.correctors).map(|(_, setting)| setting.abs());
+    let largest = settings.fold(0.0, f64::max);
+    if largest > 0.0 { POWERED.min((SHARE * largest) as f32) } else { POWERED }
+}
+
 /// What is known beforehand of a recording of a ring, from its header.
 ///
 /// # Errors
@@ -57,11 +65,11 @@ pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<S
         kick_per_ampere: single(&header.kick_per_ampere),
         dipole: header.nominal_dipole.map(|a| a as f32),
         supplies: header.nominal.iter().zip(&header.transfer).map(supply).collect::<Result<_, _>>()?,
-        powered: POWERED,
+        powered: powered(recording),
         noise: single(&header.noise),
         gate: Gate::default(),
         process_noise,
-        tune_calibration: Some(TUNE_CALIBRATION),
+        tune_calibration: Some(TUNE_CALIBRATION as f32),
     })
 }
 

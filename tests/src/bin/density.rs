@@ -10,9 +10,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use host_bridge::output;
-use inference::posterior::{BEND, Laplace, RANGE};
-use inference::stream::{self, PRIOR_WIDTH};
-use inference::{Campaign, Posterior, Readings, Recording, ResponseModel, Width};
+use inference::{BatchFit, Campaign, Laplace, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -58,12 +56,14 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let ring = Ring::booster();
     let folder = arguments.recording.clone().unwrap_or_else(|| repository("recordings/paper-vars"));
-    let campaign = Campaign::of(&ring, &Recording::read(&folder, &stream::layout(&ring))?, |_| ())?;
-    // as `orbitcal fit --method nuts --model green` puts it together
+    let campaign = Campaign::of(&ring, &Recording::read(&folder, &ring)?)?;
+    let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ())?;
+    let reduced = Reduced::of(campaign, fit)?;
+    // as `orbitcal fit --method nuts --model green` puts it together, without the tunes
     let model = ResponseModel::green(&ring)?;
-    let readings = Readings::of_frames(&campaign, &model);
-    let posterior = Posterior { model, readings, width: Width::Lognormal(f64::from(PRIOR_WIDTH)) };
-    let laplace = posterior.laplace(&campaign.fit.map_params)?;
+    let readings = Readings::of_frames(&reduced, &model, TuneUse::LeftOut);
+    let posterior = Posterior::new(model, readings, reduced.campaign.prior.clone());
+    let laplace = posterior.laplace(&reduced.fit.map_params)?;
     output::json(&arguments.json, &density(&ring, &posterior, &laplace)?)?;
     println!("{}", arguments.json.display());
     Ok(())
@@ -72,7 +72,8 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
 /// All that the density is made of.
 fn density(ring: &Ring, posterior: &Posterior, laplace: &Laplace) -> Result<Value, Box<dyn Error>> {
     let ResponseModel::Green(green) = &posterior.model else { return Err("the twin has no tables".into()) };
-    let (mean, precision) = posterior.width.normal();
+    // all params of this ring have one prior
+    let (prior, coordinates) = (&posterior.prior, posterior.coordinates.each());
     let mut random = StdRng::seed_from_u64(SEED);
     let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
     let mut point = |spread: f64| (0..posterior.dimension()).map(|_| spread * normal()).collect();
@@ -81,9 +82,9 @@ fn density(ring: &Ring, posterior: &Posterior, laplace: &Laplace) -> Result<Valu
         "names": ring.var_names(),
         "green": green,
         "readings": posterior.readings,
-        "prior": { "mean": mean, "precision": precision },
-        "range": RANGE,
-        "bend": BEND,
+        "prior": { "mean": prior.mean[0], "precision": prior.precision[0] },
+        "range": prior.range[0].map(f64::exp),
+        "bend": coordinates[0].bend(),
         "laplace": laplace,
         "checks": checks.into_iter().collect::<Result<Vec<Check>, _>>()?,
     }))
