@@ -6,7 +6,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::alternatives::{Cause, DECISIVE, Competition};
+use super::alternatives::{Cause, Competition, DECISIVE};
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
 use super::search::Found;
@@ -28,7 +28,9 @@ impl Vars {
 
     /// The vars averaged over the alternatives of the least certain finding.
     pub fn averaged(found: &Found) -> Self {
-        let certainty = |competition: &&Competition| competition.alternatives.first().map_or(competition.nothing, |a| a.probability);
+        let certainty = |competition: &&Competition| {
+            competition.alternatives.first().map_or(competition.nothing, |a| a.probability)
+        };
         let least = found.competitions.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
@@ -50,7 +52,10 @@ impl Vars {
                     let shift = units.step(&alternative.adapting);
                     let (amplitude, error) = alternative.amplitude;
                     let per_sigma = if amplitude == 0.0 { &shift * 0.0 } else { &shift * (error / amplitude) };
-                    Self { mean: &plain.mean + shift, covariance: &plain.covariance + &per_sigma * per_sigma.transpose() }
+                    Self {
+                        mean: &plain.mean + shift,
+                        covariance: &plain.covariance + &per_sigma * per_sigma.transpose(),
+                    }
                 }
             };
             parts.push((alternative.probability, part));

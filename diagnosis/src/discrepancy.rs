@@ -310,13 +310,7 @@ impl Data {
 
     /// Sums of one tune's numbers over the columns of `indicator`, about its mean, in units that make its noise as large as
     /// that of a monitor; none if the tune meter has too few readings.
-    fn tune_sums(
-        &self,
-        plane: usize,
-        miss: &DMatrix<f64>,
-        fitted: &Fitted,
-        indicator: &DMatrix<f64>,
-    ) -> Option<Sums> {
+    fn tune_sums(&self, plane: usize, miss: &DMatrix<f64>, fitted: &Fitted, indicator: &DMatrix<f64>) -> Option<Sums> {
         let noise = self.tune_noise(plane)?;
         let miss = miss.column(self.readings.ncols() + plane);
         let frames = self.tune_frames(plane);

@@ -86,7 +86,8 @@ impl Diagnosis {
         let verdict = Verdict::of(&found, &gains);
         let findings = verdict::findings(data, &found, &gains, verdict)?;
         progress("held-out correctors");
-        let whole = !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
+        let whole =
+            !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {
             let folds = heldout::by_corrector(recording);
             let scored = |fitted| Score::of(data, fitted, &folds).ok();

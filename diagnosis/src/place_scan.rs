@@ -1,8 +1,8 @@
 //! Place scan of a gradient: the `ln` Bayes factor of a thin one at every place of the ring, all unknowns of a fit adapting.
 //!
-//! The ring is cut into segments with one trial gradient in the middle of each, and into finer ones where the gradient may be.
-//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It is that
-//! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
+//! The ring is cut into segments with one trial gradient in the middle of each, and into finer ones where it is likely.
+//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It
+//! assumes one gradient at one place in a model that is otherwise correct, and is of first order about the fit.
 
 use nalgebra::{DMatrix, DVector};
 use twin::Place;

@@ -138,7 +138,8 @@ impl Search {
         let mut next = self.one_more(&data, &null)?;
         if let Ok(Some(scatter)) = scatter(&data, &null, &next) {
             let mut scattered = data.clone();
-            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero) {
+            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)
+            {
                 (data, null) = (scattered, fitted);
                 next = self.one_more(&data, &null)?;
             }
@@ -180,8 +181,10 @@ impl Search {
     /// not needed are removed. The last effect of the fit has just won its competition.
     fn settle(&self, data: &Data, fitted: Fitted, won: &Competition) -> Result<(Fitted, Vec<Competition>), FitError> {
         let (mut best, mut competitions) = self.compete(data, fitted, Some(won))?;
-        while let Some(idle) =
-            competitions.iter().filter(|competition| !competition.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
+        while let Some(idle) = competitions
+            .iter()
+            .filter(|competition| !competition.is_suspicious())
+            .max_by(|a, b| a.nothing.total_cmp(&b.nothing))
             && competitions.len() > 1
         {
             (best, competitions) = self.compete(data, idle.without.clone(), None)?;
@@ -190,7 +193,12 @@ impl Search {
     }
 
     /// The competitions of all effects, repeated while one of them is won by another candidate.
-    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Competition>) -> Result<(Fitted, Vec<Competition>), FitError> {
+    fn compete(
+        &self,
+        data: &Data,
+        fitted: Fitted,
+        won: Option<&Competition>,
+    ) -> Result<(Fitted, Vec<Competition>), FitError> {
         let mut best = fitted;
         let last = best.hypothesis.terms.len() - 1;
         let mut competitions = Vec::new();
@@ -342,7 +350,9 @@ fn scatter(data: &Data, fitted: &Fitted, next: &Competition) -> Result<Option<Ve
         }
     }
     let correction = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
-    Ok(best.filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single).map(|(one, _)| vec![one]))
+    Ok(best
+        .filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single)
+        .map(|(one, _)| vec![one]))
 }
 
 /// Widths that are tried of each family.

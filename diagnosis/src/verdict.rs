@@ -3,11 +3,11 @@
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
-use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Competition};
+use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
 use super::data::Data;
 use super::experiment::Menu;
 use super::fit::FitError;
-use super::heldout::{Fold, VALIDATED, Score};
+use super::heldout::{Fold, Score, VALIDATED};
 use super::hypothesis::{Scatter, Term};
 use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
@@ -131,7 +131,8 @@ impl Finding {
     /// The first of a competition, with the others below it.
     fn of_competition(data: &Data, competition: &Competition, first: usize) -> Result<Self, FitError> {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
-        let others: Vec<&Alternative> = competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
+        let others: Vec<&Alternative> =
+            competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
         let finding = Self::of(data, &competition.alternatives[first]);
         let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
         if let Cause::Effect(term) = &competition.alternatives[first].cause {
@@ -191,7 +192,11 @@ pub fn gains(
     if found.competitions.len() == 1 {
         return Ok(vec![after.gain_over(before)]);
     }
-    found.competitions.iter().map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?))).collect()
+    found
+        .competitions
+        .iter()
+        .map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?)))
+        .collect()
 }
 
 /// One finding for each effect, strongest first; then the most likely cause that is not in the model.
@@ -200,7 +205,9 @@ pub fn gains(
 /// [`FitError`].
 pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Result<Vec<Finding>, FitError> {
     let mut all: Vec<Finding> = Vec::new();
-    for (index, ((competition, term), &gain)) in found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
+    for (index, ((competition, term), &gain)) in
+        found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate()
+    {
         let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
@@ -272,8 +279,7 @@ fn ambiguous(findings: &[Finding]) -> String {
         let others = finding.alternatives.iter().take(SAID).map(of);
         let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
         let alike = finding.alternatives.iter().take(SAID).all(|other| other.inseparable);
-        let apart =
-            if alike && finding.together() >= DECISIVE { ", which this recording cannot separate" } else { "" };
+        let apart = if alike && finding.together() >= DECISIVE { ", which this recording cannot separate" } else { "" };
         parts.push(format!("{said}{apart}"));
     }
     format!("physics may be missing: {}", parts.join("; and "))
@@ -307,9 +313,11 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     if verdict != Verdict::Ambiguous {
         return Ok(None);
     }
-    let undecided = |competition: &&Competition| competition.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
+    let undecided =
+        |competition: &&Competition| competition.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
     let open = Some(&found.next).filter(|next| next.is_suspicious());
-    let competition = open.or(found.competitions.iter().find(undecided)).or(found.competitions.first()).unwrap_or(&found.next);
+    let competition =
+        open.or(found.competitions.iter().find(undecided)).or(found.competitions.first()).unwrap_or(&found.next);
     let effects = competition.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
