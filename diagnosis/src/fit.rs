@@ -46,7 +46,7 @@ pub struct Fitted {
 }
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
-/// Chi-square per number beyond which a fit is far off.
+/// Chi-square per number above which a fit is poor.
 const GROSS: f64 = 1.3;
 /// Number of steps after which a fit is abandoned if its cost exceeds a rival's by a factor, and that factor.
 const TRIAL: usize = 4;
@@ -276,13 +276,13 @@ impl Fitted {
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
         let data = self.data(data);
         let miss = data.miss(&self.predicted(data)?);
-        let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
+        let (mut sum, mut degrees) = (0.0, -(self.params.len() as f64));
         for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
             let own = data.about_baseline(b, &miss.column(b).into_owned());
             sum += own.norm_squared() / data.expected_noise[b].powi(2);
-            freedom += own.len() as f64 - 1.0;
+            degrees += own.len() as f64 - 1.0;
         }
-        Ok(sum / freedom)
+        Ok(sum / degrees)
     }
 
     /// Covariance of `ln` of the vars.

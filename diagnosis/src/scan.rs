@@ -178,8 +178,8 @@ impl Rivals {
         } else {
             amplitude * amplitude * power - 2.0 * amplitude * both + rival
         };
-        let freedom = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
-        0.5 * (left.max(0.0) - freedom(cause_is_free, power) + freedom(rival_is_free, rival))
+        let correction = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
+        0.5 * (left.max(0.0) - correction(cause_is_free, power) + correction(rival_is_free, rival))
     }
 }
 

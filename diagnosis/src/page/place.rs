@@ -22,7 +22,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         heading: "Place scan".into(),
         text: vec![
             "ln Bayes factor of one thin gradient at every place of the ring, given all other findings, vars adapting, to first \
-             order. Below zero the readings speak against a gradient there; a flat curve means that they contain no information on it. The credible interval has a \
+             order. Below zero the readings disfavour a gradient there; a flat curve means that they contain no information on it. The credible interval has a \
              prior uniform along the beam, and assumes one thin gradient in a model that is otherwise correct."
                 .into(),
         ],

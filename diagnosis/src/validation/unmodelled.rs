@@ -1,4 +1,4 @@
-//! Physics that the library of effects does not hold, for campaigns whose right answer is "unexplained".
+//! Physics that the library of effects does not hold, for campaigns whose right verdict is "unexplained".
 //!
 //! Sizes are drawn evenly in their logarithm, from well below the noise to far above it.
 //!
@@ -150,7 +150,7 @@ impl Unmodelled {
     }
 
     /// A slow variation between -1 and 1.
-    fn wander(&self, time: f64) -> f64 {
+    fn slow_variation(&self, time: f64) -> f64 {
         (core::f64::consts::PI * (time + 2.0 * self.when)).sin()
     }
 }
@@ -171,7 +171,7 @@ impl Beyond for Unmodelled {
             }
             UnmodelledKind::Leak => cycles.iter_mut().for_each(|c| c.kick[self.next] += self.size * c.kick[self.index]),
             UnmodelledKind::OrbitDrift => {
-                cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.wander(c.time));
+                cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.slow_variation(c.time));
             }
             _ => {}
         }
@@ -182,7 +182,7 @@ impl Beyond for Unmodelled {
             UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
             UnmodelledKind::Crosstalk => x + self.size * neighbour,
-            UnmodelledKind::BpmWander => x + self.size * self.wander(time),
+            UnmodelledKind::BpmWander => x + self.size * self.slow_variation(time),
             _ => x,
         };
         if self.index < readings.ncols() && self.next < readings.ncols() {
