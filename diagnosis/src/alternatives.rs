@@ -1,4 +1,4 @@
-//! One effect, given the others: what competes for it, with posterior probabilities.
+//! The alternatives of one finding, given the other findings, with their posterior probabilities.
 
 use nalgebra::DVector;
 
@@ -8,55 +8,55 @@ use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Candidate;
 
-/// Probability from which on a cause is decided.
+/// Probability at which a cause counts as decided.
 pub const DECISIVE: f64 = 0.95;
-/// Probability of something missing from which on a recording is not consistent: where it is less, naming it would often be
-/// wrong, and too many empty recordings would be suspected.
+/// Probability of missing physics above which a recording is not consistent. A lower limit would call too many recordings without
+/// missing physics ambiguous.
 pub const SUSPICIOUS: f64 = 0.6;
 
-/// What may fill a slot.
+/// A possible cause.
 #[derive(Debug, Clone)]
 pub enum Cause {
     /// An effect of the library.
     Effect(Term),
-    /// Something else.
+    /// Physics that the library does not hold.
     Unmodelled(Discrepancy),
 }
 
-/// One cause that competes for a slot.
+/// One of the competing causes.
 #[derive(Debug, Clone)]
 pub struct Alternative {
     /// The cause.
     pub cause: Cause,
     /// `ln` evidence over the fit without it.
     pub log_gain: f64,
-    /// Posterior probability within the slot.
+    /// Posterior probability within the competition.
     pub probability: f64,
     /// Amplitude and its standard deviation, in the unit of the kind.
     pub amplitude: (f64, f64),
-    /// How the vars and other unknowns adapt to it, to first order, in units of their prior standard deviations.
+    /// Change of the vars and other unknowns that it causes, to first order, in units of their prior standard deviations.
     pub adapting: DVector<f64>,
-    /// The exact fit with it, for the leaders.
+    /// The exact fit with it, for the leading causes.
     pub fitted: Option<Fitted>,
 }
 
-/// One effect, given the others: who competes for it.
+/// The alternatives of one effect, given the other effects.
 #[derive(Debug, Clone)]
 pub struct Competition {
-    /// Most likely first; those of any weight.
+    /// Most likely first; those of negligible probability are left out.
     pub alternatives: Vec<Alternative>,
-    /// Probability that nothing fills it.
+    /// Probability that none of them is needed.
     pub nothing: f64,
-    /// `ln` posterior odds of something over nothing.
+    /// `ln` posterior odds of any of them over none.
     pub log_odds: f64,
-    /// All candidates, to first order.
+    /// All candidates of the library, to first order.
     pub scanned: Vec<Candidate>,
-    /// The fit without it.
+    /// The fit without the effect.
     pub without: Fitted,
 }
 
 impl Cause {
-    /// The effect of the library that it is, if any.
+    /// The effect of the library, if it is one.
     pub fn term(&self) -> Option<&Term> {
         match self {
             Self::Effect(term) => Some(term),
@@ -80,7 +80,7 @@ impl Alternative {
         }
     }
 
-    /// One of the terms of a fit, beside the fit without it.
+    /// One of the terms of a fit, compared with the fit without it.
     pub(super) fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
         Self {
             cause: Cause::Effect(fitted.hypothesis.terms[term]),
@@ -92,7 +92,7 @@ impl Alternative {
         }
     }
 
-    /// Something without a class.
+    /// An unmodelled discrepancy.
     pub(super) fn unmodelled(discrepancy: Discrepancy) -> Self {
         Self {
             amplitude: (discrepancy.size, 0.0),
@@ -104,7 +104,7 @@ impl Alternative {
         }
     }
 
-    /// The effect of the library that it is, if any.
+    /// The effect of the library, if it is one.
     pub fn term(&self) -> Option<&Term> {
         self.cause.term()
     }
@@ -119,7 +119,7 @@ impl Alternative {
 const LISTED: f64 = 1e-4;
 
 impl Competition {
-    /// Normalise posterior weights (`ln`, "nothing" having 0).
+    /// Normalise posterior weights (`ln`; that of no effect is 0).
     pub(super) fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
         weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
@@ -137,7 +137,7 @@ impl Competition {
         Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
     }
 
-    /// True if something is likely to fill it.
+    /// True if an effect is likely to be needed.
     pub fn is_suspicious(&self) -> bool {
         1.0 - self.nothing > SUSPICIOUS
     }
@@ -147,7 +147,7 @@ impl Competition {
         self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
     }
 
-    /// Probability of something else.
+    /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
         self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
     }

@@ -1,4 +1,4 @@
-//! The vars, all that may be true taken into account: a mixture over the causes that compete, with their probabilities.
+//! The vars averaged over the competing causes: a mixture, weighted by their posterior probabilities.
 //!
 //! `mean = sum of p m`, `covariance = sum of p (C + (m - mean)(m - mean)^T)`.
 //!
@@ -6,7 +6,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::alternatives::{Cause, DECISIVE, Competition};
+use super::alternatives::{Cause, Competition, DECISIVE};
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
 use super::search::Found;
@@ -21,14 +21,16 @@ pub struct Vars {
 }
 
 impl Vars {
-    /// Those of one fit.
+    /// The vars of one fit.
     pub fn of(fitted: &Fitted) -> Self {
         Self { mean: DVector::from_column_slice(&fitted.params), covariance: fitted.covariance() }
     }
 
-    /// Those of all that may fill the least certain competition.
+    /// The vars averaged over the alternatives of the least certain finding.
     pub fn averaged(found: &Found) -> Self {
-        let certainty = |competition: &&Competition| competition.alternatives.first().map_or(competition.nothing, |a| a.probability);
+        let certainty = |competition: &&Competition| {
+            competition.alternatives.first().map_or(competition.nothing, |a| a.probability)
+        };
         let least = found.competitions.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
@@ -46,11 +48,14 @@ impl Vars {
                 },
                 (None, Cause::Unmodelled(_)) => plain.clone(),
                 (None, Cause::Effect(_)) => {
-                    // to first order: the fit moves along with the amplitude, and shares its uncertainty
+                    // to first order: the vars shift in proportion to the amplitude, and its uncertainty adds to theirs
                     let shift = units.step(&alternative.adapting);
                     let (amplitude, error) = alternative.amplitude;
-                    let along = if amplitude == 0.0 { &shift * 0.0 } else { &shift * (error / amplitude) };
-                    Self { mean: &plain.mean + shift, covariance: &plain.covariance + &along * along.transpose() }
+                    let per_sigma = if amplitude == 0.0 { &shift * 0.0 } else { &shift * (error / amplitude) };
+                    Self {
+                        mean: &plain.mean + shift,
+                        covariance: &plain.covariance + &per_sigma * per_sigma.transpose(),
+                    }
                 }
             };
             parts.push((alternative.probability, part));

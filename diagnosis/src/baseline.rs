@@ -1,34 +1,34 @@
-//! The orbit that the kicks are added to: what the monitors' baselines say of it, and how it moves.
+//! The orbit without kicks, as estimated from the monitors' baselines, and its change with gradients and RF frequency.
 //!
-//! Quadrupoles that stand off their places make an orbit, and the monitors read it with offsets of their own. It moves with all
-//! gradients and with the RF frequency, which is what the readings of a monitor share beside its baseline.
+//! Misaligned quadrupoles make a closed orbit, which the monitors read with their own offsets. It changes with all gradients and with
+//! the RF frequency, and this change is common to the readings of a monitor, as the baseline is.
 
 use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Tunes};
 
 use inference::Screened;
 
-/// What is known of the orbit without kicks.
+/// The orbit without kicks: its size, its changes and its uncertainty.
 #[derive(Debug, Clone)]
 pub struct Baseline {
     /// Rms of the monitors' baselines in x and y [m].
     pub rms: [f64; 2],
     /// Relative change per `ln` of all gradients, in x and y [1].
     pub sensitivity: [f64; 2],
-    /// Standard deviation of what an RF offset does to it beside the dispersion, in x and y [m].
+    /// Standard deviation of its change per RF offset beyond the design dispersion, in x and y [m].
     pub spurious: [f64; 2],
     /// Standard deviation of the orbit at each element (x, y) [m].
     pub sigma: Vec<[f64; 2]>,
 }
 
-/// Offset of a monitor from the orbit [m]: what surveys of such monitors find.
+/// Standard deviation of a monitor's offset [m], typical of surveys of such monitors.
 const OFFSET: f64 = 0.7e-3;
-/// Cotangent of the phase advance of a machine that still keeps its beam.
+/// Largest `|cot(pi Q)|`: a machine nearer to the integer resonance keeps no beam.
 const STEEPEST: f64 = 20.0;
 
 impl Baseline {
-    /// The orbit (x, y) at every element [m], and what is known of it, by readings without what the kicks do (rows frames, columns
-    /// monitors) and recorded tunes. `per_rms`: what an RF offset does beside the dispersion, per rms of the baselines.
+    /// The orbit (x, y) at every element [m] and its properties, from the readings less the response to the kicks (rows frames, columns
+    /// monitors) and the recorded tunes. `per_rms`: change per RF offset beyond the design dispersion, per rms of the baselines.
     ///
     /// # Errors
     /// [`OrbitError`] if the ring has no orbit.
@@ -44,7 +44,7 @@ impl Baseline {
         let rms = [rms(&baselines[..split]), rms(&baselines[split..])];
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
-        // an orbit's change with the momentum grows towards the integer as that with the gradients does
+        // towards the integer resonance the orbit's change with the momentum grows as its change with the gradients does
         let of_design = self::sensitivity(&DMatrix::zeros(0, 2), &tunes);
         let growth = [0, 1].map(|plane| (sensitivity[plane] / of_design[plane]).max(1.0));
         let spurious = [0, 1].map(|plane| per_rms[plane] * rms[plane] * growth[plane]);
@@ -59,8 +59,8 @@ impl Baseline {
 }
 
 /// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with
-/// the tune: `1 + pi |cot(pi Q) dQ/dln k|`, the 1 for the kicks' own growth, `dQ/dln k` the natural chromaticity, about the tune itself. The
-/// recorded tune knows how near the integer is.
+/// the tune: `1 + pi |cot(pi Q) dQ/dln k|`, where the 1 is the growth of the kicks themselves and `dQ/dln k`, the
+/// natural chromaticity, is about the tune itself. The recorded tune gives the distance to the integer resonance.
 ///
 /// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
 fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
@@ -72,7 +72,7 @@ fn sensitivity(recorded: &DMatrix<f64>, design: &Tunes) -> [f64; 2] {
     })
 }
 
-/// Mean of each monitor's readings [m]; none for a silent one.
+/// Mean of each monitor's readings [m]; none for a monitor without readings.
 fn means(readings: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
     let of = |b: usize| {
         let counts = |i: usize| screened.accepted[(i, b)] && !readings[(i, b)].is_nan();
@@ -91,7 +91,7 @@ fn rms(values: &[Option<f64>]) -> f64 {
 type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
 
 /// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard
-/// deviation: kicks of random size at all quadrupoles, as many as explain the baselines' rms.
+/// deviation: random kicks at all quadrupoles, of the size that explains the baselines' rms.
 ///
 /// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
 fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {

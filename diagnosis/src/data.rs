@@ -1,13 +1,13 @@
-//! A recording as one vector of independent numbers of variance 1.
+//! A recording whitened: one vector of independent numbers of variance 1.
 //!
-//! The readings of a monitor share what nobody knows of it: its baseline (orbit and offset), how that moves with the supplies
-//! and with the RF frequency (the misalignments' doing), and, where all quadrupoles drift, with the time. Each is a vector `u`
-//! over the frames with an unknown factor of known standard deviation, so that the readings' covariance is
+//! The readings of a monitor have unknown terms in common: its baseline (orbit and offset), the change of that with the supplies and
+//! with the RF frequency (caused by misalignments), and, where all quadrupoles drift, with the time. Each is a vector `u` over the
+//! frames with an unknown factor of known standard deviation, so that the readings' covariance is
 //!
 //! `S = sigma^2 (1 + U U^T)`, and with the thin decomposition `U = Q D V^T`,
 //! `S^(-1/2) = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T)/sigma`.
 //!
-//! Whitened once, everything that follows is plain least squares. The tune meter adds four numbers: the mean of each tune and
+//! For whitened data every fit is plain least squares. The tune meter adds four numbers: the mean of each tune and
 //! its change from start to end.
 
 use estimator::{Health, MonitorState};
@@ -31,31 +31,31 @@ pub struct Data {
     pub ring: Ring,
     /// The params in units of their priors.
     pub units: Units,
-    /// What drove the beam, and the orbit it started from.
+    /// Kicks, RF offset and time of each frame, and the orbit without kicks.
     pub drives: Drives,
-    /// What is known of that orbit.
+    /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
     /// Which readings count, and the state of the monitors.
     pub screened: Screened,
     /// `ln` of each supply's mean factor [F].
     pub supplies: Vec<f64>,
-    /// Readings at the mean supply currents, without what the orbit has beyond first order in kicks and RF offset, rows frames,
+    /// Readings at the mean supply currents, the orbit's terms above first order in kicks and RF offset subtracted, rows frames,
     /// columns monitors [m].
     pub readings: DMatrix<f64>,
-    /// As recorded [m]; one that is missing is not a number.
+    /// Readings as recorded [m]; NaN for one that is missing.
     recorded: DMatrix<f64>,
     /// `ln` of each supply's factor off its mean, of each frame [F].
     fluctuation: Vec<DVector<f64>>,
     /// Noise of a reading of each monitor by the recording's header [B] [m].
     pub expected_noise: Vec<f64>,
     channels: Vec<Channel>,
-    /// Tunes at the mean supply currents, rows frames; not a number where they do not count.
+    /// Tunes at the mean supply currents, rows frames; NaN where they do not count.
     tunes: DMatrix<f64>,
     recorded_tunes: DMatrix<f64>,
     meter: [Option<Meter>; 2],
-    /// What the operators believe the machine holds instead of the momentum.
+    /// The constraint that the header states instead of a fixed momentum.
     pub believed: Vec<Effect>,
-    /// What each monitor's readings share, in standard deviations, but for RF frequency and drift [frames][factors] [m].
+    /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
@@ -80,19 +80,19 @@ pub enum DataError {
     /// The design has no orbit.
     #[error("the ring as designed: {0}")]
     Orbit(#[from] OrbitError),
-    /// Too little to tell anything from.
+    /// Too few data for a diagnosis.
     #[error("{recording}: {what}: expected at least {expected}, found {found}")]
     TooLittle {
         /// The recording.
         recording: String,
-        /// What is too few.
+        /// Name of what there is too little of.
         what: &'static str,
         /// How many are needed.
         expected: usize,
         /// How many there are.
         found: usize,
     },
-    /// An effect that the ring cannot have.
+    /// An effect that is not defined for this ring.
     #[error(transparent)]
     Effect(#[from] EffectError),
     /// No hypothesis can be fitted.
@@ -102,9 +102,9 @@ pub enum DataError {
 
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
-/// Whitened residual from which a reading of a monitor that is known to be faulty is one of its faults.
+/// Whitened residual above which a reading of a faulty monitor is dropped.
 const FAULTY: f64 = 4.0;
-/// Monitors and correctors below which nothing can be told apart.
+/// Fewest monitors, and fewest correctors, for a diagnosis.
 pub const LEAST: usize = 4;
 
 impl Data {
@@ -160,10 +160,10 @@ impl Data {
         Ok(data)
     }
 
-    /// Take away from the recorded readings and tunes what depends on the machine, and little on the details of its model: what the
-    /// supplies' fluctuations do to the kicked orbit, to first order, and what exact orbits have beyond first order: by the
-    /// bends' curvature up to some 10 um for kicks of 0.2 mrad, more near an integer tune. Returns the chi-square of what the
-    /// readings change by.
+    /// Linearise the recorded readings and tunes about a machine: subtract the effect of the supplies' fluctuations on the kicked orbit,
+    /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
+    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. Returns the
+    /// chi-square of the change of the readings.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
@@ -185,7 +185,7 @@ impl Data {
         Ok(moved.norm_squared())
     }
 
-    /// Drop readings of monitors known to be faulty that a fit says are far off: jumps that the screening took for a first reading.
+    /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting.
     pub fn trim(&mut self, residual: &DVector<f64>) {
         for (r, place) in residual.iter().zip(self.places()) {
             if let Some((frame, b)) = place
@@ -198,7 +198,7 @@ impl Data {
         self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
     }
 
-    /// What the exact orbits of a machine have beyond first order in kicks and RF offset, rows frames; repeats share it [m].
+    /// Terms of the exact orbits of a machine above first order in kicks and RF offset, rows frames, the same for all repeats [m].
     fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
         let tracked = Tracked::of(machine.clone(), self.drives.nominal_kick)?;
         let settings = Settings::of(&self.drives);
@@ -239,7 +239,7 @@ impl Data {
         data
     }
 
-    /// A campaign like this one with other drives, for what it would say: its readings are of no use.
+    /// A hypothetical campaign with other drives; its readings are ignored.
     pub fn driven_by(&self, drives: &Drives) -> Self {
         let mut data = Self { drives: drives.clone(), ..self.clone() };
         data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
@@ -264,7 +264,7 @@ impl Data {
         Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
     }
 
-    /// What readings of a monitor in some frames share, in standard deviations [frames][factors] [m].
+    /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(b >= self.ring.horizontal_monitors());
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
@@ -275,7 +275,7 @@ impl Data {
         if drift == 0.0 {
             return shared;
         }
-        // to second order: near an integer tune an orbit grows faster than the quadrupoles drift
+        // to second order in time: near an integer tune the orbit grows faster than the gradients drift
         let time = |power: i32| {
             let relative = (drift * self.baseline.sensitivity[plane]).powi(power) * self.baseline.rms[plane];
             DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i].powi(power) * relative))
@@ -299,7 +299,7 @@ impl Data {
         enough("correctors that were moved", LEAST, self.driven_correctors().len())
     }
 
-    /// Correctors that were set to something, by index.
+    /// Correctors that were powered, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
         let moved = |&c: &usize| self.drives.kick.column(c).amax() > 0.05 * self.drives.nominal_kick;
         (0..self.drives.kick.ncols()).filter(moved).collect()
@@ -320,7 +320,7 @@ impl Data {
         self.channels.iter().map(|c| c.log_det).sum()
     }
 
-    /// The readings, less those that a machine of these tunes predicts.
+    /// Whitened residuals: readings and tunes less those predicted.
     pub fn residual(&self, predicted: &DMatrix<f64>, tunes: Tunes, tune_drift: [f64; 2]) -> DVector<f64> {
         let miss = [0, 1].map(|plane| {
             let predicted = Vector2::new([tunes.x, tunes.y][plane], tune_drift[plane]);
@@ -329,7 +329,7 @@ impl Data {
         self.whiten(|b, frame| self.readings[(frame, b)] - predicted[(frame, b)], miss)
     }
 
-    /// Readings [m] and tunes [1] as columns, less those predicted; a tune is known up to an integer.
+    /// Readings [m] and tunes [1] as columns, less those predicted, for a tune modulo 1.
     pub fn miss(&self, predicted: &DMatrix<f64>) -> DMatrix<f64> {
         let monitors = self.readings.ncols();
         let mut miss = -predicted;
@@ -359,8 +359,8 @@ impl Data {
             for (to, &frame) in part.iter_mut().zip(&channel.frames) {
                 *to = value(b, frame) / channel.sigma;
             }
-            let along = channel.basis.tr_mul(&part).component_mul(&channel.shrink);
-            part.gemv(-1.0, &channel.basis, &along, 1.0);
+            let common = channel.basis.tr_mul(&part).component_mul(&channel.shrink);
+            part.gemv(-1.0, &channel.basis, &common, 1.0);
             at += n;
         }
         for tune in tunes {
@@ -370,7 +370,7 @@ impl Data {
         all
     }
 
-    /// Frame and monitor of each whitened number; the tune meter's have none.
+    /// Frame and monitor of each whitened number; none for those of the tune meter.
     pub fn places(&self) -> Vec<Option<(usize, usize)>> {
         let of = |(b, channel): (usize, &Channel)| channel.frames.iter().map(|&i| Some((i, b))).collect::<Vec<_>>();
         self.channels.iter().enumerate().flat_map(of).chain([None; 4]).collect()
@@ -381,8 +381,8 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// A monitor's residuals about its baseline, and about that baseline's drift where the hypothesis says that it drifts: the
-    /// drift's factors are at their most likely values, `(1 + U^T U/sigma^2)^-1 U^T r/sigma^2`. `residual` has a row for every frame.
+    /// A monitor's residuals about its baseline, and about the drift of that baseline where the hypothesis holds one: the
+    /// factors of the drift are at their most likely values, `(1 + U^T U/sigma^2)^-1 U^T r/sigma^2`. `residual` has a row for every frame.
     pub fn about_baseline(&self, b: usize, residual: &DVector<f64>) -> DVector<f64> {
         let frames = self.frames(b);
         let mut own = residual.select_rows(frames);
@@ -402,9 +402,9 @@ impl Data {
     pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let channel = &self.channels[b];
         let mut part = columns.select_rows(&channel.frames) / channel.sigma;
-        let mut along = channel.basis.transpose() * &part;
-        along.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
-        part -= &channel.basis * along;
+        let mut common = channel.basis.transpose() * &part;
+        common.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
+        part -= &channel.basis * common;
         part
     }
 
@@ -418,12 +418,12 @@ impl Data {
         &self.channels[b].frames
     }
 
-    /// What readings of a monitor share in some frames, in standard deviations [frames][factors] [m].
+    /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
         self.shared_of(b, frames, self.drift)
     }
 
-    /// Mean over the monitors of what the recording's header expects as their noise [m].
+    /// Noise of a reading by the recording's header, mean over the monitors [m].
     pub fn mean_noise(&self) -> f64 {
         self.expected_noise.iter().sum::<f64>() / self.expected_noise.len().max(1) as f64
     }
@@ -439,7 +439,7 @@ impl Data {
         (0..self.tunes.nrows()).filter(counts).collect()
     }
 
-    /// Noise of one reading of the tune meter [1], if it has been read often enough.
+    /// Noise of one reading of the tune meter [1], if there are enough readings.
     pub fn tune_noise(&self, plane: usize) -> Option<f64> {
         self.meter[plane].as_ref().map(|meter| meter.noise)
     }
@@ -464,7 +464,7 @@ impl Channel {
     }
 }
 
-/// What the recording's header says was held, as an effect.
+/// The constraint that the header states, as an effect.
 fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
     let pair = recording.header.radial_loop_monitors.as_ref();
     let held = match recording.header.believed_rf {

@@ -1,12 +1,13 @@
-//! Something without a class: a part of the data that the fit does not describe, located as well as may be.
+//! An unmodelled discrepancy: a part of the data that no effect of the library describes, and its most likely location.
 //!
-//! Each place is given freedom of its own: one unknown number of standard deviation `omega` for every setting (or stretch of
-//! time) at a monitor, a corrector or a place in the ring that kicks the beam. With `Z` the whitened pattern of those numbers,
-//! `P` the projection that takes away what the fit can imitate, `g = Z^T P r` and `G = Z^T P Z`:
+//! Each place is tried with free amplitudes: one of standard deviation `omega` for every setting (or stretch of time) at a monitor, a
+//! corrector or a place in the ring that kicks the beam. With `Z` the whitened pattern of those amplitudes,
+//! `P` the projection that removes what the fit's unknowns can absorb, `g = Z^T P r` and `G = Z^T P Z`:
 //!
 //! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,
 //!
-//! averaged over omega from well below the noise to millimetres. It needs no idea of the physics, and pays for its freedom.
+//! averaged over omega from well below the noise to millimetres. It assumes nothing of the physics; the determinant corrects for the
+//! number of free amplitudes.
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
@@ -19,22 +20,22 @@ use super::fit::{FitError, Fitted};
 use super::location::Location;
 use super::settings::Settings;
 
-/// Freedom at one place, and what the data say of it.
+/// Free amplitudes at one place, and their evidence.
 #[derive(Debug, Clone)]
 pub struct Discrepancy {
     /// The place.
     pub at: Location,
     /// `ln` Bayes factor over the fit.
     pub log_bayes: f64,
-    /// Most likely standard deviation of the unknown numbers [m at the monitors].
+    /// Most likely standard deviation of the amplitudes [m at the monitors].
     pub size: f64,
     /// Places of the same sort.
     pub sites: usize,
-    /// What the fit's unknowns become, where the data ask for the freedom.
+    /// The fit's unknowns with these amplitudes, where the evidence for them is strong.
     pub adapted: Option<Adapted>,
 }
 
-/// The unknowns of a fit beside the freedom, which is marginalised: how they move, and their covariance, to first order.
+/// The unknowns of a fit together with the free amplitudes, which are marginalised: step and covariance, to first order.
 #[derive(Debug, Clone)]
 pub struct Adapted {
     /// Step from the fit, in prior standard deviations.
@@ -45,31 +46,31 @@ pub struct Adapted {
 
 /// Standard deviations tried [m].
 const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
-/// `ln` Bayes factor from which on the data ask for the freedom.
+/// `ln` Bayes factor above which the fit's unknowns are adapted.
 const ASKED: f64 = 3.0;
 /// Stretches of time.
 const STRETCHES: usize = 8;
-/// What a column of norm 1 has to add to those before it.
+/// Least norm that a column of norm 1 has at right angles to those before it.
 const DEPENDENT: f64 = 1e-8;
-/// Highest power of the position in what a monitor may read.
+/// Highest power of the position that a monitor's reading may contain.
 const POWERS: usize = 5;
 
-/// Sums of one monitor's whitened numbers over sums (settings or stretches of time).
+/// Sums of whitened numbers over settings or stretches of time, one group for each amplitude.
 struct Sums {
     /// `E^T S^-1 E`.
     gram: DMatrix<f64>,
-    /// `E^T S^(-1/2) J`, rows sums.
+    /// `E^T S^(-1/2) J`, rows groups.
     cross: DMatrix<f64>,
     /// `E^T S^(-1/2) r`.
     pull: DVector<f64>,
 }
 
-/// Everything that a scan needs of a fit.
+/// A fit, linearised at its best point.
 struct Linearised<'f> {
     fitted: &'f Fitted,
 }
 
-/// Give freedom to every place in turn.
+/// Try every place in turn.
 ///
 /// # Errors
 /// [`FitError`].
@@ -81,7 +82,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &settings.indicator())).collect();
     let stretches = stretches(data);
     let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &stretches)).collect();
-    // monitors known to be faulty scatter as they like
+    // faulty monitors scatter by themselves
     let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
     let active: Vec<usize> = data.active_monitors().into_iter().filter(healthy).collect();
     if active.is_empty() {
@@ -134,7 +135,7 @@ fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {
 }
 
 impl Linearised<'_> {
-    /// Projected pull and Gram matrix of some numbers.
+    /// Projected pull and Gram matrix of some amplitudes.
     fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
         let taken = self.fitted.free.solve(&sums.cross.transpose());
         let pull = &sums.pull - taken.tr_mul(&self.fitted.slope);
@@ -147,7 +148,7 @@ impl Linearised<'_> {
         self.conclude(Discrepancy::of(at, logs, sites), &[sums])
     }
 
-    /// Many monitors with one size, the fit's own unknowns held: less than the truth, as they would adapt.
+    /// Many monitors with one size, the fit's unknowns held: a lower limit of the evidence, as they would adapt.
     fn judge_held(&self, at: Location, each: &[&Sums]) -> Discrepancy {
         let mut logs = [0.0; SIZES.len()];
         for sums in each {
@@ -156,7 +157,7 @@ impl Linearised<'_> {
         self.conclude(Discrepancy::of(at, logs, 1), each)
     }
 
-    /// With what the fit's unknowns become.
+    /// Add the adapted unknowns of the fit.
     fn conclude(&self, found: Discrepancy, each: &[&Sums]) -> Discrepancy {
         let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
         Discrepancy { adapted, ..found }
@@ -166,7 +167,7 @@ impl Linearised<'_> {
     fn adapted(&self, each: &[&Sums], size: f64) -> Option<Adapted> {
         let lower = self.fitted.factor.l();
         let mut information = &lower * lower.transpose();
-        // all vars free here, as one at a bound may come off it
+        // all vars are free here, since one at a bound may leave it
         let mut slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u;
         for sums in each {
             let mut gram = sums.gram.clone();
@@ -191,7 +192,7 @@ impl Discrepancy {
     }
 }
 
-/// `ln` Bayes factor of unknown numbers of one size, given their projected pull and Gram matrix.
+/// `ln` Bayes factor of free amplitudes of one standard deviation, given their projected pull and Gram matrix.
 pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let variance = size * size;
     let mut grown = gram * variance;
@@ -209,7 +210,7 @@ fn stretches(data: &Data) -> DMatrix<f64> {
     })
 }
 
-/// Steps of a gain, which leave its mean alone: the steps times what is predicted, of rms 1, less their share of it.
+/// Steps of a gain about its mean: the steps times the predicted readings, scaled to rms 1, less their projection on these.
 fn scaled(stretches: &DMatrix<f64>, predicted: &DVectorView<f64>) -> DMatrix<f64> {
     let rms = (predicted.norm_squared() / predicted.len() as f64).sqrt().max(f64::MIN_POSITIVE);
     let mut columns = stretches.clone();
@@ -224,7 +225,7 @@ fn powers(position: &DVectorView<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(position.len(), POWERS, |i, power| (position[i] / scale).powi(power as i32 + 1))
 }
 
-/// The same space spanned by columns at right angles, each of rms 1; a column that adds nothing is left out.
+/// Orthogonal columns of rms 1 that span the same space; linearly dependent ones are left out.
 fn independent(mut columns: DMatrix<f64>) -> DMatrix<f64> {
     let rows = columns.nrows() as f64;
     columns.column_iter_mut().for_each(|mut column| column /= column.norm().max(f64::MIN_POSITIVE));
@@ -234,7 +235,7 @@ fn independent(mut columns: DMatrix<f64>) -> DMatrix<f64> {
     q.select_columns(&adds) * rows.sqrt()
 }
 
-/// Orbit at the read monitors for a kick at each quadrupole in each plane, of rms 1.
+/// Orbit at the read monitors for a kick at each quadrupole in each plane, scaled to rms 1.
 fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, FitError> {
     let ring = machine.ring();
     let optics = twin::Optics::of(ring, twin::Hold::Momentum { delta: 0.0 })?;
@@ -253,7 +254,7 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
     Ok(of_plane(Plane::X).chain(of_plane(Plane::Y)).collect())
 }
 
-/// One number for each setting that all monitors see by a pattern.
+/// One amplitude for each setting, common to all monitors with a fixed pattern.
 fn weighted(sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
     let first = &sums[monitors[0]];
     let mut sum = Sums::none(first.cross.nrows(), first.cross.ncols());
@@ -265,7 +266,7 @@ fn weighted(sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
     sum
 }
 
-/// One number for each pattern over the monitors (one a column), in proportion to `setting`.
+/// One amplitude for each pattern over the monitors (one a column), in proportion to `setting`.
 fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
     let mut sum = Sums::none(patterns.ncols(), sums[monitors[0]].cross.ncols());
     for &b in monitors {
@@ -277,7 +278,7 @@ fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns
     sum
 }
 
-/// One number for each monitor and each of some settings.
+/// One amplitude for each monitor and each of some settings.
 fn blocks(sums: &[Sums], monitors: &[usize], settings: &[usize]) -> Sums {
     let (m, p) = (settings.len(), sums[monitors[0]].cross.ncols());
     let n = m * monitors.len();
@@ -307,15 +308,9 @@ impl Data {
         }
     }
 
-    /// Sums of one tune's numbers over the columns of `indicator`, its mean left alone, in units that make its noise as large as
-    /// that of a monitor; none if the tune meter says too little.
-    fn tune_sums(
-        &self,
-        plane: usize,
-        miss: &DMatrix<f64>,
-        fitted: &Fitted,
-        indicator: &DMatrix<f64>,
-    ) -> Option<Sums> {
+    /// Sums of one tune's numbers over the columns of `indicator`, about its mean, in units that make its noise as large as
+    /// that of a monitor; none if the tune meter has too few readings.
+    fn tune_sums(&self, plane: usize, miss: &DMatrix<f64>, fitted: &Fitted, indicator: &DMatrix<f64>) -> Option<Sums> {
         let noise = self.tune_noise(plane)?;
         let miss = miss.column(self.readings.ncols() + plane);
         let frames = self.tune_frames(plane);
@@ -332,7 +327,7 @@ impl Data {
         })
     }
 
-    /// A signature that is there from each edge of time on, in units that move the readings by 1 rms.
+    /// A signature that sets in at each edge of time, scaled to an rms of 1 at the readings.
     fn stepped(
         &self,
         signature: &twin::Signature,

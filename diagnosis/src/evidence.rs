@@ -1,8 +1,8 @@
 //! The Gaussian about the best point of a fit, within the range of the vars.
 //!
-//! A var that is pulled against a bound is held there: the others' Gaussian is that given its value, and along it the density falls as
-//! `exp(-g x - h x^2/2)` from the bound, g its slope and h its curvature with the others adapting. Of a var that is free the part
-//! of its normal within the range counts, as if the vars were independent.
+//! A var whose best value lies at a bound is held there: the Gaussian of the others is that given its value, and its own density falls
+//! as `exp(-g x - h x^2/2)` from the bound, g the slope and h the curvature with the others adapting. For a free var the evidence
+//! contains the part of its normal distribution within the range, as if the vars were independent.
 
 use std::collections::BTreeMap;
 
@@ -11,9 +11,9 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use inference::Prior;
 use inference::bounded::Coordinates;
 
-/// Precision of a var that is held.
+/// Precision given to a var that is held.
 const HELD: f64 = 1e12;
-/// How near a bound a var is at it, in prior standard deviations.
+/// Distance from a bound within which a var counts as at the bound, in prior standard deviations.
 const AT: f64 = 1e-9;
 
 /// Params `theta = ln var` in units of their prior standard deviations, `u = (theta - mean)/sigma` [N].
@@ -78,7 +78,7 @@ impl Units {
     }
 }
 
-/// A Gaussian and what the range leaves of it.
+/// A Gaussian, and the share of it within the range.
 pub struct Within {
     /// Factor of the precision, the held vars at their bounds.
     pub free: Cholesky<f64, Dyn>,
@@ -109,9 +109,9 @@ impl Within {
         let free = matrix.cholesky()?;
         let mut log_inside = 0.0;
         for (&i, &pull) in &held {
-            let along =
+            let coupling =
                 precision.column(i).map_with_location(|row, _, h| if held.contains_key(&row) { 0.0 } else { h });
-            log_inside += log_tail(pull, precision[(i, i)] - along.dot(&free.solve(&along)));
+            log_inside += log_tail(pull, precision[(i, i)] - coupling.dot(&free.solve(&coupling)));
         }
         let covariance = free.inverse();
         for i in (0..vars).filter(|i| !held.contains_key(i)) {

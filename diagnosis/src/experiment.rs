@@ -1,7 +1,7 @@
-//! What to measure next: how far one more campaign of the same length would take two causes apart.
+//! Experiment design: how well one more campaign of the same length would separate two causes.
 //!
-//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), with the whitened signatures of the old and the
-//! new campaign below each other, all vars adapting.
+//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), from the whitened signatures of the present and
+//! the new campaign together, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Machine, Quadrupole, Signatures};
@@ -11,32 +11,32 @@ use super::fit::{FitError, Fitted};
 use super::hypothesis::Term;
 use super::scan::Rivals;
 
-/// One thing that could be done.
+/// One possible measurement.
 #[derive(Debug, Clone)]
 pub struct Proposal {
-    /// What, in words that follow "A second campaign".
+    /// Its description, to follow "A second campaign".
     pub what: String,
-    /// Expected `ln` Bayes factor between the two causes, old and new campaign together.
+    /// Expected `ln` Bayes factor between the two causes, present and new campaign together.
     pub separation: f64,
 }
 
-/// The menu for two causes, best first, and the separation that the present campaign can expect.
+/// The possible measurements for two causes, best first, and the separation expected of the present campaign.
 #[derive(Debug, Clone)]
 pub struct Menu {
-    /// Expected now.
+    /// Expected of the present campaign.
     pub present: f64,
-    /// What could be done.
+    /// Possible measurements.
     pub proposals: Vec<Proposal>,
 }
 
-/// Change of a family's gradients that is tried [1]: tunes move by some 0.05.
+/// Change of a family's gradients that is tried [1]: tunes change by some 0.05.
 const RETUNE: f64 = 0.01;
-/// RF offset that is tried [1], as large as those of a dispersion measurement.
+/// RF offset that is tried [1], as in a dispersion measurement.
 const RF_STEP: f64 = 4e-4;
 /// Rigidity of an earlier moment of the cycle, relative.
 const EARLIER: f64 = 0.5;
 
-/// Derivatives of one campaign.
+/// Derivatives of the whitened data of one campaign.
 struct Derivatives {
     jacobian: DMatrix<f64>,
     one: DVector<f64>,
@@ -44,7 +44,7 @@ struct Derivatives {
 }
 
 impl Menu {
-    /// For a cause of some amplitude and what competes with it (another, or nothing), beside a fit.
+    /// For a cause of some amplitude and its rival (another cause, or none), beside a fit.
     ///
     /// # Errors
     /// [`FitError`].
@@ -55,7 +55,7 @@ impl Menu {
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
-            // a machine that would lose its beam is no proposal
+            // a machine that would lose its beam is not proposed
             let Ok(new) = Derivatives::of(data, &machine, &drives, one.0, other, weight) else { continue };
             proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, free) });
         }
@@ -65,7 +65,7 @@ impl Menu {
 }
 
 impl Derivatives {
-    /// `weight`: how much larger the cause is than now.
+    /// `weight`: size of the cause over its present size.
     fn of(
         data: &Data,
         machine: &Machine,
@@ -88,7 +88,7 @@ impl Derivatives {
     }
 }
 
-/// What could be done: words, machine, drives, and the weight of stray fields.
+/// Possible measurements: description, machine, drives, and the weight of stray fields.
 fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<(String, Machine, Drives, f64)> {
     let ring = machine.ring();
     let retuned = |supply: usize, factor: f64| {
@@ -117,7 +117,7 @@ fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec
     }
     if one.kind.is_stray() {
         let stronger = Drives { kick: &drives.kick / EARLIER, ..drives.clone() };
-        let what = "earlier in the cycle, at half the momentum, where a stray field weighs twice as much".to_owned();
+        let what = "earlier in the cycle, at half the momentum, where a stray field has twice the effect".to_owned();
         all.push((what, machine.clone(), stronger, 1.0 / EARLIER));
     }
     all

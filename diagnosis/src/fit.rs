@@ -1,11 +1,11 @@
-//! The best vars and amplitudes of a hypothesis with the exact twin, and its evidence.
+//! The fit of a hypothesis: its best vars and amplitudes with the exact twin, and its evidence.
 //!
 //! In units of their prior standard deviations all unknowns `u` are standard normal, and the data whitened, so that
 //!
 //! `cost = |r(u)|^2 + |u|^2`, `ln evidence = -cost/2 - ln det(1 + J^T J)/2` (Laplace),
 //!
-//! minimised by damped Gauss-Newton within the range of the vars (what that takes from the integral: [`super::evidence`]). The
-//! normalisation of the data is the same for all hypotheses but those that change their covariance, and is counted.
+//! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::evidence`]). The normalisation of
+//! the data is included, since hypotheses with drifting baselines change their covariance.
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
@@ -19,7 +19,7 @@ use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise}
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]
 pub struct Fitted {
-    /// What is fitted.
+    /// The hypothesis that is fitted.
     pub hypothesis: Hypothesis,
     /// Vars and other unknowns, in units of their prior standard deviations.
     pub u: DVector<f64>,
@@ -46,9 +46,9 @@ pub struct Fitted {
 }
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
-/// Chi-square per number beyond which a fit is far off.
+/// Chi-square per number above which a fit is poor.
 const GROSS: f64 = 1.3;
-/// Steps after which a fit is given up whose cost is larger than a rival's by this factor.
+/// Number of steps after which a fit is abandoned if its cost exceeds a rival's by a factor, and that factor.
 const TRIAL: usize = 4;
 const HOPELESS: f64 = 1.5;
 /// Step of an amplitude for its derivative, in prior standard deviations.
@@ -72,7 +72,7 @@ struct Point {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FitError {
-    /// No stable machine where the fit begins, or an effect that the ring cannot have.
+    /// No stable machine where the fit begins, or an effect that is not defined for this ring.
     #[error(transparent)]
     Effect(#[from] EffectError),
     /// A derivative is so large, or not a number, that the normal matrix is not positive.
@@ -95,7 +95,7 @@ impl Fitted {
         Self::against(data, hypothesis, guess, f64::INFINITY)
     }
 
-    /// The same, given up after a few steps if the cost stays far above that of a rival.
+    /// The same, abandoned after a few steps if the cost stays far above that of a rival.
     ///
     /// # Errors
     /// [`FitError`].
@@ -190,17 +190,17 @@ impl Fitted {
         Ok((-0.5 * (residual.norm_squared() + u.norm_squared()), slope))
     }
 
-    /// True where the fit is so far off that its vars are bent out of shape.
+    /// True where the fit is so poor that its vars are strongly biased.
     pub fn is_gross(&self) -> bool {
         self.residual.norm_squared() > GROSS * self.residual.len() as f64
     }
 
-    /// `ln` posterior at the best point, up to a constant of the recording: evidence without the freedom of the unknowns.
+    /// `ln` posterior at the best point, up to a constant of the recording: the evidence without its determinant.
     pub fn log_posterior(&self, data: &Data) -> f64 {
         -0.5 * (self.cost + self.data(data).log_det())
     }
 
-    /// Amplitude and standard deviation of a term, the vars' range left out of the latter; (1, 0) without one.
+    /// Amplitude and standard deviation of a term, the latter without the vars' range; (1, 0) for a switch, which has no amplitude.
     pub fn amplitude(&self, data: &Data, term: usize) -> (f64, f64) {
         self.unknown(data, term).map_or((1.0, 0.0), |(at, scale)| {
             let mut unit = DVector::zeros(self.u.len());
@@ -209,7 +209,7 @@ impl Fitted {
         })
     }
 
-    /// Which of the unknowns is the amplitude of a term, and its prior standard deviation.
+    /// Index of the amplitude of a term among the unknowns, and its prior standard deviation.
     pub fn unknown(&self, data: &Data, term: usize) -> Option<(usize, f64)> {
         let unknowns = self.hypothesis.unknowns(data);
         unknowns.iter().enumerate().find_map(|(i, unknown)| match unknown {
@@ -218,7 +218,7 @@ impl Fitted {
         })
     }
 
-    /// The machine at the best point, and what drives it.
+    /// The machine at the best point, and its drives.
     ///
     /// # Errors
     /// [`EffectError`].
@@ -268,7 +268,7 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines (and their drift) taken out, per degree
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines (and their drift) subtracted, per degree
     /// of freedom (readings less baselines less vars).
     ///
     /// # Errors
@@ -276,13 +276,13 @@ impl Fitted {
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
         let data = self.data(data);
         let miss = data.miss(&self.predicted(data)?);
-        let (mut sum, mut freedom) = (0.0, -(self.params.len() as f64));
+        let (mut sum, mut degrees) = (0.0, -(self.params.len() as f64));
         for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
             let own = data.about_baseline(b, &miss.column(b).into_owned());
             sum += own.norm_squared() / data.expected_noise[b].powi(2);
-            freedom += own.len() as f64 - 1.0;
+            degrees += own.len() as f64 - 1.0;
         }
-        Ok(sum / freedom)
+        Ok(sum / degrees)
     }
 
     /// Covariance of `ln` of the vars.

@@ -1,11 +1,11 @@
-//! How well a hypothesis predicts frames that it was not fitted to.
+//! Held-out frames: how well a hypothesis predicts frames that it was not fitted to.
 //!
 //! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
 //! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z`, of a monitor or of the tune meter, has a
-//! normal density: the mean is the prediction `h` with what the kept readings of that instrument say of its shared factors
-//! (baseline, calibration and the like, `U`, known to `C`),
+//! normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
+//! like, `U`) as estimated from its kept readings with covariance `C`,
 //!
-//! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less what the factors take.
+//! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less its projection on the common terms.
 //!
 //! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
 //! standard error of its mean over readings: given the model they are independent, also within a frame, and an effect of one corrector
@@ -27,7 +27,7 @@ use inference::recording::Recording;
 /// Frames that are left out together.
 pub type Fold = Vec<usize>;
 
-/// Standard errors by which held-out frames have to be predicted better.
+/// Number of standard errors by which the prediction of held-out frames has to improve.
 pub const VALIDATED: f64 = 2.0;
 /// Folds at most.
 const FOLDS: usize = 5;
@@ -41,7 +41,7 @@ pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
         let key = (set.collect::<Vec<_>>(), row.rf_offset.to_bits());
         let settings = seen.len();
         let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
-        // settings begin in different folds, so that one that is never repeated does not fall in with all others
+        // settings begin in different folds, so that those without repeats are spread over all folds
         folds[(*setting + *repeat) % FOLDS].push(i);
         *repeat += 1;
     }
@@ -65,7 +65,7 @@ pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
     folds
 }
 
-/// What the left-out readings say of a hypothesis.
+/// The held-out predictions of a hypothesis, scored.
 #[derive(Debug, Clone)]
 pub struct Score {
     /// Log density of each reading, rows frames, columns monitors and the two tunes; 0 for one that does not count.
@@ -133,8 +133,8 @@ struct Left {
     variance: f64,
 }
 
-/// One column of what a frame holds, a monitor or a tune: kept frames, left-out ones, noise, and what their readings share, in
-/// standard deviations.
+/// One column of a frame, a monitor or a tune: kept frames, left-out ones, noise, and the common terms of their readings, in standard
+/// deviations.
 struct Column {
     index: usize,
     kept: Vec<usize>,
@@ -173,7 +173,7 @@ fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Lef
         let Some(normal) = normal.cholesky() else { continue };
         let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], at)]);
         let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, at)]));
-        // what the kept readings say of the factors, of the residual and of each derivative
+        // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
         let back = u_in.transpose() / column.variance;
         let factors = normal.solve(&(&back * of(&column.kept)));
         let innovation = of(&column.out) - u_out * factors;
@@ -193,6 +193,6 @@ pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitE
     let vars = fitted.params.len();
     let without: Hypothesis = fitted.hypothesis.without(term);
     let near = Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned());
-    // vars that kept the beam with the term need not keep it without
+    // vars that are stable with the term may be unstable without it
     near.or_else(|_| Fitted::of(data, &without, &DVector::zeros(vars)))
 }

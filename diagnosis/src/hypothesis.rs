@@ -1,4 +1,4 @@
-//! What may be true of a machine: some effects, and what is then unknown beside the vars.
+//! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
 use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Rf, Ring, Site};
 
@@ -7,18 +7,18 @@ use super::data::Data;
 /// One effect that a hypothesis holds, its amplitude unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Term {
-    /// What happens.
+    /// Kind of effect.
     pub kind: EffectKind,
-    /// Where.
+    /// Its place.
     pub site: Site,
 }
 
-/// Instruments or magnets that all scatter a little: ordinary, and no discovery.
+/// Random errors of all members of a family of instruments or magnets, of ordinary size and therefore not a finding.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scatter {
-    /// What of them scatters.
+    /// The property that scatters.
     pub kind: EffectKind,
-    /// All of them together, in words.
+    /// Name of the family and property.
     pub name: &'static str,
     /// Standard deviation, in the unit of the kind.
     pub width: f64,
@@ -27,7 +27,7 @@ pub struct Scatter {
 /// Some effects, any number of them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Hypothesis {
-    /// Discoveries.
+    /// Effects that count as findings.
     pub terms: Vec<Term>,
     /// Ordinary scatter.
     pub scatter: Vec<Scatter>,
@@ -35,7 +35,7 @@ pub struct Hypothesis {
     pub given: Vec<Effect>,
 }
 
-/// One number that is unknown beside the vars, with its prior standard deviation.
+/// One unknown besides the vars, with its prior standard deviation.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Unknown {
     /// The amplitude of a term.
@@ -47,7 +47,7 @@ pub enum Unknown {
 }
 
 impl Term {
-    /// An effect at a place that is named.
+    /// An effect at a named place.
     ///
     /// # Errors
     /// [`EffectError::Place`].
@@ -66,7 +66,7 @@ impl Term {
         if place.is_empty() { self.kind.word().into() } else { format!("{}@{place}", self.kind) }
     }
 
-    /// Where it sits along the beam [m], the first of two places; none of the whole ring.
+    /// Position along the beam [m], the first of two places; none for the whole ring.
     pub fn position(self, ring: &Ring) -> Option<f64> {
         self.site.positions(ring).first().copied()
     }
@@ -93,7 +93,7 @@ impl Hypothesis {
         less
     }
 
-    /// What is unknown beside the vars.
+    /// The unknowns besides the vars.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {
             let amplitude = term.kind.prior_scale().map(|scale| Unknown::Amplitude(i, scale));
@@ -116,10 +116,10 @@ impl Hypothesis {
         self.scatter.iter().map(|scatter| members(scatter.kind, data).len()).sum()
     }
 
-    /// The machine, and what drives it, at given `ln` vars and values of the unknowns in units of their standard deviations.
+    /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations.
     ///
     /// # Errors
-    /// [`EffectError`] if a place is none.
+    /// [`EffectError`] if an effect is not defined at its place.
     pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
         effects.extend(self.given.iter().chain(&data.believed));
@@ -142,7 +142,7 @@ impl Hypothesis {
     }
 }
 
-/// The members of a family that the data can say anything about.
+/// The members of a family that affect the data.
 pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
     let driven = data.driven_correctors();
     let active: Vec<usize> = data.active_monitors().into_iter().map(|b| data.ring.read_monitors[b]).collect();

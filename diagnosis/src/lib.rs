@@ -1,9 +1,10 @@
-//! Missing physics: where simulation and recording differ, what was left out, and whether leaving it in predicts better.
+//! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
+//! better.
 //!
 //! [`Diagnosis::of`] is the path from top to bottom: the recording is whitened ([`data`]), fitted by the exact twin without any
-//! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]) and so is freedom without a class
-//! ([`discrepancy`]); the leaders are refitted and compete ([`search`]); what is found has to predict frames that it was not
-//! fitted to ([`heldout`]); then the verdict is spoken ([`verdict`]).
+//! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]), and so is an unmodelled discrepancy
+//! ([`discrepancy`]); the leading candidates are refitted and compete ([`search`]); what is found has to predict frames that it was
+//! not fitted to ([`heldout`]); [`verdict`] puts the result into one word and one sentence.
 
 pub mod alternatives;
 pub mod average;
@@ -47,26 +48,26 @@ pub struct Diagnosis {
     pub found: Found,
     /// The verdict.
     pub verdict: Verdict,
-    /// In words.
+    /// The verdict as a sentence.
     pub sentence: String,
-    /// One for each effect, strongest first.
+    /// One finding for each effect, strongest first.
     pub findings: Vec<Finding>,
-    /// Held-out frames without any effect.
+    /// Held-out frames, predicted without any effect.
     pub before: Score,
-    /// Held-out frames with all effects.
+    /// Held-out frames, predicted with all effects.
     pub after: Score,
     /// Held-out correctors without and with the effects, where none is a corrector's own.
     pub correctors: Option<(Score, Score)>,
-    /// Vars without any effect.
+    /// Strength factors of the quadrupoles (vars), fitted without any effect.
     pub vars_before: Vars,
-    /// Vars, averaged over all that may be true.
+    /// Vars, averaged over the competing causes.
     pub vars_after: Vars,
-    /// What would settle it.
+    /// The measurement that would best separate the leading causes, for an ambiguous verdict.
     pub next_measurement: Option<String>,
 }
 
 impl Diagnosis {
-    /// Diagnose a recording; `progress` hears what is being done.
+    /// Diagnose a recording; `progress` is called with the name of each step.
     ///
     /// # Errors
     /// [`DataError`].
@@ -85,7 +86,8 @@ impl Diagnosis {
         let verdict = Verdict::of(&found, &gains);
         let findings = verdict::findings(data, &found, &gains, verdict)?;
         progress("held-out correctors");
-        let whole = !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
+        let whole =
+            !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let correctors = if whole {
             let folds = heldout::by_corrector(recording);
             let scored = |fitted| Score::of(data, fitted, &folds).ok();
@@ -94,7 +96,7 @@ impl Diagnosis {
             None
         };
         progress("what to measure next");
-        // a proposal is a help, and no part of the verdict
+        // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let sentence = verdict::sentence(data, &found, verdict, &findings);
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
@@ -112,7 +114,7 @@ impl Diagnosis {
         })
     }
 
-    /// The effects that were taken up, at their most likely amplitudes.
+    /// The effects in the fitted model, at their most likely amplitudes.
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);

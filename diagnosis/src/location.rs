@@ -1,39 +1,39 @@
-//! Where something without a class may sit, and how to say it.
+//! Locations of an unmodelled discrepancy, and their descriptions.
 
 use twin::Plane;
 
 use super::data::Data;
 
-/// Where something sits.
+/// Location of an unmodelled discrepancy.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Location {
-    /// At a monitor, setting by setting.
+    /// A monitor, one amplitude a setting.
     Monitor(usize),
-    /// At a monitor, as time goes by.
+    /// A monitor, one amplitude a stretch of time.
     MonitorInTime(usize),
-    /// A monitor's gain, as time goes by.
+    /// A monitor's gain, in time.
     GainInTime(usize),
-    /// A monitor that reads another sum of position and slope in both planes than its own position.
+    /// A monitor that responds to the orbit at another location: a sum of position and slope in both planes.
     MonitorElsewhere(usize),
-    /// A monitor that reads another function of its position.
+    /// A monitor whose reading is a nonlinear function of the position.
     MonitorCurve(usize),
     /// At a corrector.
     Corrector(usize),
-    /// A corrector whose kick is not where it should be, or not all.
+    /// A corrector that kicks the beam at a second location as well.
     CorrectorElsewhere(usize),
-    /// At a place in the ring (a quadrupole's entrance) that kicks the beam in a plane.
+    /// A place in the ring (a quadrupole's entrance) where the beam is kicked in a plane.
     Ring(usize, Plane),
     /// A quadrupole that changes in time.
     QuadrupoleInTime(usize),
-    /// All monitors, as time goes by.
+    /// All monitors, in time.
     Time,
-    /// The tunes, as time goes by.
+    /// The tunes, in time.
     Tunes,
-    /// Everywhere.
+    /// All monitors, one amplitude a setting each.
     Everywhere,
 }
 
-/// Sorts of places, which share the prior.
+/// Number of sorts of location, equally likely a priori.
 pub const SORTS: usize = 12;
 
 impl Location {
@@ -61,10 +61,10 @@ impl Location {
             Self::Monitor(_) => format!("monitor {name}"),
             Self::MonitorInTime(_) => format!("monitor {name}, in time"),
             Self::GainInTime(_) => format!("gain of {name} in time"),
-            Self::MonitorElsewhere(_) => format!("monitor {name}, elsewhere"),
+            Self::MonitorElsewhere(_) => format!("monitor {name}, other location"),
             Self::MonitorCurve(_) => format!("curve of {name}"),
             Self::Corrector(_) => format!("corrector {name}"),
-            Self::CorrectorElsewhere(_) => format!("corrector {name}, elsewhere"),
+            Self::CorrectorElsewhere(_) => format!("corrector {name}, other location"),
             Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
@@ -74,29 +74,29 @@ impl Location {
         }
     }
 
-    /// What is said of it.
+    /// As a clause of the sentence.
     pub fn phrase(&self, data: &Data) -> String {
         let name = self.label(data);
         match self {
             Self::Monitor(_) => format!("monitor {name} does not follow the orbit"),
             Self::MonitorInTime(_) => format!("monitor {name} changes with time"),
             Self::GainInTime(_) => format!("the gain of monitor {name} changes with time"),
-            Self::MonitorElsewhere(_) => format!("monitor {name} reads something of the orbit elsewhere"),
-            Self::MonitorCurve(_) => format!("monitor {name} reads another function of the position"),
-            Self::Corrector(_) => format!("corrector {name} does something else than one kick"),
-            Self::CorrectorElsewhere(_) => format!("corrector {name} kicks the beam elsewhere too"),
-            Self::Ring(_, Plane::X) => format!("something near {name} kicks the beam horizontally"),
-            Self::Ring(_, Plane::Y) => format!("something near {name} kicks the beam vertically"),
+            Self::MonitorElsewhere(_) => format!("monitor {name} responds to the orbit at another location"),
+            Self::MonitorCurve(_) => format!("monitor {name} reads a nonlinear function of the position"),
+            Self::Corrector(_) => format!("corrector {name} acts otherwise than by a single kick"),
+            Self::CorrectorElsewhere(_) => format!("corrector {name} kicks the beam at another location too"),
+            Self::Ring(_, Plane::X) => format!("the beam is kicked horizontally near {name}"),
+            Self::Ring(_, Plane::Y) => format!("the beam is kicked vertically near {name}"),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
             Self::Time => "the orbit changes with time at many monitors".into(),
             Self::Tunes => "the tunes change during the campaign".into(),
             Self::Everywhere => {
-                "the readings scatter more from setting to setting than from repeat to repeat, everywhere".into()
+                "the readings of all monitors scatter more between settings than between repeats".into()
             }
         }
     }
 
-    /// Where it is along the beam [m].
+    /// Position along the beam [m].
     pub fn position(&self, data: &Data) -> Option<f64> {
         let ring = &data.ring;
         let at = match *self {

@@ -1,8 +1,8 @@
-//! Where along the ring a gradient sits: the `ln` Bayes factor of a thin one at every place, all unknowns of a fit adapting.
+//! Place scan of a gradient: the `ln` Bayes factor of a thin one at every place of the ring, all unknowns of a fit adapting.
 //!
-//! The ring is cut into segments with one trial gradient in the middle of each, and into finer ones where the gradient may be.
-//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It is that
-//! of a gradient at one place, in a model that is otherwise true, to first order about the fit.
+//! The ring is cut into segments with one trial gradient in the middle of each, and into finer ones where it is likely.
+//! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It
+//! assumes one gradient at one place in a model that is otherwise correct, and is of first order about the fit.
 
 use nalgebra::{DMatrix, DVector};
 use twin::Place;
@@ -15,8 +15,8 @@ use super::scan::{BATCH, Projection, SignatureScore};
 /// Longest segment [m], and longest where the gradient may be.
 const STEP: f64 = 0.5;
 const FINE: f64 = 0.05;
-/// How far behind the first a place may be to be looked at more finely [nat], and as a share of the first: where nothing is,
-/// nothing is far behind.
+/// Places within this `ln` Bayes factor of the best are cut more finely [nat]; the second limit, a share of the best, applies where
+/// the best is small.
 const BEHIND: f64 = 12.0;
 const BEHIND_SHARE: f64 = 0.5;
 
@@ -39,7 +39,7 @@ pub struct Interval {
     pub to_m: f64,
 }
 
-/// A thin gradient everywhere.
+/// A thin gradient at every place of the ring.
 #[derive(Debug, Clone)]
 pub struct PlaceScan {
     /// Normal or skew.
@@ -53,7 +53,7 @@ pub struct PlaceScan {
 }
 
 impl PlaceScan {
-    /// Scan the ring about a fit, one of its effects left out if the scan stands in for it.
+    /// Scan the ring about a fit, one of its effects left out if the scan replaces it.
     ///
     /// # Errors
     /// [`FitError`].
@@ -182,7 +182,7 @@ mod tests {
     fn the_scan_peaks_where_the_gradient_is() {
         let (ring, recording) = template();
         let hardware = Hardware::shipped(&ring, &recording);
-        // a normal gradient hides behind the vars of its neighbours: it has to be larger, and is placed less well
+        // the vars of its neighbours imitate a normal gradient: it has to be larger, and its place is less certain
         let cases = [(Thin::Normal, "SLOT_C6", 0.08, 12.0), (Thin::Skew, "SLOT_E3", 0.01, 4.0)];
         for (thin, place, amplitude, widest) in cases {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();

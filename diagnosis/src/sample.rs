@@ -1,4 +1,4 @@
-//! The posterior of vars and amplitudes of a hypothesis, for NUTS: what the Gaussian of [`super::fit`] is checked by.
+//! The posterior of vars and amplitudes of a hypothesis, sampled by NUTS to validate the Gaussian of [`super::fit`].
 //!
 //! In units of prior standard deviations, `-cost/2` is the log-density of u. The vars have coordinates w without bounds (see
 //! [`inference::bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
@@ -20,8 +20,8 @@ struct Extended {
     spread: DMatrix<f64>,
 }
 
-/// Sample vars and amplitudes about a fit; what is kept are the vars and all other unknowns, in the order of the fit, the latter
-/// in prior standard deviations.
+/// Sample vars and amplitudes about a fit; the draws hold the vars and all other unknowns, in the order of the fit, the latter in
+/// prior standard deviations.
 ///
 /// # Errors
 /// [`NutsError`].
@@ -36,7 +36,7 @@ pub fn sample(data: &Data, fitted: &Fitted, settings: NutsSettings) -> Result<Nu
     explore(Arc::new(extended), &names, settings, |_| ())
 }
 
-/// `1 + J^T J` in coordinates without bounds, and what the bounds bend.
+/// `1 + J^T J` in coordinates without bounds, with the curvature of the coordinates near a bound.
 fn curvature(fitted: &Fitted) -> DMatrix<f64> {
     let lower = fitted.factor.l();
     let mut curvature = &lower * lower.transpose();

@@ -1,7 +1,7 @@
-//! Every candidate at once, to first order: what each would gain over a fit, vars and all other unknowns adapting.
+//! First-order scan of all candidates: the gain of each over a fit, vars and all other unknowns adapting.
 //!
-//! With `d` the whitened signature of a candidate in units of its prior standard deviation, and `P` the projection that takes away
-//! what the fit's own unknowns can imitate, `g = d P r` and `h = d P d`:
+//! With `d` the whitened signature of a candidate in units of its prior standard deviation, and `P` the projection that removes
+//! what the fit's own unknowns can absorb, `g = d P r` and `h = d P d`:
 //!
 //! `ln Bayes factor = g^2/(1 + h)/2 - ln(1 + h)/2`, or `g - h/2` for an effect without an amplitude.
 //!
@@ -23,16 +23,16 @@ pub struct Candidate {
     pub amplitude: f64,
     /// `ln` Bayes factor over the fit.
     pub log_bayes: f64,
-    /// What the fit cannot imitate: `d P d`, per prior standard deviation.
+    /// Norm squared of what the fit cannot absorb: `d P d`, per prior standard deviation.
     pub power: f64,
-    /// How the fit's unknowns adapt to an amplitude of one prior standard deviation.
+    /// Change of the fit's unknowns for an amplitude of one prior standard deviation.
     pub adapting: DVector<f64>,
 }
 
 /// Signatures that are scored together.
 pub const BATCH: usize = 64;
 
-/// A fit, ready for the scores of further signatures.
+/// A fit, prepared to score further signatures.
 pub struct Projection {
     residual: DVector<f64>,
     /// `J^T`.
@@ -42,7 +42,7 @@ pub struct Projection {
     slope: DVector<f64>,
 }
 
-/// What the data say of one signature.
+/// The score of one signature.
 #[derive(Debug, Clone, Copy)]
 pub struct SignatureScore {
     /// `d P r`.
@@ -51,7 +51,7 @@ pub struct SignatureScore {
     pub power: f64,
 }
 
-/// Scores of some signatures, and how the fit's unknowns imitate each.
+/// Scores of some signatures, and the fit's unknowns that absorb each.
 pub struct Scored {
     /// One for each.
     pub scores: Vec<SignatureScore>,
@@ -70,7 +70,7 @@ impl Projection {
         }
     }
 
-    /// About the same point without one of its unknowns: residuals are what they are with it at zero.
+    /// About the same point without one of its unknowns: the residuals are those with it at zero.
     ///
     /// # Errors
     /// [`FitError::Degenerate`].
@@ -114,13 +114,13 @@ impl SignatureScore {
         (pull / (1.0 + power), 0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p())
     }
 
-    /// The same of an effect that is there or not.
+    /// The same for an effect without an amplitude.
     pub fn of_switch(self) -> (f64, f64) {
         (1.0, self.pull - 0.5 * self.power)
     }
 }
 
-/// All candidates that the data can say anything about.
+/// All candidates that affect the data.
 pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
     let of_kind = |&kind: &EffectKind| members(kind, data);
     let held = |pair: &[String; 2]| Term::at(EffectKind::RadialLoop, &pair.join(","), &data.ring).ok();
@@ -154,7 +154,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     Ok(all)
 }
 
-/// A cause and a rival to a fit: what it cannot imitate of both, per prior standard deviation.
+/// A cause and its rival: norms of what a fit cannot absorb of both, per prior standard deviation.
 #[derive(Debug, Clone, Copy)]
 pub struct Rivals {
     /// `d P d` of the cause.
@@ -169,8 +169,8 @@ pub struct Rivals {
 
 impl Rivals {
     /// Expected `ln` Bayes factor of the cause, if it is true and `amplitude` prior standard deviations large (known, as far as the
-    /// prior goes): with the rival's amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less what the freedom of
-    /// the one costs more than that of the other, `ln((1 + h)/(1 + h_rival))/2`.
+    /// prior goes): with the rival's amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less the difference of
+    /// their corrections for a free amplitude, `ln((1 + h)/(1 + h_rival))/2`.
     pub fn expected(self, amplitude: f64) -> f64 {
         let Self { power, rival, both, free: [cause_is_free, rival_is_free] } = self;
         let left = if rival_is_free {
@@ -178,8 +178,8 @@ impl Rivals {
         } else {
             amplitude * amplitude * power - 2.0 * amplitude * both + rival
         };
-        let freedom = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
-        0.5 * (left.max(0.0) - freedom(cause_is_free, power) + freedom(rival_is_free, rival))
+        let correction = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
+        0.5 * (left.max(0.0) - correction(cause_is_free, power) + correction(rival_is_free, rival))
     }
 }
 
@@ -208,7 +208,7 @@ pub fn separations(
     Ok(others.iter().enumerate().map(of).collect())
 }
 
-/// The whitened signature of a term, per prior standard deviation; what leads to no stable machine has nothing to say.
+/// The whitened signature of a term, per prior standard deviation; zero if there is no stable machine with it.
 fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
     let scale = term.kind.prior_scale().unwrap_or(1.0);
     let signature = signatures.of_effect(term.kind, term.site);

@@ -1,4 +1,4 @@
-//! A diagnosis against the answer key, `truth.json`.
+//! The score of a diagnosis against the truth of its recording, `truth.json`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -37,9 +37,9 @@ pub struct TrueEffect {
 pub enum TrueCause {
     /// One of the library.
     Effect(Term),
-    /// One of the library that needs a place which the key leaves to the recording's header, as for a radial loop.
+    /// One of the library whose place is given by the recording's header and not by the key, as for a radial loop.
     Kind(EffectKind),
-    /// Something that the library does not hold.
+    /// Physics that the library does not hold.
     Unmodelled {
         /// What it is.
         what: String,
@@ -79,11 +79,11 @@ pub enum Grade {
     Partial,
     /// Not decided, with the truth among the alternatives.
     Listed,
-    /// Not decided, without the truth; or said to be beyond the library.
+    /// Not decided, without the truth; or called unexplained.
     Open,
-    /// Something is there and nothing was found.
+    /// An effect is present and nothing was found.
     Missed,
-    /// Something was named that is not there.
+    /// A false identification.
     Wrong,
 }
 
@@ -93,15 +93,15 @@ pub enum Grade {
 pub enum Fate {
     /// Named at its place, in a verdict that stands.
     Named,
-    /// Not decided between causes that the recording cannot tell apart, this one among them, and proven on held-out frames.
+    /// Not decided between causes that the recording cannot tell apart, this one among them, and validated on held-out frames.
     Together,
     /// Not decided, and listed.
     Listed,
-    /// Not mentioned, where something else or nothing is said.
+    /// Not mentioned.
     Absent,
 }
 
-/// Why an answer key cannot be read.
+/// Why a key cannot be read.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: {what}")]
 pub struct TruthError {
@@ -181,7 +181,7 @@ impl Truth {
         self.effects.iter().filter_map(pull).collect()
     }
 
-    /// Normalised estimation error squared of the vars, per var; not a number if the key lacks one.
+    /// Normalised estimation error squared of the vars, per var; NaN if the key lacks one.
     pub fn nees(&self, names: &[String], vars: &Vars) -> f64 {
         let truth = |name: &String| self.vars.get(name).map_or(f64::NAN, |var| var.ln());
         let off = names.iter().zip(vars.mean.iter()).map(|(name, mean)| mean - truth(name));
@@ -217,7 +217,7 @@ impl TrueEffect {
         }
     }
 
-    /// True for something that the library does not hold.
+    /// True for physics that the library does not hold.
     pub fn is_unmodelled(&self) -> bool {
         matches!(self.cause, TrueCause::Unmodelled { .. })
     }

@@ -1,13 +1,13 @@
-//! From all candidates to the few that the data speak for, the price of the search paid.
+//! The search for the effects that the data support, corrected for the number of candidates tried.
 //!
-//! Prior: nothing is missing in half of all campaigns. Where something is, it is one effect, or more with odds of 1 to 4 each; it
-//! is something that the library does not hold with 15 %, else each kind is as likely as the other, and each place of a kind.
+//! Prior: in half of all campaigns the model is complete. Otherwise one effect is missing, and each further one with odds of 1 to 4. With
+//! 15 % it is physics that the library does not hold; else all kinds are equally likely, and all places of a kind.
 //! The posterior weight of a candidate is its prior times its evidence: exact twin, everything refitted, for the leaders; first
 //! order for the rest.
 //!
-//! Forward: the best candidate is taken up as long as "one more" is clearly more likely than "no more". Backward: each is taken out
-//! again and all candidates compete for its competition, given the others; one that need not be there is dropped. Where something
-//! without a class is the most likely, one more effect is still tried: two strong ones may need each other.
+//! Forward: the best candidate is added as long as one more effect is clearly more likely than none. Backward: each effect is removed
+//! in turn and competes with all candidates, given the others; one that is not needed is dropped. Where an unmodelled discrepancy is
+//! the most likely, one more effect is still tried: two strong effects may show only together.
 
 use std::collections::BTreeMap;
 
@@ -26,41 +26,41 @@ use inference::bounded::softplus;
 /// Prior odds of one (more) effect.
 const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
-/// Share of what the library does not hold.
+/// Prior probability of physics that the library does not hold.
 const UNMODELLED: f64 = 0.15;
-/// Rounds of competition for all competitions, and the gain of `ln` posterior that is worth another one.
+/// Rounds over all competitions, and the gain of `ln` posterior that calls for another round.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
 /// Effects at most.
 const MOST: usize = 4;
-/// Leaders that are refitted exactly, and how far behind the first a candidate may be, in nat and relative to the first.
+/// Number of candidates that are refitted exactly, and their largest distance from the best, in nat and relative to the best.
 const LEADERS: usize = 8;
 const BEHIND: f64 = 6.0;
 const BEHIND_SHARE: f64 = 0.3;
-/// `ln` Bayes factor below which first order will do.
+/// `ln` Bayes factor below which first order suffices.
 const WORTH: f64 = 3.0;
 
-/// Passes of straightening at most, and the chi-square of what one changes from which on the next is worth it.
+/// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
 const PASSES: usize = 4;
 const CURVED: f64 = 4.0;
 
-/// What the search found.
+/// The result of the search.
 #[derive(Debug, Clone)]
 pub struct Found {
-    /// The recording, its curvature taken from the machine that was found.
+    /// The recording, linearised about the machine that was found.
     pub data: Data,
     /// The fit without any effect (ordinary scatter included).
     pub null: Fitted,
-    /// The fit with all that were taken up.
+    /// The fit with all effects found.
     pub best: Fitted,
-    /// One for each effect of `best`, in its order.
+    /// The alternatives of each effect of `best`, in its order.
     pub competitions: Vec<Competition>,
-    /// Who would be next.
+    /// The alternatives of one more effect.
     pub next: Competition,
 }
 
 impl Found {
-    /// Probability that nothing is missing.
+    /// Probability that the model without effects is complete.
     pub fn nothing(&self) -> f64 {
         self.competitions.iter().fold(self.next.nothing, |least, competition| least.min(competition.nothing))
     }
@@ -79,17 +79,17 @@ fn log_prior(terms: &[Term]) -> Vec<f64> {
     terms.iter().map(|term| -(kinds * count[&term.kind] as f64).ln()).collect()
 }
 
-/// The price of a first search: what a `ln` Bayes factor has to exceed for even odds, of each candidate.
+/// Correction of a first search for the number of candidates: the `ln` Bayes factor of each that gives even odds.
 pub fn corrections(terms: &[Term]) -> Vec<f64> {
     log_prior(terms).into_iter().map(|prior| -(prior + ((1.0 - UNMODELLED) * ODDS).ln())).collect()
 }
 
-/// The same of something without a class.
+/// The same for an unmodelled discrepancy.
 pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
     -(UNMODELLED * ODDS / (SORTS * discrepancy.sites) as f64).ln()
 }
 
-/// The candidates of a recording, and what they are worth beforehand.
+/// The candidates of a recording, with their prior.
 pub struct Search {
     terms: Vec<Term>,
     /// `ln` prior of each candidate, given that the library holds the effect.
@@ -109,20 +109,20 @@ impl Search {
     /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let mut found = self.without_effects(data)?;
-        // effects can put each other out, so that there may be more steps than effects
+        // one effect can make another unnecessary, so that there may be more steps than effects
         for _ in 0..2 * MOST {
             if found.competitions.len() >= MOST || !found.next.is_suspicious() {
                 break;
             }
             let Some(leader) = found.next.leader() else { break };
-            // a trial that leads to no stable machine is not taken
+            // a trial without a stable machine is discarded
             let Ok(further) = self.further(&found, leader) else { break };
-            // back where it was: one effect has put another out
+            // no progress: the new effect has only replaced another
             let gained = self.log_posterior(&further.best) - self.log_posterior(&found.best);
             if further.competitions.len() <= found.competitions.len() && gained < BETTER {
                 break;
             }
-            // something without a class may say it better than one more effect, but not than two that need each other
+            // an unmodelled discrepancy may be better than one more effect, but worse than two that show only together
             if found.next.library() <= found.next.unknown() && self.log_weight(&further) < self.log_weight(&found) {
                 break;
             }
@@ -131,14 +131,15 @@ impl Search {
         Ok(found)
     }
 
-    /// Nothing but vars, and the ordinary scatter of a family if there is any.
+    /// The fit of the vars alone, with the ordinary scatter of a family if there is any.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let zero = DVector::zeros(data.units.len());
         let mut null = fit_linearised(&mut data, &Hypothesis::default(), &zero)?;
         let mut next = self.one_more(&data, &null)?;
         if let Ok(Some(scatter)) = scatter(&data, &null, &next) {
             let mut scattered = data.clone();
-            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero) {
+            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)
+            {
                 (data, null) = (scattered, fitted);
                 next = self.one_more(&data, &null)?;
             }
@@ -151,8 +152,8 @@ impl Search {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
         let (mut best, mut competitions) = self.settle(&data, leader, &found.next)?;
-        // orbits that the effects have changed are curved in another way; without them the readings would be curved as before, by
-        // less than what decides where there is so much to straighten
+        // the effects change the orbits' higher orders, so that the readings are linearised about the new machine; the fit without
+        // effects is then linearised about a wrong machine, an error small against an effect of this size
         if data.linearise_about(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
             best = fit_linearised(&mut data, &best.hypothesis, &best.u)?;
             null = Fitted::of(&data, &null.hypothesis, &null.u)?;
@@ -176,12 +177,14 @@ impl Search {
         fitted.log_evidence + fitted.hypothesis.terms.iter().map(prior_of).sum::<f64>()
     }
 
-    /// Let all candidates compete for each competition, given the others, until the best one is in each; what then need not be there is
-    /// taken out. The last effect of the fit has just won the competition for its competition.
+    /// Let each effect compete with all candidates, given the others, until the best one stands in each place; effects that are then
+    /// not needed are removed. The last effect of the fit has just won its competition.
     fn settle(&self, data: &Data, fitted: Fitted, won: &Competition) -> Result<(Fitted, Vec<Competition>), FitError> {
         let (mut best, mut competitions) = self.compete(data, fitted, Some(won))?;
-        while let Some(idle) =
-            competitions.iter().filter(|competition| !competition.is_suspicious()).max_by(|a, b| a.nothing.total_cmp(&b.nothing))
+        while let Some(idle) = competitions
+            .iter()
+            .filter(|competition| !competition.is_suspicious())
+            .max_by(|a, b| a.nothing.total_cmp(&b.nothing))
             && competitions.len() > 1
         {
             (best, competitions) = self.compete(data, idle.without.clone(), None)?;
@@ -189,8 +192,13 @@ impl Search {
         Ok((best, competitions))
     }
 
-    /// The competition for every competition, again where a better one has got into one of them.
-    fn compete(&self, data: &Data, fitted: Fitted, won: Option<&Competition>) -> Result<(Fitted, Vec<Competition>), FitError> {
+    /// The competitions of all effects, repeated while one of them is won by another candidate.
+    fn compete(
+        &self,
+        data: &Data,
+        fitted: Fitted,
+        won: Option<&Competition>,
+    ) -> Result<(Fitted, Vec<Competition>), FitError> {
         let mut best = fitted;
         let last = best.hypothesis.terms.len() - 1;
         let mut competitions = Vec::new();
@@ -200,7 +208,7 @@ impl Search {
             for i in 0..=last {
                 let known = won.filter(|_| round == 0 && i == last && !changed);
                 let competition = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
-                // the same effects may have been fitted better from elsewhere
+                // the leader may be the same effects, better fitted from another start
                 if let Some(other) = competition.leader()
                     && self.log_posterior(&other) > self.log_posterior(&best) + BETTER
                     && round < ROUNDS
@@ -216,7 +224,7 @@ impl Search {
         Ok((best, competitions))
     }
 
-    /// The competition for one of the effects of a fit.
+    /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
         let rest = super::heldout::reduced(data, fitted, term)?;
         let present = Alternative::exact(data, &rest, fitted.clone(), term);
@@ -261,8 +269,8 @@ impl Search {
         Ok(Competition::of(weights, fitted.clone(), scanned))
     }
 
-    /// The candidates that are worth an exact fit. Where the fit is far off, its vars are bent out of shape and mislead: those
-    /// that lead at the prior's mean are then taken too.
+    /// The candidates for an exact fit. Where the fit is poor its vars are strongly biased, and so is a scan about them: the leaders of a
+    /// scan at the prior's mean are then added.
     fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, FitError> {
         let mut leaders = self.first(scanned, &fitted.hypothesis);
         if fitted.is_gross() {
@@ -272,7 +280,7 @@ impl Search {
         Ok(leaders)
     }
 
-    /// Those near the first of a scan.
+    /// The candidates near the best of a scan.
     fn first(&self, scanned: &[Candidate], hypothesis: &Hypothesis) -> Vec<usize> {
         let weight = |i: usize| scanned[i].log_bayes + self.log_prior[i];
         let mut order: Vec<usize> =
@@ -286,7 +294,7 @@ impl Search {
     }
 }
 
-/// Fit, and straighten the readings by the machine that was found, until that changes them no more.
+/// Fit, and linearise the readings about the fitted machine, until they no longer change.
 fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
     if !fitted.is_gross() {
@@ -305,7 +313,7 @@ fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
     Ok(fitted)
 }
 
-/// The exact fit with a candidate, given up where it stays far behind the least cost of its rivals.
+/// The exact fit with a candidate, abandoned where its cost stays far above the least of its rivals.
 fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alternative {
     let hypothesis = fitted.hypothesis.with(candidate.term);
     let vars = fitted.params.len();
@@ -321,14 +329,14 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
         guesses.push(DVector::zeros(vars));
     }
     let fits = guesses.iter().filter_map(|guess| Fitted::against(data, &hypothesis, guess, least).ok());
-    // a candidate that leads to no stable machine is none
+    // a candidate without a stable machine is excluded
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
     };
     Alternative::exact(data, fitted, refitted, fitted.hypothesis.terms.len())
 }
 
-/// Families of instruments or magnets that scatter, if that explains the data better than any single effect.
+/// A family of instruments or magnets that scatters, if that explains the data better than any single effect.
 fn scatter(data: &Data, fitted: &Fitted, next: &Competition) -> Result<Option<Vec<Scatter>>, FitError> {
     let single = next.log_odds;
     let mut best: Option<(Scatter, f64)> = None;
@@ -342,13 +350,15 @@ fn scatter(data: &Data, fitted: &Fitted, next: &Competition) -> Result<Option<Ve
         }
     }
     let correction = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
-    Ok(best.filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single).map(|(one, _)| vec![one]))
+    Ok(best
+        .filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single)
+        .map(|(one, _)| vec![one]))
 }
 
 /// Widths that are tried of each family.
 const WIDTHS: usize = 3;
 /// By how much scatter of a whole family has to describe the readings better than any single effect [nat]: where rolls imitate each
-/// other a family can stand in for any of them.
+/// other a family can imitate any one of them.
 const CLEARLY: f64 = 6.0;
 /// Families whose members all scatter a little, and the widths tried, in the unit of the kind.
 ///

@@ -1,11 +1,11 @@
-//! The settings of a campaign: frames that drive the beam alike.
+//! The settings of a campaign: groups of frames with the same kicks and RF offset.
 
 use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector};
 use twin::Drives;
 
-/// Which frames are of one setting.
+/// Frames grouped by setting.
 pub struct Settings {
     /// Setting of each frame.
     pub of_frame: Vec<usize>,
@@ -48,7 +48,7 @@ impl Settings {
         (0..self.powered.len()).filter(|&i| self.powered[i].iter().any(|(of, _)| *of == c)).collect()
     }
 
-    /// What a corrector is set to in each setting, in units of the nominal.
+    /// Kick of a corrector in each setting, in units of the nominal.
     pub fn strength(&self, c: usize) -> DVector<f64> {
         let set = |powered: &Vec<(usize, i64)>| {
             powered.iter().find(|(of, _)| *of == c).map_or(0.0, |(_, fifths)| 0.2 * *fifths as f64)

@@ -1,4 +1,4 @@
-//! What the tests of this crate simulate campaigns from.
+//! Template and hardware of the campaigns that the tests simulate.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ pub fn template() -> (Ring, Recording) {
     (ring, recording)
 }
 
-/// Hardware of which nothing is seen but the orbit.
+/// Hardware without noise, offsets or jumps.
 pub fn ideal(ring: &Ring) -> Hardware {
     let noise = vec![0.0; ring.read_monitors.len()];
     Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 }

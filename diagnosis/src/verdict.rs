@@ -1,33 +1,33 @@
-//! The verdict, in one word and in one sentence.
+//! The verdict, as a word and as a sentence.
 
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
-use super::alternatives::{Alternative, Cause, DECISIVE, SUSPICIOUS, Competition};
+use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
 use super::data::Data;
 use super::experiment::Menu;
 use super::fit::FitError;
-use super::heldout::{Fold, VALIDATED, Score};
+use super::heldout::{Fold, Score, VALIDATED};
 use super::hypothesis::{Scatter, Term};
 use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
 use super::search::Found;
 
-/// What the recording says about the model.
+/// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Nothing is missing at the noise level.
+    /// Nothing was found at the noise level.
     Consistent,
-    /// The effects are named, and predict held-out frames better.
+    /// The effects are named, and the model with them predicts held-out frames better.
     Identified,
-    /// Something is there, and the data cannot tell which of the alternatives.
+    /// Physics may be missing, and the data cannot separate the alternatives, or exclude chance.
     Ambiguous,
-    /// Something is there that no effect of the library describes.
+    /// Physics is missing that no effect of the library describes.
     Unexplained,
 }
 
-/// Unit of something without a class [m], read in mm.
+/// Unit of an unmodelled discrepancy [m], shown in mm.
 const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
@@ -47,7 +47,7 @@ impl Verdict {
         }
     }
 
-    /// From the competition for each competition, and the held-out gain of each effect.
+    /// From the competition of each effect, and its held-out gain.
     pub fn of(found: &Found, gains: &[(f64, f64)]) -> Self {
         let next = &found.next;
         if next.unknown() > SUSPICIOUS {
@@ -74,7 +74,7 @@ impl Verdict {
     }
 }
 
-/// One cause, with what competes with it.
+/// One cause, with its alternatives.
 #[derive(Debug, Clone)]
 pub struct Finding {
     /// The cause.
@@ -87,17 +87,17 @@ pub struct Finding {
     pub interval: Vec<Interval>,
     /// Amplitude and its standard deviation, in the unit of the cause.
     pub amplitude: (f64, f64),
-    /// In words.
+    /// As a clause of the sentence.
     pub phrase: String,
     /// `ln` evidence over the fit without it.
     pub log_evidence_gain: f64,
-    /// Posterior probability among all that compete for its competition.
+    /// Posterior probability among its alternatives.
     pub probability: f64,
     /// Gain of held-out log predictive density, and its standard error; none if it is not in the model.
     pub heldout: Option<(f64, f64)>,
-    /// True for an alternative that such a recording is not expected to tell from the finding.
+    /// True for an alternative that a recording like this one is not expected to separate from the finding.
     pub inseparable: bool,
-    /// The rest of the competition.
+    /// Its alternatives, most likely first.
     pub alternatives: Vec<Finding>,
 }
 
@@ -131,7 +131,8 @@ impl Finding {
     /// The first of a competition, with the others below it.
     fn of_competition(data: &Data, competition: &Competition, first: usize) -> Result<Self, FitError> {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
-        let others: Vec<&Alternative> = competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
+        let others: Vec<&Alternative> =
+            competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
         let finding = Self::of(data, &competition.alternatives[first]);
         let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
         if let Cause::Effect(term) = &competition.alternatives[first].cause {
@@ -161,7 +162,7 @@ impl Finding {
         format!("{}@{}", self.word(), self.at)
     }
 
-    /// Unit of the amplitude; of something unknown, the rms of what it does to the readings.
+    /// Unit of the amplitude; for an unmodelled discrepancy that of its rms in the readings.
     pub fn unit(&self) -> Unit {
         self.term().map_or(UNMODELLED, |term| term.kind.unit())
     }
@@ -171,7 +172,7 @@ impl Finding {
         self.heldout.is_some_and(|(gain, error)| gain > VALIDATED * error)
     }
 
-    /// Probability of this cause and of all that cannot be told from it.
+    /// Probability of this cause together with all that the recording cannot separate from it.
     pub fn together(&self) -> f64 {
         self.probability + self.alternatives.iter().filter(|a| a.inseparable).map(|a| a.probability).sum::<f64>()
     }
@@ -191,20 +192,26 @@ pub fn gains(
     if found.competitions.len() == 1 {
         return Ok(vec![after.gain_over(before)]);
     }
-    found.competitions.iter().map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?))).collect()
+    found
+        .competitions
+        .iter()
+        .map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?)))
+        .collect()
 }
 
-/// One finding for each effect, strongest first; of what is not in the model, the most likely.
+/// One finding for each effect, strongest first; then the most likely cause that is not in the model.
 ///
 /// # Errors
 /// [`FitError`].
 pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Result<Vec<Finding>, FitError> {
     let mut all: Vec<Finding> = Vec::new();
-    for (index, ((competition, term), &gain)) in found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate() {
+    for (index, ((competition, term), &gain)) in
+        found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate()
+    {
         let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
-            // without a scan there is no interval, and the finding stands
+            // if the scan fails there is no interval, but the finding stands
             Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
@@ -230,7 +237,7 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
     let text = match verdict {
-        Verdict::Consistent => format!("nothing is missing at the noise level; {}", power(found)),
+        Verdict::Consistent => format!("nothing was found at the noise level; {}", power(found)),
         Verdict::Identified => {
             let gain: Vec<String> = findings
                 .iter()
@@ -250,7 +257,7 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
     };
     let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
         let Scatter { kind, name, width } = scatter;
-        format!("; all {name} scatter by {} {}, which is ordinary", width * kind.unit().factor, kind.unit().shown)
+        format!("; all {name} scatter by {} {}, an ordinary size", width * kind.unit().factor, kind.unit().shown)
     });
     let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
@@ -272,14 +279,13 @@ fn ambiguous(findings: &[Finding]) -> String {
         let others = finding.alternatives.iter().take(SAID).map(of);
         let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
         let alike = finding.alternatives.iter().take(SAID).all(|other| other.inseparable);
-        let apart =
-            if alike && finding.together() >= DECISIVE { ", which this recording cannot tell apart" } else { "" };
+        let apart = if alike && finding.together() >= DECISIVE { ", which this recording cannot separate" } else { "" };
         parts.push(format!("{said}{apart}"));
     }
-    format!("something may be missing: {}", parts.join("; and "))
+    format!("physics may be missing: {}", parts.join("; and "))
 }
 
-/// The amplitudes that would have been seen: `ln` Bayes factor of 12 at half of the places.
+/// Median detection limits: the amplitudes that give a `ln` Bayes factor of 12 at half of the places.
 fn power(found: &Found) -> String {
     const SEEN: f64 = 12.0;
     let shown = [EffectKind::BpmGain, EffectKind::CorrectorGain, EffectKind::QuadRoll, EffectKind::StrayGradient];
@@ -291,7 +297,7 @@ fn power(found: &Found) -> String {
         Some(format!("{kind} {}", kind.unit().rounded(amplitude)))
     };
     let list: Vec<String> = shown.into_iter().filter_map(of_kind).collect();
-    format!("what would have been seen at half of the places: {}", list.join(", "))
+    format!("median detection limits: {}", list.join(", "))
 }
 
 fn capitalised(text: &str) -> String {
@@ -299,7 +305,7 @@ fn capitalised(text: &str) -> String {
     characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
 }
 
-/// What could be measured, and the labels of the two causes that it would take apart, for what is not settled.
+/// The possible measurements for an ambiguous verdict, and the labels of the two causes that they would separate.
 ///
 /// # Errors
 /// [`FitError`].
@@ -307,9 +313,11 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     if verdict != Verdict::Ambiguous {
         return Ok(None);
     }
-    let undecided = |competition: &&Competition| competition.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
+    let undecided =
+        |competition: &&Competition| competition.alternatives.first().is_none_or(|a| a.probability < DECISIVE);
     let open = Some(&found.next).filter(|next| next.is_suspicious());
-    let competition = open.or(found.competitions.iter().find(undecided)).or(found.competitions.first()).unwrap_or(&found.next);
+    let competition =
+        open.or(found.competitions.iter().find(undecided)).or(found.competitions.first()).unwrap_or(&found.next);
     let effects = competition.alternatives.iter().filter_map(|a| Some((a, a.term()?)));
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
@@ -319,7 +327,7 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     Ok(Some((menu, [one.label(&data.ring), against])))
 }
 
-/// The measurement that would take the two most likely causes furthest apart, for what is not settled.
+/// The measurement that would best separate the two most likely causes, for an ambiguous verdict.
 ///
 /// # Errors
 /// [`FitError`].

@@ -1,6 +1,6 @@
 //! What predicts the readings: the exact twin, or the surrogate's Green's function in f64.
 //!
-//! Both answer with the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
+//! Both give the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
 //! frequency: `-D/eta`, the orbit of a unit of relative offset [m]; and with the tunes. And both give the gradient of any function of
 //! these.
 

@@ -62,7 +62,7 @@ pub enum NutsError {
     /// The sampler stopped.
     #[error("the sampler stopped: {0}")]
     Sampler(String),
-    /// The sampler's answer lacks something.
+    /// The sampler's result is incomplete.
     #[error("the sampler's answer has no {0}")]
     Missing(&'static str),
 }

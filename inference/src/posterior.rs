@@ -68,7 +68,7 @@ impl From<OptimiseError<OrbitError>> for LaplaceError {
 
 const LIMITS: Limits = Limits { settled: 1e-8, steps: 40, halvings: 10 };
 /// Squared length of the last step, in standard deviations, that is small beside the width: for readings that no ring explains,
-/// whose steps creep.
+/// whose steps are small.
 const CLOSE: f64 = 0.05 * 0.05;
 
 impl Posterior {

@@ -1,4 +1,4 @@
-//! What a campaign says of the orbit response: one quadratic form a monitor, baselines eliminated; and of the tunes.
+//! The information of a campaign on the orbit response, one quadratic form a monitor with the baselines eliminated, and on the tunes.
 //!
 //! A prediction is linear in the response `rho` of a monitor (a row of [`crate::ResponseModel::predict`]) once the frame's
 //! drive `k` (kicks, RF offset) is known, so that all frames together say
@@ -35,7 +35,7 @@ pub struct Reduced {
 #[derive(Debug, Clone, Serialize)]
 pub struct Readings {
     forms: Vec<Form>,
-    /// What each tune meter says, where it counts.
+    /// Measured tunes, where they count.
     meters: [Option<Meter>; 2],
     /// `ln` of each quadrupole's supply factor [M].
     supplies: Vec<f64>,

@@ -1,7 +1,7 @@
 //! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
 //!
 //! [`like`] is the machine that the estimator believes in: linear optics, constant baselines, and nothing missing.
-//! [`campaign()`] is one that nobody has linearised, with any effects.
+//! [`campaign()`] is one of exact orbits, with any effects.
 
 mod campaign;
 

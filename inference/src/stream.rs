@@ -73,7 +73,7 @@ pub enum StreamError {
     Unstable,
 }
 
-/// A core on the host for a ring of any size, with the model that it goes by: the core of exactly the ring's sizes if there is one,
+/// A core on the host for a ring of any size, with the model that it uses: the core of exactly the ring's sizes if there is one,
 /// else the smallest with room for it, see [`training::rooms`].
 #[derive(Clone)]
 pub struct Core {
@@ -102,7 +102,7 @@ impl Core {
         Self::holding(tables, setup, stream)
     }
 
-    /// The same in a core that is larger than the ring: its answer differs by rounding.
+    /// The same in a core that is larger than the ring: its result differs by rounding.
     ///
     /// # Errors
     /// [`StreamError::Unstable`].

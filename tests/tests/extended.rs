@@ -1,4 +1,4 @@
-//! A machine with physics beyond its design, through the core: by the design's tables, and by a model file that knows of it.
+//! A machine with physics that its design lacks, estimated by the core with the design's tables and with a model file that holds it.
 
 use host_bridge::model_file;
 use inference::stream::{self, Core};
@@ -36,14 +36,14 @@ fn recorded(ring: &Ring, vars: &[f64], effects: &[Effect]) -> Recording {
     recording
 }
 
-/// What the core says of a recording: chi-square per degree of freedom, NEES per var, and the vars.
-struct Answer {
+/// The core's result for a recording: chi-square per degree of freedom, NEES per var, and the vars.
+struct CoreResult {
     chi_square: f32,
     nees: f64,
     vars: Vec<f64>,
 }
 
-fn answer(mut core: Core, recording: &Recording, truth: &[f64]) -> Answer {
+fn replay(mut core: Core, recording: &Recording, truth: &[f64]) -> CoreResult {
     let mut last = None;
     stream::replay(&mut core, recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     let last = last.unwrap();
@@ -52,19 +52,19 @@ fn answer(mut core: Core, recording: &Recording, truth: &[f64]) -> Answer {
     let nees = (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0] / 48.0;
     let quality = core.fit_quality();
     let vars = last.map_params.iter().map(|theta| f64::from(theta.exp())).collect();
-    Answer { chi_square: quality.chi_square / quality.degrees_of_freedom, nees, vars }
+    CoreResult { chi_square: quality.chi_square / quality.degrees_of_freedom, nees, vars }
 }
 
 /// By the design's tables, and by a model file of the effects, made at the vars of a first pass with them.
-fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -> [Answer; 2] {
+fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -> [CoreResult; 2] {
     let setup = stream::setup(ring, recording, 0.0).unwrap();
-    let design = answer(Core::try_new(ring, setup).unwrap(), recording, truth);
+    let design = replay(Core::try_new(ring, setup).unwrap(), recording, truth);
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {
         let extended = training::extended::tables(ring, effects, vars).unwrap();
         model_file::write(path.path(), &ring.name, &extended.tables).unwrap();
         let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup).unwrap();
-        answer(core, recording, truth)
+        replay(core, recording, truth)
     };
     let first = by_file(&design.vars);
     [design, by_file(&first.vars)]
@@ -79,8 +79,8 @@ fn a_model_with_the_missing_physics_describes_the_machine() {
         let effects = [Effect::parse(effect, &ring).unwrap()];
         let recording = recorded(&ring, &vars, &effects);
         let [design, extended] = both(&ring, &recording, &vars, &effects);
-        // chi-square falls by 50 at least, of some 10,000; it is that of the noise which the core has learnt, and what a model
-        // misses counts as noise in part
+        // chi-square falls by 50 at least, of some 10,000; the core estimates the noise itself, and counts part of what the
+        // model lacks as noise
         let fall = design.chi_square - extended.chi_square;
         assert!(fall > 5e-3 || design.nees > 10.0, "{effect}: chi2/dof falls by {fall:.4}");
         assert!(extended.nees < design.nees, "{effect}: NEES/48 {:.2} {:.2}", design.nees, extended.nees);

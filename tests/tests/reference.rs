@@ -41,7 +41,7 @@ fn sample(reduced: &Reduced, posterior: Posterior, settings: NutsSettings) -> Nu
 fn the_gradient_is_that_of_the_density() {
     let (ring, recording) = read("paper-vars");
     let reduced = reduced(&ring, &recording);
-    let pairs = Subset::draw(&reduced, Kind::MinusToPlus, 1).pairs;
+    let pairs = Subset::draw(&reduced.campaign, Kind::MinusToPlus, 1).pairs;
     for model in [ResponseModel::twin(&ring).unwrap(), ResponseModel::green(&ring).unwrap()] {
         let frames = Readings::of_frames(&reduced, &model, TuneUse::Readings);
         let modes = [frames, Readings::of_pairs(&reduced, &model, &pairs)];

@@ -1,4 +1,4 @@
-//! Chi-square per reading, by what the readings have in common.
+//! Chi-square per reading, by monitor, corrector, sign of the kick and time.
 
 use super::residuals::{Residual, Residuals};
 use super::table;
@@ -12,7 +12,7 @@ const APART: f64 = 0.17;
 /// Chi-square from which on the axis is logarithmic.
 const LOGARITHMIC: f64 = 8.0;
 
-/// Some residuals by their name, and which they are.
+/// A group of residuals: its name, and the test of membership.
 type Group = (String, Box<dyn Fn(&Residual) -> bool>);
 
 /// Mean square of some residuals.
@@ -55,20 +55,20 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
     Section {
         heading: "Structure of the residuals".into(),
         text: vec![format!(
-            "Mean square of the residuals in units of their noise. Expected is 1, less the share of the readings that baselines and \
-                 vars take up; in-plane are readings of x while an H corrector is powered and of y while a V corrector is, cross-plane \
+            "Mean square of the residuals in units of their noise. The expected value is 1, less the share of degrees of freedom that baselines \
+                 and vars take; in-plane are readings of x while an H corrector is powered and of y while a V corrector is, cross-plane \
                  the others. Noise alone scatters a marker by {:.2} (by monitor) and {:.2} (by corrector). Monitors that are noisy or \
-                 jump are given more noise than they mostly have, and lie low.",
+                 jump are weighted by a larger noise than they have in most frames, so that their chi-square is low.",
             scatter(monitors.len()),
             scatter(correctors.len())
         )],
         figures: vec![
             (
-                "By monitor. A monitor at fault stands out in its own column; a fault of the ring lifts many.".into(),
+                "By monitor. A faulty monitor stands out in its own column; a fault of the ring raises many.".into(),
                 figure("Chi-square by monitor", "monitor", &monitors, &monitor_names, by_monitor),
             ),
             (
-                "By corrector. A corrector at fault stands out in its own column; a fault of the ring lifts many."
+                "By corrector. A faulty corrector stands out in its own column; a fault of the ring raises many."
                     .into(),
                 figure("Chi-square by corrector", "corrector", &correctors, &corrector_names, by_corrector),
             ),
@@ -140,7 +140,7 @@ fn groups(residuals: &[Residuals]) -> Table {
         "after",
         "σ of noise (all)",
     ];
-    let caption = "Chi-square per reading by sign of the kick and by stretch of time, without any effect (before) and with what was \
+    let caption = "Chi-square per reading by sign of the kick and by stretch of time, without any effect (before) and with the effects \
                    found (after). The last column is the standard deviation that noise alone gives a mean over all readings of the row.";
     table(caption, header, groups.iter().map(row).collect())
 }

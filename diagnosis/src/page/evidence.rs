@@ -1,4 +1,4 @@
-//! What competes in the first search, and the price that it pays.
+//! The leading candidates of the first search, and the correction for their number.
 
 use crate::fit::FitError;
 
@@ -11,7 +11,7 @@ use report::{Axes, Figure, Ranked, Section};
 /// Causes shown.
 const LEADING: usize = 15;
 
-/// The leading causes, the model without any effect being the alternative.
+/// The leading causes, compared with the model without any effect.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let found = &diagnosis.found;
     let (null, data) = (&found.null, &found.data);
@@ -39,21 +39,21 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let axes = Axes::new(
         "The leading causes of the first search",
         "ln Bayes factor over the model without any effect [nat]",
-        "price of the search: a bar that ends there is chance as likely as not",
+        "correction for the number of candidates: even odds against chance",
     );
     Ok(Section {
         heading: "Evidence".into(),
         text: vec![format!(
-            "{count} candidates, every effect of the library at every place, and {sites} places with freedom of their own, each alone beside \
-             the vars and to first order. Of so many, some stand out by chance: the price of the search is the logarithm of the \
-             prior odds against a candidate, and evidence counts from there on. When one effect is large, others imitate it and \
-             rank close behind; that is settled by the exact fits of the table of findings, not here."
+            "{count} candidates, every effect of the library at every place, and {sites} locations of an unmodelled discrepancy, each alone \
+             with the vars and to first order. Among so many, some stand out by chance: the correction for the number of candidates is \
+             the logarithm of the prior odds against a candidate, where the evidence gives even odds against chance. When one effect is \
+             large, others imitate it and rank close behind; the exact fits in the table of findings separate them."
         )],
         figures: vec![(
             format!(
-                "The {LEADING} causes with the largest evidence; each pays the price at its own tick, which is higher where a kind has more places."
+                "The {LEADING} causes with the largest evidence; the tick of each is its correction, which is larger where a kind has more places."
             ),
-            Figure::ranking(&axes, &["effects of the library", "freedom without a class"], &all),
+            Figure::ranking(&axes, &["effects of the library", "unmodelled discrepancy"], &all),
         )],
         ..Section::default()
     })

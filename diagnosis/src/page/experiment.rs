@@ -1,4 +1,4 @@
-//! What is not settled, and the measurement that would settle it.
+//! The undecided causes, and the measurement that would separate them.
 
 use crate::fit::FitError;
 
@@ -6,7 +6,7 @@ use super::table;
 use crate::{Diagnosis, Verdict, verdict};
 use report::Section;
 
-/// Alternatives of the leading findings, and the menu.
+/// Alternatives of the leading findings, and the possible measurements.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut section = Section { heading: "What to measure next".into(), ..Section::default() };
     section.text.push(match &diagnosis.next_measurement {
@@ -15,11 +15,11 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     });
     if let Some((menu, [one, other])) = verdict::menu(&diagnosis.found.data, &diagnosis.found, diagnosis.verdict)? {
         let row = |what: &str, separation: f64| [what.to_owned(), format!("{separation:.1}")];
-        let mut rows = vec![row("none: what the present one can be expected to say", menu.present)];
+        let mut rows = vec![row("none: the present campaign alone", menu.present)];
         rows.extend(menu.proposals.iter().map(|proposal| row(&proposal.what, proposal.separation)));
         let caption = format!(
-            "How far one more campaign of the same length would take {one} apart from {other}: ln Bayes factor expected of both campaigns together, \
-             if the first is true."
+            "How well one more campaign of the same length would separate {one} from {other}: expected ln Bayes factor of both campaigns \
+             together, if the first is true."
         );
         section.tables.push(table(&caption, ["second campaign", "expected ln Bayes factor [nat]"], rows));
     }
@@ -34,21 +34,22 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         }
     }
     if !rows.is_empty() {
-        let caption = "What is not decided: every cause of some weight, in words.";
+        let caption = "Undecided causes, with their probabilities.";
         section.tables.push(table(caption, ["cause", "probability", "ln evidence gain"], rows));
     }
     Ok(section)
 }
 
-/// What is said where there is nothing to propose.
+/// The text where no measurement is proposed.
 fn settled(verdict: Verdict) -> &'static str {
     match verdict {
-        Verdict::Consistent => "Nothing is missing, and nothing has to be told apart.",
+        Verdict::Consistent => "Nothing was found, so that there are no causes to separate.",
         Verdict::Identified => {
-            "What was found is decided; no further measurement is needed to tell it from anything else."
+            "The effects found are decided; no further measurement is needed to separate them from others."
         }
         Verdict::Ambiguous | Verdict::Unexplained => {
-            "The library has no second cause to tell the first one from, so no campaign can be computed that would. What is found at one              instrument is best looked for there: exchange it, or its electronics, and repeat the campaign."
+            "The library holds no second cause, so that no campaign can be computed that separates two. If the location is one \
+             instrument, exchange it, or its electronics, and repeat the campaign."
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The findings, each with what competes with it.
+//! The findings, each with its alternatives.
 
 use crate::fit::FitError;
 
@@ -22,15 +22,16 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         format!("Verdict: {}. {}", diagnosis.verdict.word(), meaning(diagnosis.verdict)),
         format!(
             "Recording {}: {} frames in {minutes:.0} minutes, recorded with {}. Expected noise of a reading {:.0} µm. Chi-square per \
-             degree of freedom {before:.3} without any effect, {after:.3} with what was found.",
+             degree of freedom {before:.3} without any effect, {after:.3} with the effects found.",
             recording.name,
             recording.rows.len(),
             recording.header.recorded_with,
             found.data.mean_noise() * 1e6,
         ),
         format!(
-            "Probability that nothing{} is missing {}, that an effect of the library is {}, that something else is {}.",
-            if found.competitions.is_empty() { "" } else { " more" },
+            "Probability that no{} effect is missing {}, that an effect of the library is missing {}, that physics outside the library is \
+             missing {}.",
+            if found.competitions.is_empty() { "" } else { " further" },
             percent(next.nothing),
             percent(next.library()),
             percent(next.unknown()),
@@ -39,13 +40,13 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
     let mut rows = Vec::new();
     for (i, finding) in diagnosis.findings.iter().enumerate() {
         rows.push(row(&format!("{}.", i + 1), finding));
-        let or = |other: &Finding| if other.inseparable { "or (not to be told apart)" } else { "or" };
+        let or = |other: &Finding| if other.inseparable { "or (inseparable)" } else { "or" };
         rows.extend(finding.alternatives.iter().take(ALTERNATIVES).map(|other| row(or(other), other)));
     }
     let header =
         ["", "effect", "at", "s [m]", "amplitude", "unit", "ln evidence gain", "probability", "held-out gain [nat]"];
-    let caption = "What was found, strongest first, and below each what else would explain the same readings. The evidence gain \
-                   is over the fit without it; the probability is among all that compete, the number of candidates paid for; \
+    let caption = "Findings, strongest first, and below each the alternatives that explain the same readings. The evidence gain \
+                   is over the fit without it; the probability is among these, corrected for the number of candidates; \
                    the held-out gain is that of log predictive density, all effects against all but this one, ± its standard error.";
     let tables = if rows.is_empty() { Vec::new() } else { vec![table(caption, header, rows)] };
     Ok(Section { heading: "Findings".into(), text, tables, ..Section::default() })
@@ -53,16 +54,16 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
 
 fn meaning(verdict: Verdict) -> &'static str {
     match verdict {
-        Verdict::Consistent => "Nothing is missing in the model at the noise level of the recording.",
+        Verdict::Consistent => "Nothing was found at the noise level of the recording.",
         Verdict::Identified => {
             "The effects below are decided (probability at least 95 %) and predict frames that they were not fitted to better by more than two \
              standard errors."
         }
         Verdict::Ambiguous => {
-            "Something may be missing, and the recording cannot tell which of the alternatives, or whether."
+            "Physics may be missing in the model; the data cannot separate the alternatives, or exclude chance."
         }
         Verdict::Unexplained => {
-            "Something is there that no effect of the library describes; the place is where freedom of its own helps most."
+            "The readings contain a discrepancy that no effect of the library describes; its most likely location is given."
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Frames that the model was not fitted to.
+//! Predictions of frames that the model was not fitted to.
 
 use super::{signed, table};
 use crate::Diagnosis;
@@ -19,14 +19,14 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
         }
         None if diagnosis.found.competitions.is_empty() => "",
         None => {
-            " Whole correctors were not held out: an effect that belongs to one corrector is not seen in the others."
+            " Whole correctors were not held out: an effect of one corrector does not appear in the frames of the others."
         }
     };
     Section {
         heading: "Held-out frames".into(),
         text: vec![format!(
             "Frames are left out in folds, the model is fitted to the rest and predicts them, with the uncertainty of vars, amplitudes and \
-             baselines. An effect that is real predicts better; one that only follows the noise does not. Too few readings within \
+             baselines. A real effect improves the prediction; one that fits only noise does not. Too few readings within \
              one or two standard deviations would mean that the error bars are too small, too many that they are too large.{note}"
         )],
         tables,
@@ -54,12 +54,12 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     let same = before.log_density == after.log_density;
     let mut rows = vec![row(if same { "the model" } else { "without any effect" }, before, "0".into())];
     if !same {
-        rows.push(row("with what was found", after, format!("{} ± {error:.1}", signed(gain, 1))));
+        rows.push(row("with the effects found", after, format!("{} ± {error:.1}", signed(gain, 1))));
     }
     let n = before.readings;
     let empty = String::new();
     rows.push([
-        "expected of true error bars".into(),
+        "expected of correct error bars".into(),
         n.to_string(),
         empty.clone(),
         empty.clone(),

@@ -1,6 +1,6 @@
-//! A diagnosis on paper: one page for the people who know the machine, from the sentence to the readings behind it.
+//! The page of a diagnosis for those who operate the machine, from the sentence to the readings that support it.
 //!
-//! [`page`] is the list of its sections in the order in which they are read; each is one file.
+//! [`page`] lists its sections in order; each is one file.
 
 mod chi2;
 mod evidence;
@@ -44,7 +44,7 @@ pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, FitErr
         monitors::section(diagnosis),
     ];
     Ok(Page {
-        title: format!("What is missing in the model of {}", recording.name),
+        title: format!("Missing physics in the model of {}", recording.name),
         lead: format!("{}.", diagnosis.sentence.trim_end_matches('.')),
         sections,
     })

@@ -1,4 +1,4 @@
-//! Monitors that are at fault by themselves.
+//! Faulty monitors.
 
 use estimator::MonitorState;
 
@@ -6,7 +6,7 @@ use super::table;
 use crate::Diagnosis;
 use report::Section;
 
-/// State, noise and refused readings.
+/// State, noise and rejected readings.
 pub fn section(diagnosis: &Diagnosis) -> Section {
     let data = &diagnosis.found.data;
     let frames = data.readings.nrows();
@@ -25,12 +25,12 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
         .collect();
     let expected = data.mean_noise() * 1e6;
     let text = match rows.len() {
-        0 => format!("Every monitor that is read is in order; expected noise of a reading {expected:.0} µm."),
+        0 => format!("All monitors that are read are in state ok; expected noise of a reading {expected:.0} µm."),
         _ => format!(
-            "Noise, jumps and silence are faults of a monitor and not of the model. Its readings weigh less, or nothing. Expected noise of a reading {expected:.0} µm."
+            "Noise, jumps and silence are faults of a monitor and not of the model. Its readings have less weight, or none. Expected noise of a reading {expected:.0} µm."
         ),
     };
-    let header = ["monitor", "state", "noise [µm]", "weighted as [µm]", "readings refused"];
+    let header = ["monitor", "state", "noise [µm]", "weighted as [µm]", "readings rejected"];
     let caption = "Monitors that are not in state ok.";
     let tables = if rows.is_empty() { Vec::new() } else { vec![table(caption, header, rows)] };
     Section { heading: "Faulty monitors".into(), text: vec![text], tables, ..Section::default() }

@@ -1,4 +1,4 @@
-//! Where scan the beam a gradient would sit.
+//! Place scans of normal and skew gradients.
 
 use twin::{Element, Ring, Thin};
 
@@ -10,20 +10,20 @@ use report::{Axes, Figure, Reference, Section, Series};
 
 /// Share of the posterior that an interval holds.
 const SHARE: f64 = 0.95;
-/// Stretches that are still listed.
+/// Most stretches that are listed one by one.
 const STRETCHES: usize = 4;
-/// Density, over that of the peak, that is not worth showing, and what is shown beside it [m].
+/// Density, relative to the peak, below which it is not shown, and the margin on both sides [m].
 const NEGLIGIBLE: f64 = 1e-3;
 const AROUND: f64 = 0.5;
 
 /// The scans for normal and skew gradients.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut section = Section {
-        heading: "The scan scan the ring".into(),
+        heading: "Place scan".into(),
         text: vec![
             "ln Bayes factor of one thin gradient at every place of the ring, given all other findings, vars adapting, to first \
-             order. Below zero the readings speak against a gradient there; a flat curve means that they cannot tell. The credible interval has a \
-             prior uniform scan the beam, and assumes one thin gradient in a model that is otherwise true."
+             order. Below zero the readings disfavour a gradient there; a flat curve means that they contain no information on it. The credible interval has a \
+             prior uniform along the beam, and assumes one thin gradient in a model that is otherwise correct."
                 .into(),
         ],
         ..Section::default()
@@ -87,7 +87,7 @@ fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figur
             series.push(Series::points(label, x, y));
         }
     }
-    let title = format!("A thin {word} gradient scan the ring");
+    let title = format!("A thin {word} gradient along the ring");
     let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
     let peak = scan.peak();
     let caption = format!(
@@ -110,13 +110,13 @@ fn nearest(ring: &Ring, s: f64) -> &str {
     named.min_by(|one, other| away(one).total_cmp(&away(other))).map_or("", |element| &element.name)
 }
 
-/// The posterior of the place, as far as it matters: all of it, and what the interval holds.
+/// The posterior of the place near its peak: all of it, and the part within the interval.
 fn density(scan: &PlaceScan, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
     let peak = scan.peak();
     let (middle, largest) = (scan.segments[peak].s, scan.log_bayes[peak]);
     let weight = |i: usize| (scan.log_bayes[i] - largest).exp();
     let sum: f64 = (0..scan.segments.len()).map(|i| weight(i) * scan.segments[i].length).sum();
-    // unrolled about the peak: the ring begins anywhere
+    // s relative to the peak, since the interval may cross the start of the ring
     let s = |i: usize| scan.segments[i].s - circumference * ((scan.segments[i].s - middle) / circumference).round();
     let mut order: Vec<usize> = (0..scan.segments.len()).collect();
     order.sort_by(|&i, &j| s(i).total_cmp(&s(j)));
@@ -137,7 +137,7 @@ fn density(scan: &PlaceScan, interval: &[Interval], circumference: f64, word: &s
     let axes =
         Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
     let caption = format!(
-        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform scan the ring."
+        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring."
     );
     (caption, Figure::densities(&axes, &series))
 }

@@ -1,4 +1,4 @@
-//! What the fit leaves of the readings, setting by setting.
+//! Residuals of the readings, setting by setting.
 
 use nalgebra::DMatrix;
 use twin::Plane;
@@ -19,13 +19,13 @@ pub struct Residual {
     pub in_plane: bool,
     /// Time, from -1 to 1.
     pub time: f64,
-    /// In standard deviations of its noise, the monitor's baseline taken out.
+    /// In standard deviations of its noise, the monitor's baseline subtracted.
     pub value: f64,
 }
 
 /// All residuals of a fit.
 pub struct Residuals {
-    /// Which fit.
+    /// Name of the fit.
     pub name: &'static str,
     /// One for each reading that counts.
     pub all: Vec<Residual>,
@@ -64,7 +64,7 @@ impl Residuals {
     }
 }
 
-/// Colours end here at least, and at most [standard deviations].
+/// Least and largest limit of the colour scale [standard deviations].
 const LEAST: f64 = 4.0;
 const MOST: f64 = 12.0;
 
@@ -95,15 +95,15 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
     Section {
         heading: "Residual maps".into(),
         text: vec![
-            "What the fit leaves of the response to each corrector: measured less predicted readings, in units of their noise, each \
-             monitor's baseline taken out, summed over the frames of a corrector with the sign of the kick and divided by the square root of their \
+            "Residuals of the response to each corrector: measured less predicted readings, in units of their noise, each \
+             monitor's baseline subtracted, summed over the frames of a corrector with the sign of the kick and divided by the square root of their \
              number. Noise alone has rms 1 and no pattern. A fault of a monitor is a row, one of a corrector a column; a fault of \
              the ring is a pattern over both, and where it couples the planes it fills the blocks that join x to V and y to H."
                 .into(),
         ],
         figures: vec![(
             format!(
-                "One cell for each monitor and corrector; lines divide the planes; grey cells have no readings; where names do not fit, every second is written. Colours end at \
+                "One square for each monitor and corrector; lines divide the planes; grey squares have no readings; where names do not fit, every second is written. Colours end at \
                  ±{limit:.0}. {}.",
                 largest.join("; ")
             ),
@@ -113,11 +113,11 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
     }
 }
 
-/// What a fit is called on the page.
+/// Name of a fit on the page.
 pub fn title(name: &str, all: &[Residuals]) -> String {
     match (name, all.len()) {
         (_, 1) => "the model".into(),
         ("before", _) => "before: without any effect".into(),
-        _ => "after: with what was found".into(),
+        _ => "after: with the effects found".into(),
     }
 }

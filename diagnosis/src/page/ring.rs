@@ -1,4 +1,4 @@
-//! Where it is: the ring with what was found marked on it.
+//! The ring with the findings marked.
 
 use twin::{Class, Kind, Ring};
 
@@ -26,19 +26,19 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     }
     let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(ring) });
     let caption = if diagnosis.findings.is_empty() {
-        "The ring; nothing is missing, so nothing is marked. Names inside the path are half-cells."
+        "The ring; nothing was found, so nothing is marked. Names inside the path are half-cells."
     } else {
         "The ring; filled squares are findings, open circles alternatives to them. Names inside the path are half-cells: a quadrupole, \
          monitor or corrector is named after the one it stands in."
     };
-    Section { heading: "Where it is".into(), figures: vec![(caption.into(), figure)], ..Section::default() }
+    Section { heading: "Location".into(), figures: vec![(caption.into(), figure)], ..Section::default() }
 }
 
 fn named(label: &str, pale: bool) -> String {
     if pale { format!("or {label}") } else { label.to_owned() }
 }
 
-/// Where a finding is: exchanged monitors are at two places, what acts on the whole ring at none.
+/// Positions of a finding: two for exchanged monitors, none for an effect on the whole ring.
 fn positions(ring: &Ring, finding: &Finding) -> Vec<f64> {
     let Some(term) = finding.term() else { return finding.s.into_iter().collect() };
     match term.kind.class() {

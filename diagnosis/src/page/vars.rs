@@ -1,4 +1,4 @@
-//! What becomes of the quadrupoles when the effects are in the model.
+//! The quadrupoles' strength factors without and with the effects.
 
 use nalgebra::DVector;
 
@@ -21,9 +21,9 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     Section {
         heading: "Quadrupoles before and after".into(),
         text: vec![format!(
-            "A var is the factor on the gradient of a quadrupole. What is missing in the model is made up for by wrong vars, as far as they can. \
-             Mean standard deviation {:.2} % before, {:.2} % after; {} moves most, by {:.1} of its standard deviations. After is \
-             averaged over all that may be true, with its probability.",
+            "The strength factor (var) of a quadrupole multiplies its gradient. Missing physics biases the vars, which absorb as much of it as they can. \
+             Mean standard deviation {:.2} % before, {:.2} % after; {} changes most, by {:.1} of its standard deviations. After is \
+             model-averaged over the competing causes.",
             mean(before),
             mean(after),
             names[most],
@@ -31,7 +31,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
         )],
         figures: vec![(
             "Each quadrupole's strength over its design, focusing ones above, defocusing ones below, without any effect (before) and averaged over \
-             what may be true (after)."
+             the competing causes (after)."
                 .into(),
             Figure::bands(&axes, &[band("before", before), band("after", after)]),
         )],

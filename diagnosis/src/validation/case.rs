@@ -1,4 +1,4 @@
-//! What the blind campaigns are made of: a case is its number and one seed for all.
+//! The cases of the validation: each is fixed by its number and one seed for all.
 
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
@@ -12,17 +12,17 @@ use crate::score::{TrueCause, TrueEffect, Truth};
 use inference::recording::Recording;
 use inference::simulate;
 
-/// What a case is.
+/// Class of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Class {
-    /// Nothing is missing.
+    /// No effect.
     Empty,
     /// One effect of the library.
     Single,
     /// Two of them.
     Pair,
-    /// Something that the library does not hold.
+    /// Physics that the library does not hold.
     Unknown,
 }
 
@@ -31,13 +31,13 @@ pub enum Class {
 pub struct Case {
     /// Its number.
     pub index: usize,
-    /// What it is.
+    /// Its class.
     pub class: Class,
     /// Factor on each quadrupole.
     pub vars: Vec<f64>,
     /// Effects of the library.
     pub effects: Vec<Effect>,
-    /// Effects beyond it.
+    /// Physics that it does not hold.
     pub unmodelled: Vec<Unmodelled>,
     /// Seed of the machine's hardware and noise.
     pub seed: u64,
@@ -78,7 +78,7 @@ impl Case {
         Self { index, class, vars, effects, unmodelled, seed: stream() }
     }
 
-    /// The answer key.
+    /// The truth.
     pub fn key(&self, ring: &Ring) -> Truth {
         let library = self.effects.iter().map(|effect| TrueEffect {
             cause: TrueCause::Effect((*effect).into()),

@@ -1,9 +1,9 @@
-//! The proof of the diagnosis: simulated blind campaigns whose truth is known, among them empty ones and some with physics that
-//! no effect of the library describes.
+//! Validation of the diagnosis on simulated blind campaigns whose truth is known, some without effects and some with physics that no
+//! effect of the library describes.
 //!
 //! A case is drawn ([`case`]), tracked exactly, diagnosed, and scored; [`tables`] counts. Beside each verdict stands the oracle:
-//! the gain in `ln` posterior when kind, place and size are given, over the best that vars and baselines can do without. Of what
-//! the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
+//! the gain in `ln` posterior when kind, place and size are given, over the best fit of vars and baselines without effects.
+//! For physics that the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
 
 pub mod case;
 pub mod tables;
@@ -26,18 +26,18 @@ use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware};
 pub use unmodelled::{Unmodelled, UnmodelledKind};
 
-/// What became of one case.
+/// The result of one case.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Outcome {
     /// Number of the case.
     pub index: usize,
-    /// What it is.
+    /// Its class.
     pub class: Class,
     /// The effects it was made with.
     pub truth: Vec<Made>,
     /// Gain in `ln` posterior when kind, place and size are given.
     pub oracle_gain: f64,
-    /// Of each effect, the same beside the others, and what became of it.
+    /// Of each effect, the same beside the others, and its fate.
     pub fates: Vec<(f64, Fate)>,
     /// The verdict.
     pub verdict: Verdict,
@@ -45,9 +45,9 @@ pub struct Outcome {
     pub grade: Grade,
     /// Kinds and places of the findings, strongest first.
     pub found: Vec<String>,
-    /// Most likely cause (or `nothing`) of the least certain slot, its stated probability, and whether it is true.
+    /// Most likely cause (or `nothing`) of the least certain finding, its stated probability, and whether it is true.
     pub stated: (String, f64, bool),
-    /// Probability that nothing is missing.
+    /// Probability that the model without effects is complete.
     pub nothing: f64,
     /// Held-out gain and its standard error.
     pub heldout: (f64, f64),
@@ -64,7 +64,7 @@ pub struct Outcome {
 /// One effect of a case.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Made {
-    /// The word for its kind; of what the library does not hold, what it is.
+    /// The word for its kind, of the library or not.
     pub kind: String,
     /// Amplitude in prior standard deviations, if the kind has one.
     pub size: Option<f64>,
@@ -120,7 +120,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     }))
 }
 
-/// What the diagnosis thinks most likely where it is least certain, how likely, and whether it is so.
+/// The most likely cause of the least certain finding, its probability, and whether it is true.
 fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
     let least =
         diagnosis.findings.iter().filter(|f| f.term().is_some()).min_by(|a, b| a.probability.total_cmp(&b.probability));
@@ -160,7 +160,7 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
 }
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
-/// others; of what the library does not hold, when its signal is taken out.
+/// others; for physics that the library does not hold, when its signal is subtracted.
 fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<(f64, Vec<f64>), DataError> {
     let data = Data::of(&Campaign::of(ring, recording)?)?;
     let zero = DVector::zeros(data.units.len());

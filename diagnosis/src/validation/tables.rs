@@ -1,4 +1,4 @@
-//! What all outcomes together say, as numbers and as Markdown.
+//! Summary of all outcomes, as numbers and as Markdown.
 
 use core::fmt::Write;
 use std::collections::BTreeMap;
@@ -23,7 +23,7 @@ pub struct Share {
     pub limits: [f64; 2],
 }
 
-/// What became of the effects of one row.
+/// Fates of the effects of one row.
 #[derive(Debug, Clone, Default, Serialize)]
 #[allow(missing_docs)] // named after the fates
 pub struct Fates {
@@ -53,9 +53,9 @@ pub struct Tables {
     pub empty_identified: Share,
     /// What became of the effects of the library, by their own oracle gain.
     pub by_gain: Vec<([f64; 2], Fates)>,
-    /// Campaigns with something named that is not there, of all but those with unknown physics.
+    /// Campaigns with a false identification, of all but those with unmodelled physics.
     pub wrong: Share,
-    /// Campaigns beyond the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
+    /// Campaigns with physics outside the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
     pub unknown: Vec<([f64; 2], Share, usize)>,
     /// Single effects named right, by kind and size (weak, medium, strong thirds of the logarithm).
     pub power: BTreeMap<String, [Share; 3]>,
@@ -185,7 +185,7 @@ impl Tables {
         )?;
         writeln!(
             text,
-            "| oracle gain | effects | named | undecided among causes that cannot be told apart | undecided, listed | not mentioned | named or such a set |"
+            "| oracle gain | effects | named | undecided among inseparable causes | undecided, listed | not mentioned | named or such a set |"
         )?;
         writeln!(text, "|---|---|---|---|---|---|---|")?;
         for (bin, fates) in &self.by_gain {
@@ -194,8 +194,8 @@ impl Tables {
             let counts = format!("{} | {named} | {together} | {listed} | {absent}", fates.total());
             writeln!(text, "| {} | {counts} | {} |", range(bin), found.text())?;
         }
-        writeln!(text, "\nCampaigns in which something was named that is not there: {}.", self.wrong.text())?;
-        writeln!(text, "\nPhysics beyond the library:\n")?;
+        writeln!(text, "\nCampaigns with a false identification: {}.", self.wrong.text())?;
+        writeln!(text, "\nPhysics outside the library:\n")?;
         writeln!(text, "| oracle gain | called unexplained or ambiguous | named as something else |\n|---|---|---|")?;
         for (bin, share, wrong) in &self.unknown {
             writeln!(text, "| {} | {} | {wrong} |", range(bin), share.text())?;
@@ -215,9 +215,9 @@ impl Tables {
         }
         writeln!(
             text,
-            "\nStated probability of what is thought most likely (where least certain), and how often it is so:\n"
+            "\nStated probability of the most likely cause of the least certain finding, and how often it is true:\n"
         )?;
-        writeln!(text, "| stated | mean | is so |\n|---|---|---|")?;
+        writeln!(text, "| stated | mean | true |\n|---|---|---|")?;
         for Reliability { bin, stated, is_so } in &self.reliability {
             writeln!(text, "| {:.2} to {:.2} | {stated:.3} | {} |", bin[0], bin[1].min(1.0), is_so.text())?;
         }

@@ -1,18 +1,18 @@
-//! Physics that the library of effects does not hold, for campaigns whose right answer is "unexplained".
+//! Physics that the library of effects does not hold, for campaigns whose right verdict is "unexplained".
 //!
-//! Sizes are drawn evenly in their logarithm, from one that drowns in the noise to one that nobody would miss.
+//! Sizes are drawn evenly in their logarithm, from well below the noise to far above it.
 //!
 //! | word | what happens, `a` the size | unit |
 //! |---|---|---|
 //! | `corrector_hysteresis` | a corrector keeps the share `a` of the kick that it had before its present setting | 1 |
 //! | `quad_jump` | one quadrupole is stronger by the share `a` from some moment on | 1 |
 //! | `bpm_warm_up` | a monitor's gain is off by `a exp(-(t + 1)/0.5)`, t from -1 to 1 | 1 |
-//! | `bpm_saturation` | a monitor reads `x/(1 + (a x)^8)^(1/8)`: linear, and then no more than `1/a` | 1/m |
+//! | `bpm_saturation` | a monitor reads `x/(1 + (a x)^8)^(1/8)`: linear for small x, and limited to `1/a` | 1/m |
 //! | `bpm_crosstalk` | a monitor reads the share `a` of the next one of its plane as well | 1 |
 //! | `corrector_leak` | the share `a` of a corrector's kick goes to the next one as well | 1 |
 //! | `octupole` | a thin octupole of K3L `a` stands in a free straight | 1/m3 |
-//! | `orbit_drift` | a corrector that nobody logs wanders by `a` and back | rad |
-//! | `bpm_wander` | a monitor's offset wanders by `a` and back | m |
+//! | `orbit_drift` | the kick of an unlogged corrector varies slowly by ±`a` | rad |
+//! | `bpm_wander` | a monitor's offset varies slowly by ±`a` | m |
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -26,13 +26,13 @@ use inference::simulate::Beyond;
 /// The kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnmodelledKind {
-    /// A corrector remembers its previous setting.
+    /// Hysteresis of a corrector: a share of its previous setting remains.
     Hysteresis,
     /// A quadrupole changes at once in mid-campaign.
     QuadJump,
     /// A monitor's gain settles while its electronics warm up.
     WarmUp,
-    /// A monitor reads no more than a limit.
+    /// A monitor saturates.
     Saturation,
     /// A monitor sees some of its neighbour's signal.
     Crosstalk,
@@ -40,9 +40,9 @@ pub enum UnmodelledKind {
     Leak,
     /// An octupole.
     Octupole,
-    /// The orbit wanders.
+    /// The orbit drifts.
     OrbitDrift,
-    /// A monitor's offset wanders.
+    /// A monitor's offset drifts.
     BpmWander,
 }
 
@@ -59,7 +59,7 @@ pub struct Unmodelled {
     index: usize,
     /// Index of the neighbour that a leak or a crosstalk concerns.
     next: usize,
-    /// When a jump happens, or the phase of a wandering, -0.5 to 0.5.
+    /// Time of a jump, or phase of a slow variation, -0.5 to 0.5.
     when: f64,
 }
 
@@ -149,8 +149,8 @@ impl Unmodelled {
         Self::of(*kind, ring, campaign, stream())
     }
 
-    /// A slow wandering between -1 and 1.
-    fn wander(&self, time: f64) -> f64 {
+    /// A slow variation between -1 and 1.
+    fn slow_variation(&self, time: f64) -> f64 {
         (core::f64::consts::PI * (time + 2.0 * self.when)).sin()
     }
 }
@@ -171,7 +171,7 @@ impl Beyond for Unmodelled {
             }
             UnmodelledKind::Leak => cycles.iter_mut().for_each(|c| c.kick[self.next] += self.size * c.kick[self.index]),
             UnmodelledKind::OrbitDrift => {
-                cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.wander(c.time));
+                cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.slow_variation(c.time));
             }
             _ => {}
         }
@@ -182,7 +182,7 @@ impl Beyond for Unmodelled {
             UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
             UnmodelledKind::Crosstalk => x + self.size * neighbour,
-            UnmodelledKind::BpmWander => x + self.size * self.wander(time),
+            UnmodelledKind::BpmWander => x + self.size * self.slow_variation(time),
             _ => x,
         };
         if self.index < readings.ncols() && self.next < readings.ncols() {
@@ -206,7 +206,9 @@ fn indices(kind: UnmodelledKind, ring: &Ring, site: Site) -> [usize; 2] {
         others.find(|&i| planes[i] == planes[index]).unwrap_or(index)
     };
     match (kind, site) {
-        (UnmodelledKind::Leak, Site::Corrector(at)) => [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())],
+        (UnmodelledKind::Leak, Site::Corrector(at)) => {
+            [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())]
+        }
         (_, Site::Monitor(at)) => {
             let index = ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors");
             let is_shared = kind == UnmodelledKind::Crosstalk;

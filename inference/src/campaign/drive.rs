@@ -4,7 +4,7 @@ use nalgebra::DVector;
 
 use crate::recording::{Header, Row};
 
-/// What drives the beam in one frame.
+/// What supplies and correctors do in one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Drive {
     /// Kick of each corrector [C] [rad].

@@ -1,4 +1,4 @@
-//! The tune meter: what all frames say of one tune.
+//! The tune meter: one tune and its drift from all frames.
 
 use nalgebra::{Matrix2, Vector2};
 

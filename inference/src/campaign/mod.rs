@@ -1,4 +1,4 @@
-//! One recording of one ring, assembled once: what drove the beam, which readings count, what the tune meter says.
+//! One recording of one ring, assembled once: drives, accepted readings, measured tunes.
 //!
 //! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
 
@@ -42,13 +42,13 @@ pub struct Campaign {
     sharing: Vec<f64>,
     /// Mean `ln` of each supply's factor [F].
     pub supplies: Vec<f64>,
-    /// Frames that ask the same of the machine.
+    /// Frames grouped by setting.
     pub settings: Settings,
     /// Readings as recorded, rows frames, columns monitors; not a number where a monitor did not report [m].
     pub readings: DMatrix<f64>,
     /// Fractional tunes as recorded, rows frames, columns x and y; not a number where the meter did not report [1].
     pub tunes: DMatrix<f64>,
-    /// What the tune meter says, at the mean supply currents and without an RF offset.
+    /// Measured tunes, at the mean supply currents and without an RF offset.
     pub meters: [Option<Meter>; 2],
     /// Which readings count, and the state of the monitors.
     pub screened: Screened,

@@ -70,9 +70,9 @@ const UPHILL: f64 = 1.0;
 const HALVINGS: i32 = 4;
 /// Share of a prediction's variance by the params that their linearisation adds.
 const UNDERWEIGHT: f64 = 0.2;
-/// Frames without a setting in a row in which most readings have to surprise before the model is at fault, and not the beam.
+/// Consecutive frames without a setting that need most readings outside the gate before the model, and not the beam, is at fault.
 const CONVINCED: usize = 3;
-/// One in this many readings of a frame may surprise before the frame does.
+/// A frame is unexpected if more than one in this many of its readings lies outside the gate.
 const MOST: usize = 8;
 
 /// The repeats of one monitor in one setting.
@@ -96,9 +96,9 @@ struct Screening<'c> {
     model: Model,
     normal: Normal,
     best: Best,
-    /// Accepted readings have to be weighted anew.
+    /// Accepted readings need re-weighting.
     stale: bool,
-    /// Frames without a setting in a row of which most readings surprised.
+    /// Consecutive frames without a setting with most readings outside the gate.
     surprises: usize,
 }
 
@@ -280,7 +280,7 @@ impl<'c> Screening<'c> {
         }
     }
 
-    /// Monitors fail one at a time: when most readings of a frame without a setting surprise, the beam was lost or the model is
+    /// Monitors fail one at a time: when most readings of a frame without a setting lie outside the gate, the beam was lost or the model is
     /// at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before are not.
     fn pardon(&mut self, frame: usize, rejected: &[usize]) {
         let accepted = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).count();
@@ -324,7 +324,7 @@ impl<'c> Screening<'c> {
         Weighed::one(self.residual(frame, b), 1.0 / self.variance(frame, b))
     }
 
-    /// Linearise at the best params if they have left those of the model, or if readings have to be weighted anew.
+    /// Linearise at the best params if they have left those of the model, or if readings need re-weighting.
     fn linearise_if_due(&mut self, frames: usize) {
         let covariance = self.best.factor.inverse();
         let moved = |i: usize| self.best.step[i].abs() > MOVED * covariance[(i, i)].sqrt();
@@ -366,7 +366,7 @@ impl<'c> Screening<'c> {
 
 impl Repeats {
     /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects it. A
-    /// surprising one waits. Two that agree outvote the model, and whatever came before.
+    /// reading outside the gate waits. Two that agree outvote the model, and whatever came before.
     fn judge(&self, agrees_with_mean: bool, agrees_with_last: bool, expected: bool) -> Verdict {
         let any = !self.frames.is_empty();
         if (any && agrees_with_mean) || (agrees_with_last && !self.waiting) {

@@ -1,4 +1,4 @@
-//! The settings of a campaign: frames that ask the same of the machine, by their read-backs.
+//! The settings of a campaign: frames with the same kicks and RF offset, by their read-backs.
 
 use super::drive::Drive;
 

@@ -1,7 +1,7 @@
-//! Whole campaigns of a machine that nobody has linearised: every frame is one exact closed orbit of the twin.
+//! Campaigns of a simulated machine, not linearised: every frame is one exact closed orbit of the twin.
 //!
-//! A frame of a template (its settings, read-backs and gaps) becomes a [`Cycle`] of a ring whose quadrupoles stand where chance
-//! put them. The monitors make of the orbit what their effects tell them, and
+//! A frame of a template (its settings, read-backs and gaps) becomes a [`Cycle`] of a ring with random misalignments of
+//! the quadrupoles. The monitors read the orbit with their effects, and
 //!
 //! `reading = read(orbit of the cycle) + offset_b + noise_b (+ jump)`,
 //!
@@ -31,7 +31,7 @@ pub struct Truth<'a> {
     pub beyond: &'a [&'a dyn Beyond],
 }
 
-/// Physics beyond the library, free to change a campaign at each of its three stages.
+/// Physics outside the library, which may change a campaign at each of its three stages.
 pub trait Beyond {
     /// Change the ring itself.
     fn alter_ring(&self, _ring: &mut Ring) {}
@@ -43,7 +43,7 @@ pub trait Beyond {
     fn alter_readings(&self, _cycles: &[Cycle], _readings: &mut DMatrix<f64>) {}
 }
 
-/// What chance does to a machine and its instruments.
+/// Random errors of a machine and its instruments.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hardware {
     /// Standard deviation of the quadrupoles' positions in x and y [m].
@@ -165,7 +165,7 @@ impl Hardware {
         }
     }
 
-    /// What the meter makes of each tune: it knows no integer.
+    /// The meter's reading of each tune: its fractional part.
     fn meter(&self, tunes: &[Tunes], random: &mut StdRng) -> Vec<[f64; 2]> {
         let mut read = |tune: f64| (tune + self.tune_noise * normal(random)).rem_euclid(1.0);
         tunes.iter().map(|tunes| [read(tunes.x), read(tunes.y)]).collect()
@@ -201,7 +201,7 @@ mod tests {
         (ring, recording)
     }
 
-    /// Hardware of which nothing is seen but the orbit.
+    /// Hardware without noise, offsets or jumps.
     fn ideal(ring: &Ring) -> Hardware {
         let noise = vec![0.0; ring.read_monitors.len()];
         Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 }

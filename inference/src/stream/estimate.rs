@@ -1,4 +1,4 @@
-//! What a core says of a frame, for a ring of any size.
+//! The estimate of a core after a frame, for a ring of any size.
 
 use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior};
 use training::rooms::large;
@@ -75,7 +75,7 @@ impl Estimate {
         }
     }
 
-    /// That of a device of any size, if every list of its answer is whole.
+    /// That of a device of any size, if every list of its reply is complete.
     pub fn of_answer(answer: &large::Answer) -> Option<Self> {
         let (params, monitors) = (answer.mean.len(), answer.health.len());
         let lists = [&answer.sigma, &answer.map_params, &answer.centre, &answer.params_sigma];

@@ -26,7 +26,7 @@ impl Clone for Box<dyn Stream> {
 
 /// A core whose setup and estimates can be had without their sizes.
 pub trait Room: Core + Clone + Send + Sync + 'static {
-    /// For this core, which goes by these tables.
+    /// For this core, which uses these tables.
     fn setup(tables: &Self::Tables, setup: &Setup) -> Self::Setup;
     /// Without spare slots.
     fn estimate(tables: &Self::Tables, estimate: &Self::Estimate) -> Estimate;
