@@ -58,12 +58,12 @@ fn replay(mut core: Core, recording: &Recording, truth: &[f64]) -> CoreResult {
 /// By the design's tables, and by a model file of the effects, made at the vars of a first pass with them.
 fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -> [CoreResult; 2] {
     let setup = stream::setup(ring, recording, 0.0).unwrap();
-    let design = replay(Core::try_new(ring, setup).unwrap(), recording, truth);
+    let design = replay(Core::try_new(ring, setup.clone()).unwrap(), recording, truth);
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {
         let extended = training::extended::tables(ring, effects, vars).unwrap();
         model_file::write(path.path(), &ring.name, &extended.tables).unwrap();
-        let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup).unwrap();
+        let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup.clone()).unwrap();
         replay(core, recording, truth)
     };
     let first = by_file(&design.vars);

@@ -7,6 +7,7 @@ use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
+use estimator::Tables as _;
 use estimator::wire::link::{Refusal, Status};
 use host_bridge::source::link::Link;
 use inference::Recording;
@@ -14,6 +15,8 @@ use inference::stream::{self, Core, Estimate};
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
+use training::LINE;
+use training::rooms::large::{PACKET, Reply, Request};
 use twin::{Effect, Ring};
 
 /// Built once for all tests.

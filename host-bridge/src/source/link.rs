@@ -268,7 +268,9 @@ impl<L: Read + Write> Link<L> {
                 Ok(other) => return Ok(Event::Other(Box::new(other))),
                 Err(error @ LinkError::Reply(_)) => return Err(error),
                 // no more will come of it
-                Err(error) => return self.coming.take().map(|coming| Event::Heard(Box::new(coming.heard()))).ok_or(error),
+                Err(error) => {
+                    return self.coming.take().map(|coming| Event::Heard(Box::new(coming.heard()))).ok_or(error);
+                }
             }
         }
     }

@@ -11,7 +11,6 @@ use host_bridge::output::{self, table};
 use host_bridge::record::Names;
 use host_bridge::sink::shared_memory::{PUBLISHER, Publisher, SERVICE};
 use inference::Recording;
-use inference::stream;
 use serde_json::{Value, json};
 use system_tests::qemu::{Image, Sizes};
 use system_tests::repository;
