@@ -205,12 +205,12 @@ impl Data {
         let drives = settings.means(&self.drives);
         let cycle = |kick: Vec<f64>, rf_offset: f64| {
             let strength = vec![0.0; self.ring.quadrupoles.len()];
-            tracked.cycle(&Cycle { kick, strength, rf_offset, time: 0.0 })
+            tracked.readings(&Cycle { kick, strength, rf_offset, time: 0.0 })
         };
-        let (plain, _) = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
+        let plain = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
         let mut higher = -machine.readings(&drives)?.0;
         for (i, mut row) in higher.row_iter_mut().enumerate() {
-            let (exact, _) = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
+            let exact = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
             row.iter_mut().zip(exact.iter().zip(&plain)).for_each(|(to, (exact, plain))| *to += exact - plain);
         }
         Ok(higher.select_rows(&settings.of_frame))

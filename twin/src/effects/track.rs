@@ -9,7 +9,7 @@ use super::hold::Closing;
 use super::machine::Machine;
 use crate::lattice::Ring;
 use crate::map::{DELTA, X, Y};
-use crate::orbit::{Hold, OrbitError};
+use crate::orbit::{ClosedOrbit, Hold, OrbitError};
 use crate::response::Optics;
 use crate::tune::Tunes;
 
@@ -49,14 +49,33 @@ impl Tracked {
     /// # Errors
     /// [`OrbitError`] if the ring keeps no beam in this cycle.
     pub fn cycle(&self, cycle: &Cycle) -> Result<(Vec<f64>, Tunes), OrbitError> {
-        let ring = self.driven(cycle);
-        let orbit = self.closing.orbit(&ring, cycle.rf_offset)?;
-        let position = |monitor: &crate::Monitor| [X, Y].map(|at| orbit.at[monitor.element][at]);
-        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(position).collect();
-        self.machine.monitors.iter().for_each(|reading| reading.of_orbit(&ring, &mut at));
-        let readings = ring.read_monitors.iter().map(|&i| at[i][ring.monitors[i].plane.index()]).collect();
+        let (ring, orbit) = self.orbit(cycle)?;
+        let readings = self.read(&ring, &orbit);
         let hold = Hold::Momentum { delta: orbit.at[0][DELTA] };
         Ok((readings, Optics::about(&ring, hold, orbit)?.tunes()?))
+    }
+
+    /// The same without the tunes, which next to a sum resonance a kicked orbit need not have.
+    ///
+    /// # Errors
+    /// [`OrbitError`] without a closed orbit in this cycle.
+    pub fn readings(&self, cycle: &Cycle) -> Result<Vec<f64>, OrbitError> {
+        self.orbit(cycle).map(|(ring, orbit)| self.read(&ring, &orbit))
+    }
+
+    /// The ring of a cycle, and its closed orbit.
+    fn orbit(&self, cycle: &Cycle) -> Result<(Ring, ClosedOrbit), OrbitError> {
+        let ring = self.driven(cycle);
+        let orbit = self.closing.orbit(&ring, cycle.rf_offset)?;
+        Ok((ring, orbit))
+    }
+
+    /// What the read monitors make of an orbit [m].
+    fn read(&self, ring: &Ring, orbit: &ClosedOrbit) -> Vec<f64> {
+        let position = |monitor: &crate::Monitor| [X, Y].map(|at| orbit.at[monitor.element][at]);
+        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(position).collect();
+        self.machine.monitors.iter().for_each(|reading| reading.of_orbit(ring, &mut at));
+        ring.read_monitors.iter().map(|&i| at[i][ring.monitors[i].plane.index()]).collect()
     }
 
     /// The ring with the kicks and gradients of a cycle.
