@@ -85,6 +85,7 @@ impl<'p> Sampling<'p> {
             progress(name, before + done, total);
         });
         let run = run.map_err(|source| StudyError::Nuts { run: name.to_owned(), source })?;
+        progress(name, before + each, total);
         let sampled = Sampled::of(&run.draws);
         self.runs.push(RunNumbers {
             name: name.to_owned(),

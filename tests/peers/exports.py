@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RINGS = {"ten-cells": ROOT / "recordings/ten-cells/ring.json", "odd": ROOT / "tests/golden/rings/odd.json",
          "shifted": ROOT / "tests/golden/rings/shifted.json"}
 KICK = 2e-6  # rad: orbits small enough to be linear, even in the sextupoles here, and 1e-12 m is 5e-7 m/rad
+at.DConstant.XYStep = 1e-6  # m: the 3e-8 that pyAT takes of itself leaves up to 4e-7 of rounding in a tune
 TUNE, RESPONSE = 1e-6, 1e-4  # tolerances [1, m/rad]
 
 

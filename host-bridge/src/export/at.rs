@@ -12,7 +12,7 @@ use super::lattice::Lattice;
 
 /// Steps of the integrator per unit of focusing phase `sqrt(|K1|) L`, and at least.
 ///
-/// The error of a tune goes with the fourth power of the phase of a step: at 1/60 it is 1e-7 for the Booster's 48
+/// The error of a tune goes with the fourth power of the phase of a step: at 1/60 it is 4e-8 for the Booster's 48
 /// quadrupoles.
 const STEPS: (f64, f64) = (60.0, 10.0);
 

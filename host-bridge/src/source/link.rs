@@ -435,7 +435,7 @@ mod tests {
     #[test]
     fn noise_is_not_kept_and_the_reply_after_it_is_heard() {
         let (mut link, mut device) = pair();
-        device.write_all(&[7; 5000]).unwrap();
+        device.write_all(&[7; PACKET + 4096]).unwrap();
         assert!(matches!(link.next(), Err(LinkError::Reply(FrameError::Oversized { .. }))));
         device.write_all(&[0]).unwrap();
         device.write_all(&sealed(&Reply::Restarted)).unwrap();
