@@ -270,7 +270,8 @@ impl FindingResult {
 
 /// Tunes of the machine that was found; none if it is unstable.
 fn tunes_of(ring: &Ring, diagnosis: &Diagnosis) -> Option<Tunes> {
-    let ring = ring.with_vars(diagnosis.vars_after.mean.as_slice());
+    let factors: Vec<f64> = diagnosis.vars_after.mean.iter().map(|theta| theta.exp()).collect();
+    let ring = ring.with_vars(&factors);
     let machine = Machine::new(ring, Rf::FixedMomentum, &diagnosis.effects()).ok()?;
     let tunes = machine.response().ok()?.tunes;
     Some(Tunes { x: tunes.x, y: tunes.y })
