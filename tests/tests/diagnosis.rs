@@ -222,8 +222,8 @@ fn the_extended_machine_is_that_of_the_findings() {
     let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", &ring).unwrap());
     let data = whitened(&read("concealed/open-02"));
     let (machine, _) = hypothesis.machine(&data, &[0.0; 48], &[-1.0]).unwrap();
-    let strength: Vec<f64> = data.supplies.iter().map(|s| s.exp()).collect();
+    let strength = ring.strengths(&[0.0; 48], &data.supplies);
     let gain = Effect::parse("bpm_gain@x_E6=-0.08", &ring).unwrap();
-    let direct = Machine::new(ring.with_vars(&strength), Rf::FixedMomentum, &[gain]).unwrap();
+    let direct = Machine::new(ring.with_strengths(&strength), Rf::FixedMomentum, &[gain]).unwrap();
     assert_eq!(machine.response().unwrap().x, direct.response().unwrap().x);
 }
