@@ -28,7 +28,8 @@ fn recorded(ring: &Ring, vars: &[f64], effects: &[Effect]) -> Recording {
             rf_offset: drive.rf_offset,
             time: 0.0,
         };
-        let (orbit, _) = machine.cycle(&cycle).unwrap();
+        let (orbit, tunes) = machine.cycle(&cycle).unwrap();
+        row.tune = [tunes.x, tunes.y].map(|tune| Some((tune + normal(5e-4)).rem_euclid(1.0)));
         for ((reading, orbit), baseline) in row.reading.iter_mut().zip(orbit).zip(&baseline) {
             *reading = Some(orbit + baseline + normal(0.15e-3));
         }
