@@ -98,9 +98,10 @@ fn a_recording_that_says_nothing_gives_the_prior_and_says_so() {
         if column.starts_with("ic_") || column == "setting_A" { "0".to_owned() } else { cell.to_owned() }
     };
     let still = edited(home.path(), no_kick).display().to_string();
-    for (folder, expected) in
-        [(&silent, "no monitor has a reading that counts"), (&still, "kicks and RF offsets move the beam by too little to tell anything")]
-    {
+    for (folder, expected) in [
+        (&silent, "no monitor has a reading that counts"),
+        (&still, "kicks and RF offsets move the beam by too little to tell anything"),
+    ] {
         for arguments in [&["fit", folder.as_str()][..], &["replay", folder, "--no-publish"]] {
             let result = json(arguments);
             assert_eq!(result["lack"], *expected, "{arguments:?}");
