@@ -234,9 +234,6 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Body<B, C, 
         let mut valid = Mask::NONE;
         let sent = Mask::<W>::from_words(&self.valid);
         (0..layout.monitors()).for_each(|b| valid.put(layout.monitor(b), sent.has(b)));
-        if self.valid.len() != crate::mask::words(layout.monitors()) {
-            return Err(FrameError::Malformed);
-        }
         let (mut corrector, mut supply, mut reading) = ([CurrentCode(0); C], [CurrentCode(0); F], [PositionCode(0); B]);
         place(
             &mut corrector,
@@ -254,6 +251,10 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Body<B, C, 
                 PositionCode::try_new(got).ok_or(beyond)
             },
         )?;
+        // after the lists, whose counts say more
+        if self.valid.len() != crate::mask::words(layout.monitors()) {
+            return Err(FrameError::Malformed);
+        }
         let got = self.rf_offset;
         let beyond = FrameError::Range { field: "rf offset", index: 0, limit: RfCode::LIMIT, got };
         Ok(Frame {
