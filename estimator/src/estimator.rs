@@ -266,7 +266,7 @@ impl<
             .reset(|i| prior_of::<G, B, C, F, N>(model, i), |channel| if channel < B { BASELINE } else { calibration });
         self.gaussian.clone_from(&self.loose);
         self.gaussian.recentre(&[0.0; N]);
-        self.solution.solve(&self.gaussian, |i| prior_of::<G, B, C, F, N>(model, i));
+        self.solve(model);
         self.started = true;
         Ok(())
     }

@@ -110,6 +110,7 @@ impl<
     ///
     /// Settings of one kind differ by the powered corrector's current, so that one derivative serves them all. The 20 mA by
     /// which idle correctors scatter count in the orbit and not in its derivative, a thousandth of it.
+    #[inline(never)]
     fn rebuild(&mut self, model: &Model<'_, G, B, C, F>, params: &[f32; N]) {
         self.gaussian.recentre(params);
         let level = *self.gaussian.baselines();
