@@ -151,7 +151,7 @@ pub struct Serve {
     /// Send it the frames of this recording; without it, a front end does
     #[arg(long, value_name = "RECORDING")]
     pub feed: Option<PathBuf>,
-    /// Send it the tables of the machine first; without it, it goes by those that it has
+    /// Send it the tables of the machine first; otherwise the device keeps its tables
     #[arg(long, requires = "feed")]
     pub load: bool,
     /// Random walk of each ln var, standard deviation per sqrt(frame)
