@@ -6,7 +6,7 @@ RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench peers exports prove prove-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil train bench peers exports validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -69,12 +69,12 @@ exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the sch
 	python3 -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet numpyro==0.22.0 blackjax==1.7.1 'jax[cpu]==0.10.2' 'arviz==0.23.*'
 
-prove: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run is taken up again (anew after `rm target/prove.jsonl`)
-	$(ORBITCAL) prove recordings/paper-vars --outcomes target/prove.jsonl --page docs/diagnosis.md --json target/prove.json
+validate: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
+	$(ORBITCAL) validate recordings/paper-vars --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
 
-prove-short: build ## the same with 80 campaigns, four minutes, and an error if anything is named that is not there (beside unknown physics)
-	rm -f target/prove-short.jsonl
-	$(ORBITCAL) prove recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 18 --outcomes target/prove-short.jsonl --strict
+validate-short: build ## the same with 80 campaigns, four minutes, and an error at a false identification (unmodelled physics apart)
+	rm -f target/validate-short.jsonl
+	$(ORBITCAL) validate recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 18 --outcomes target/validate-short.jsonl --strict
 
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps

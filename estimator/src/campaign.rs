@@ -1,6 +1,6 @@
-//! The campaign so far, in fixed size: for every setting of the machine the means of what drove the beam and of what the
-//! monitors read. With constant params these means are all that the frames have to say, however the model is
-//! linearised, so that every frame so far counts again when the MAP moves.
+//! The stored settings, in fixed size: for every setting of the machine the mean drive and the mean reading of each
+//! monitor. With constant params these means are sufficient statistics, however the model is linearised, so that every
+//! frame so far counts again when the MAP moves.
 //!
 //! Means are kept in fixed point and move by `round((value - mean)/n)`: a year of frames loses less than a tenth of a
 //! micrometre (test `means_hold_for_a_year`).
@@ -28,7 +28,7 @@ const SAME_CURRENT: i32 = 16;
 const SAME_OFFSET: i32 = 1_000;
 
 impl Setting {
-    /// The setting of a frame; none if several things are moved at once, as by a feedback.
+    /// The setting of a frame; none if several correctors, or a corrector and the RF, are moved at once, as by a feedback.
     pub fn of<const B: usize, const C: usize, const F: usize, const W: usize>(
         frame: &Frame<B, C, F, W>,
         powered: f32,
@@ -67,9 +67,9 @@ pub fn is_moved(rf_offset: RfCode) -> bool {
 const FRACTION: u32 = 10;
 /// Steps of a mean in a metre.
 const READING: f32 = 1024.0 / PositionCode::METRES_PER_LSB;
-/// Steps of a mean kick in a radian; +-21 mrad fit.
+/// Steps of a mean kick in a radian; ±21 mrad fit.
 const KICK: f32 = 1e11;
-/// Steps of a mean in a unit of strength or of RF offset; +-2 fit.
+/// Steps of a mean in a unit of strength or of RF offset; ±2 fit.
 const RATIO: f32 = 1e9;
 
 /// A mean of ratios, and of strengths, in its steps.
@@ -202,10 +202,10 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
         self.last.get(b).and_then(|last| last.code())
     }
 
-    /// What the repeats say of a reading, moved to the mean drive; `sigma` is the monitor's noise [m].
+    /// Judge a reading, moved to the mean drive, by its repeats; `sigma` is the monitor's noise [m].
     ///
-    /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects
-    /// it. A surprising one waits. Two that agree outvote the model, and whatever came before.
+    /// A reading passes if it agrees with the mean or the last of its repeats, or, if it is the first, with the model.
+    /// Otherwise it waits. Two consecutive readings that agree outvote the model and all earlier readings.
     pub fn judge(&self, b: usize, moved: i32, sigma: f32, gate: Gate, expected: bool) -> Verdict {
         let (mean, count) = self.mean(b);
         let reading = moved as f32 * PositionCode::METRES_PER_LSB;
@@ -291,7 +291,7 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
         self.cells.get_mut(usize::from(index))
     }
 
-    /// The cell of a setting, a new one if it is new; none if there is no room.
+    /// Index of a setting, which is stored if it is new; none if there is no room.
     pub fn find(&mut self, setting: &Setting) -> Option<u16> {
         let known = self.cells.iter().position(|cell| cell.setting.repeats(setting));
         let index = known.or_else(|| {
@@ -386,7 +386,7 @@ mod tests {
                 (500, true, Confirms { outvotes: true }),
                 (40_000, true, Held),
             ],
-            // a surprise that nothing confirms makes way for what is expected
+            // an unconfirmed reading outside the gate gives way to an expected one
             &[(40_000, false, Held), (0, true, Accepted), (500, true, Accepted)],
             // the machine itself has moved
             &[
@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     fn means_hold_for_a_year() {
-        // a cell of a 10 Hz machine with 100 settings sees 3 million frames a year
+        // a setting of a 10 Hz machine with 100 settings gets 3 million frames a year
         let (mut mean, mut exact) = (0, 0_i64);
         let mut state = 1_u32;
         let n = 3_000_000;

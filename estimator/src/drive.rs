@@ -85,7 +85,7 @@ pub struct Beyond {
 }
 
 impl SupplyCalibration {
-    /// A supply that nothing hangs on.
+    /// A supply without quadrupoles.
     pub const IDLE: Self = Self { nominal: 1.0, transfer: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0] };
 
     /// Gradients over those of the design, at nominal momentum.
@@ -103,7 +103,7 @@ impl SupplyCalibration {
 }
 
 impl<const C: usize, const F: usize> Calibration<C, F> {
-    /// True if every number is one, every size positive, and there is one supply for each.
+    /// True if every number is finite, every size positive, and there is one supply for each.
     pub fn is_sound(&self) -> bool {
         let is_positive = |v: f32| v.is_finite() && v > 0.0;
         self.kick_per_ampere.is_positive()

@@ -3,7 +3,7 @@
 use crate::mask::Mask;
 use crate::prior::{Marginal, Prior};
 
-/// How a monitor is doing.
+/// State of a monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[repr(u8)]
@@ -13,7 +13,7 @@ pub enum MonitorState {
     Ok = 0,
     /// Its repeats scatter more than 1.5 times the expected noise.
     Noisy = 1,
-    /// It jumps now and then.
+    /// It jumps occasionally.
     Jumps = 2,
     /// It does not report, or repeats one value.
     Dead = 3,
@@ -32,20 +32,20 @@ impl MonitorState {
     }
 }
 
-/// State of one monitor.
+/// State and noise of one monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Health {
-    /// How it is doing.
+    /// Its state.
     pub state: MonitorState,
     /// Noise of one reading [m].
     pub noise: f32,
-    /// Noise as which a reading is weighted: more than its noise for a monitor that jumps [m].
+    /// Noise that sets the weight of a reading: larger than `noise` for a monitor that jumps [m].
     pub weighted_as: f32,
     /// Readings that were not used.
     pub rejected: u32,
 }
 
-/// The vars and the state of the instruments after a frame.
+/// The vars and the state of the monitors after a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate<const B: usize, const N: usize, const W: usize> {
     /// Sequence number of the frame.
@@ -84,7 +84,7 @@ pub struct Estimate<const B: usize, const N: usize, const W: usize> {
     pub setting: Option<u16>,
     /// `ln` of the evidence of all readings under the model.
     pub log_evidence: f32,
-    /// The model was linearised anew after this frame.
+    /// The model was relinearised since the last estimate.
     pub linearised: bool,
     /// State of every monitor.
     pub health: [Health; B],

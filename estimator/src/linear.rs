@@ -22,8 +22,8 @@ pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>
     }
 }
 
-/// `to += sum of factor * row`, all four in one pass: loads and stores of `to` are what costs. Rows are at least as long;
-/// what they have beyond its end does not count.
+/// `to += sum of factor * row`, all four in one pass: the cost is in loads and stores of `to`. Rows are at least as long;
+/// entries beyond the end of `to` are ignored.
 #[inline(never)]
 pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
     // one length for all, so that the loop below has no bounds to check and becomes vector code
@@ -36,8 +36,8 @@ pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
     }
 }
 
-/// [`add_four`] for two at a time: loads of the rows are shared. What the longer has beyond the other's end is done by
-/// itself; it is not much.
+/// [`add_four`] for two at a time: loads of the rows are shared. The few entries of the longer beyond the other's end are
+/// added separately.
 #[inline(never)]
 pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
     let [one, other] = to;
@@ -52,8 +52,8 @@ pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]
 }
 
 /// The part of [`add_four_twice`] that both share, eight entries at a time: within a block, addresses are fixed distances
-/// from six pointers. The two are arguments of their own, so that the compiler knows them apart from the rows and keeps what
-/// it has loaded.
+/// from six pointers. The two are separate arguments, so that the compiler knows that they do not alias the rows, and keeps
+/// loaded values.
 #[inline(never)]
 fn two_by_four(one: &mut [f32], other: &mut [f32], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
     let n = one.len();
@@ -79,7 +79,7 @@ fn two_by_four(one: &mut [f32], other: &mut [f32], factors: [[f32; 4]; 2], rows:
     }
 }
 
-/// Scalar product, summed in eight lanes; what one has beyond the other's end does not count.
+/// Scalar product, summed in eight lanes; entries of one beyond the other's end are ignored.
 #[inline]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     let shared = a.len().min(b.len());

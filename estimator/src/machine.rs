@@ -80,17 +80,17 @@ macro_rules! machine {
         pub type Drive = $crate::Drive<CORRECTORS, SUPPLIES>;
         /// What its surrogate predicts.
         pub type Prediction = $crate::Prediction<MONITORS, SUPPLIES, PARAMS>;
-        /// What is known of it beforehand.
+        /// Its setup: priors, noise, calibration.
         pub type Setup = $crate::Setup<MONITORS, CORRECTORS, SUPPLIES>;
-        /// What is known of it after a frame.
+        /// Its estimate after a frame.
         pub type Estimate = $crate::Estimate<MONITORS, PARAMS, WORDS>;
         /// The same on the wire.
         pub type Answer = $crate::wire::link::Answer<MONITORS, PARAMS, WORDS>;
         /// A part of its tables.
         pub type Parcel = $crate::Parcel<LINE>;
-        /// What a host asks of its device.
+        /// A request of its host.
         pub type Request = $crate::wire::link::Request<Setup, Parcel>;
-        /// What its device says.
+        /// A reply of its device.
         pub type Reply = $crate::wire::link::Reply<Answer>;
     };
 }

@@ -1,8 +1,8 @@
-//! Monitors as instruments: noise learnt from repeats, a gate against jumps, and how each one is doing.
+//! Monitors: noise learnt from repeats, a gate against jumps, and the state of each.
 //!
-//! Noise is learnt from the difference of readings that repeat a setting, never from the model's residuals: those would
-//! swallow the very mismatch that the tool looks for. The gate, too, lets a reading pass that its own repeat confirms,
-//! whatever the model says. Batch fits use these same definitions.
+//! Noise is learnt from the difference of readings that repeat a setting, never from the model's residuals: those contain
+//! the mismatch that the tool looks for. The gate likewise passes a reading that its repeat confirms, whatever the model
+//! predicts. Batch fits use these same definitions.
 
 use micromath::F32Ext;
 use serde::{Deserialize, Serialize};
@@ -45,7 +45,7 @@ const ONE_SIGMA: f32 = 0.682_689_5;
 /// Standard error of `ln sigma` from one sigma's quantile of n differences is this over `sqrt(n)`:
 /// `sqrt(p (1 - p))/(2 phi(1))` = 0.96, and 1.2 times that since neighbouring differences share a reading.
 const QUANTILE_ERROR: f32 = 1.15;
-/// Standard errors by which the repeats must contradict the expected noise before it is given up.
+/// Standard errors by which the repeats must contradict the expected noise before it is replaced.
 const CONTRADICTION: f32 = 4.0;
 /// Standard errors by which they must contradict a noise that was learnt already.
 const REVISION: f32 = 0.5;
@@ -54,8 +54,8 @@ const ENOUGH: u32 = 8;
 
 /// The noise of one monitor, learnt from differences of repeats.
 ///
-/// A histogram of the logarithm of their size is a robust scale: its 68 % quantile does not care how far a tenth of the
-/// readings jump, nor in which order the frames came. Interpolating between quarter-octave bins and micromath's `exp`
+/// A histogram of the logarithm of their size is a robust scale: its 68 % quantile does not depend on how far a tenth of
+/// the readings jump, nor on the order of the frames. Interpolating between quarter-octave bins and micromath's `exp`
 /// (0.25 %) together cost less than 2 %, small against the 7 % statistical error of a campaign's 270 differences (test
 /// `the_scale_is_right_for_normal_noise`).
 #[derive(Debug, Clone)]
@@ -103,7 +103,7 @@ impl Noise {
         self.total = self.histogram.iter().map(|&count| u32::from(count)).sum();
     }
 
-    /// Noise that the differences so far call for [m]; none before there are enough.
+    /// Noise estimated from the differences so far [m]; none before there are enough.
     pub fn learnt(&self) -> Option<f32> {
         if self.total < ENOUGH {
             return None;
@@ -138,7 +138,7 @@ impl Noise {
 const SILENCE: u16 = 20;
 /// Identical codes in a row after which a monitor counts as stuck: noise of 1500 steps makes that once in 1e9 frames.
 const STUCK: u16 = 4;
-/// Share of rejected readings above which a monitor is one that jumps; the gate's own share is 6e-7.
+/// Share of rejected readings above which a monitor counts as jumping; normal noise gives 6e-7.
 const JUMPY: f32 = 0.01;
 /// Fewest rejected readings for that.
 const FEWEST_JUMPS: u32 = 3;
@@ -174,7 +174,7 @@ impl Monitor {
         last_code: 0,
     };
 
-    /// Begin anew, with an expected noise [m].
+    /// Restart with an expected noise [m].
     pub fn expect(&mut self, sigma: f32) {
         *self = Self { noise: Noise::expecting(sigma), ..Self::BLANK };
     }
@@ -198,12 +198,12 @@ impl Monitor {
         self.rejected = self.rejected.saturating_add(1);
     }
 
-    /// Take a rejection back: a repeat has confirmed the reading.
+    /// Accept a late reading: a repeat has confirmed it.
     pub fn pardon(&mut self) {
         self.rejected = self.rejected.saturating_sub(1);
     }
 
-    /// Judge the monitor anew; true if readings so far have to be weighted differently.
+    /// Update the monitor's state; true if its readings so far need re-weighting.
     pub fn judge(&mut self) -> bool {
         let (jumped, noise_changed) = (self.jumps, self.noise.revise());
         self.jumps = self.rejected >= FEWEST_JUMPS && self.rejected as f32 > JUMPY * self.reported as f32;
@@ -225,7 +225,7 @@ impl Monitor {
         if self.jumps { JUMPING * variance } else { variance }
     }
 
-    /// For the outside.
+    /// State, noise and rejections, as an estimate carries them.
     pub fn health(&self) -> Health {
         Health {
             state: self.state,
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn silent_and_stuck_monitors_are_dead_until_they_speak() {
+    fn silent_and_stuck_monitors_are_dead_until_they_report() {
         let mut monitor = Monitor::BLANK;
         monitor.expect(1.5e-4);
         for _ in 0..SILENCE {

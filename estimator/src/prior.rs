@@ -31,7 +31,7 @@ impl Prior {
         Self { mean: -0.5 * variance, sigma, lower: libm::logf(lower), upper: libm::logf(upper) }
     }
 
-    /// True if every number is one, and sizes are positive.
+    /// True if every number is finite, and sizes are positive.
     pub fn is_sound(&self) -> bool {
         let Self { mean, sigma, lower, upper } = *self;
         [mean, sigma, lower, upper].iter().all(|v| v.is_finite()) && sigma > 0.0 && upper > lower

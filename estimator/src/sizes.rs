@@ -1,4 +1,4 @@
-//! How many of everything a ring has, how many a core has room for, and where the ring's lie among the core's.
+//! Sizes of a ring and of a core, and the slots of a larger core that the ring takes.
 
 use serde::{Deserialize, Serialize};
 

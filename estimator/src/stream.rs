@@ -1,4 +1,4 @@
-//! What the loop around a core needs of it, whatever its sizes.
+//! The interface of a core to the loop around it, independent of its sizes.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -11,11 +11,11 @@ use crate::wire::link::Answer;
 /// A core with its types; see [`Estimator`] for what each method does.
 #[allow(missing_docs)] // those of `Estimator`
 pub trait Core: Sized {
-    /// What it goes by.
+    /// The model's tables.
     type Tables: Tables;
-    /// What is known beforehand, besides the tables.
+    /// Priors, noise and calibration.
     type Setup: Clone + Serialize + DeserializeOwned;
-    /// What it says of a frame.
+    /// The estimate after a frame.
     type Estimate;
     /// The same on the wire.
     type Answer: Serialize + DeserializeOwned + for<'e> From<&'e Self::Estimate>;
@@ -39,7 +39,7 @@ pub trait Core: Sized {
     fn covariance(&self, i: usize, j: usize) -> f32;
     /// Number of the frame that an estimate is of.
     fn sequence(estimate: &Self::Estimate) -> u32;
-    /// True if a person should have a look: a monitor is not ok, or a var clipped.
+    /// True if an operator should look: a monitor is not ok, or a var is clipped.
     fn needs_attention(estimate: &Self::Estimate) -> bool;
 }
 

@@ -96,7 +96,7 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
     /// Cholesky factor `L` of the symmetric matrix, in place, and the logarithm of its determinant; none if it is not
     /// positive. nalgebra's own takes a full matrix by value, 9 kB of stack.
     ///
-    /// Four columns of the factor at a time, then their products are taken from the rows that remain.
+    /// Four columns of the factor at a time, then their products are subtracted from the remaining rows.
     pub fn factorise(&mut self) -> Option<f32> {
         let mut determinant = LogProduct::ONE;
         for from in (0..N).step_by(4) {
@@ -116,8 +116,8 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
         Some(determinant.value())
     }
 
-    /// Column `j` of the factor, to `column` and in place; what the columns before take from it is taken already, but for
-    /// those of its own group. Returns its pivot, the square of its diagonal.
+    /// Column `j` of the factor, to `column` and in place; earlier columns have been eliminated, except those of its own
+    /// group. Returns its pivot, the square of its diagonal.
     fn factorise_column(&mut self, j: usize, column: &mut [f32; N], group: &[[f32; N]]) -> Option<f32> {
         let below = column.get_mut(j..)?;
         below.iter_mut().zip(self.rows_from(j)).for_each(|(to, row)| *to = row.get(j).copied().unwrap_or(0.0));
@@ -139,7 +139,7 @@ impl<const N: usize, const T: usize> Triangle<N, T> {
 
     /// Invert a lower triangle, in place: `x_i = (e_i - sum over k < i of L_ik x_k)/L_ii` by rows.
     ///
-    /// Four rows of the inverse at a time; the rows below then hold, left of where their factor still stands, the sum so far.
+    /// Four rows of the inverse at a time; in the rows below, entries left of the remaining factor hold the sum so far.
     pub fn invert(&mut self) {
         for from in (0..N).step_by(4) {
             let to = (from + 4).min(N);

@@ -1,7 +1,7 @@
-//! A tune meter as an instrument: its noise learnt from one frame to the next, and the mean of its readings.
+//! The tune meter: its noise learnt from one frame to the next, and the mean of its readings.
 //!
-//! With constant params all that its frames have to say is the mean tune at the mean strength of the supplies. What each
-//! frame's supplies add is known, and so is taken out of its tune before two are compared.
+//! With constant params the sufficient statistic is the mean tune at the mean strength of the supplies. What each frame's
+//! supplies add is known, and is subtracted before two tunes are compared.
 
 use crate::campaign::{move_mean, ratio, ratio_steps};
 use crate::monitor::{Gate, Noise};
@@ -34,7 +34,7 @@ impl<const F: usize> TuneMeter<F> {
     pub const BLANK: Self =
         Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: Sum::ZERO, last: None };
 
-    /// Begin anew.
+    /// Restart without readings.
     pub fn clear(&mut self) {
         *self = Self { noise: Noise::unknown(SCALE), ..Self::BLANK };
     }
@@ -72,7 +72,7 @@ impl<const F: usize> TuneMeter<F> {
         }
     }
 
-    /// Judge its noise anew; true if readings so far have to be weighted differently.
+    /// Update its noise; true if readings so far need re-weighting.
     pub fn judge(&mut self) -> bool {
         self.noise.revise()
     }
@@ -117,7 +117,7 @@ mod tests {
         (meter, used)
     }
 
-    /// Uniform in +-1e-3, by the bits of a sine.
+    /// Uniform in ±1e-3, by the bits of a sine.
     fn scatter(i: u32) -> f64 {
         let hashed = 43_758.545 * libm::sin(12.9898 * f64::from(i) + 0.1);
         1e-3 * (2.0 * (hashed - libm::floor(hashed)) - 1.0)
@@ -130,7 +130,7 @@ mod tests {
             let (mean, _, count) = meter.mean();
             assert_eq!((used, count), (399, 399));
             assert!(f64::from(wrapped(mean - design as f32)).abs() < 1e-4, "{mean}");
-            // uniform in +-1e-3: 5.8e-4 rms, and the 68 % quantile of a difference over sqrt 2 is 6.2e-4
+            // uniform in ±1e-3: 5.8e-4 rms, and the 68 % quantile of a difference over sqrt 2 is 6.2e-4
             let sigma = libm::sqrtf(meter.variance().unwrap());
             assert!((5e-4..8e-4).contains(&sigma), "{sigma}");
             let rms = libm::sqrtf(meter.scatter() / count as f32);
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_supplies_do_is_not_noise() {
+    fn supply_ripple_is_not_noise() {
         let mut meter = TuneMeter::<1>::BLANK;
         meter.clear();
         for i in 0..100 {

@@ -20,7 +20,7 @@ static SLOT: ConstStaticCell<Tables> = ConstStaticCell::new(Tables::BLANK);
 const BAUD: u32 = 921_600;
 /// One machine cycle [us], that of the recordings' drift stream.
 const CYCLE_US: u32 = 200_000;
-/// The watchdog bites after [s]: 25 cycles.
+/// Timeout of the watchdog [s]: 25 cycles.
 const WATCHDOG_S: u32 = 5;
 
 #[cortex_m_rt::entry]

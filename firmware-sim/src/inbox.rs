@@ -1,9 +1,9 @@
-//! From bytes to packets: what stands between two zeros.
+//! From bytes to packets, which zeros separate.
 
 use embedded_io::{Error, ErrorKind, Read};
 use estimator::wire::link::Refusal;
 
-/// Cycles without a byte after which the rest of a packet will not come: its sender has stalled, or begun anew.
+/// Cycles without a byte after which the rest of a packet will not come: its sender has stalled or restarted.
 const PATIENCE: u32 = 2;
 
 /// The packet that is coming in, of `P` bytes at most.
@@ -24,9 +24,9 @@ pub struct Inbox<const P: usize> {
 pub enum Event<'i> {
     /// The bytes of a packet, its zero included.
     Packet(&'i mut [u8]),
-    /// Bytes that are none.
+    /// Bytes that are not a packet.
     Broken(Refusal),
-    /// No packet yet: nothing came for a cycle, or many bytes that are none.
+    /// No packet yet: nothing came for a cycle, or many bytes without a packet.
     Silence,
     /// The source has ended.
     End,
@@ -44,8 +44,8 @@ impl<const P: usize> Inbox<P> {
         self.silent_cycles
     }
 
-    /// Wait for a packet, or for a cycle to pass without a byte. A stream of bytes that never makes a packet is left now and
-    /// then, so that the loop around can show that it lives.
+    /// Wait for a packet, or for a cycle to pass without a byte. A stream of bytes without packets is interrupted occasionally,
+    /// so that the loop can feed the watchdog.
     ///
     /// # Errors
     /// What the source reports, but [`ErrorKind::TimedOut`].
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_without_packets_is_left_now_and_then() {
+    fn a_stream_without_packets_is_interrupted_occasionally() {
         for noise in [0, 1] {
             let script = [Some(noise); 3 * MOST];
             let (mut source, mut inbox) = (Script(&script), Small::default());

@@ -1,5 +1,5 @@
-//! The loop around the core: bytes in, answers out, on the host and on a Cortex-M. Start reading at [`run`]; what travels
-//! is in `docs/device.md`.
+//! The loop around the core: bytes in, replies out, on the host and on a Cortex-M. Start reading at [`run`]; the messages
+//! are in `docs/device.md`.
 #![no_std]
 
 #[cfg(test)]

@@ -10,8 +10,8 @@ include!(concat!(env!("OUT_DIR"), "/machine.rs"));
 const ROOM: usize = (224 - 6) * 1024;
 const _: () = assert!(size_of::<Estimator>() + size_of::<Tables>() <= ROOM, "{}", TOO_LARGE);
 
-/// What its core goes by.
+/// The tables of its core.
 pub type Tables = <Estimator as estimator::Core>::Tables;
 
-/// The tables of its design.
+/// Those of its design.
 pub static BUILT_IN: Tables = include!(concat!(env!("OUT_DIR"), "/tables.rs"));

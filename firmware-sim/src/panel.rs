@@ -1,9 +1,8 @@
-//! What a person, and a watchdog, can see of a device: three pins.
+//! The three output pins of a device, for the operator and a watchdog.
 
 use embedded_hal::digital::OutputPin;
 
-/// Two lamps, one that follows the cycle and one that says that something needs a look; and the line that keeps an
-/// external watchdog from resetting the device, fed by an edge.
+/// Two lamps, a heartbeat and one that asks for attention; and the line whose edges feed an external watchdog.
 #[derive(Debug)]
 pub struct Panel<P, W> {
     heartbeat: Line<P>,
@@ -11,7 +10,7 @@ pub struct Panel<P, W> {
     watchdog: Line<W>,
 }
 
-/// A pin that shows its news by an edge.
+/// A pin that signals by an edge.
 #[derive(Debug)]
 struct Line<P> {
     pin: P,
@@ -50,7 +49,7 @@ impl<P: OutputPin, W: OutputPin> Panel<P, W> {
         self.attention.set_high()
     }
 
-    /// Say that the loop goes round.
+    /// Feed the watchdog.
     ///
     /// # Errors
     /// What the pin reports.

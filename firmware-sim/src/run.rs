@@ -1,4 +1,4 @@
-//! The loop of a device: bytes in, packets, answers out. The same on the host and on a chip.
+//! The loop of a device: bytes in, packets, replies out. The same on the host and on a chip.
 
 use embedded_hal::digital::OutputPin;
 use embedded_io::{Read, Write};
@@ -11,8 +11,8 @@ use crate::panel::Panel;
 
 /// Run until the source ends. No packet has more than `P` bytes.
 ///
-/// `source` reports [`embedded_io::ErrorKind::TimedOut`] once a machine cycle while nothing comes; `vitals` asks the board
-/// how it is, when a host asks for that.
+/// `source` reports [`embedded_io::ErrorKind::TimedOut`] once a machine cycle while nothing comes; `vitals` reads the status of
+/// the board, when a host requests it.
 ///
 /// # Errors
 /// What the source or the sink report.
@@ -34,7 +34,7 @@ pub fn run<E: Core, R: Read, W: Write<Error = R::Error>, const L: usize, const P
             }
         };
         let refused = device.refused();
-        let answer = match event {
+        let estimate = match event {
             Event::Packet(bytes) => device.hear(bytes, || Vitals { silent_cycles, ..vitals() }, &mut reply),
             Event::Broken(why) => {
                 device.refuse(why, &mut reply);
@@ -43,12 +43,12 @@ pub fn run<E: Core, R: Read, W: Write<Error = R::Error>, const L: usize, const P
             Event::Silence => None,
             Event::End => return sink.flush(),
         };
-        // a lamp that does not light is no reason to stop
-        let _ = answer.map(|estimate| panel.show(E::needs_attention(&estimate)));
+        // a pin that fails is no reason to stop
+        let _ = estimate.map(|estimate| panel.show(E::needs_attention(&estimate)));
         let _ = (device.refused() != refused).then(|| panel.alarm());
         sent?;
         let _ = panel.feed();
-        // the answer is out; this may take until the next frame
+        // the reply is sent; this may take until the next frame
         device.prepare();
     }
 }

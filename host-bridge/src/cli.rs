@@ -35,14 +35,14 @@ pub enum Command {
     Fit(Fit),
     /// The published studies of a recording, as one report
     Study(Study),
-    /// Find what the model of a recording lacks, with proof on held-out frames
+    /// Find what the model of a recording lacks, tested on held-out frames
     Diagnose(Diagnose),
     /// The calibrated ring as a lattice file of another code
     Export(Export),
     /// Diagnose the recordings below a folder, score them by their truth.json
     Challenge(Challenge),
-    /// Diagnose simulated blind campaigns, count how often it is right
-    Prove(Prove),
+    /// Diagnose simulated blind campaigns, count how often the result is right
+    Validate(Validate),
     /// Publish the estimates of a device
     Serve(Serve),
     /// Surrogates and their measured errors
@@ -151,7 +151,7 @@ pub struct Serve {
     /// Send it the frames of this recording; without it, a front end does
     #[arg(long, value_name = "RECORDING")]
     pub feed: Option<PathBuf>,
-    /// Send it the tables of the machine first; without it, it goes by those that it has
+    /// Send it the tables of the machine first; otherwise the device keeps its tables
     #[arg(long, requires = "feed")]
     pub load: bool,
     /// Random walk of each ln var, standard deviation per sqrt(frame)
@@ -325,15 +325,15 @@ pub struct Challenge {
     pub common: Common,
 }
 
-/// `orbitcal prove`.
+/// `orbitcal validate`.
 #[derive(Debug, Args)]
-pub struct Prove {
+pub struct Validate {
     /// Campaign whose settings, read-backs and gaps the simulated ones have
     pub template: PathBuf,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
-    /// Campaigns with nothing missing
+    /// Campaigns of a machine that the model describes
     #[arg(long, value_name = "N", default_value_t = 300)]
     pub empty: usize,
     /// Campaigns with one effect of the library
@@ -342,11 +342,11 @@ pub struct Prove {
     /// Campaigns with two
     #[arg(long, value_name = "N", default_value_t = 48)]
     pub pair: usize,
-    /// Campaigns with physics that the library does not hold
+    /// Campaigns with an effect that the library does not hold
     #[arg(long, value_name = "N", default_value_t = 90)]
     pub unknown: usize,
-    /// One line a campaign; those that are there already are not run again
-    #[arg(long, value_name = "FILE.jsonl", default_value = "target/prove.jsonl")]
+    /// One line a campaign; campaigns already in the file are not run again
+    #[arg(long, value_name = "FILE.jsonl", default_value = "target/validate.jsonl")]
     pub outcomes: PathBuf,
     /// Write the tables between the marks of this page
     #[arg(long, value_name = "FILE.md")]
@@ -354,7 +354,7 @@ pub struct Prove {
     /// Fixes every random choice
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// End with an error if, in an empty campaign or beside effects of the library, something was named that is not there
+    /// End with an error at a false identification in an empty campaign or beside effects of the library
     #[arg(long)]
     pub strict: bool,
 }

@@ -7,7 +7,7 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, diagnose, export, fit, prove, replay, response, serve, study, surrogate, watch,
+    CommandError, challenge, check, diagnose, export, fit, replay, response, serve, study, surrogate, validate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -32,7 +32,7 @@ fn main() -> ExitCode {
         Command::Diagnose(options) => diagnose::run(options),
         Command::Challenge(options) => challenge::run(options),
         Command::Export(options) => export::run(options),
-        Command::Prove(options) => prove::run(options),
+        Command::Validate(options) => validate::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Surrogate(options) => surrogate::run(options),
     };

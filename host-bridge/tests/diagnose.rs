@@ -1,4 +1,4 @@
-//! `orbitcal diagnose`, `challenge` and `prove` as users run them, on good and on bad recordings.
+//! `orbitcal diagnose`, `challenge` and `validate` as users run them, on good and on bad recordings.
 
 use std::fs;
 use std::path::Path;
@@ -136,7 +136,7 @@ fn what_is_no_recording_is_refused() {
     for arguments in [
         ["diagnose", "recordings/no-such"].as_slice(),
         &["challenge", "docs"],
-        &["prove", "recordings/no-such"],
+        &["validate", "recordings/no-such"],
         &["replay", "recordings/paper-vars", "--model-file", "Cargo.toml"],
     ] {
         let run = orbitcal(arguments);
@@ -145,16 +145,16 @@ fn what_is_no_recording_is_refused() {
     }
 }
 
-/// A run that is taken up again does not run a campaign twice, and the tables are the same.
+/// A resumed run runs no campaign twice, and the tables are the same.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-fn a_proof_is_taken_up_where_it_stopped() {
+fn a_stopped_validation_resumes() {
     let folder = tempfile::tempdir().unwrap();
     let outcomes = folder.path().join("outcomes.jsonl");
     let run = |single: &str| {
         let few = ["--empty", "1", "--single", single, "--pair", "0", "--unknown", "1"];
         let arguments =
-            ["prove", "recordings/paper-vars", "--json", "-", "--quiet", "--outcomes", outcomes.to_str().unwrap()];
+            ["validate", "recordings/paper-vars", "--json", "-", "--quiet", "--outcomes", outcomes.to_str().unwrap()];
         let run = orbitcal(&[arguments.as_slice(), few.as_slice()].concat());
         assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
         let tables: Value = serde_json::from_slice(&run.stdout).unwrap();

@@ -123,7 +123,7 @@ fn tables_of_another_ring_are_not_answered_by() {
     let mut other = tables();
     other.stated_error[0] *= 2.0;
     let message = format!(
-        "goes by tables {:08x}, this model has {:08x}; --load",
+        "uses tables {:08x}, this model has {:08x}; --load",
         other.digest::<LINE>(),
         tables().digest::<LINE>()
     );

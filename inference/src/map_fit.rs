@@ -30,7 +30,7 @@ pub struct BatchFit {
     pub chi2_per_dof: f64,
     /// Tunes x and y at the MAP, and as measured.
     pub tunes: [FittedTune; 2],
-    /// What the orbits lack to say anything: the result is then the prior, but for measured tunes.
+    /// Why the orbits do not constrain the params, if so: the result is then the prior, but for measured tunes.
     pub lack: Option<Lack>,
     /// Rms of the baselines in x and y [m].
     pub orbit: [f64; 2],
@@ -54,7 +54,7 @@ impl FittedTune {
     }
 }
 
-/// What a campaign lacks to say anything of the params by orbits.
+/// Why the orbits of a campaign do not constrain the params.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lack {
     /// No monitor has a reading that counts.

@@ -63,7 +63,7 @@ pub enum NutsError {
     #[error("the sampler stopped: {0}")]
     Sampler(String),
     /// The sampler's result is incomplete.
-    #[error("the sampler's answer has no {0}")]
+    #[error("the sampler's result has no {0}")]
     Missing(&'static str),
 }
 

@@ -80,7 +80,7 @@ pub enum End {
     Stalled,
     /// There were as many steps as allowed.
     Exhausted,
-    /// Whoever watched has given it up.
+    /// The caller stopped it.
     GivenUp,
 }
 

@@ -1,12 +1,12 @@
 //! The information of a campaign on the orbit response, one quadratic form a monitor with the baselines eliminated, and on the tunes.
 //!
 //! A prediction is linear in the response `rho` of a monitor (a row of [`crate::ResponseModel::predict`]) once the frame's
-//! drive `k` (kicks, RF offset) is known, so that all frames together say
+//! drive `k` (kicks, RF offset) is known, so that all frames together give
 //!
 //! `chi2 = rho^T A rho - 2 m rho + const`, `A = sum of k k^T/variance`, `m = sum of k reading/variance`,
 //!
-//! less what the unknown baseline takes (the Schur complement of its row). Two things are not linear in the response and are
-//! taken from the readings beforehand, at the MAP: the frame's own supply currents, which scatter by 2e-4 (they move an
+//! less what the unknown baseline absorbs (the Schur complement of its row). Two things are not linear in the response and are
+//! subtracted from the readings beforehand, at the MAP: the frame's own supply currents, which scatter by 2e-4 (they move an
 //! orbit by up to 3 um, and by less than 0.1 um differently within the posterior), and the second order of the RF orbit.
 //!
 //! Two data modes: all frames with baselines ([`Readings::of_frames`]), and, as the paper did, differences of one frame pair

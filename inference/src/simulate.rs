@@ -1,6 +1,6 @@
 //! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
 //!
-//! [`like`] is the machine that the estimator believes in: linear optics, constant baselines, and nothing missing.
+//! [`like`] is the machine of the estimator's model: linear optics, constant baselines, no other effects.
 //! [`campaign()`] is one of exact orbits, with any effects.
 
 mod campaign;
@@ -93,7 +93,7 @@ pub fn like(
 pub const TUNE_CUT: f64 = 0.05;
 
 /// Distance of a tune from the next half integer that a ring needs to keep its beam: supplies that fluctuate by 2e-4, and
-/// now and then by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again.
+/// occasionally by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again.
 const STOP_BAND: f64 = 0.03;
 
 /// Vars drawn from the truncated priors of a ring's params; with the tune cut, those whose ring's tunes are within

@@ -93,7 +93,7 @@ impl Core {
         Self::with_tables(training::green::tables(ring)?, setup)
     }
 
-    /// The core at its prior, going by other tables than a design's: those of [`training::extended`], or from a file.
+    /// The core at its prior, with other tables than a design's: those of [`training::extended`], or from a file.
     ///
     /// # Errors
     /// [`StreamError::Unstable`].
@@ -142,7 +142,7 @@ impl Core {
         self.stream.prepare()
     }
 
-    /// Go over to other tables of the same machine. See [`estimator::Estimator::adopt`].
+    /// Switch to other tables of the same machine. See [`estimator::Estimator::adopt`].
     ///
     /// # Errors
     /// [`Unstable`] if they have no ring at the vars at hand, or are of another machine; the former tables are then in use again.

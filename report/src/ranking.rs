@@ -28,7 +28,7 @@ pub struct Ranked {
     /// How large it is.
     pub value: f64,
     /// What it has to exceed, if anything.
-    pub price: Option<f64>,
+    pub threshold: Option<f64>,
 }
 
 impl Figure {
@@ -36,9 +36,9 @@ impl Figure {
     pub fn ranking(axes: &Axes, groups: &[&str], entries: &[Ranked]) -> Figure {
         let rows = entries.iter().map(|entry| {
             let group = groups.get(entry.group).copied().unwrap_or_default();
-            [entry.label.clone(), group.into(), number(entry.value), entry.price.map_or(String::new(), number)]
+            [entry.label.clone(), group.into(), number(entry.value), entry.threshold.map_or(String::new(), number)]
         });
-        Figure { svg: chart(axes, groups, entries), csv: csv(["name", "group", "value", "price"], rows) }
+        Figure { svg: chart(axes, groups, entries), csv: csv(["name", "group", "value", "threshold"], rows) }
     }
 }
 
@@ -48,7 +48,7 @@ fn chart(axes: &Axes, groups: &[&str], entries: &[Ranked]) -> String {
     let left = entries.iter().map(|entry| text_width(&entry.label, TICK)).fold(0.0, f64::max) + 20.0;
     let top = legend.bottom() + if axes.y_label.is_empty() { 0.0 } else { 20.0 };
     let place = Place { left, top, right: WIDTH - RIGHT - FIGURES, bottom: top + ROW * entries.len().max(1) as f64 };
-    let values = entries.iter().flat_map(|entry| [Some(entry.value), entry.price]).flatten();
+    let values = entries.iter().flat_map(|entry| [Some(entry.value), entry.threshold]).flatten();
     let range = span(values.chain([0.0]));
     let range = if range.start < 0.0 { aired(range) } else { range.start..aired(range).end };
     draw(&axes.title, place.bottom + BELOW, |sheet| {
@@ -76,7 +76,7 @@ fn bar(plot: &Plot, left: f64, row: f64, entry: &Ranked) -> Drawn {
     pen.mark(plot.sheet, to)?;
     let figures = format!("{:.1}", entry.value).replace('-', "\u{2212}");
     plot.sheet.draw_text(&figures, &plain(TICK, HPos::Right), (px(WIDTH - 8.0), from.1))?;
-    entry.price.map_or(Ok(()), |price| tick(plot, plot.spot(price, row)))
+    entry.threshold.map_or(Ok(()), |threshold| tick(plot, plot.spot(threshold, row)))
 }
 
 fn tick(plot: &Plot, (x, y): (i32, i32)) -> Drawn {
@@ -90,10 +90,14 @@ mod tests {
 
     #[test]
     fn every_bar_has_its_row_of_numbers() {
-        let entry =
-            |i: usize| Ranked { label: format!("cause {i}"), group: i % 2, value: 9.0 - i as f64, price: Some(7.0) };
+        let entry = |i: usize| Ranked {
+            label: format!("cause {i}"),
+            group: i % 2,
+            value: 9.0 - i as f64,
+            threshold: Some(7.0),
+        };
         let entries: Vec<Ranked> = (0..6).map(entry).collect();
-        let figure = Figure::ranking(&Axes::new("t", "ln Bayes factor", "price"), &["one", "other"], &entries);
+        let figure = Figure::ranking(&Axes::new("t", "ln Bayes factor", "threshold"), &["one", "other"], &entries);
         assert_eq!(figure.csv.lines().count(), 1 + 6);
         assert_eq!(figure.csv.lines().nth(2), Some("cause 1,other,8.0,7.0"));
         assert!(entries.iter().all(|entry| figure.svg.contains(&format!(">\n{}\n</text>", entry.label))));

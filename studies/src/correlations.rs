@@ -1,4 +1,4 @@
-//! Correlations of the vars: of one with all others, of all with all, and whether they are the machine's or the method's.
+//! Correlations of the vars: of one with all others, of all with all, and whether they come from the machine or the method.
 
 use inference::simulate::{self, Instruments};
 use inference::{Readings, TuneUse};
@@ -28,9 +28,9 @@ pub fn study(sampling: &mut Sampling, reference: &Sampled, var: usize) -> Result
         .compared(Reference::Level(0.0));
     let alike = likeness(&measured, &made);
     let verdict = if alike > 0.9 {
-        "The pattern is the method's: it is there in readings that the twin alone has made. Posterior covariances follow from how responses depend on \
+        "The pattern comes from the method: readings simulated by the twin show it too. Posterior covariances follow from how responses depend on \
          neighbouring quadrupoles, from the settings and from the weights, and hardly from the readings themselves, so that this \
-         pattern says nothing for or against errors of the machine."
+         pattern is no evidence for or against errors of the machine."
     } else {
         "The two differ by more than that: few draws, or readings that count in one and not in the other."
     };

@@ -57,7 +57,7 @@ pub struct Numbers {
     pub runs: Vec<RunNumbers>,
     /// The reference: all frames, twin.
     pub vars: Vec<VarNumbers>,
-    /// Tunes of the fitted ring, which was not told the measured ones.
+    /// Tunes of the fitted ring, whose fit leaves out the measured ones.
     pub tunes: [TuneNumbers; 2],
     /// Every subset of the data.
     pub subsets: Vec<SubsetNumbers>,
@@ -268,10 +268,10 @@ impl VarNumbers {
 mod tests {
     use super::*;
 
-    /// Only `paper-vars` is of the published campaign; any other recording is spoken of by its own settings and vars.
+    /// Only `paper-vars` is of the published campaign; any other recording is described by its own settings and vars.
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes unoptimised; the release tests run it")]
-    fn a_study_speaks_of_what_is_in_the_recording() {
+    fn a_study_describes_its_own_recording() {
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
         let ring = Ring::read(&folder.join("ring.json")).unwrap();
         let recording = Recording::read(&folder.join("plain"), &ring).unwrap();

@@ -47,7 +47,7 @@ pub fn study(sampling: &mut Sampling, subsets: &Subsets) -> Result<(Section, ByW
             data(subsets),
             widths.join(", ")
         )],
-        figures: vec![("What the prior's width does to each var.".into(), Figure::bands(&axes, &bands))],
+        figures: vec![("Each var under every prior.".into(), Figure::bands(&axes, &bands))],
         ..Section::default()
     };
     Ok((section, by_width))

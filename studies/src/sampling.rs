@@ -140,7 +140,7 @@ pub(crate) fn section(runs: &[RunNumbers]) -> Section {
     let unmixed: Vec<&str> =
         runs.iter().filter(|run| run.rhat_max > nuts::UNMIXED).map(|run| run.name.as_str()).collect();
     let verdict = if unmixed.is_empty() {
-        format!("All are below {}, as those of chains that have mixed.", nuts::UNMIXED)
+        format!("All are below {}: the chains have mixed.", nuts::UNMIXED)
     } else {
         format!(
             "Above {}, so that the chains do not agree yet and their numbers are provisional: {}.",

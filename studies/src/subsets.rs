@@ -1,4 +1,4 @@
-//! Stability: differences of single frame pairs, drawn anew several times, and all of them pooled.
+//! Stability: differences of single frame pairs, drawn several times, and all of them pooled.
 
 use inference::campaign::Campaign;
 use inference::diagnostics::quantile;
@@ -186,7 +186,7 @@ impl Subsets {
         }
     }
 
-    /// How the subsets differ beside what their own widths allow.
+    /// Scatter of the subsets over their stated widths.
     fn scatter(&self, names: &[String]) -> String {
         let scatter = |kind: Kind| {
             let each: Vec<&Sampled> = self.of(kind).collect();

@@ -48,9 +48,9 @@ pub fn study(sampling: &Sampling) -> Result<(Section, Vec<Fault>), StudyError> {
     let section = Section {
         heading: "Outliers".into(),
         text: vec![format!(
-            "For every corrector and monitor, all differences of two frames less what the twin expects at the MAP; a reading is at fault \
+            "For every corrector and monitor, all differences of two frames less what the twin predicts at the MAP; a reading is at fault \
              if most of its differences stand out by {STANDS_OUT:.0} standard deviations. {} readings in {} frames are at fault; the \
-             core's own gate decides cycle by cycle without knowing them.",
+             core's own gate decides cycle by cycle, independently of them.",
             faults.len(),
             frames.len()
         )],

@@ -18,7 +18,7 @@ fn main() {
 
 type Linearised = <Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised;
 
-/// Frames of `recordings/paper-vars` as wire bytes, and a core that has heard some of them.
+/// Frames of `recordings/paper-vars` as wire bytes, and a core that has ingested some of them.
 struct Campaign {
     wires: Vec<Vec<u8>>,
     core: Core,
@@ -43,7 +43,7 @@ impl Campaign {
         frames
     }
 
-    /// The core just before each time that it linearises anew.
+    /// The core just before each relinearisation.
     fn linearisations(mut self) -> Vec<Core> {
         let mut before = Vec::new();
         for wire in &self.wires {
@@ -67,7 +67,7 @@ fn frame(bencher: Bencher) {
         .bench_local_values(|(mut core, mut wire)| (core.ingest(black_box(&mut wire)), core));
 }
 
-/// Between frames: the surrogate linearised anew and all settings so far counted again.
+/// Between frames: the surrogate relinearised and all settings so far counted again.
 #[divan::bench(sample_size = 1)]
 fn linearise_anew(bencher: Bencher) {
     let before = Campaign::read().linearisations();

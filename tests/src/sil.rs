@@ -86,7 +86,7 @@ pub fn compare(
     })
 }
 
-/// True if the core in process says the same of a frame, bit for bit: the whole estimate, and the covariance.
+/// True if the core in process gives the same for a frame, bit for bit: the whole estimate, and the covariance.
 fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
     core.prepare();
     let Ok(estimate) = core.ingest(&mut wire) else { return false };
@@ -95,7 +95,7 @@ fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
         && places.all(|(i, j)| core.covariance(i, j).to_bits() == heard.covariance(i, j).to_bits())
 }
 
-/// Everything that an estimate says, to the bit.
+/// All of an estimate, to the bit.
 pub fn bits(e: &Estimate) -> Vec<u64> {
     let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma].into_iter().flatten();
     let floats = lists.chain([&e.nis, &e.log_evidence]).map(|v| u64::from(v.to_bits()));

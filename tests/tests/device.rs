@@ -63,7 +63,7 @@ impl embedded_hal::digital::OutputPin for Dark {
     }
 }
 
-/// What a device with these tables in flash says to these bytes.
+/// Replies of a device with these tables in flash to these bytes.
 fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
     let mut device = Device::<_, LINE>::new(&mut *core, built_in, &mut *slot);
@@ -112,26 +112,26 @@ fn in_flash(tables: &Tables) -> Box<Green> {
     green
 }
 
-/// An answer as a host reads it that hears devices of any size.
-fn estimate_of(answer: &Answer) -> Estimate {
+/// A reply as read by a host that serves devices of any size.
+fn estimate_of(sent: &Answer) -> Estimate {
     let mut bytes = vec![0; PACKET];
-    let n = Reply::Estimate(answer.clone()).encode(&mut bytes).unwrap();
-    let rooms::large::Reply::Estimate(answer) = rooms::large::Reply::decode(&mut bytes[..n]).unwrap() else {
+    let n = Reply::Estimate(sent.clone()).encode(&mut bytes).unwrap();
+    let rooms::large::Reply::Estimate(sent) = rooms::large::Reply::decode(&mut bytes[..n]).unwrap() else {
         panic!("another reply")
     };
-    Estimate::of_answer(&answer).unwrap()
+    Estimate::of_answer(&sent).unwrap()
 }
 
 fn estimates(replies: &[Reply]) -> Vec<Estimate> {
-    let answer = |reply: &Reply| match reply {
-        Reply::Estimate(answer) => Some(estimate_of(answer)),
+    let sent = |reply: &Reply| match reply {
+        Reply::Estimate(sent) => Some(estimate_of(sent)),
         _ => None,
     };
-    replies.iter().filter_map(answer).collect()
+    replies.iter().filter_map(sent).collect()
 }
 
 #[test]
-fn the_loop_answers_as_the_core_in_process() {
+fn the_loop_replies_as_the_core_in_process() {
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let mut bytes = start(&core);
@@ -148,8 +148,8 @@ fn the_loop_answers_as_the_core_in_process() {
     for (at, wire) in wires(&recording).iter_mut().enumerate() {
         core.prepare();
         let estimate = core.ingest(wire).unwrap();
-        let Some(Reply::Estimate(answer)) = replies.next() else { panic!("no estimate") };
-        assert!(estimate_of(answer) == estimate, "frame {at}");
+        let Some(Reply::Estimate(sent)) = replies.next() else { panic!("no estimate") };
+        assert!(estimate_of(sent) == estimate, "frame {at}");
         let mut places = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
         for _ in (0..if at % 100 == 0 { TRIANGLE } else { 0 }).step_by(56) {
             let Some(Reply::Covariance { sequence, entries, .. }) = replies.next() else { panic!("no covariance") };
@@ -166,57 +166,57 @@ fn the_loop_answers_as_the_core_in_process() {
 }
 
 #[test]
-fn bad_bytes_are_counted_and_good_frames_answered_as_if_there_were_none() {
+fn bad_bytes_are_counted_and_change_no_estimate() {
     let (ring, recording) = paper_vars();
     let core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let good = wires(&recording);
-    let (mut clean, mut disturbed) = (start(&core), start(&core));
+    let (mut clean, mut faulty) = (start(&core), start(&core));
     let mut faults = Vec::new();
     for (at, wire) in good.iter().take(120).enumerate() {
         clean.extend(heard(wire));
-        disturbed.extend(heard(wire));
+        faulty.extend(heard(wire));
         let next = &good[at + 1];
         match at % 6 {
             0 => {
-                disturbed.extend(heard(wire));
+                faulty.extend(heard(wire));
                 faults.push(Refusal::Repeated);
             }
             1 => {
-                disturbed.extend(heard(&good[0]));
+                faulty.extend(heard(&good[0]));
                 faults.push(Refusal::OutOfOrder);
             }
             2 => {
-                // reset in mid-frame: half of the next one, and then it begins anew
-                disturbed.extend(heard(&next[..next.len() / 2]));
-                disturbed.push(Some(0));
+                // reset in mid-frame: half of the next one, and then it restarts
+                faulty.extend(heard(&next[..next.len() / 2]));
+                faulty.push(Some(0));
                 faults.push(Refusal::Framing);
             }
             3 => {
                 // stalled in mid-frame
-                disturbed.extend(heard(&next[..next.len() / 3]));
-                disturbed.extend([None, None]);
+                faulty.extend(heard(&next[..next.len() / 3]));
+                faulty.extend([None, None]);
                 faults.push(Refusal::Stalled);
             }
             4 => {
-                disturbed.extend([Some(1); 4000]);
-                disturbed.push(Some(0));
+                faulty.extend([Some(1); 4000]);
+                faulty.push(Some(0));
                 faults.push(Refusal::Oversized);
             }
             _ => {
                 let mut changed = next.clone();
                 changed[100] ^= 0x10;
-                disturbed.extend(heard(&changed));
+                faulty.extend(heard(&changed));
             }
         }
     }
-    let (clean, disturbed) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &disturbed));
+    let (clean, faulty) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &faulty));
     let rejected_frames = |mut estimate: Estimate| {
         estimate.rejected_frames = 0;
         estimate
     };
     let posteriors = |replies: &[Reply]| estimates(replies).into_iter().map(rejected_frames).collect::<Vec<_>>();
-    assert!(posteriors(&clean) == posteriors(&disturbed), "another posterior");
-    let refused: Vec<(Refusal, u32)> = disturbed
+    assert!(posteriors(&clean) == posteriors(&faulty), "another posterior");
+    let refused: Vec<(Refusal, u32)> = faulty
         .iter()
         .filter_map(|reply| match reply {
             Reply::Refused { why, count } => Some((*why, *count)),
@@ -240,7 +240,7 @@ fn other_tables(ring: &Ring) -> Tables {
 }
 
 #[test]
-fn new_tables_change_the_answer_as_they_do_in_process() {
+fn new_tables_change_the_estimate_as_they_do_in_process() {
     let (ring, recording) = paper_vars();
     let core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let good = wires(&recording);
@@ -253,7 +253,7 @@ fn new_tables_change_the_answer_as_they_do_in_process() {
     bytes.extend(request(&Request::BuiltIn));
     bytes.extend(request(&Request::Status));
     let replies = replies(&in_flash(&core.tables), &bytes);
-    // a core that went by the new tables from its first frame on, linearised at other moments
+    // a core with the new tables from its first frame on, linearised at other moments
     let mut expected = Core::with_tables(other.clone(), core.setup.clone()).unwrap();
     let mut last = None;
     stream::replay(&mut expected, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
@@ -277,11 +277,11 @@ fn damaged_tables_are_rejected_whole() {
     let parcels: Vec<Parcel> = other_tables(&ring).parcels().collect();
     let mut clean = start(&core);
     good.iter().take(40).for_each(|wire| clean.extend(heard(wire)));
-    let mut disturbed = start(&core);
-    good[..20].iter().for_each(|wire| disturbed.extend(heard(wire)));
+    let mut faulty = start(&core);
+    good[..20].iter().for_each(|wire| faulty.extend(heard(wire)));
     // one parcel lost
     let lost = parcels.iter().enumerate().filter(|(at, _)| *at != 77);
-    lost.for_each(|(_, parcel)| disturbed.extend(request(&Request::Model(parcel.clone()))));
+    lost.for_each(|(_, parcel)| faulty.extend(request(&Request::Model(parcel.clone()))));
     // one code changed, and its packet's CRC right
     for parcel in &parcels {
         let mut parcel = parcel.clone();
@@ -290,23 +290,23 @@ fn damaged_tables_are_rejected_whole() {
         {
             codes[3] += 1;
         }
-        disturbed.extend(request(&Request::Model(parcel)));
+        faulty.extend(request(&Request::Model(parcel)));
     }
     // a part without its head
-    disturbed.extend(request(&Request::Model(parcels[5].clone())));
-    good[20..40].iter().for_each(|wire| disturbed.extend(heard(wire)));
-    let (clean, disturbed) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &disturbed));
-    assert!(estimates(&clean) == estimates(&disturbed), "another posterior");
+    faulty.extend(request(&Request::Model(parcels[5].clone())));
+    good[20..40].iter().for_each(|wire| faulty.extend(heard(wire)));
+    let (clean, faulty) = (replies(&in_flash(&core.tables), &clean), replies(&in_flash(&core.tables), &faulty));
+    assert!(estimates(&clean) == estimates(&faulty), "another posterior");
     let wrong: Vec<ParcelError> =
-        disturbed.iter().filter_map(|r| if let Reply::Model(Err(e)) = r { Some(*e) } else { None }).collect();
+        faulty.iter().filter_map(|r| if let Reply::Model(Err(e)) = r { Some(*e) } else { None }).collect();
     assert!(
         matches!(wrong[..], [ParcelError::Corrupted { .. }, ParcelError::Corrupted { .. }, ParcelError::Headless]),
         "{wrong:?}"
     );
-    assert!(!disturbed.contains(&Reply::Model(Ok(Taken::InUse))));
+    assert!(!faulty.contains(&Reply::Model(Ok(Taken::InUse))));
 }
 
-/// What the device says of itself at the end.
+/// Status of the device at the end.
 fn last_status(replies: &[Reply]) -> Status {
     match replies.last() {
         Some(Reply::Status(status)) => *status,
@@ -330,12 +330,12 @@ fn tables_that_cannot_be_left_stay_in_use() {
     good[60..90].iter().for_each(|wire| bytes.extend(heard(wire)));
     bytes.extend(request(&Request::Status));
     let replies = replies(&steep, &bytes);
-    // then it says that it cannot, and answers on by the tables that it has
+    // then it refuses, and goes on with the tables that it has
     assert!(replies.contains(&Reply::Model(Err(ParcelError::Unstable))));
     let status = last_status(&replies);
     assert_eq!((status.loaded, status.tables, status.frames), (true, core.tables.digest::<LINE>(), 90));
-    let answers = estimates(&replies);
-    for (wire, got) in good[..90].iter().zip(&answers) {
+    let sent = estimates(&replies);
+    for (wire, got) in good[..90].iter().zip(&sent) {
         core.prepare();
         let expected = core.ingest(&mut wire.clone()).unwrap();
         for i in 0..48 {
@@ -346,7 +346,7 @@ fn tables_that_cannot_be_left_stay_in_use() {
 }
 
 #[test]
-fn a_restart_by_tables_without_a_design_goes_back_to_those_in_flash() {
+fn a_restart_with_tables_without_a_design_goes_back_to_those_in_flash() {
     // given tables whose Green's function between nodes is beyond all numbers
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
@@ -360,14 +360,14 @@ fn a_restart_by_tables_without_a_design_goes_back_to_those_in_flash() {
     bytes.extend(heard(wire));
     bytes.extend(request(&Request::Status));
     let replies = replies(&in_flash(&core.tables), &bytes);
-    // then they are given up, aloud, and the frame is answered by those in flash
-    let [.., Reply::Model(taken), Reply::Model(Err(ParcelError::Unstable)), Reply::Restarted, answer, _] = &replies[..]
+    // then it says that it drops them, and uses those in flash for the frame
+    let [.., Reply::Model(taken), Reply::Model(Err(ParcelError::Unstable)), Reply::Restarted, sent, _] = &replies[..]
     else {
         panic!("{:?}", replies.iter().rev().take(5).collect::<Vec<_>>());
     };
     assert_eq!(*taken, Ok(Taken::InUse));
-    let Reply::Estimate(answer) = answer else { panic!("no estimate") };
-    assert!(estimate_of(answer) == core.ingest(&mut wire.clone()).unwrap());
+    let Reply::Estimate(sent) = sent else { panic!("no estimate") };
+    assert!(estimate_of(sent) == core.ingest(&mut wire.clone()).unwrap());
     let status = last_status(&replies);
     assert_eq!((status.loaded, status.tables, status.refused), (false, core.tables.digest::<LINE>(), 0));
 }
@@ -385,7 +385,7 @@ fn a_device_without_a_design_says_so() {
 }
 
 #[test]
-fn a_front_end_that_counts_anew_is_taken_after_a_word() {
+fn a_front_end_that_restarts_its_counter_is_accepted_after_a_request() {
     let (ring, recording) = paper_vars();
     let core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let good = wires(&recording);
@@ -396,7 +396,7 @@ fn a_front_end_that_counts_anew_is_taken_after_a_word() {
     bytes.extend(heard(&good[0]));
     let replies = replies(&in_flash(&core.tables), &bytes);
     assert!(matches!(replies[2], Reply::Refused { why: Refusal::OutOfOrder, count: 1 }));
-    assert!(matches!(&replies[4], Reply::Estimate(answer) if answer.sequence == 0 && answer.frames == 2));
+    assert!(matches!(&replies[4], Reply::Estimate(sent) if sent.sequence == 0 && sent.frames == 2));
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! Missing physics is found, and only then: on recordings of an independent code whose effects are concealed, and on simulated ones
-//! of every kind. The error bars agree with those of the exact posterior.
+//! Missing physics is found, without false identifications: on recordings of an independent code whose effects are concealed,
+//! and on simulated ones of every kind. The error bars agree with those of the exact posterior.
 
 use diagnosis::fit::Fitted;
 use diagnosis::hypothesis::{Hypothesis, Term};
@@ -136,10 +136,10 @@ fn scatter_of_a_family_is_ordinary() {
     }
 }
 
-/// Strong physics that the library does not hold is not named but located, and the vars are right beside it.
+/// Strong unmodelled physics is located and not named, and the vars are right beside it.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-fn physics_beyond_the_library_is_not_named() {
+fn unmodelled_physics_is_not_named() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let hardware = Hardware::shipped(&ring, &template);
     let vars = simulate::vars(&ring, true, 3).unwrap();
@@ -196,7 +196,7 @@ fn the_amplitude_is_that_of_nuts() {
         let (mean, sigma) = fitted.amplitude(&data, 0);
         let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
         let run = sample::sample(&data, &fitted, settings).unwrap();
-        // a step that has been adapted in so few draws is too long at one of the bounds now and then
+        // a step that has been adapted in so few draws is occasionally too long at one of the bounds
         assert!(run.divergences.len() <= 4, "{name}: {:?}", run.divergences);
         let scale = kind.prior_scale().unwrap();
         let drawn: Vec<f64> = run.draws.chains.iter().flat_map(|c| &c.draws).map(|draw| draw[48] * scale).collect();

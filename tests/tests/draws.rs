@@ -8,24 +8,24 @@ use system_tests::repository;
 /// against its mean.
 const ROUNDING: f64 = 1e-11;
 
-/// What ArviZ says of a quantity: name, then `r_hat`, `ess_bulk`, `ess_tail`, `mcse_mean` and `mcse_sd`.
-type Answer = (String, [f64; 5]);
+/// ArviZ on a quantity: name, then `r_hat`, `ess_bulk`, `ess_tail`, `mcse_mean` and `mcse_sd`.
+type Row = (String, [f64; 5]);
 
 fn draws() -> Draws {
     Draws::read(&repository("tests/golden/draws")).unwrap()
 }
 
-fn answers() -> Vec<Answer> {
+fn of_arviz() -> Vec<Row> {
     let text = std::fs::read_to_string(repository("tests/golden/arviz.csv")).unwrap();
-    let answer = |line: &str| {
+    let row = |line: &str| {
         let (name, figures) = line.split_once(',').unwrap();
         let figures: Vec<f64> = figures.split(',').map(|figure| figure.parse().unwrap()).collect();
         (name.to_owned(), figures.try_into().unwrap())
     };
-    text.lines().skip(1).map(answer).collect()
+    text.lines().skip(1).map(row).collect()
 }
 
-fn ours(draws: &Draws, index: usize, summary: &Summary) -> Answer {
+fn ours(draws: &Draws, index: usize, summary: &Summary) -> Row {
     let Summary { name, r_hat, ess_bulk, ess_tail, mcse_mean, .. } = summary;
     (name.clone(), [*r_hat, *ess_bulk, *ess_tail, *mcse_mean, mcse_sd(&draws.quantity(index))])
 }
@@ -35,7 +35,7 @@ fn diagnostics_are_those_of_arviz() {
     let draws = draws();
     let ours =
         draws.summary().iter().enumerate().map(|(index, summary)| ours(&draws, index, summary)).collect::<Vec<_>>();
-    let theirs = answers();
+    let theirs = of_arviz();
     assert_eq!(ours.len(), theirs.len());
     for ((name, ours), (their_name, theirs)) in ours.iter().zip(&theirs) {
         assert_eq!(name, their_name);

@@ -1,4 +1,4 @@
-//! The reference: is the density the recording's, is NUTS converged on it, and is the Laplace answer of the core the posterior?
+//! The reference: is the density the recording's, is NUTS converged on it, and is the core's Laplace approximation the posterior?
 
 use std::sync::Arc;
 
@@ -84,7 +84,7 @@ fn the_reduced_density_has_the_batch_fits_maximum() {
     }
 }
 
-/// R-hat, effective sample sizes and divergences of the reference, and the core's Laplace answer beside it.
+/// R-hat, effective sample sizes and divergences of the reference, and the core's Laplace approximation beside it.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute unoptimised; the release tests run it")]
 fn the_core_is_the_posterior_that_nuts_finds() {

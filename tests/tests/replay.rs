@@ -1,5 +1,5 @@
 //! The main job on the recordings that ship with the repository: readings in, vars out, against the truth, against the
-//! exact batch answer, and in another order.
+//! exact batch fit, and in another order.
 
 use inference::stream::{self, Core, Estimate, Setup};
 use inference::{BatchFit, Campaign, Recording, TuneUse};
@@ -118,7 +118,7 @@ fn the_core_agrees_with_the_exact_batch_fit() {
     }
 }
 
-/// Frames in another order, numbered anew: only the moments at which the model was linearised differ, and a few readings
+/// Frames in another order, renumbered: only the moments at which the model was linearised differ, and a few readings
 /// of the noisy monitor that were judged before its noise was known. Measured: 0.06 sigma at most.
 #[test]
 fn the_order_of_frames_does_not_matter() {
@@ -144,7 +144,7 @@ fn shuffled(name: &str, seed: u32) -> (Ring, Recording) {
     (ring, recording)
 }
 
-/// Has any number changed? `BLESS=1` rewrites the files; their diff is then reviewed. `NAME-orbits.csv` is the answer without
+/// Has any number changed? `BLESS=1` rewrites the files; their diff is then reviewed. `NAME-orbits.csv` is the result without
 /// tunes.
 #[test]
 fn the_final_table_is_the_committed_one() {
@@ -188,7 +188,7 @@ fn tunes_narrow_what_orbits_leave_open() {
 }
 
 #[test]
-fn a_core_with_spare_room_gives_the_same_answer() {
+fn a_core_with_spare_room_gives_the_same_result() {
     for name in ["paper-vars", "random-vars"] {
         let exact = replay(read(name));
         let setup = exact.core.setup.clone();

@@ -1,5 +1,5 @@
-//! What the core makes of bytes that are no frame, of frames that no machine sends, of settings that never repeat, and of a
-//! monitor that falls silent.
+//! The core with bytes that are no frame, frames that no machine sends, settings that never repeat, and a monitor that falls
+//! silent.
 
 use estimator::booster::{self, CORRECTORS, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, Setup};
 use estimator::{
@@ -231,7 +231,7 @@ fn faulty(
     }
 }
 
-/// Everything that an estimate says, to the bit, but the number of refused frames.
+/// All of an estimate, to the bit, but the number of refused frames.
 fn bits(core: &Core, estimate: &Estimate) -> Vec<u64> {
     let e = estimate;
     let of = |values: &[f32]| values.iter().map(|v| u64::from(v.to_bits())).collect::<Vec<_>>();
@@ -256,27 +256,27 @@ fn ten_thousand_faulty_frames_leave_the_posterior_as_it_was() {
     let (ring, recording) = paper_vars();
     let good = wires(&recording);
     let mut alone = stream::estimator(&ring, &recording, 0.0).unwrap();
-    let mut disturbed = alone.clone();
+    let mut mixed = alone.clone();
     let (mut random, mut thrown) = (Random::new(1), 0);
     for (at, wire) in good.iter().enumerate() {
         alone.prepare();
-        disturbed.prepare();
+        mixed.prepare();
         let expected = alone.ingest(&mut wire.clone()).unwrap();
-        let estimate = disturbed.ingest(&mut wire.clone()).unwrap();
-        assert_eq!(bits(&disturbed, &estimate), bits(&alone, &expected), "frame {at}");
+        let estimate = mixed.ingest(&mut wire.clone()).unwrap();
+        assert_eq!(bits(&mixed, &estimate), bits(&alone, &expected), "frame {at}");
         assert_eq!((expected.rejected_frames, estimate.rejected_frames), (0, thrown), "frame {at}");
         let next = good.get(at + 1).unwrap_or(&good[0]);
         while (thrown as usize) < (at + 1) * FAULTY / good.len() {
             let fault = thrown as usize % FAULTS;
             let (mut bytes, is_expected) = faulty(fault, wire, next, &good[0], &mut random);
             let shown = bytes.clone();
-            let error = disturbed.ingest(&mut bytes).expect_err("a faulty frame");
+            let error = mixed.ingest(&mut bytes).expect_err("a faulty frame");
             assert!(is_expected(&error), "fault {fault} after frame {at}: {error} for {shown:02x?}");
             thrown += 1;
         }
     }
     assert_eq!(thrown as usize, FAULTY);
-    let quality = [alone, disturbed].map(|mut core| core.fit_quality());
+    let quality = [alone, mixed].map(|mut core| core.fit_quality());
     assert_eq!(quality[0], quality[1]);
 }
 
@@ -285,7 +285,7 @@ fn seeded(cases: u32) -> ProptestConfig {
     ProptestConfig { cases, rng_seed: RngSeed::Fixed(1), failure_persistence: None, ..ProptestConfig::default() }
 }
 
-/// A core that has heard 150 frames, and what it said last.
+/// A core after 150 frames, and its last estimate.
 fn seasoned() -> (Core, Estimate) {
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
@@ -432,7 +432,7 @@ fn check(core: &Core, estimate: &Estimate, prior: &Prior, walks: bool) -> Result
         if sigma <= 0.0 || e.sigma[i] <= 0.0 {
             return Err(format!("sigma of {i} is {sigma}, of its var {}", e.sigma[i]));
         }
-        // Rounding of f32: kicks of 25 times the usual size, on a ring that readings of +-100 mm have pushed to the edge of
+        // Rounding of f32: kicks of 25 times the usual size, on a ring that readings of ±100 mm have pushed to the edge of
         // stability, weigh a million times the prior. Measured 1.95.
         if !walks && sigma > prior.sigma * 3.0 {
             return Err(format!("sigma of {i} is {sigma}, beyond the prior's"));
@@ -646,8 +646,8 @@ fn a_frame_without_beam_moves_nothing() {
 // ---- A monitor that falls silent ----
 
 #[test]
-fn a_silent_monitor_is_dead_until_it_speaks() {
-    // given a campaign in which one monitor says nothing in 300 frames
+fn a_silent_monitor_is_dead_until_it_reports() {
+    // given a campaign in which one monitor does not report in 300 frames
     let (ring, recording) = paper_vars();
     let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
     let (monitor, silence) = (10, 20..320);

@@ -1,6 +1,6 @@
 //! The twin against other codes' numbers: MAD-X TWISS, Bmad and pyAT (`tests/golden/reference-*.json`).
 //!
-//! Every tolerance states the largest error measured and what it comes from. The codes kick by +-0.2 mrad and halve the
+//! Every tolerance states the largest error measured and what it comes from. The codes kick by ±0.2 mrad and halve the
 //! difference; [`Optics::response`] is the limit of small kicks, and [`kicked`] does what the codes do.
 
 use nalgebra::DMatrix;
@@ -42,14 +42,14 @@ fn matrix(value: &Value) -> DMatrix<f64> {
 fn machines(code: &str) -> Vec<(String, Value, Ring)> {
     let design = Ring::booster();
     let names = design.var_names();
-    let of = |(name, answers): (&String, &Value)| {
-        let vars: Vec<f64> = names.iter().map(|n| number(&answers["vars"][n])).collect();
+    let of = |(name, reference): (&String, &Value)| {
+        let vars: Vec<f64> = names.iter().map(|n| number(&reference["vars"][n])).collect();
         assert_eq!(
-            words(&answers["bpm"]),
+            words(&reference["bpm"]),
             design.labels(design.monitors.iter().map(|m| m.element)),
             "order of the monitors"
         );
-        (format!("{code} {name}"), answers.clone(), design.with_vars(&vars))
+        (format!("{code} {name}"), reference.clone(), design.with_vars(&vars))
     };
     let all: Vec<_> = golden(code)["machines"].as_object().unwrap().iter().map(of).collect();
     assert_eq!(all.len(), 4);
@@ -87,7 +87,7 @@ fn orbit(ring: &Ring, corrector: usize, kick: f64, hold: Hold) -> (Vec<f64>, Vec
     (at(0), at(2), optics.orbit(0)[4])
 }
 
-/// Half the difference of the orbits at +-0.2 mrad over the kick: response of x and y, and of the momentum [1/rad].
+/// Half the difference of the orbits at ±0.2 mrad over the kick: response of x and y, and of the momentum [1/rad].
 fn kicked(ring: &Ring, hold: Hold) -> ([DMatrix<f64>; 2], Vec<f64>) {
     let mut x = DMatrix::zeros(ring.monitors.len(), ring.correctors.len());
     let (mut y, mut momentum) = (x.clone(), Vec::new());
@@ -104,49 +104,49 @@ fn kicked(ring: &Ring, hold: Hold) -> ([DMatrix<f64>; 2], Vec<f64>) {
 
 #[test]
 fn tunes_equal_those_of_madx_and_bmad() {
-    for (what, answers, ring) in both_codes() {
+    for (what, reference, ring) in both_codes() {
         let tunes = Optics::of(&ring, ON_MOMENTUM).unwrap().tunes().unwrap();
         // measured 2e-14; asked for 1e-6
-        assert_near(&what, &[tunes.x, tunes.y], &[number(&answers["qx"]), number(&answers["qy"])], ROUNDING);
+        assert_near(&what, &[tunes.x, tunes.y], &[number(&reference["qx"]), number(&reference["qy"])], ROUNDING);
     }
 }
 
 #[test]
 fn beta_functions_equal_those_of_madx_and_bmad() {
-    for (what, answers, ring) in both_codes() {
+    for (what, reference, ring) in both_codes() {
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         for (plane, key) in [(Plane::X, "beta_x"), (Plane::Y, "beta_y")] {
             let beta: Vec<f64> = ring.monitors.iter().map(|m| optics.beta(m.element, plane)).collect();
-            assert_near(&format!("{what} {key}"), &beta, &numbers(&answers[key]), ROUNDING); // measured 5e-13 m
+            assert_near(&format!("{what} {key}"), &beta, &numbers(&reference[key]), ROUNDING); // measured 5e-13 m
         }
     }
 }
 
 #[test]
 fn dispersion_equals_that_of_madx_and_bmad() {
-    for (what, answers, ring) in both_codes() {
+    for (what, reference, ring) in both_codes() {
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         let ours: Vec<f64> = optics.monitor_places(Plane::X).iter().map(|o| optics.dispersion(o)).collect();
-        assert_near(&what, &ours, &numbers(&answers["dispersion_x"]), ROUNDING); // measured 2e-13 m; asked for 1e-3 m
+        assert_near(&what, &ours, &numbers(&reference["dispersion_x"]), ROUNDING); // measured 2e-13 m; asked for 1e-3 m
     }
 }
 
 #[test]
 fn transition_energy_equals_that_of_madx_and_bmad() {
-    for (what, answers, ring) in both_codes() {
+    for (what, reference, ring) in both_codes() {
         let ours = Optics::of(&ring, ON_MOMENTUM).unwrap().gamma_transition();
-        assert_near(&what, &[ours], &[number(&answers["gamma_tr"])], ROUNDING); // measured 7e-15
+        assert_near(&what, &[ours], &[number(&reference["gamma_tr"])], ROUNDING); // measured 7e-15
     }
 }
 
 #[test]
 fn chromaticity_equals_that_of_bmad() {
-    for (what, answers, ring) in machines("bmad") {
+    for (what, reference, ring) in machines("bmad") {
         let at = |delta| Optics::of(&ring, Hold::Momentum { delta }).unwrap().tunes().unwrap();
         let h = 1e-4;
         let (up, down, far_up, far_down) = (at(h), at(-h), at(2.0 * h), at(-2.0 * h));
         let slope = |q: fn(&twin::Tunes) -> f64| (8.0 * (q(&up) - q(&down)) - (q(&far_up) - q(&far_down))) / (12.0 * h);
-        let theirs = [number(&answers["chrom_x"]), number(&answers["chrom_y"])];
+        let theirs = [number(&reference["chrom_x"]), number(&reference["chrom_y"])];
         // Bmad's own differencing: measured 1.4e-8.
         assert_near(&what, &[slope(|t| t.x), slope(|t| t.y)], &theirs, 5e-8);
     }
@@ -154,9 +154,9 @@ fn chromaticity_equals_that_of_bmad() {
 
 #[test]
 fn every_response_element_equals_that_of_madx() {
-    for (what, answers, ring) in machines("madx") {
+    for (what, reference, ring) in machines("madx") {
         let [x, y] = small(&ring, ON_MOMENTUM);
-        let (h, v) = (matrix(&answers["response_H_m_per_rad"]), matrix(&answers["response_V_m_per_rad"]));
+        let (h, v) = (matrix(&reference["response_H_m_per_rad"]), matrix(&reference["response_V_m_per_rad"]));
         // The kick's size, of which TWISS keeps little: measured 5.8e-6 in x, 5.0e-7 in y; asked for 2e-4.
         assert_near(&what, block(&x, Plane::X, Plane::X).as_slice(), h.as_slice(), 2e-5);
         assert_near(&what, block(&y, Plane::Y, Plane::Y).as_slice(), v.as_slice(), 2e-6);
@@ -164,7 +164,7 @@ fn every_response_element_equals_that_of_madx() {
 }
 
 /// Blocks of Bmad's response, by plane of the monitors and of the correctors.
-fn assert_equals_bmad(what: &str, answers: &Value, [x, y]: &[DMatrix<f64>; 2], tolerance: [f64; 2]) {
+fn assert_equals_bmad(what: &str, reference: &Value, [x, y]: &[DMatrix<f64>; 2], tolerance: [f64; 2]) {
     for (response, monitors, correctors, key) in [
         (x, Plane::X, Plane::X, "response_H_m_per_rad"),
         (x, Plane::Y, Plane::X, "response_x_at_V_places_m_per_rad"),
@@ -173,24 +173,24 @@ fn assert_equals_bmad(what: &str, answers: &Value, [x, y]: &[DMatrix<f64>; 2], t
     ] {
         let tolerance = tolerance[usize::from(correctors == Plane::Y)];
         let ours = block(response, monitors, correctors);
-        assert_near(&format!("{what} {key}"), ours.as_slice(), matrix(&answers[key]).as_slice(), tolerance);
+        assert_near(&format!("{what} {key}"), ours.as_slice(), matrix(&reference[key]).as_slice(), tolerance);
     }
 }
 
 #[test]
 fn every_response_element_equals_that_of_bmad() {
-    for (what, answers, ring) in machines("bmad") {
+    for (what, reference, ring) in machines("bmad") {
         // The kick's size, and nothing else (see the next test): measured 1.03e-4 in x, 2.8e-6 in y; asked for 2e-4.
-        assert_equals_bmad(&what, &answers, &small(&ring, ON_MOMENTUM), [2e-4, 1e-5]);
+        assert_equals_bmad(&what, &reference, &small(&ring, ON_MOMENTUM), [2e-4, 1e-5]);
     }
 }
 
 #[test]
 fn kicks_of_the_same_size_give_the_response_of_bmad() {
-    for (what, answers, ring) in machines("bmad") {
+    for (what, reference, ring) in machines("bmad") {
         let (response, _) = kicked(&ring, ON_MOMENTUM);
         // Nine decimals in the file and Newton's 1e-12 m over twice the kick: measured 7e-10.
-        assert_equals_bmad(&what, &answers, &response, [3e-9; 2]);
+        assert_equals_bmad(&what, &reference, &response, [3e-9; 2]);
     }
 }
 
@@ -216,10 +216,10 @@ fn assert_cases_equal(code: &str, tolerance: impl Fn(&str) -> [f64; 2]) {
     let golden = golden(code);
     let cases = golden["cases"].as_object().unwrap();
     assert_eq!(cases.len(), 7);
-    for (name, answers) in cases {
-        let effects: Vec<Effect> = answers["effects"].as_array().unwrap().iter().map(effect).collect();
+    for (name, reference) in cases {
+        let effects: Vec<Effect> = reference["effects"].as_array().unwrap().iter().map(effect).collect();
         let ours = Machine::new(Ring::booster(), twin::Rf::FixedMomentum, &effects).unwrap().response().unwrap();
-        let (x, y) = (matrix(&answers["response_x_m_per_rad"]), matrix(&answers["response_y_m_per_rad"]));
+        let (x, y) = (matrix(&reference["response_x_m_per_rad"]), matrix(&reference["response_y_m_per_rad"]));
         let tolerance = tolerance(name);
         assert_near(&format!("{code} {name} x"), ours.x.as_slice(), x.as_slice(), tolerance[0]);
         assert_near(&format!("{code} {name} y"), ours.y.as_slice(), y.as_slice(), tolerance[1]);
@@ -273,17 +273,17 @@ fn by_hand(case: &str) -> (Ring, Hold) {
 
 #[test]
 fn kicks_of_the_same_size_give_every_effect_of_bmad() {
-    for (name, answers) in golden("bmad")["cases"].as_object().unwrap() {
+    for (name, reference) in golden("bmad")["cases"].as_object().unwrap() {
         let (ring, hold) = by_hand(name);
         let ([x, y], momentum) = kicked(&ring, hold);
         // Nine decimals in the file, and in the dipole the curvature of its gradient, which the twin leaves out:
         // measured 4.9e-9 and 1.5e-6.
         let tolerance = if name == "dipole_gradient" { 5e-6 } else { 1.5e-8 };
-        let known = [matrix(&answers["response_x_m_per_rad"]), matrix(&answers["response_y_m_per_rad"])];
+        let known = [matrix(&reference["response_x_m_per_rad"]), matrix(&reference["response_y_m_per_rad"])];
         assert_near(&format!("{name} x"), x.as_slice(), known[0].as_slice(), tolerance);
         assert_near(&format!("{name} y"), y.as_slice(), known[1].as_slice(), tolerance);
         if name == "fixed_rf_frequency" {
-            assert_near("dp_per_rad", &momentum, &numbers(&answers["dp_per_rad"]), 3e-9); // measured 7.7e-10
+            assert_near("dp_per_rad", &momentum, &numbers(&reference["dp_per_rad"]), 3e-9); // measured 7.7e-10
         }
     }
 }

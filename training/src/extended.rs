@@ -1,10 +1,10 @@
-//! Tables of a ring with effects beyond its design, so that the core goes by the machine that a diagnosis has found.
+//! Tables of a ring with effects beyond its design, so that the core uses the machine that a diagnosis has found.
 //!
-//! Gradients and edges change the ring that the Green's function is of; gains, polarities and exchanged names are factors
-//! and places of its rows and columns. Both stay exact while vars move. What couples the planes, or lets the momentum follow
-//! the kicks, comes on top as terms of [low rank](estimator::surrogate::LowRank): the exact response less what the tables
-//! predict, at given vars. They are held constant: when the vars move at random by the error bars of a campaign, 0.3 % (QH)
-//! and 0.5 % (QV), a term is off by 3 % rms of itself, 0.8 um for a quadrupole rolled by 18 mrad and kicks of 0.2 mrad.
+//! Gradients and edges change the ring of the Green's function; gains, polarities and exchanged names scale or permute its
+//! rows and columns. Both stay exact while vars move. Coupling of the planes, and a momentum that follows the kicks, are added
+//! as terms of [low rank](estimator::surrogate::LowRank): the exact response less what the tables predict, at given vars.
+//! They are held constant: when the vars move at random by the error bars of a campaign, 0.3 % (QH) and 0.5 % (QV), a term
+//! is off by 3 % rms of itself, 0.8 um for a quadrupole rolled by 18 mrad and kicks of 0.2 mrad.
 
 use estimator::surrogate::TERMS;
 use nalgebra::{DMatrix, DVector};
@@ -21,14 +21,14 @@ pub struct Extended {
     pub tables: Tables,
     /// Effects that they carry.
     pub carried: Vec<Effect>,
-    /// Effects that no response has, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `quad_drift`
+    /// Effects that no response shows, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `quad_drift`
     /// and `sextupole_error`.
     pub left_out: Vec<Effect>,
-    /// Rms over monitors and correctors of what is missing at the vars given [m/rad]: more terms would take it in.
+    /// Rms remainder over monitors and correctors at the vars given [m/rad]; more terms would reduce it.
     pub missing: f64,
 }
 
-/// Rms of a remainder that is left alone [m/rad]: 0.4 um at 0.2 mrad, less than the tables' stated error.
+/// Rms of a remainder that is neglected [m/rad]: 0.4 um at 0.2 mrad, less than the tables' stated error.
 const NEGLIGIBLE: f64 = 2e-3;
 
 /// Tables of a ring with effects; `vars` [N] is where the part of low rank is exact.

@@ -1,4 +1,4 @@
-//! What a core makes of tables: its orbit response, and its tunes, at given vars.
+//! Orbit response and tunes of a core with given tables, at given vars.
 
 use estimator::{Drive, Surrogate};
 use nalgebra::DMatrix;
@@ -6,10 +6,10 @@ use nalgebra::DMatrix;
 use crate::tables::Tables;
 use crate::{in_room, with_stack};
 
-/// RF offset at which a core is asked [1]: its second order is below the first by 1e-3 there, and cancels.
+/// RF offset at which a core is evaluated [1]: its second order is below the first by 1e-3 there, and cancels.
 const RF_OFFSET: f32 = 1e-4;
 
-/// What a core says of a ring.
+/// Prediction of a core for a ring.
 #[derive(Debug, Clone)]
 pub(crate) struct CoreResponse {
     /// Response [m/rad], rows monitors, columns correctors and the RF [m].
@@ -18,7 +18,7 @@ pub(crate) struct CoreResponse {
     pub tunes: [f64; 2],
 }
 
-/// The core of tables at each of many vars `[N]`; none where it has no ring.
+/// Predictions of a core with these tables at each of many vars `[N]`; none where no ring is stable.
 ///
 /// # Panics
 /// If there is no core for the ring, which its tables exclude.

@@ -1,4 +1,4 @@
-//! Green's function tables of a ring of any size: what a core of its size, or one with room for it, goes by.
+//! Green's function tables of a ring of any size, for a core of its size or one with room for it.
 
 use estimator::surrogate::{List, RING, TERMS, Table, VERSION, code, shape, step};
 use estimator::{Layout, Parcel, ParcelError, Sizes, Tables as _};

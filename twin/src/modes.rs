@@ -3,7 +3,7 @@
 //! `cos(mu)` of the modes are the roots of the quadratic formed by the trace of the 4x4 one-turn matrix and the determinant
 //! of its coupling block:
 //!
-//! `cos(mu) = (t_x + t_y)/2 +- sqrt((t_x - t_y)^2/4 + det(m + n^+)/4)`,
+//! `cos(mu) = (t_x + t_y)/2 ± sqrt((t_x - t_y)^2/4 + det(m + n^+)/4)`,
 //!
 //! `t` half the traces of the diagonal blocks, `m` and `n` the blocks that couple.
 //!

@@ -1,8 +1,8 @@
 //! Orbit response and its derivatives from the closed-orbit Green's function, planes coupled, elements thick.
 //!
 //! Everything is written in the frame of the ring's start. A kick `v` at a place with transfer `T` appears there as the
-//! source `c = T^-1 v`; the ring answers with the closed orbit `W c` (at the start), where `W` solves the closure
-//! equations of [`Hold`]; an observer with row `a = e T` sees
+//! source `c = T^-1 v`; the closed orbit at the start is `W c`, where `W` solves the closure equations of [`Hold`]; an
+//! observer with row `a = e T` sees
 //!
 //! `G(observer, source) = a (W + step) c`, `step` = 1 downstream of the source, else 0.
 //!
@@ -219,10 +219,10 @@ impl<'r> Optics<'r> {
 
     /// Orbit response [m/rad], rows observers, columns sources.
     pub fn response(&self, observers: &[Observer], sources: &[Source]) -> DMatrix<f64> {
-        let answers: Vec<_> = sources.iter().map(|s| (self.closed * s.column, s)).collect();
+        let orbits: Vec<_> = sources.iter().map(|s| (self.closed * s.column, s)).collect();
         DMatrix::from_fn(observers.len(), sources.len(), |i, j| {
-            let (answer, source) = &answers[j];
-            let near = (observers[i].row * answer)[0];
+            let (orbit, source) = &orbits[j];
+            let near = (observers[i].row * orbit)[0];
             if source.place < observers[i].place { near + (observers[i].row * source.column)[0] } else { near }
         })
     }

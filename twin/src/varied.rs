@@ -1,5 +1,5 @@
 //! The ring with nothing but its quadrupoles free: response, dispersion and their gradient in a fraction of the time of
-//! [`Optics`], for a sampler that asks a hundred thousand times.
+//! [`Optics`], for a sampler that needs a hundred thousand of them.
 //!
 //! What lies between two quadrupoles never changes and is multiplied out once. The rest is the formula of
 //! [`crate::response`]: with `a` the row of an observer and `c` the column of a source, both brought to the ring's start,
@@ -85,7 +85,7 @@ pub struct VariedOptics<'r> {
 }
 
 impl VariedRing {
-    /// Take a ring apart.
+    /// Split a ring at its quadrupoles.
     ///
     /// # Errors
     /// [`OrbitError`] if it has no closed orbit.
@@ -250,8 +250,8 @@ impl VariedOptics<'_> {
         self.kernels.iter().map(|kernel| Modes::tune_slope(&slopes, &self.turn, kernel)).collect()
     }
 
-    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` (by param, see [`Ring::by_parameter`]) of a function of the response, from its derivative `weights` with respect
-    /// to each entry of [`VariedOptics::response`].
+    /// Gradient with respect to `ln` of each quadrupole's gradient `[M]` (by param, see [`Ring::by_parameter`]) of a function of
+    /// the response, from its derivative `weights` with respect to each entry of [`VariedOptics::response`].
     pub fn pull_back(&self, weights: &DMatrix<f64>) -> Vec<f64> {
         let rf = self.sources.len();
         let mut sent: Vec<Vector6<f64>> = self.sources.iter().map(|source| self.closed * source).collect();
@@ -293,7 +293,7 @@ mod tests {
     use super::*;
     use crate::testing::mixed;
 
-    /// Params that are rather wrong, and supplies.
+    /// Params a few per cent off, and supplies.
     fn wrong(ring: &Ring) -> (Vec<f64>, Vec<f64>) {
         let params = (0..ring.parameters.len()).map(|i| 0.015 * f64::sin(3.0 * i as f64));
         (params.collect(), vec![0.002; ring.supplies.len()])

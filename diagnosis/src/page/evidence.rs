@@ -25,13 +25,13 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let library = scanned.into_iter().zip(corrections(&terms)).map(|(candidate, correction)| {
         let (kind, names) = (candidate.term.kind.word().replace('_', " "), candidate.term.site.names(&data.ring));
         let place = names.join(", ");
-        Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, price: Some(correction) }
+        Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, threshold: Some(correction) }
     });
     let discrepancies = discrepancy::scan(data, null)?;
     let sites = discrepancies.len();
     let unmodelled = discrepancies.iter().map(|one| {
         let label = format!("unmodelled: {}", one.at.short(data));
-        Ranked { label, group: 1, value: one.log_bayes, price: Some(correction_of(one)) }
+        Ranked { label, group: 1, value: one.log_bayes, threshold: Some(correction_of(one)) }
     });
     let mut all: Vec<Ranked> = library.chain(unmodelled).collect();
     all.sort_by(|one, other| other.value.total_cmp(&one.value));

@@ -1,10 +1,10 @@
-//! The closed-orbit Green's function of the design ring, quantised, with the gradient errors taken in exactly.
+//! The closed-orbit Green's function of the design ring, quantised, with the gradient errors included exactly.
 //!
 //! Each quadrupole is two Gauss-Legendre nodes. With `G` the design Green's functions between correctors c, monitors b
 //! and nodes q, and `D = diag(k L w (strength - 1))` (k becomes -k in y, w = 1/2), the function between the nodes of the
-//! ring as it is, `Z_qq = (1 + G_qq D)^-1 G_qq`, is built up node by node: switching on the error `e` of node n takes
+//! ring as it is, `Z_qq = (1 + G_qq D)^-1 G_qq`, is built up node by node: switching on the error `e` of node n subtracts
 //!
-//! `g g^T e/(1 + e g_n)` from it, `g` its column n. The rest are products:
+//! `g g^T e/(1 + e g_n)`, `g` column n. The rest are products:
 //!
 //! `Z_qc = G_qc - Z_qq D G_qc`, `Z_qb = G_qb - Z_qq D G_qb`, `R = G_bc - Z_bq D G_qc`, and
 //! `dR_bc/d(ln strength) = - sum over the quadrupole's nodes of k L w strength Z_qb Z_qc`.
@@ -12,10 +12,10 @@
 //! The product of all `1 + e g_n` is `det(1 + G_qq D)`, which gives the tunes: `sin^2(pi Q) = sin^2(pi Q0) det(1 + G_qq D)`, and
 //! `dQ/d(ln strength) = tan(pi Q)/(2 pi) sum over the quadrupole's nodes of k L w strength Z_nn`.
 //!
-//! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent; what couples
-//! them, and whatever else a ring has beyond its design, is a short sum of products on top, see [`LowRank`].
+//! Dispersion is one more column of the same form, whose source is the dipoles. Both planes are independent; coupling and
+//! other extension terms are a short sum of products on top, see [`LowRank`].
 //!
-//! Source: the resolvent (Dyson) form of the perturbed Green's function, taken in by rank one after rank one (J. Sherman
+//! Source: the resolvent (Dyson) form of the perturbed Green's function, by successive rank-one updates (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
 use nalgebra::SMatrix;
@@ -92,7 +92,7 @@ pub struct Green<
     pub dispersion: Dispersion<BX, Q>,
     /// Design tunes [1].
     pub tune: [f32; 2],
-    /// What is beyond both planes' Green's functions; none in a ring as designed.
+    /// Extension terms; none in a ring as designed.
     pub low_rank: LowRank<BX, BY, CX, CY>,
     /// Stated rms error in x and y [m].
     pub stated_error: [f32; 2],
@@ -246,7 +246,7 @@ impl<
         let slope_y = at.slope.map(|k| -k);
         let focusing = self.focusing();
         self.y.linearise(&excess_y, (self.tune[1], &slope_y), focusing, &mut at.y, &mut mutual)?;
-        // x last: what it leaves between the nodes is used once more, for the dispersion
+        // x last: its function between the nodes also gives the dispersion
         let excess_x = excess_y.map(|e| -e);
         self.x.linearise(&excess_x, (self.tune[0], &at.slope), focusing, &mut at.x, &mut mutual)?;
         self.linearise_dispersion(&excess_x, at, &mutual);
@@ -254,7 +254,7 @@ impl<
     }
 
     fn orbit(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut [f32; B]) {
-        // without a change of current, what the nodes would add is not needed
+        // without a change of current the nodes add nothing
         let pushes = if drive.strength == [0.0; F] { [[0.0; Q]; 2] } else { at.pushes(drive) };
         self.read(at, drive, &pushes, into);
     }
@@ -448,8 +448,8 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
     ) -> Result<(), Unstable> {
         self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
         let mut determinant = 1.0;
-        // a quadrupole that focuses and one that does not together: in between, the tunes stay between the design's and the
-        // ring's
+        // one focusing and one defocusing quadrupole at a time: the intermediate tunes then stay between the design's and
+        // the ring's
         for k in 0..focusing.max(M - focusing.min(M)) {
             let (one, other) = (2 * k, 2 * (k + focusing));
             let one = if k < focusing { [one, one + 1] } else { [Q; 2] };

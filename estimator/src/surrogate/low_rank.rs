@@ -1,8 +1,8 @@
-//! Responses that no Green's function of one plane has, as a short sum of products.
+//! Extension terms: responses that no Green's function of one plane has, as a short sum of products.
 //!
 //! A rolled quadrupole or a skew gradient couples the planes through the orbit at one place, a held RF frequency adds the
 //! dispersion at the monitor times that at the corrector, a rolled monitor or corrector is one row or one column: each is a
-//! product `seen driven^T`, or few of them. They are constant: what the vars change of them is left out.
+//! product `seen driven^T`, or few of them. They are constant: their dependence on the vars is left out.
 
 use super::quantised::{code, step};
 
@@ -11,7 +11,7 @@ pub const TERMS: usize = 8;
 
 /// Products added to the orbit, `reading_b += scale seen_b (sum of driven_c kick_c + rf_offset f)`, each with its codes.
 ///
-/// Terms stand in front; the first `scale` of zero ends them, so that none cost nothing.
+/// Terms come first; the first `scale` of zero ends the list, so that an empty one costs nothing.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LowRank<const BX: usize, const BY: usize, const CX: usize, const CY: usize> {
     /// Size of one step of `seen` times one of `driven` [m/rad].
@@ -63,7 +63,7 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank
         true
     }
 
-    /// Add what kicks [rad] and a relative RF offset make of the orbit [m].
+    /// Add the orbit that kicks [rad] and a relative RF offset make through the terms [m].
     pub(super) fn read(&self, [kick_x, kick_y]: [&[f32]; 2], rf_offset: f32, [x, y]: [&mut [f32]; 2]) {
         let seen = self.seen_x.iter().zip(&self.seen_y);
         let driven = self.driven_x.iter().zip(&self.driven_y);

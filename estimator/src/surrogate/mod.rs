@@ -69,10 +69,10 @@ pub trait Tables {
     }
 }
 
-/// A model of the ring that is linearised now and then, and asked every frame: `B` monitors, `C` correctors, `F` supplies,
-/// `N` params.
+/// A model of the ring, relinearised occasionally, evaluated every frame: `B` monitors, `C` correctors, `F` supplies, `N`
+/// params.
 pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usize>: Tables {
-    /// What one linearisation leaves behind.
+    /// The result of one linearisation.
     type Linearised;
 
     /// Memory for a linearisation, all zero.

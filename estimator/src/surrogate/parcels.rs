@@ -1,4 +1,4 @@
-//! Green's function tables in parcels: which table and which list has which number, and what of them the ring has.
+//! Green's function tables in parcels: the numbers of tables and lists, and the lines that the ring has.
 
 use heapless::Vec;
 
@@ -392,7 +392,7 @@ mod tests {
         assert_eq!(roomy.digest::<40>(), tables().digest::<9>());
     }
 
-    /// What the seal says of these parcels.
+    /// The seal's result for these parcels.
     fn sealed<'p>(parcels: impl IntoIterator<Item = &'p Part>) -> Result<(), ParcelError> {
         let mut taken = Small::BLANK;
         parcels.into_iter().map(|parcel| taken.take(parcel)).last().unwrap()

@@ -52,11 +52,11 @@ pub enum FrameError {
     Range {
         /// Which value.
         field: &'static str,
-        /// Its place in its list.
+        /// Its index in its list.
         index: usize,
         /// Largest magnitude, in steps.
         limit: i32,
-        /// What stands there, in steps.
+        /// The value, in steps.
         got: i32,
     },
     /// The buffer to write to is too small.

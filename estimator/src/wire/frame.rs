@@ -51,15 +51,15 @@ macro_rules! code {
 }
 
 code!(
-    /// A beam position in steps of 0.1 um, within +-100 mm: offsets reach 10 mm, and jumps more.
+    /// A beam position in steps of 0.1 um, within ±100 mm: offsets reach 10 mm, and jumps more.
     PositionCode, METRES_PER_LSB = 1e-7, limit 1_000_000
 );
 code!(
-    /// A magnet or corrector current in steps of 0.1 mA, within +-10 kA.
+    /// A magnet or corrector current in steps of 0.1 mA, within ±10 kA.
     CurrentCode, AMPERES_PER_LSB = 1e-4, limit 100_000_000
 );
 code!(
-    /// A relative offset of the RF frequency in steps of 1e-9, within +-1 %.
+    /// A relative offset of the RF frequency in steps of 1e-9, within ±1 %.
     RfCode, RATIO_PER_LSB = 1e-9, limit 10_000_000
 );
 code!(
@@ -107,7 +107,7 @@ pub struct Frame<const B: usize, const C: usize, const F: usize, const W: usize>
     pub valid: Mask<W>,
 }
 
-/// The body on the wire: lists carry their length, so that a frame of another machine is told from noise.
+/// The body on the wire: lists carry their length, so that a frame of another machine is told from damage.
 #[derive(Serialize, Deserialize)]
 struct Body<const B: usize, const C: usize, const F: usize, const W: usize> {
     sequence: u32,
@@ -171,8 +171,7 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Frame<B, C,
 
     const FITS: () = assert!(W >= crate::mask::words(B), "W words have a bit for each of B monitors");
 
-    /// Write the frame of a ring to `out`, terminator included; returns the number of bytes. Slots that the ring does not
-    /// have do not travel.
+    /// Write the frame of a ring to `out`, terminator included; returns the number of bytes. Spare slots are not sent.
     ///
     /// # Errors
     /// [`FrameError::Space`] if `out` is too small; [`Frame::MAX_WIRE_BYTES`] always suffice.
@@ -434,7 +433,7 @@ mod tests {
         assert_eq!(other, FrameError::Count { list: "supplies", need: 2, got: 1 });
     }
 
-    /// What this machine says to a frame of one that is larger or smaller.
+    /// The error of this machine for the frame of a larger or smaller one.
     fn of_machine<const B: usize, const C: usize, const F: usize, const W: usize>(
         reading: [PositionCode; B],
     ) -> FrameError {
@@ -467,7 +466,7 @@ mod tests {
         }
     }
 
-    /// Slots that the ring does not have do not travel, and are silent on the other side.
+    /// Spare slots are not sent, and are silent in the receiver.
     #[test]
     fn a_core_with_more_room_reads_the_same_bytes() {
         let room = Sizes::new([4, 40], [3, 5], [3; 3]);

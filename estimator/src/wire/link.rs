@@ -1,4 +1,4 @@
-//! What host and device say to each other besides frames: requests in, replies out, each a packet of its own kind. See
+//! Messages of host and device besides frames: requests in, replies out, each a packet of its own kind. See
 //! `docs/device.md`.
 
 use heapless::Vec;
@@ -20,17 +20,17 @@ pub const PIECE: usize = 56;
 /// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
 pub const OTHER_BYTES: usize = 1 + VARINT_32 + 3 + LENGTH + 4 * PIECE;
 
-/// What a host asks of a device: `S` is the setup of its core, `P` a parcel of its tables.
+/// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
 pub enum Request<S, P> {
     /// Forget all frames and begin at the prior.
     Restart(S),
-    /// Take the next frame whatever its number: the front end counts anew.
+    /// Take the next frame whatever its number: the front end has restarted its counter.
     ForgetSequence,
     /// Send the covariance after the next estimate.
     Covariance,
-    /// Say how the device is.
+    /// Send the status of the device.
     Status,
     /// A part of new tables. The last one puts them in use, if they are whole.
     Model(P),
@@ -38,11 +38,11 @@ pub enum Request<S, P> {
     BuiltIn,
 }
 
-/// What a device says: `A` is the answer of its core.
+/// A reply of a device: `A` is its core's estimate on the wire.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
 pub enum Reply<A> {
-    /// The answer to a frame.
+    /// The estimate after a frame.
     Estimate(A),
     /// A part of the covariance of `theta = ln var`, lower triangle row by row.
     Covariance {
@@ -97,7 +97,7 @@ pub enum Refusal {
     OutOfOrder,
     Beyond,
     NotStarted,
-    /// A setup with a number that is none, or a size that is not positive.
+    /// A setup with a number that is not finite, or a size that is not positive.
     Setup,
     /// The rest of it did not come within two cycles.
     Stalled,
@@ -132,10 +132,10 @@ impl From<IngestError> for Refusal {
     }
 }
 
-/// What a board says of itself.
+/// Status of a board.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Vitals {
-    /// Bytes that found the receive queue or the receiver full.
+    /// Bytes lost because the receive queue or the receiver was full.
     pub lost_bytes: u32,
     /// Machine cycles since power-on.
     pub cycles: u32,
@@ -152,7 +152,7 @@ pub struct Status {
     pub frames: u32,
     /// Packets refused so far.
     pub refused: u32,
-    /// What the board says of itself.
+    /// Status of the board.
     pub vitals: Vitals,
     /// CRC of the tables in use, see [`crate::Tables::digest`].
     pub tables: u32,

@@ -92,7 +92,7 @@ impl postcard::ser_flavors::Flavor for Fed<'_, '_> {
     }
 }
 
-/// Why tables were not taken. They are then not to be used.
+/// Why tables were refused; they must not be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ParcelError {
@@ -117,7 +117,7 @@ pub enum ParcelError {
         /// Its length.
         length: u16,
     },
-    /// A number that is none, or a size that is not positive.
+    /// A number that is not finite, or a size that is not positive.
     Number,
     /// A parcel is missing, or was changed.
     Corrupted {

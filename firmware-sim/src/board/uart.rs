@@ -18,7 +18,7 @@ use super::registers::{NVIC_ISER0, UART0_BAUDDIV, UART0_CTRL, UART0_DATA, UART0_
 /// Room for received bytes [B].
 ///
 /// Between two packets the main loop takes none while it updates (1.5 ms at 480 MHz and one instruction a cycle), sends the
-/// estimate (15 ms at 921,600 baud) and linearises anew (12 million instructions, 25 ms): 42 ms, and 55 ms more if it sends
+/// estimate (15 ms at 921,600 baud) and relinearises (12 million instructions, 25 ms): 42 ms, and 55 ms more if it sends
 /// a covariance. A sender without pauses fills this in 44 ms; what it sends then is lost, and counted. A front end that
 /// sends a frame of 260 bytes a cycle, and some requests, is far from that.
 const QUEUE: usize = 4096;
@@ -65,7 +65,7 @@ pub fn start(baud: u32, clock: &Clock) -> (Receiver<'_>, Sender) {
 
 /// What the interrupt does: take the byte from the hardware's register to the queue.
 ///
-/// The interrupt is cleared before the register is read, so that a byte that arrives in between raises it anew. Inlined
+/// The interrupt is cleared before the register is read, so that a byte that arrives in between raises it again. Inlined
 /// into its handler, so that a count of instructions can leave out all that an interrupt adds.
 #[inline(always)]
 pub fn receive() {

@@ -1,4 +1,4 @@
-//! The watchdog: a main loop that does not come back is reported, and then reset.
+//! The watchdog: a stalled main loop is reported, and then reset.
 //!
 //! A count that runs out once raises the non-maskable interrupt, in which [`super::fault`] reports; were that stuck too,
 //! the second time resets the machine.
@@ -24,7 +24,7 @@ pub struct Watchdog<P> {
 }
 
 impl<P: OutputPin> Watchdog<P> {
-    /// Start it; it wants to be fed more often than this [s].
+    /// Start it; it must be fed more often than this [s].
     pub fn start(seconds: u32, supervisor: P) -> Self {
         WATCHDOG_LOCK.write(UNLOCK);
         WATCHDOG_LOAD.write(seconds * SYSCLK_HZ);
@@ -33,7 +33,7 @@ impl<P: OutputPin> Watchdog<P> {
         Self { supervisor }
     }
 
-    /// Start the count anew.
+    /// Restart the count.
     fn feed(&mut self) {
         WATCHDOG_LOCK.write(UNLOCK);
         WATCHDOG_INTCLR.write(1);
@@ -60,5 +60,5 @@ impl<P: OutputPin> OutputPin for Watchdog<P> {
 #[exception]
 #[allow(unsafe_code)] // the attribute asks for `unsafe fn`: this interrupt cannot be masked, no critical section holds it off
 unsafe fn NonMaskableInt() {
-    fault::fail(|| defmt::error!("watchdog: the main loop did not come back"));
+    fault::fail(|| defmt::error!("watchdog: the main loop has stalled"));
 }

@@ -5,12 +5,12 @@ pub mod check;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
-pub mod prove;
 pub mod replay;
 pub mod response;
 pub mod serve;
 pub mod study;
 pub mod surrogate;
+pub mod validate;
 pub mod watch;
 
 use core::fmt::Display;

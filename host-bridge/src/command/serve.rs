@@ -83,9 +83,9 @@ fn feed(
     deliver(&options.common, &FitResult::of_core(ring, recording, &last, quality, timing))
 }
 
-/// A device goes by the tables that it has, whatever ring they are of.
+/// A device uses the tables that it has, whatever their ring.
 fn expect_tables<L: Line>(link: &mut Link<L>, expected: u32) -> Result<(), CommandError> {
     let got = link.status().map_err(CommandError::other)?.tables;
-    let wrong = || format!("the device goes by tables {got:08x}, this model has {expected:08x}; --load sends them");
+    let wrong = || format!("the device uses tables {got:08x}, this model has {expected:08x}; --load sends them");
     if got == expected { Ok(()) } else { Err(CommandError::Other(wrong())) }
 }

@@ -290,7 +290,7 @@ impl<L: Read + Write> Link<L> {
     /// Put other tables in use; `progress` hears of each of their parts.
     ///
     /// # Errors
-    /// [`LinkError::Tables`] if the device did not take them, in which case it goes by the former ones.
+    /// [`LinkError::Tables`] if the device did not take them, in which case it keeps the former ones.
     pub fn load(&mut self, tables: &Tables, mut progress: impl FnMut()) -> Result<(), LinkError> {
         self.send(&Request::BuiltIn)?;
         self.taken()?;

@@ -161,7 +161,7 @@ impl Campaign {
         self.screened.accepted.iter().any(|counts| *counts)
     }
 
-    /// What the meter says of frames without an RF offset, the supplies' fluctuations taken out to first order.
+    /// The meter's tunes of the frames without an RF offset, the supplies' fluctuations taken out to first order.
     fn read_meters(&self, linearised: &Linearised) -> [Option<Meter>; 2] {
         let at_mean = |plane: usize| -> Vec<f64> {
             let slopes = linearised.tune_supply_slopes.row(plane).transpose();

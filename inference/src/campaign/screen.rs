@@ -1,8 +1,8 @@
-//! Which readings count, and how well each monitor is doing: the rules of the core (`estimator::Monitor`, `estimator::Cell`), in f64 and
+//! Which readings count, and the state of each monitor: the rules of the core (`estimator::Monitor`, `estimator::Cell`), in f64 and
 //! for a ring of any size.
 //!
 //! Frames are taken in the order of time. A reading is judged by the repeats of its setting; the first one by the model with all
-//! that is known of the params so far, in normal equations that are linearised anew when the params have moved.
+//! that is known of the params so far, in normal equations that are relinearised when the params have moved.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use super::rms_by_plane;
 use super::setting::Settings;
 use crate::prior::Prior;
 
-/// What is known of the instruments.
+/// The monitors, and their readings that count.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Screened {
     /// Which readings count, rows frames, columns monitors.
@@ -99,7 +99,7 @@ struct Screening<'c> {
     /// Accepted readings need re-weighting.
     stale: bool,
     /// Consecutive frames without a setting with most readings outside the gate.
-    surprises: usize,
+    unexpected: usize,
 }
 
 /// The ring linearised at some params.
@@ -198,7 +198,7 @@ impl<'c> Screening<'c> {
             model,
             normal,
             stale: false,
-            surprises: 0,
+            unexpected: 0,
             of,
         })
     }
@@ -222,7 +222,7 @@ impl<'c> Screening<'c> {
             self.stale |= self.monitors[b].judge();
         }
         if setting.is_none() {
-            self.pardon(frame, &rejected);
+            self.judge_frame(frame, &rejected);
         }
         self.learn(frame);
         self.best = Best::of(self.of, &self.model, &self.normal);
@@ -282,14 +282,14 @@ impl<'c> Screening<'c> {
 
     /// Monitors fail one at a time: when most readings of a frame without a setting lie outside the gate, the beam was lost or the model is
     /// at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before are not.
-    fn pardon(&mut self, frame: usize, rejected: &[usize]) {
+    fn judge_frame(&mut self, frame: usize, rejected: &[usize]) {
         let accepted = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).count();
         if MOST * rejected.len() <= accepted + rejected.len() {
-            self.surprises = 0;
+            self.unexpected = 0;
             return;
         }
-        self.surprises += 1;
-        let convinced = self.surprises >= CONVINCED;
+        self.unexpected += 1;
+        let convinced = self.unexpected >= CONVINCED;
         for &b in rejected {
             self.monitors[b].pardon();
             self.accepted[(frame, b)] = true;
@@ -302,11 +302,11 @@ impl<'c> Screening<'c> {
     fn is_expected(&self, frame: usize, b: usize) -> bool {
         let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
         let (expected, of_baseline, of_params) = self.normal.expect(b, slope, &self.best.step, &self.best.factor);
-        let surprise = (self.residual(frame, b) - expected) as f32;
+        let innovation = (self.residual(frame, b) - expected) as f32;
         let certain = self.variance(frame, b) + of_baseline;
         // the uncertainty of the params is only worked out for readings that need it
-        self.gate.expects(surprise, certain as f32)
-            || self.gate.expects(surprise, (certain + (1.0 + UNDERWEIGHT) * of_params()) as f32)
+        self.gate.expects(innovation, certain as f32)
+            || self.gate.expects(innovation, (certain + (1.0 + UNDERWEIGHT) * of_params()) as f32)
     }
 
     fn residual(&self, frame: usize, b: usize) -> f64 {
@@ -331,7 +331,7 @@ impl<'c> Screening<'c> {
         if !self.stale && !(0..self.best.step.len()).any(moved) {
             return;
         }
-        // readings that are weighted anew have another chi-square; the step is then judged with the next one
+        // re-weighted readings have another chi-square; the step is then judged with the next one
         let highest = if self.stale { f64::INFINITY } else { self.best.cost + UPHILL };
         self.stale = false;
         let (from, step) = (self.model.params.clone(), self.best.step.clone());

@@ -264,7 +264,7 @@ mod tests {
 
     /// For kicks of 0.2 mrad and RF offsets of 2e-4, to the error that the tables state (2 um of largest error measured).
     #[test]
-    fn it_answers_as_the_twin() {
+    fn it_predicts_as_the_twin() {
         let (model, ring, vars) = example();
         let exact = VariedRing::of(&ring).unwrap().at(&vars).unwrap().response();
         let error = (model.at(&vars).unwrap().response() - &exact) * 2e-4;

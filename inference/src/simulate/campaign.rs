@@ -8,7 +8,7 @@
 //! `tune = fractional part of the cycle's tune + noise`. What the template's monitors did not report stays unreported.
 //!
 //! Misalignments, offsets, noise, jumps and the tune meter have streams of random numbers of their own: the same seed gives
-//! the same hall whatever effects the machine has.
+//! the same random errors whatever effects the machine has.
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -27,11 +27,11 @@ pub struct Truth<'a> {
     pub vars: &'a [f64],
     /// Effects of the library.
     pub effects: &'a [Effect],
-    /// Physics that the library does not hold.
+    /// Unmodelled physics.
     pub beyond: &'a [&'a dyn Beyond],
 }
 
-/// Physics outside the library, which may change a campaign at each of its three stages.
+/// Unmodelled physics, which may change a campaign at each of its three stages.
 pub trait Beyond {
     /// Change the ring itself.
     fn alter_ring(&self, _ring: &mut Ring) {}
@@ -52,13 +52,13 @@ pub struct Hardware {
     pub offset: f64,
     /// Noise of one reading of each read monitor [m].
     pub noise: Vec<f64>,
-    /// Monitors that jump now and then.
+    /// Monitors that jump occasionally.
     pub jumps: Vec<Jumps>,
     /// Noise of the tune meter [1].
     pub tune_noise: f64,
 }
 
-/// A read monitor whose reading is far off now and then.
+/// A read monitor whose reading is occasionally far off.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Jumps {
     /// Index among the read monitors.
@@ -86,7 +86,7 @@ impl Hardware {
     }
 }
 
-/// The campaign that a machine would have given: the template with the readings and tunes of every frame made anew.
+/// The campaign that a machine would have given: the template with new readings and tunes in every frame.
 ///
 /// # Errors
 /// [`EffectError`] if an effect has no place in the ring, or if the machine loses its beam.
@@ -108,7 +108,7 @@ pub fn campaign(
     let (mut readings, tunes) = track(&Tracked::of(machine, template.nominal_kick())?, &cycles)?;
     truth.beyond.iter().for_each(|beyond| beyond.alter_readings(&cycles, &mut readings));
     hardware.offset(&mut readings, &mut stream());
-    hardware.disturb(&mut readings, &mut stream());
+    hardware.add_noise(&mut readings, &mut stream());
     hardware.jump(&mut readings, &mut stream());
     let tunes = hardware.meter(&tunes, &mut stream());
     Ok(recorded(template, &readings, &tunes))
@@ -149,7 +149,7 @@ impl Hardware {
         readings.column_iter_mut().for_each(|mut column| column.add_scalar_mut(self.offset * normal(random)));
     }
 
-    fn disturb(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
+    fn add_noise(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
         for (mut column, noise) in readings.column_iter_mut().zip(&self.noise) {
             column.apply(|reading| *reading += noise * normal(random));
         }
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn each_effect_leaves_the_hall_alone() {
+    fn effects_change_no_random_error() {
         let (ring, recording) = template();
         let few = Recording { rows: recording.rows[..40].to_vec(), ..recording };
         let hardware = Hardware::shipped(&ring, &few);

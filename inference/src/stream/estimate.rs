@@ -3,7 +3,7 @@
 use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior};
 use training::rooms::large;
 
-/// The vars and the state of the instruments after a frame: [`estimator::Estimate`] without spare slots.
+/// The vars and the state of the monitors after a frame: [`estimator::Estimate`] without spare slots.
 #[derive(Debug, Clone, PartialEq)]
 #[allow(missing_docs)] // those of `estimator::Estimate`
 pub struct Estimate {

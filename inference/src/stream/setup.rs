@@ -1,4 +1,4 @@
-//! What is known beforehand, besides the tables, for a ring of any size.
+//! Priors, noise and calibration of a core, for a ring of any size.
 
 use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, SupplyCalibration};
 use training::rooms::large;
@@ -13,7 +13,7 @@ use crate::recording::Recording;
 const POWERED: f32 = 1.0;
 const SHARE: f64 = 0.05;
 
-/// What is known beforehand: [`estimator::Setup`] for a ring of any size.
+/// Priors, noise and calibration: [`estimator::Setup`] for a ring of any size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setup {
     /// Priors of `theta = ln var`; which of them a param has stands in the tables. From 1 to [`GROUPS`].

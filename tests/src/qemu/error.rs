@@ -16,7 +16,7 @@ pub enum Error {
     Failed {
         /// Its name.
         program: &'static str,
-        /// What it had to say.
+        /// Its standard error.
         stderr: String,
     },
     /// A file could not be read or written.

@@ -1,7 +1,7 @@
-//! Correctors that kick otherwise than they are told.
+//! Errors of correctors: gain, roll, reversed polarity, even part.
 //!
-//! The kick that a magnet gives is one function of the kick that it is believed to give and of an amplitude,
-//! [`CorrectorEffect::kick`]; a rolled magnet kicks elsewhere and is one of the ring's elements.
+//! The actual kick is one function of the nominal kick and of an amplitude, [`CorrectorEffect::kick`]; a rolled magnet kicks
+//! in both planes, as an element of the ring.
 
 use nalgebra::{DMatrix, DVector};
 use num_dual::first_derivative;
@@ -34,7 +34,7 @@ pub(super) struct Kick {
 }
 
 impl CorrectorEffect {
-    /// The kick given for the one believed [rad].
+    /// The actual kick for a nominal one [rad].
     fn kick<T: Scalar>(self, amplitude: T, believed: T, nominal: f64) -> T {
         match self {
             Self::Gain => believed * (amplitude + 1.0),

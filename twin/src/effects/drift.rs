@@ -1,4 +1,4 @@
-//! What changes while a campaign runs, and nobody records.
+//! Unrecorded drifts during a campaign.
 //!
 //! Every gradient is `k1 (1 + a t)` in a cycle at time t, from -1 to 1; per frame that is `t a (dR/dln k1) k`, and the derivative is the
 //! same without a. A response, which is the machine in mid-campaign, does not move.

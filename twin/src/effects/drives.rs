@@ -5,7 +5,7 @@
 //!
 //! `position = R k - (D/eta) f + t a (dR/dln k1) k + quadratic terms of sextupole fields`,
 //!
-//! and what a monitor makes of a position (gain, roll, cubic term, exchanged names) comes last. Everything is the change
+//! and the monitors' errors (gain, roll, cubic term, exchanged names) are applied last. Everything is the change
 //! against the orbit without kicks, whose own reading is unknown and constant. A sextupole field and a cubic term depend on
 //! that orbit: it is part of [`Drives`].
 

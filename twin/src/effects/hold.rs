@@ -18,7 +18,7 @@ use crate::orbit::{ClosedOrbit, Hold, OrbitError};
 use crate::response::{Gradient, Observer, Optics, Source};
 use crate::site::Site;
 
-/// What is held otherwise than thought.
+/// What is held instead of the design momentum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum HoldEffect {
     /// The beam is off momentum.
@@ -43,7 +43,7 @@ pub enum Rf {
 pub(super) struct Holding {
     /// Momentum of the beam on average.
     pub delta: f64,
-    /// Share of the answer that is given at fixed RF frequency.
+    /// Share of the response at fixed RF frequency.
     frequency_share: f64,
     /// Monitors whose mean is held, and the share.
     radial_loop: Option<([usize; 2], f64)>,

@@ -20,9 +20,9 @@ pub struct Machine {
     pub(super) ring: Ring,
     /// What it holds constant.
     pub(super) hold: Holding,
-    /// What monitors make of the orbit, in the order given.
+    /// Effects of monitors, in the order given.
     pub(super) monitors: Vec<Reading>,
-    /// What correctors make of their settings, in the order given.
+    /// Effects of correctors, in the order given.
     pub(super) correctors: Vec<Kick>,
     /// Sextupole fields beyond the ring's: element, K2L [1/m^2].
     pub(super) sextupoles: Vec<(usize, f64)>,
@@ -30,7 +30,7 @@ pub struct Machine {
     pub(super) drift: f64,
 }
 
-/// What a machine answers: response of x and y at every monitor to every corrector, and its linear optics.
+/// Response of x and y at every monitor to every corrector, and the linear optics of a machine.
 #[derive(Debug, Clone)]
 pub struct MachineResponse {
     /// x at the monitors to the correctors [m/rad].

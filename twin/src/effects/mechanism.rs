@@ -1,4 +1,4 @@
-//! What has to be known of a kind of effect, and how to say it.
+//! The properties of a kind of effect, and its words.
 
 use super::{EffectError, Machine, Signature, Signatures};
 use crate::lattice::{Plane, Ring};

@@ -1,8 +1,8 @@
 //! Physics that a ring may have beyond its design, in the words of the command line: `KIND[@PLACE][=AMPLITUDE]`.
 //!
-//! An effect changes the ring itself, what the machine holds constant, or what its monitors and correctors say; a
-//! [`Machine`] is a ring with effects applied, and answers with the response that would then be measured. Each [`Class`] has a
-//! file in which its kinds stand with all that is to be known of them: [`Mechanism`].
+//! An effect changes the ring itself, what the machine holds constant, its readings or its kicks; a [`Machine`] is a ring with
+//! effects applied, and gives the response that would then be measured. Each [`Class`] has a file that defines its kinds, each
+//! by its [`Mechanism`].
 
 #[cfg(test)]
 mod agreement;
@@ -38,9 +38,9 @@ pub use track::{Cycle, Tracked};
 /// The classes of effect, each with its kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Class {
-    /// What one monitor, or two, make of the orbit.
+    /// Errors of one monitor, or of two.
     Monitor(MonitorEffect),
-    /// What one corrector makes of its setting.
+    /// Errors of one corrector.
     Corrector(CorrectorEffect),
     /// Fields in the ring.
     Field(FieldEffect),

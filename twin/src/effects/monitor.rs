@@ -1,6 +1,6 @@
-//! Monitors that read something else than the orbit at their place.
+//! Errors of monitors: gain, roll, cubic term, exchanged names.
 //!
-//! What one monitor makes of a position is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
+//! The reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
 //! cycle is its value, a frame's is a difference of two values, the response its slope in the position, the signature its slope in
 //! the amplitude: the last two by dual numbers.
 

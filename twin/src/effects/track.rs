@@ -1,7 +1,7 @@
 //! Exact closed orbits of single machine cycles, nothing linearised: what simulated campaigns are made of.
 //!
 //! The ring is as misaligned as its elements say. Kicks, supplies, drift and what the machine holds constant enter the exact
-//! maps, and what the monitors make of the orbit comes last. An RF offset is relative to the frequency at which this ring
+//! maps; the monitors' errors are applied last. An RF offset is relative to the frequency at which this ring
 //! closes without kicks.
 
 use super::drift;
@@ -26,7 +26,7 @@ pub struct Cycle {
     pub time: f64,
 }
 
-/// A machine ready to be asked for one cycle after the other.
+/// A machine that is evaluated cycle by cycle.
 #[derive(Debug, Clone)]
 pub struct Tracked {
     machine: Machine,

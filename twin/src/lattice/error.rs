@@ -58,7 +58,7 @@ pub enum LatticeError {
         /// Where the second one starts [m].
         s: f64,
     },
-    /// A stated label that another element of the sort goes by.
+    /// A stated label that is another element's label or name.
     #[error("element {name}: label {label:?} is taken by element {other}")]
     Label {
         /// The element.

@@ -1,4 +1,4 @@
-//! `orbitcal prove`: simulated blind campaigns through the diagnosis, on all cores, to be taken up again where it stopped.
+//! `orbitcal validate`: simulated blind campaigns through the diagnosis, on all cores; a stopped run resumes.
 
 use core::sync::atomic::{AtomicUsize, Ordering};
 use std::collections::BTreeMap;
@@ -10,19 +10,19 @@ use std::sync::Mutex;
 use diagnosis::data::{Data, DataError};
 use diagnosis::scan::candidates;
 use diagnosis::validation::tables::Tables;
-use diagnosis::validation::{Case, Class, Outcome, run as prove};
+use diagnosis::validation::{self, Case, Class, Outcome};
 use inference::{Campaign, Recording};
 use twin::Ring;
 
 use super::{CommandError, check_outputs, machine, progress, recording};
-use crate::cli::Prove;
+use crate::cli::Validate;
 use crate::output;
 
 /// Run it.
 ///
 /// # Errors
 /// [`CommandError`].
-pub fn run(options: &Prove) -> Result<(), CommandError> {
+pub fn run(options: &Validate) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.page.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let template = recording(&options.template, &ring)?;
@@ -49,17 +49,14 @@ pub fn run(options: &Prove) -> Result<(), CommandError> {
         output::say(tables.markdown())?;
     }
     if options.strict && tables.wrong.of > 0 {
-        let what = format!(
-            "something was named that is not there in {} of {} campaigns",
-            tables.wrong.of, tables.wrong.trials
-        );
+        let what = format!("false identifications in {} of {} campaigns", tables.wrong.of, tables.wrong.trials);
         return Err(CommandError::Other(what));
     }
     Ok(())
 }
 
 /// Cases of all classes; the number of a case fixes it, so that a longer run begins with the shorter one's.
-fn cases(options: &Prove, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
+fn cases(options: &Validate, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
     let data = Data::of(&Campaign::of(ring, template).map_err(DataError::from)?)?;
     let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
     let classes = [
@@ -117,7 +114,7 @@ fn all(
     let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     let work = || -> Result<(), CommandError> {
         while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
-            let outcome = prove(ring, template, case)
+            let outcome = validation::run(ring, template, case)
                 .map_err(|error: DataError| CommandError::Other(format!("campaign {}: {error}", case.index)))?;
             if let Some(outcome) = outcome {
                 append(&file, key, &outcome).map_err(wrong)?;
@@ -141,7 +138,7 @@ fn append(file: &Mutex<File>, key: &str, outcome: &Outcome) -> std::io::Result<(
     file.lock().expect("no thread panics with it").write_all(line.as_bytes())
 }
 
-const MARKS: [&str; 2] = ["<!-- tables of make prove -->", "<!-- end of tables -->"];
+const MARKS: [&str; 2] = ["<!-- tables of make validate -->", "<!-- end of tables -->"];
 
 /// Replace what is between the marks of a page.
 fn write_between_marks(path: &Path, tables: &str) -> Result<(), CommandError> {
