@@ -408,6 +408,20 @@ impl Data {
         part
     }
 
+    /// `E^T S^-1 E` of a monitor's readings for groups of frames, of which `group` names that of each frame: `diag(alone) - common common^T`,
+    /// the latter of their common terms. Returns both, [groups] and [groups][factors].
+    pub fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
+        let channel = &self.channels[b];
+        let taken = channel.shrink.map(|shrink| (shrink * (2.0 - shrink)).sqrt() / channel.sigma).transpose();
+        let (mut alone, mut common) = (DVector::zeros(groups), DMatrix::zeros(groups, taken.len()));
+        for (row, &frame) in channel.basis.row_iter().zip(&channel.frames) {
+            alone[group[frame]] += channel.sigma.powi(-2);
+            let mut common = common.row_mut(group[frame]);
+            common += row.component_mul(&taken);
+        }
+        (alone, common)
+    }
+
     /// True if a reading counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
         self.screened.accepted[(frame, b)] && !self.readings[(frame, b)].is_nan()

@@ -12,7 +12,7 @@
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
 use estimator::MonitorState;
-use nalgebra::{DMatrix, DVector, DVectorView};
+use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
 use twin::{Plane, Signatures};
 
 use super::data::Data;
@@ -65,6 +65,13 @@ struct Sums {
     pull: DVector<f64>,
 }
 
+/// The Gram matrix of a monitor's amplitudes for settings. No frame has two, so that it is diagonal but for the common terms of the
+/// readings: `diag(alone) - common common^T`.
+struct Apart {
+    alone: DVector<f64>,
+    common: DMatrix<f64>,
+}
+
 /// A fit, linearised at its best point.
 struct Linearised<'f> {
     fitted: &'f Fitted,
@@ -80,6 +87,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let settings = Settings::of(&data.drives);
     let monitors = data.readings.ncols();
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &settings.indicator())).collect();
+    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings)).collect();
     let stretches = stretches(data);
     let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &stretches)).collect();
     // faulty monitors scatter by themselves
@@ -107,7 +115,9 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let driven = data.driven_correctors();
     for &c in &driven {
         let of_corrector = settings.of_corrector(c);
-        all.push(linearised.judge(Location::Corrector(c), &blocks(&sums, &active, &of_corrector), driven.len()));
+        let (of_each, apart): (Vec<Sums>, Vec<Apart>) =
+            active.iter().map(|&b| (sums[b].select(&of_corrector), apart[b].select(&of_corrector))).unzip();
+        all.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
         let patterns = independent(signatures.beside(c));
         let beside = patterned(&sums, &active, &settings.strength(c), &patterns);
         all.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
@@ -146,6 +156,37 @@ impl Linearised<'_> {
         let (pull, gram) = self.project(sums);
         let logs = SIZES.map(|size| marginal(&pull, &gram, size));
         self.conclude(Discrepancy::of(at, logs, sites), &[sums])
+    }
+
+    /// The same of one amplitude for each monitor and each of some settings. As many as there are readings, they are taken monitor by
+    /// monitor: with `D = 1 + omega^2 Z^T Z` of one, `A = 1 + J^T J` and `C = Z^T J`,
+    ///
+    /// `1 + omega^2 G = D - omega^2 C A^-1 C^T`, whose determinant is `det D det B/det A`, `B = A - omega^2 C^T D^-1 C`,
+    ///
+    /// and whose inverse `D^-1 + omega^2 D^-1 C B^-1 C^T D^-1`; `D`, `C^T D^-1 C` and the like are sums over the monitors.
+    fn judge_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
+        let taken = self.fitted.free.solve(&self.fitted.slope);
+        let sides: Vec<DMatrix<f64>> =
+            each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &taken))).collect();
+        let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
+        self.conclude(Discrepancy::of(at, logs, sites), &each.iter().collect::<Vec<_>>())
+    }
+
+    /// `ln` Bayes factor of one size; `sides` are `(C, g)` of each monitor.
+    fn marginal_apart(&self, sides: &[DMatrix<f64>], apart: &[Apart], size: f64) -> Option<f64> {
+        let (variance, p) = (size * size, self.fitted.slope.len());
+        let (mut log_det, mut sum) = (0.0, DMatrix::zeros(p + 1, p + 1));
+        for (sides, apart) in sides.iter().zip(apart) {
+            let (of_one, inner) = apart.grown(variance, sides)?;
+            log_det += of_one;
+            sum += inner;
+        }
+        let before = self.fitted.free.l();
+        let after = (&before * before.transpose() - sum.view((0, 0), (p, p)) * variance).cholesky()?;
+        log_det += log_det_of(&after) - log_det_of(&self.fitted.free);
+        let with_pull = sum.view((0, p), (p, 1));
+        let pull = sum[(p, p)] + variance * with_pull.dot(&after.solve(&with_pull));
+        Some(0.5 * (variance * pull - log_det))
     }
 
     /// Many monitors with one size, the fit's unknowns held: a lower limit of the evidence, as they would adapt.
@@ -198,8 +239,12 @@ pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let mut grown = gram * variance;
     (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
     let Some(factor) = grown.cholesky() else { return f64::NEG_INFINITY };
-    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum();
-    0.5 * variance * pull.dot(&factor.solve(pull)) - log_det
+    0.5 * (variance * pull.dot(&factor.solve(pull)) - log_det_of(&factor))
+}
+
+/// `ln` of the determinant of what is factorised.
+fn log_det_of(factor: &Cholesky<f64, Dyn>) -> f64 {
+    2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
 }
 
 /// Steps at the edges of the stretches of time: rows frames, columns edges.
@@ -278,23 +323,6 @@ fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns
     sum
 }
 
-/// One amplitude for each monitor and each of some settings.
-fn blocks(sums: &[Sums], monitors: &[usize], settings: &[usize]) -> Sums {
-    let (m, p) = (settings.len(), sums[monitors[0]].cross.ncols());
-    let n = m * monitors.len();
-    let mut all = Sums { gram: DMatrix::zeros(n, n), cross: DMatrix::zeros(n, p), pull: DVector::zeros(n) };
-    for (k, &b) in monitors.iter().enumerate() {
-        for (i, &one) in settings.iter().enumerate() {
-            for (j, &other) in settings.iter().enumerate() {
-                all.gram[(k * m + i, k * m + j)] = sums[b].gram[(one, other)];
-            }
-            all.cross.row_mut(k * m + i).copy_from(&sums[b].cross.row(one));
-            all.pull[k * m + i] = sums[b].pull[one];
-        }
-    }
-    all
-}
-
 impl Data {
     /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
     fn sums(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Sums {
@@ -353,5 +381,79 @@ impl Sums {
     fn none(numbers: usize, unknowns: usize) -> Self {
         let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
         Self { gram, cross, pull: DVector::zeros(numbers) }
+    }
+
+    /// Of some of the groups.
+    fn select(&self, groups: &[usize]) -> Self {
+        let gram = self.gram.select_rows(groups).select_columns(groups);
+        Self { gram, cross: self.cross.select_rows(groups), pull: self.pull.select_rows(groups) }
+    }
+
+    /// The cross sums, and one more column.
+    fn beside(&self, column: &DVector<f64>) -> DMatrix<f64> {
+        let at = self.cross.ncols();
+        let mut all = self.cross.clone().insert_column(at, 0.0);
+        all.set_column(at, column);
+        all
+    }
+}
+
+impl Apart {
+    fn of(data: &Data, b: usize, settings: &Settings) -> Self {
+        let (alone, common) = data.information(b, &settings.of_frame, settings.count());
+        Self { alone, common }
+    }
+
+    /// Of some of the settings.
+    fn select(&self, settings: &[usize]) -> Self {
+        Self { alone: self.alone.select_rows(settings), common: self.common.select_rows(settings) }
+    }
+
+    /// `ln det D` and `sides^T D^-1 sides`, `D = 1 + variance (diag(alone) - common common^T)`: with `d` its diagonal and
+    /// `R = 1 - variance common^T d^-1 common`, `det D = det d det R`, `D^-1 = d^-1 + variance d^-1 common R^-1 common^T d^-1`.
+    fn grown(&self, variance: f64, sides: &DMatrix<f64>) -> Option<(f64, DMatrix<f64>)> {
+        let diagonal = self.alone.map(|alone| 1.0 + variance * alone);
+        let over = |columns: &DMatrix<f64>| {
+            let mut over = columns.clone();
+            over.column_iter_mut().for_each(|mut column| column.component_div_assign(&diagonal));
+            over
+        };
+        let (common, across) = (self.common.tr_mul(&over(&self.common)), self.common.tr_mul(&over(sides)));
+        let rest = (DMatrix::identity(common.nrows(), common.ncols()) - common * variance).cholesky()?;
+        let log_det = diagonal.iter().map(|d| d.ln()).sum::<f64>() + log_det_of(&rest);
+        Some((log_det, sides.tr_mul(&over(sides)) + across.tr_mul(&rest.solve(&across)) * variance))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use inference::Campaign;
+
+    use super::*;
+    use crate::hypothesis::Hypothesis;
+    use crate::testing::template;
+
+    #[test]
+    fn the_evidence_taken_monitor_by_monitor_is_that_of_one_large_matrix() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
+        let (linearised, settings) = (Linearised { fitted: &fitted }, Settings::of(&data.drives));
+        let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
+        let each = monitors.map(|b| data.sums(b, &fitted, &settings.indicator()).select(&some));
+        let apart = monitors.map(|b| Apart::of(&data, b, &settings).select(&some));
+        let (n, unknowns) = (some.len(), fitted.u.len());
+        let mut all = Sums::none(n * each.len(), unknowns);
+        for (at, (sums, apart)) in each.iter().zip(&apart).enumerate() {
+            let gram = DMatrix::from_diagonal(&apart.alone) - &apart.common * apart.common.transpose();
+            assert!((gram - &sums.gram).amax() < 1e-9 * sums.gram.amax(), "rounding");
+            all.gram.view_mut((n * at, n * at), (n, n)).copy_from(&sums.gram);
+            all.cross.rows_mut(n * at, n).copy_from(&sums.cross);
+            all.pull.rows_mut(n * at, n).copy_from(&sums.pull);
+        }
+        let one = linearised.judge(Location::Corrector(0), &all, 1);
+        let other = linearised.judge_apart(Location::Corrector(0), &each, &apart, 1);
+        assert_eq!(one.size, other.size);
+        assert!((one.log_bayes / other.log_bayes - 1.0).abs() < 1e-9, "{} {}", one.log_bayes, other.log_bayes);
     }
 }

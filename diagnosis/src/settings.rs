@@ -30,6 +30,11 @@ impl Settings {
         Self { of_frame, powered }
     }
 
+    /// Number of settings.
+    pub fn count(&self) -> usize {
+        self.powered.len()
+    }
+
     /// The corrector that is powered most in a frame, and the sign of its kick.
     pub fn kick(&self, frame: usize) -> Option<(usize, f64)> {
         let strongest = self.powered[self.of_frame[frame]].iter().max_by_key(|(_, fifths)| fifths.abs());

@@ -1,14 +1,14 @@
-//! Measured error of a surrogate against the exact twin.
+//! Measured error of a surrogate against the exact twin; the tables state it.
 
 use estimator::Tables as _;
-use estimator::surrogate::List;
 use nalgebra::DMatrix;
-use twin::{Hold, Optics, Ring};
+use twin::{Hold, Optics, Parameter, ParameterPrior, Ring};
 
+use crate::instruments::Instruments;
 use crate::response::responses;
 use crate::tables::{LINE, Tables};
 
-/// Error of one surrogate in one plane, on the -22 A to +22 A response over many vars.
+/// Error of one surrogate in one plane, of the orbit of a kick of 0.4 mrad, over many vars.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SurrogateError {
     /// Name of the surrogate.
@@ -31,19 +31,24 @@ pub struct SurrogateError {
     pub tune_max: f64,
 }
 
-/// Range of each var.
-const RANGE: (f64, f64) = (0.94, 1.06);
+/// Each var is drawn evenly within so many widths of its prior from 1, and within its range: 0.94 to 1.06 by default.
+const WIDTHS: f64 = 2.0;
 /// Largest distance of a tune from the design that the paper's data allow.
 pub const TUNE_CUT: f64 = 0.05;
-/// Kick of -22 A to +22 A [rad].
+/// Kick at which the error is measured [rad]: the Booster's from -22 A to +22 A. Tables know of no campaign; its kicks are smaller
+/// as a rule, and the error is proportional to them.
 const FULL_SWING: f64 = 0.4e-3;
 
 /// Vars at point `i` of a scrambled Sobol sequence [N].
 ///
 /// Source: B. Burley, Practical Hash-based Owen Scrambling, JCGT 9 (2020).
-pub fn sobol_vars(i: u32, n: usize, seed: u32) -> Vec<f64> {
-    let of = |d| RANGE.0 + (RANGE.1 - RANGE.0) * f64::from(sobol_burley::sample(i, d, seed));
-    (0..n as u32).map(of).collect()
+fn sobol_vars(i: u32, ring: &Ring, seed: u32) -> Vec<f64> {
+    let of = |(n, parameter): (usize, &Parameter)| {
+        let ParameterPrior { width, range: [lowest, highest] } = parameter.prior;
+        let (from, to) = (lowest.max(1.0 - WIDTHS * width), highest.min(1.0 + WIDTHS * width));
+        from + (to - from) * f64::from(sobol_burley::sample(i, n as u32, seed))
+    };
+    ring.parameters.iter().enumerate().map(of).collect()
 }
 
 /// A ring of the sample, as the twin sees it.
@@ -53,22 +58,31 @@ struct Exact {
 }
 
 /// Measure the Green's function surrogate on `samples` vars within the tune cut; `progress` hears of each.
-pub fn check(
+pub fn check(ring: &Ring, tables: &Tables, samples: usize, seed: u32, progress: impl FnMut()) -> [SurrogateError; 2] {
+    check_with(ring, &Instruments::sound(ring), tables, samples, seed, progress)
+}
+
+/// The same of tables of the ring as its instruments show it.
+pub(crate) fn check_with(
     ring: &Ring,
+    instruments: &Instruments,
     tables: &Tables,
     samples: usize,
     seed: u32,
     mut progress: impl FnMut(),
 ) -> [SurrogateError; 2] {
-    let n = ring.parameters.len();
-    let design = exact(ring, &vec![1.0; n]).expect("the surrogate has a stable design").tunes;
+    let ones = vec![1.0; ring.parameters.len()];
+    let exact = |vars: &[f64]| exact(ring, instruments, vars);
+    let design = exact(&ones).expect("the surrogate has a stable design").tunes;
     let near = |e: &Exact| e.tunes.iter().zip(design).all(|(tune, design)| (tune - design).abs() <= TUNE_CUT);
-    let tried = (0..).map(|i| sobol_vars(i, n, seed)).take(TRIES * samples);
-    let within = tried.filter_map(|vars| exact(ring, &vars).filter(near).map(|exact| (vars, exact)));
+    // a ring whose prior has no machine near enough is measured as designed
+    let tried = (0..).map(|i| sobol_vars(i, ring, seed)).take(TRIES * samples).chain([ones]);
+    let within = tried.filter_map(|vars| exact(&vars).filter(near).map(|exact| (vars, exact)));
     let (vars, rings): (Vec<_>, Vec<_>) = within.inspect(|_| progress()).take(samples).unzip();
     let mut errors = [Errors::default(); 2];
     for (exact, core) in rings.iter().zip(responses(tables, &vars)) {
-        let core = core.expect("a ring within the tune cut is connected with the design");
+        // a core refuses a ring beyond a resonance, whose tunes may be near up to an integer
+        let Some(core) = core else { continue };
         let (monitors, correctors) = (ring.horizontal_monitors(), ring.horizontal_correctors());
         for c in 0..exact.response.ncols() {
             for b in 0..exact.response.nrows() {
@@ -91,7 +105,7 @@ pub fn check(
         samples: rings.len(),
         rms: (errors[plane].squares / errors[plane].count.max(1) as f64).sqrt(),
         max: errors[plane].largest,
-        stated_rms: f64::from(tables.list(List::Ring)[7 + plane]),
+        stated_rms: f64::from(tables.stated_error()[plane]),
         tune_max: errors[plane].tune,
     })
 }
@@ -117,11 +131,11 @@ impl Errors {
 }
 
 /// The twin at given vars; none where it is not stable.
-fn exact(ring: &Ring, vars: &[f64]) -> Option<Exact> {
+fn exact(ring: &Ring, instruments: &Instruments, vars: &[f64]) -> Option<Exact> {
     let changed = ring.with_vars(vars);
-    let optics = Optics::of(&changed, Hold::Momentum { delta: 0.0 }).ok()?;
+    let optics = Optics::of(&changed, Hold::Momentum { delta: instruments.delta }).ok()?;
     let tunes = optics.tunes().ok()?;
-    let response = optics.response(&optics.read_monitors(), &optics.correctors());
+    let response = optics.response(&instruments.monitors(&optics), &instruments.correctors(&optics));
     Some(Exact { response, tunes: [tunes.x, tunes.y] })
 }
 
@@ -147,17 +161,20 @@ fn entries(tables: &Tables) -> (usize, usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::rings;
 
+    /// Measured: 0.44 to 0.93 of what is stated.
     #[test]
-    fn the_green_surrogate_is_as_good_as_it_states() {
-        let ring = Ring::booster();
-        let green = crate::green::tables(&ring).unwrap();
-        for plane in check(&ring, &green, 100, 1, || ()) {
-            assert!(plane.rms < plane.stated_rms, "{plane:?}");
-            assert!(plane.rms > 0.1 * plane.stated_rms, "stated too generously: {plane:?}");
-            // beside the calibration error of a tune meter, 3e-4; quantisation of the tables
-            assert!(plane.tune_max < 1e-4, "{plane:?}"); // measured 6e-5
-            assert!(plane.bytes <= 64 * 1024, "{plane:?}");
+    fn tables_are_as_good_as_they_state() {
+        for ring in rings() {
+            let green = crate::green::tables(&ring).unwrap();
+            for plane in check(&ring, &green, 100, 1, || ()) {
+                assert!(plane.rms < plane.stated_rms, "{}: {plane:?}", ring.name);
+                assert!(plane.rms > 0.25 * plane.stated_rms, "{}: stated too generously: {plane:?}", ring.name);
+                // beside the calibration error of a tune meter, 3e-4; quantisation of the tables
+                assert!(plane.tune_max < 1e-4, "{plane:?}"); // measured 7e-5
+                assert!(plane.bytes <= 64 * 1024, "{plane:?}");
+            }
         }
     }
 }

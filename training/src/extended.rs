@@ -10,7 +10,8 @@ use estimator::surrogate::TERMS;
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Effect, EffectKind, Machine, Rf, Ring, Site};
 
-use crate::green::{Instruments, TrainingError, tables_with};
+use crate::green::{TrainingError, tables_with};
+use crate::instruments::Instruments;
 use crate::response::responses;
 use crate::tables::Tables;
 

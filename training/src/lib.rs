@@ -3,10 +3,13 @@
 pub mod check;
 pub mod extended;
 pub mod green;
+mod instruments;
 mod response;
 pub mod rooms;
 mod source;
 mod tables;
+#[cfg(test)]
+mod testing;
 
 pub use check::{SurrogateError, check};
 pub use extended::Extended;

@@ -20,6 +20,9 @@ pub struct Tables {
     lists: [Vec<f32>; List::ALL.len()],
 }
 
+/// Where the stated errors stand in the list of the ring.
+const STATED: usize = RING - 2;
+
 /// One step of a table in a plane, in the list of them.
 fn step_of(table: Table) -> Option<usize> {
     let planes = [
@@ -107,6 +110,15 @@ impl Tables {
     /// If there is no such param.
     pub fn prior_group(&self, param: usize) -> usize {
         self.lines(Table::Group)[0][param] as usize
+    }
+
+    /// Rms error of the response in x and y that the tables state [m].
+    pub fn stated_error(&self) -> [f32; 2] {
+        [0, 1].map(|plane| self.list(List::Ring)[STATED + plane])
+    }
+
+    pub(crate) fn state_error(&mut self, error: [f32; 2]) {
+        self.list_mut(List::Ring)[STATED..].copy_from_slice(&error);
     }
 
     /// Number of terms of low rank.

@@ -5,6 +5,9 @@ use nalgebra::{DMatrix, DVector, Matrix6};
 use crate::map::{DELTA, PATH};
 use crate::response::{Gradient, Observer, Optics, seen_rows};
 
+/// Momentum step of differences in the RF frequency [1].
+const DELTA_STEP: f64 = 1.9e-3;
+
 impl Optics<'_> {
     /// Dispersion seen by an observer [m], momentum deviations closed at any hold.
     pub fn dispersion(&self, observer: &Observer) -> f64 {
@@ -53,6 +56,12 @@ impl Optics<'_> {
     /// Slip factor `alpha_c - 1/gamma^2` [1].
     pub fn slip_factor(&self) -> f64 {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
+    }
+
+    /// RF offset for differences of orbits [1]: it moves the momentum by 1.9e-3, whatever the slip factor. The Booster's is 2e-4; with
+    /// half of it the second order of an orbit changes by 5e-5 of its largest.
+    pub fn rf_step(&self) -> f64 {
+        (self.slip_factor() * DELTA_STEP).abs()
     }
 
     /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients [m per 1/m^2, or per 1/m

@@ -13,9 +13,6 @@ use crate::response::Optics;
 const MACHINES: u32 = 40;
 const SHIFT: f64 = 0.2e-3;
 
-/// Step of the RF frequency [1].
-const STEP: f64 = 2e-4;
-
 /// Rms change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit,
 /// beyond the design dispersion [1]; 0 in a plane in which shifted quadrupoles make no orbit that is read.
 ///
@@ -27,15 +24,15 @@ pub fn spurious_dispersion(ring: &Ring) -> Result<[f64; 2], OrbitError> {
 
 fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut change, mut orbit) = ([0.0; 2], [0.0; 2]);
+    let (mut change, mut orbit, step) = ([0.0; 2], [0.0; 2], optics.rf_step());
     for machine in 0..MACHINES {
         let shifted = misaligned(ring, machine, rms);
         let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(STEP)?, at(-STEP)?, at(0.0)?);
+        let (up, down, rest) = (at(step)?, at(-step)?, at(0.0)?);
         for at in ring.monitors_read().map(|monitor| monitor.element) {
             let design = [optics.dispersion(&optics.observe(at, Plane::X)), 0.0];
             for (plane, coordinate) in [(0, X), (1, Y)] {
-                let slope = |coordinate: usize| (up.at[at][coordinate] - down.at[at][coordinate]) / (2.0 * STEP);
+                let slope = |coordinate: usize| (up.at[at][coordinate] - down.at[at][coordinate]) / (2.0 * step);
                 change[plane] += (slope(coordinate) - design[plane] * slope(DELTA)).powi(2);
                 orbit[plane] += rest.at[at][coordinate].powi(2);
             }

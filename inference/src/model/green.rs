@@ -83,7 +83,7 @@ impl GreenModel {
                 inverse_gamma_squared: ring[3],
                 circumference: ring[4],
             },
-            stated_error: [ring[7], ring[8]],
+            stated_error: tables.stated_error().map(f64::from),
         }
     }
 
