@@ -6,7 +6,7 @@ use crate::map::{DELTA, PATH};
 use crate::response::{Gradient, Observer, Optics, seen_rows};
 
 /// Momentum step of differences in the RF frequency [1].
-const DELTA_STEP: f64 = 1.9e-3;
+const DELTA_STEP: f64 = 1.88e-3;
 
 impl Optics<'_> {
     /// Dispersion seen by an observer [m], momentum deviations closed at any hold.
@@ -58,7 +58,7 @@ impl Optics<'_> {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
     }
 
-    /// RF offset for differences of orbits [1]: it moves the momentum by 1.9e-3, whatever the slip factor. The Booster's is 2e-4; with
+    /// RF offset for differences of orbits [1]: it moves the momentum by 1.88e-3, whatever the slip factor. The Booster's is 2e-4; with
     /// half of it the second order of an orbit changes by 5e-5 of its largest.
     pub fn rf_step(&self) -> f64 {
         (self.slip_factor() * DELTA_STEP).abs()
