@@ -23,6 +23,9 @@ pub struct SurrogateError {
     pub samples: usize,
     /// Rms over samples, monitors and correctors [m].
     pub rms: f64,
+    /// Median over samples of the rms over monitors and correctors [m]: few samples tell it, as it does not hang on those near a
+    /// resonance.
+    pub median: f64,
     /// Largest [m].
     pub max: f64,
     /// What the surrogate states of itself [m].
@@ -57,7 +60,7 @@ struct Exact {
     tunes: [f64; 2],
 }
 
-/// Measure the Green's function surrogate on `samples` vars within the tune cut; `progress` hears of each.
+/// Measure the Green's function surrogate on the design and on `samples` vars in all within the tune cut; `progress` hears of each.
 pub fn check(ring: &Ring, tables: &Tables, samples: usize, seed: u32, progress: impl FnMut()) -> [SurrogateError; 2] {
     check_with(ring, &Instruments::sound(ring), tables, samples, seed, progress)
 }
@@ -75,23 +78,26 @@ pub(crate) fn check_with(
     let exact = |vars: &[f64]| exact(ring, instruments, vars);
     let design = exact(&ones).expect("the surrogate has a stable design").tunes;
     let near = |e: &Exact| e.tunes.iter().zip(design).all(|(tune, design)| (tune - design).abs() <= TUNE_CUT);
-    // a ring whose prior has no machine near enough is measured as designed
-    let tried = (0..).map(|i| sobol_vars(i, ring, seed)).take(TRIES * samples).chain([ones]);
-    let within = tried.filter_map(|vars| exact(&vars).filter(near).map(|exact| (vars, exact)));
+    let tried = (0..).map(|i| sobol_vars(i, ring, seed)).take(TRIES * samples);
+    let within =
+        core::iter::once(ones).chain(tried).filter_map(|vars| exact(&vars).filter(near).map(|exact| (vars, exact)));
     let (vars, rings): (Vec<_>, Vec<_>) = within.inspect(|_| progress()).take(samples).unzip();
-    let mut errors = [Errors::default(); 2];
+    let (mut errors, mut each) = ([Errors::default(); 2], [Vec::new(), Vec::new()]);
     for (exact, core) in rings.iter().zip(responses(tables, &vars)) {
-        // a core refuses a ring beyond a resonance, whose tunes may be near up to an integer
+        // a core refuses a ring beyond a resonance
         let Some(core) = core else { continue };
         let (monitors, correctors) = (ring.horizontal_monitors(), ring.horizontal_correctors());
+        let mut here = [Errors::default(); 2];
         for c in 0..exact.response.ncols() {
             for b in 0..exact.response.nrows() {
                 if (b < monitors) == (c < correctors) {
                     let error = FULL_SWING * (core.response[(b, c)] - exact.response[(b, c)]);
-                    errors[usize::from(b >= monitors)].add(error.abs());
+                    here[usize::from(b >= monitors)].add(error.abs());
                 }
             }
         }
+        each.iter_mut().zip(&here).for_each(|(each, here)| each.push(here.rms()));
+        errors.iter_mut().zip(here).for_each(|(errors, here)| errors.join(here));
         for (errors, (ours, exact)) in errors.iter_mut().zip(core.tunes.iter().zip(exact.tunes)) {
             let miss = ours - exact;
             errors.tune = errors.tune.max((miss - miss.round()).abs());
@@ -102,8 +108,9 @@ pub(crate) fn check_with(
         plane: ['x', 'y'][plane],
         parameters: parameters(tables),
         bytes: bytes(tables),
-        samples: rings.len(),
-        rms: (errors[plane].squares / errors[plane].count.max(1) as f64).sqrt(),
+        samples: each[plane].len(),
+        rms: errors[plane].rms(),
+        median: median(&mut each[plane]),
         max: errors[plane].largest,
         stated_rms: f64::from(tables.stated_error()[plane]),
         tune_max: errors[plane].tune,
@@ -128,6 +135,22 @@ impl Errors {
         self.count += 1;
         self.largest = self.largest.max(error);
     }
+
+    fn join(&mut self, other: Self) {
+        self.squares += other.squares;
+        self.count += other.count;
+        self.largest = self.largest.max(other.largest);
+    }
+
+    fn rms(&self) -> f64 {
+        (self.squares / self.count.max(1) as f64).sqrt()
+    }
+}
+
+/// The middle one, the upper of two; 0 of none.
+fn median(of: &mut [f64]) -> f64 {
+    of.sort_by(f64::total_cmp);
+    of.get(of.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// The twin at given vars; none where it is not stable.
@@ -163,14 +186,14 @@ mod tests {
     use super::*;
     use crate::testing::rings;
 
-    /// Measured: 0.44 to 0.93 of what is stated.
+    /// Measured: 0.26 to 0.93 of what is stated.
     #[test]
     fn tables_are_as_good_as_they_state() {
         for ring in rings() {
             let green = crate::green::tables(&ring).unwrap();
             for plane in check(&ring, &green, 100, 1, || ()) {
                 assert!(plane.rms < plane.stated_rms, "{}: {plane:?}", ring.name);
-                assert!(plane.rms > 0.25 * plane.stated_rms, "{}: stated too generously: {plane:?}", ring.name);
+                assert!(plane.rms > 0.2 * plane.stated_rms, "{}: stated too generously: {plane:?}", ring.name);
                 // beside the calibration error of a tune meter, 3e-4; quantisation of the tables
                 assert!(plane.tune_max < 1e-4, "{plane:?}"); // measured 7e-5
                 assert!(plane.bytes <= 64 * 1024, "{plane:?}");

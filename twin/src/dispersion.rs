@@ -58,10 +58,12 @@ impl Optics<'_> {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
     }
 
-    /// RF offset for differences of orbits [1]: it moves the momentum by 1.9e-3, whatever the slip factor. The Booster's is 2e-4; with
-    /// half of it the second order of an orbit changes by 5e-5 of its largest.
+    /// RF offset for differences of orbits [1], to one digit: it moves the momentum by 1.9e-3 or so, whatever the slip factor. The
+    /// Booster's is 2e-4; with half of it the second order of an orbit changes by 5e-5 of its largest.
     pub fn rf_step(&self) -> f64 {
-        (self.slip_factor() * DELTA_STEP).abs()
+        let step = (self.slip_factor() * DELTA_STEP).abs();
+        let digit = 10f64.powi(step.log10().floor() as i32);
+        (step / digit).round() * digit
     }
 
     /// Derivative of the orbit per unit of RF frequency offset, `-D/eta`, rows observers, columns gradients [m per 1/m^2, or per 1/m
@@ -81,6 +83,12 @@ impl Optics<'_> {
 #[cfg(test)]
 mod tests {
     use crate::{Hold, Optics, Plane, Ring};
+
+    #[test]
+    fn the_boosters_rf_step_is_one_digit() {
+        let ring = Ring::booster();
+        assert_eq!(Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap().rf_step(), 2e-4);
+    }
 
     #[test]
     fn dispersion_and_compaction_follow_their_derivatives() {
