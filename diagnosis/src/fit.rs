@@ -7,6 +7,8 @@
 //! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::evidence`]). The normalisation of
 //! the data is included, since hypotheses with drifting baselines change their covariance.
 
+use core::ops::{Div, Sub};
+
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Drives, EffectError, Machine, OrbitError, Signature, Signatures};
@@ -261,7 +263,7 @@ impl Fitted {
                         u[vars + i] += step;
                         self.predicted_at(data, &u)
                     };
-                    (at(DIFFERENCE)? - at(-DIFFERENCE)?) / (2.0 * DIFFERENCE)
+                    difference(at)?
                 }
             });
         }
@@ -331,7 +333,8 @@ impl<'d> Problem<'d> {
                         u[vars + i] += step;
                         self.residual(&u)
                     };
-                    (at(-DIFFERENCE)? - at(DIFFERENCE)?) / (2.0 * DIFFERENCE)
+                    // of the predictions, not of what they leave
+                    -difference(at)?
                 }
             };
             jacobian.set_column(vars + i, &column);
@@ -355,6 +358,18 @@ impl Objective for Problem<'_> {
     fn linearise(&self, u: &DVector<f64>, residual: &DVector<f64>) -> Result<(Quadratic, DMatrix<f64>), EffectError> {
         let jacobian = self.jacobian(u)?;
         Ok((Quadratic { matrix: normal(&jacobian), slope: jacobian.tr_mul(residual) - u }, jacobian))
+    }
+}
+
+/// Derivative at 0. Next to a resonance one side has no stable machine, and the other one serves alone.
+fn difference<T: Sub<Output = T> + Div<f64, Output = T>>(
+    at: impl Fn(f64) -> Result<T, EffectError>,
+) -> Result<T, EffectError> {
+    match (at(DIFFERENCE), at(-DIFFERENCE)) {
+        (Ok(above), Ok(below)) => Ok((above - below) / (2.0 * DIFFERENCE)),
+        (Ok(above), Err(_)) => Ok((above - at(0.0)?) / DIFFERENCE),
+        (Err(_), Ok(below)) => Ok((at(0.0)? - below) / DIFFERENCE),
+        (Err(error), Err(_)) => Err(error),
     }
 }
 
