@@ -122,11 +122,8 @@ fn tables_of_another_ring_are_not_answered_by() {
     let folder = tempfile::tempdir().unwrap();
     let mut other = tables();
     other.stated_error[0] *= 2.0;
-    let message = format!(
-        "uses tables {:08x}, this model has {:08x}; --load",
-        other.digest::<LINE>(),
-        tables().digest::<LINE>()
-    );
+    let message =
+        format!("uses tables {:08x}, this model has {:08x}; --load", other.digest::<LINE>(), tables().digest::<LINE>());
     device(&folder.path().join("uart"), other);
     let source = format!("unix:{}", folder.path().join("uart").display());
     let service = format!("orbitcal/test/{}/other", std::process::id());
