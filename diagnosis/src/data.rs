@@ -12,16 +12,13 @@
 
 use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, RowVector2, Vector2};
-use twin::{
-    Cycle, Drives, Effect, EffectError, EffectKind, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
-    Tunes,
-};
+use twin::{Cycle, Drives, Effect, EffectError, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked, Tunes};
 
 use super::baseline::Baseline;
 use super::evidence::Units;
 use super::fit::FitError;
 use super::settings::Settings;
-use inference::recording::{BelievedRf, Recording};
+use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
 
 /// A recording, whitened.
@@ -118,7 +115,7 @@ impl Data {
             .map(|(f, mean)| DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[f] - mean)))
             .collect();
         let mut drives = drives_of(campaign);
-        let believed = believed(recording, ring)?;
+        let believed = recording.header.believed(ring)?;
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
         let design = Machine::new(at_supplies, Rf::FixedMomentum, &believed)?;
         let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
@@ -476,17 +473,6 @@ impl Channel {
         let log_det = log_sigma + grown.iter().map(|g| g.ln()).sum::<f64>();
         Self { frames, sigma, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
     }
-}
-
-/// The constraint that the header states, as an effect.
-fn believed(recording: &Recording, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
-    let pair = recording.header.radial_loop_monitors.as_ref();
-    let held = match recording.header.believed_rf {
-        BelievedRf::FixedMomentum => None,
-        BelievedRf::FixedFrequency => Some((EffectKind::FixedRfFrequency, String::new())),
-        BelievedRf::RadialLoop => pair.map(|pair| (EffectKind::RadialLoop, pair.join(","))),
-    };
-    held.into_iter().map(|(kind, place)| Effect::at(kind, &place, 1.0, ring)).collect()
 }
 
 fn drives_of(campaign: &Campaign) -> Drives {

@@ -64,11 +64,11 @@ impl<'r> Calibrated<'r> {
         let beats = [0, 1].map(|plane| self.beats(plane).0);
         let rms = beats.map(|beat| (beat.iter().map(|b| b * b).sum::<f64>() / beat.len() as f64).sqrt());
         format!(
-            "{} frames, method {}, chi2/dof {:.4}. Tunes {:.4} ± {:.4} and {:.4} ± {:.4}; rms beta-beat {:.1} % in x and {:.1} % \
+            "{} frames, method {}, chi2/dof {}. Tunes {:.4} ± {:.4} and {:.4} ± {:.4}; rms beta-beat {:.1} % in x and {:.1} % \
              in y against the design.",
             self.result.frames,
             self.result.method,
-            self.result.chi2_per_dof,
+            self.result.chi2(),
             tunes.x,
             sigma.x,
             tunes.y,

@@ -8,6 +8,7 @@ use core::fmt;
 
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal};
+use inference::campaign::supplies_of;
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
 use serde::Serialize;
@@ -34,10 +35,10 @@ pub struct FitResult {
     pub rejected_frames: u32,
     pub vars: Vec<Var>,
     pub covariance: Vec<Vec<f64>>,
-    pub chi2_per_dof: f64,
-    /// The core's alarm: its readings are further off than noise explains.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub mismatch: Option<bool>,
+    /// None without degrees of freedom.
+    pub chi2_per_dof: Option<f64>,
+    /// The alarm: readings are further off than noise explains.
+    pub mismatch: bool,
     /// The model's.
     pub tunes: Option<Tunes>,
     pub tunes_measured: TunesMeasured,
@@ -91,7 +92,7 @@ impl FitResult {
         let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
-        let (n, tunes) = (vars.len(), tunes(ring, &vars));
+        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &supplies_of(recording)));
         Self {
             recording: recording.name.clone(),
             method: "laplace",
@@ -103,8 +104,9 @@ impl FitResult {
             lack: lack(recording).map(|lack| lack.to_string()),
             tunes,
             vars,
-            chi2_per_dof: f64::from(quality.chi_square / quality.degrees_of_freedom),
-            mismatch: Some(quality.is_mismatch()),
+            chi2_per_dof: (quality.degrees_of_freedom > 0.0)
+                .then(|| f64::from(quality.chi_square / quality.degrees_of_freedom)),
+            mismatch: quality.is_mismatch(),
             monitors: last.monitors(),
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
@@ -136,7 +138,7 @@ impl FitResult {
             method: "nuts",
             model,
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
-            tunes: tunes(&reduced.campaign.ring, &vars),
+            tunes: tunes(&reduced.campaign.ring, &vars, &reduced.campaign.supplies),
             vars,
             nuts: Some(Sampling::of(&sampled, run)),
             ..Self::of_both(&reduced.campaign, &reduced.fit)
@@ -154,8 +156,8 @@ impl FitResult {
             rejected_frames: 0,
             vars: Vec::new(),
             covariance: Vec::new(),
-            chi2_per_dof: fit.chi2_per_dof,
-            mismatch: None,
+            chi2_per_dof: Some(fit.chi2_per_dof).filter(|chi2| chi2.is_finite()),
+            mismatch: fit.mismatch,
             tunes: Some(Tunes { x: x.model, y: y.model }),
             tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
             lack: fit.lack.map(|lack| lack.to_string()),
@@ -185,6 +187,11 @@ impl FitResult {
         table
     }
 
+    /// Chi-square per degree of freedom as people read it.
+    pub(crate) fn chi2(&self) -> String {
+        self.chi2_per_dof.map_or_else(|| "-".into(), |chi2| format!("{chi2:.4}"))
+    }
+
     /// What a reader has to know before using the numbers.
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
@@ -192,8 +199,7 @@ impl FitResult {
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),
-            (self.mismatch == Some(true))
-                .then(|| "model and machine disagree beyond the noise: orbitcal diagnose may say why".into()),
+            self.mismatch.then(|| "model and machine disagree beyond the noise: orbitcal diagnose may say why".into()),
             self.nuts.and_then(|nuts| nuts.remark()),
         ];
         remarks.into_iter().flatten().collect()
@@ -207,7 +213,7 @@ impl fmt::Display for FitResult {
         writeln!(f, "{}", self.table())?;
         writeln!(f, "{}", fill(&format!("monitors: {}", faults(&self.monitors))))?;
         self.remarks().iter().try_for_each(|remark| writeln!(f, "{}", fill(remark)))?;
-        write!(f, "chi2/dof {:.4}", self.chi2_per_dof)?;
+        write!(f, "chi2/dof {}", self.chi2())?;
         if let Some(tunes) = &self.tunes {
             write!(f, ", tunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
         }

@@ -135,3 +135,158 @@ fn a_wrong_kick_constant_shows_in_the_tunes() {
     let said = said.replace('\n', " ");
     assert!(said.contains("measured tunes differ from the model's"), "{said}");
 }
+
+/// The plain recording with one line of its header changed.
+fn with_header(home: &Path, old: &str, new: &str) -> String {
+    let folder = edited(home, |_, cell| cell.to_owned());
+    let header = std::fs::read_to_string(folder.join("header.toml")).unwrap();
+    assert_eq!(header.matches(old).count(), 1, "{old}");
+    std::fs::write(folder.join("header.toml"), header.replace(old, new)).unwrap();
+    folder.display().to_string()
+}
+
+#[test]
+fn a_header_that_its_frames_contradict_is_refused_by_key() {
+    for (old, new, expected) in [
+        ("bpm_sigma_mm = 0.02", "bpm_sigma_mm = 1e-9", "line 6, key bpm_sigma_mm: 1e-9 mm, the repeats say 0.02"),
+        ("bpm_sigma_mm = 0.02", "bpm_sigma_mm = 1.0", "line 6, key bpm_sigma_mm: 1.0 mm, the repeats say 0.02"),
+        (
+            "_per_A = 0.08",
+            "_per_A = 80",
+            "line 7, key kick_mrad_per_A: expected kicks up to 100.0 mrad, found 0.16 rad",
+        ),
+        (
+            "quad_transfer",
+            "radial_loop_monitors = [\"x_Z1\", \"x_Z2\"]\nquad_transfer",
+            "line 11, key radial_loop_monitors: effect radial_loop: expected two horizontal monitors, found \"x_Z1,x_Z2\"",
+        ),
+    ] {
+        let home = tempfile::tempdir().unwrap();
+        let folder = with_header(home.path(), old, new);
+        for command in ["check", "fit", "diagnose"] {
+            let output = orbitcal(&[command, &folder, "--machine", RING]);
+            let said = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{command}: {said}");
+            assert!(
+                said.lines().count() == 1 && said.contains(&format!("header.toml, {expected}")),
+                "{command}: {said}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_stuck_monitor_counts_as_one_without_readings() {
+    let fitted = |cell: &'static str| {
+        let home = tempfile::tempdir().unwrap();
+        let stuck = |column: &str, old: &str| if column == "x_04F_mm" { cell.to_owned() } else { old.to_owned() };
+        json(&["fit", edited(home.path(), stuck).to_str().unwrap()])
+    };
+    let (stuck, silent) = (fitted("0.5"), fitted(""));
+    assert_eq!(stuck["monitors"][3]["state"], "dead");
+    assert_eq!((&stuck["vars"], &stuck["chi2_per_dof"]), (&silent["vars"], &silent["chi2_per_dof"]));
+}
+
+#[test]
+fn monitors_that_are_all_stuck_leave_the_prior() {
+    let home = tempfile::tempdir().unwrap();
+    let is_monitor = |column: &str| column.starts_with("x_") || column.starts_with("y_");
+    let stuck = |column: &str, cell: &str| if is_monitor(column) { "0.5".to_owned() } else { cell.to_owned() };
+    let folder = edited(home.path(), stuck).display().to_string();
+    let result = json(&["fit", &folder]);
+    assert_eq!(result["lack"], "no monitor has a reading that counts");
+    assert!(result["chi2_per_dof"].is_null() && result["mismatch"] == false, "{result}");
+    assert!(text(&["fit", &folder]).contains("chi2/dof -,"));
+}
+
+#[test]
+fn without_degrees_of_freedom_there_is_no_chi_square() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = edited(home.path(), |_, cell| cell.to_owned());
+    let frames = std::fs::read_to_string(folder.join("frames.csv")).unwrap();
+    let first: String = frames.lines().take(3).map(|line| format!("{line}\n")).collect();
+    std::fs::write(folder.join("frames.csv"), first).unwrap();
+    let folder = folder.display().to_string();
+    for arguments in [&["fit", folder.as_str()][..], &["replay", &folder, "--no-publish"]] {
+        assert!(json(arguments)["chi2_per_dof"].is_null(), "{arguments:?}");
+        assert!(text(arguments).contains("chi2/dof -"), "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_fit_says_that_model_and_machine_disagree() {
+    let gain = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/ten-cells/gain");
+    for (folder, expected) in [(gain, true), (PLAIN, false)] {
+        assert_eq!(json(&["fit", folder])["mismatch"], expected);
+        assert_eq!(text(&["fit", folder]).contains("model and machine disagree beyond the noise"), expected);
+    }
+}
+
+/// Neighbouring steps of this fit shrink by a quarter: it ran out of them at a fiftieth of an error bar.
+#[test]
+fn a_fit_whose_last_step_was_small_has_converged() {
+    let swapped = |line: &str, one: usize, other: usize| {
+        let mut cells: Vec<&str> = line.split(',').collect();
+        cells.swap(one, other);
+        cells.join(",") + "\n"
+    };
+    let home = tempfile::tempdir().unwrap();
+    let folder = edited(home.path(), |_, cell| cell.to_owned());
+    let frames = std::fs::read_to_string(folder.join("frames.csv")).unwrap();
+    let columns: Vec<&str> = frames.lines().next().unwrap().split(',').collect();
+    let at = |name: &str| columns.iter().position(|column| *column == name).unwrap();
+    let rows = frames.lines().skip(1).map(|line| swapped(line, at("y_01F_mm"), at("y_06F_mm")));
+    let text: String = core::iter::once(columns.join(",") + "\n").chain(rows).collect();
+    std::fs::write(folder.join("frames.csv"), text).unwrap();
+    assert_eq!(json(&["fit", folder.to_str().unwrap()])["mismatch"], true);
+}
+
+/// Supplies that run 1 % above their nominal currents, by a header that says so: vars absorb it, tunes at the real currents do not.
+#[test]
+fn tunes_are_those_of_the_recorded_currents() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = with_header(home.path(), "qh = 100.0", "qh = 99.0");
+    let (stream, batch) = (json(&["replay", &folder, "--no-publish"]), json(&["fit", &folder]));
+    for plane in ["x", "y"] {
+        let away = number(&stream["tunes"][plane]) - number(&batch["tunes"][plane]);
+        assert!(away.abs() < 1e-3, "{plane}: {away}"); // 1 % of the focusing gradients are 0.03
+        let measured = number(&stream["tunes"][plane]) - number(&stream["tunes_measured"][plane]["mean"]);
+        assert!(measured.abs() < 3e-3, "{plane}: {measured}");
+    }
+    let (result, lattice) = (home.path().join("fit.json"), home.path().join("ring.madx"));
+    std::fs::write(&result, batch.to_string()).unwrap();
+    let (result, lattice) = (result.display().to_string(), lattice.display().to_string());
+    let said = text(&["export", &result, "--as", "madx", "--out", &lattice]).replace('\n', " ");
+    let written = std::fs::read_to_string(&lattice).unwrap();
+    for text in [said.as_str(), &written] {
+        let tunes = format!("{:.4} {:.4}", number(&batch["tunes"]["x"]), number(&batch["tunes"]["y"]));
+        assert!(text.contains("at the supplies' nominal currents: tunes "), "{text}");
+        assert!(text.contains(&format!("at the recording's mean currents {tunes}")), "{text}");
+    }
+}
+
+#[test]
+fn what_only_the_exact_twin_models_is_said_by_all_others() {
+    let home = tempfile::tempdir().unwrap();
+    let new = "believed_rf = \"radial_loop\"\nradial_loop_monitors = [\"x_03F\", \"x_08F\"]";
+    let folder = with_header(home.path(), "believed_rf = \"fixed_momentum\"", new);
+    let output = orbitcal(&["replay", &folder, "--no-publish", "--machine", RING]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("this does not model a radial loop"), "{said}");
+    let output = orbitcal(&["fit", &folder, "--method", "nuts", "--machine", RING]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.contains("this does not model a radial loop"), "{said}");
+}
+
+#[test]
+fn a_surrogate_needs_a_monitor_and_a_var() {
+    let ring: Value = serde_json::from_str(&std::fs::read_to_string(RING).unwrap()).unwrap();
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("ring.json");
+    let mut blind = ring.clone();
+    blind["elements"].as_array_mut().unwrap().retain(|element| element["type"] != "bpm");
+    std::fs::write(&path, blind.to_string()).unwrap();
+    let output = orbitcal(&["surrogate", "check", "--machine", path.to_str().unwrap()]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.ends_with(": no monitor to predict\n"), "{said}");
+}

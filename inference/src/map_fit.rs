@@ -9,7 +9,7 @@
 
 use core::fmt;
 
-use estimator::Marginal;
+use estimator::{FitQuality, Marginal};
 use nalgebra::{DMatrix, DVector, Vector2};
 use twin::{OrbitError, Tunes};
 
@@ -28,6 +28,8 @@ pub struct BatchFit {
     /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines less
     /// params); not a number without any.
     pub chi2_per_dof: f64,
+    /// True if that is more than noise explains, by the rule of the core.
+    pub mismatch: bool,
     /// Tunes x and y at the MAP, and as measured.
     pub tunes: [FittedTune; 2],
     /// Why the orbits do not constrain the params, if so: the result is then the prior, but for measured tunes.
@@ -112,6 +114,9 @@ impl From<OptimiseError<OrbitError>> for BatchError {
 }
 
 const LIMITS: Limits = Limits { settled: 1e-5, steps: 30, halvings: 8 };
+/// Squared length of the last step, in standard deviations, that is small beside the error bars: for readings that no ring explains,
+/// whose steps shrink slowly.
+const CLOSE: f64 = 0.01 * 0.01;
 /// Share of a param's prior standard deviation that orbits have to take away from one of them, to say anything: the scatter of idle
 /// correctors takes some percent.
 const LEARNT: f64 = 0.1;
@@ -128,7 +133,7 @@ impl BatchFit {
             true
         };
         let found = minimise(&problem, &campaign.params, &campaign.prior.range, &LIMITS, watch)?;
-        if found.end == End::Exhausted {
+        if found.end == End::Exhausted && found.expected > CLOSE {
             return Err(BatchError::NotConverged { steps: found.steps, moved: found.expected.max(0.0).sqrt() });
         }
         problem.result(&found)
@@ -159,8 +164,8 @@ impl Objective for Problem<'_> {
     type Error = OrbitError;
 
     fn evaluate(&self, params: &DVector<f64>) -> Result<(f64, Point), OrbitError> {
-        let Campaign { ring, supplies, drives, prior, .. } = self.campaign;
-        let linearised = Linearised::of(ring, params, supplies, drives)?;
+        let Campaign { held, supplies, drives, prior, .. } = self.campaign;
+        let linearised = Linearised::of(held, params, supplies, drives)?;
         let (mut normal, chi2) = self.orbits(params, &linearised);
         let (_, of_orbits) = normal.eliminated();
         if self.tunes == TuneUse::Readings {
@@ -234,6 +239,7 @@ impl Problem<'_> {
             map_params: found.x.iter().copied().collect(),
             covariance,
             chi2_per_dof: if point.chi2.1 > 0.0 { point.chi2.0 / point.chi2.1 } else { f64::NAN },
+            mismatch: quality(point.chi2).is_mismatch(),
             tunes: [tune(0, point.tunes.x), tune(1, point.tunes.y)],
             lack: self.lack(&point.of_orbits),
             orbit: point.orbit,
@@ -251,6 +257,11 @@ impl Problem<'_> {
         let learnt = |i: usize| (left[(i, i)] * precision[i]).sqrt() < 1.0 - LEARNT;
         (!precision.is_empty() && !(0..precision.len()).any(learnt)).then_some(Lack::Kick)
     }
+}
+
+/// Chi-square and its degrees of freedom as the core has them.
+fn quality((chi_square, degrees_of_freedom): (f64, f64)) -> FitQuality {
+    FitQuality { chi_square: chi_square as f32, degrees_of_freedom: degrees_of_freedom as f32 }
 }
 
 /// Sum of squares about the mean.

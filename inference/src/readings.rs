@@ -67,9 +67,9 @@ impl Reduced {
     /// # Errors
     /// [`OrbitError`] if these have no closed orbit.
     pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
-        let Campaign { ring, supplies, drives, .. } = &campaign;
+        let Campaign { ring, held, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
-        let exact = Linearised::of(ring, &params, supplies, drives)?.orbits(drives);
+        let exact = Linearised::of(held, &params, supplies, drives)?.orbits(drives);
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;

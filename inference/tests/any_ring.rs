@@ -4,10 +4,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use inference::nuts::{self, NutsSettings};
+use inference::recording::BelievedRf;
 use inference::simulate::{self, Instruments};
-use inference::{BatchFit, Campaign, Lack, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{BatchFit, Campaign, Drive, Lack, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use nalgebra::DVector;
 use serde_json::{Value, json};
-use twin::Ring;
+use twin::{Effect, Machine, Rf, Ring};
 
 fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
@@ -86,6 +88,36 @@ fn ten_cells_of_another_code_are_fitted_with_tunes_and_without() {
         assert_eq!(with.measured, without.measured);
     }
     assert!(with.covariance.trace() < without.covariance.trace());
+}
+
+/// What a radial loop, or a held frequency, adds to every orbit is that of the true ring; the fit is told by the header.
+#[test]
+fn what_is_held_instead_of_the_momentum_is_part_of_the_fit() {
+    let (ring, plain, truth) = ten_cells("plain");
+    let pair = ["x_03F", "x_08F"].map(str::to_owned);
+    for (believed_rf, effect) in
+        [(BelievedRf::RadialLoop, "radial_loop@x_03F,x_08F"), (BelievedRf::FixedFrequency, "fixed_rf_frequency")]
+    {
+        let response = |effects: &[Effect]| {
+            let machine = Machine::new(ring.with_vars(&truth), Rf::FixedMomentum, effects).unwrap();
+            machine.response().unwrap().x
+        };
+        let held = response(&[Effect::parse(effect, &ring).unwrap()]) - response(&[]);
+        let mut recording = plain.clone();
+        for row in recording.rows.iter_mut().filter(|row| row.rf_offset == 0.0) {
+            let kick = DVector::from_vec(Drive::of(&plain.header, row).kick.as_slice().to_vec());
+            let moved = &held * kick;
+            let monitors = ring.horizontal_monitors();
+            row.reading[..monitors].iter_mut().zip(moved.iter()).for_each(|(to, x)| *to = to.map(|to| to + x));
+        }
+        let (_, untold) = fit(&ring, &recording, TuneUse::Readings);
+        assert!(untold.mismatch && untold.chi2_per_dof > 1.5, "{effect}: chi2/dof {}", untold.chi2_per_dof);
+        recording.header.believed_rf = believed_rf;
+        recording.header.radial_loop_monitors = Some(pair.clone());
+        let (_, told) = fit(&ring, &recording, TuneUse::Readings);
+        assert_right(effect, &told, &truth);
+        assert!(!told.mismatch);
+    }
 }
 
 /// A monitor that reads 5 % too little cannot be fitted: what is said of the vars must still be within reach.

@@ -29,7 +29,7 @@ mod varied;
 
 pub use calibrated::CalibratedOptics;
 pub use effects::{
-    Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect,
+    Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect, Held,
     HoldEffect, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin, Tracked,
     Unit,
 };

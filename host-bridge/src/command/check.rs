@@ -4,12 +4,12 @@ use core::fmt;
 
 use comfy_table::CellAlignment;
 use inference::stream::{self, Core};
-use inference::{Campaign, Recording};
+use inference::{Campaign, Lack, Recording};
 use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
 
-use super::{CommandError, check_outputs, deliver, machine, recording};
+use super::{CommandError, check_outputs, deliver, machine, not_modelled, recording};
 use crate::cli::Check;
 use crate::output::{lines, table};
 use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
@@ -184,7 +184,9 @@ fn replay(campaign: &Campaign) -> Usable {
     });
     let what = match &ready {
         Err(error) => error.to_string(),
-        Ok(()) => prior_only(campaign).unwrap_or_else(|| "each frame to an estimate".into()),
+        Ok(()) => prior_only(campaign)
+            .or_else(|| not_modelled(recording))
+            .unwrap_or_else(|| "each frame to an estimate".into()),
     };
     Usable { command: "replay", can: ready.is_ok(), what }
 }
@@ -197,7 +199,8 @@ fn fit(campaign: &Campaign) -> Usable {
 
 /// That the result would be the prior.
 fn prior_only(campaign: &Campaign) -> Option<String> {
-    lack(&campaign.recording).map(|lack| format!("{lack}: the result would be the prior, but for measured tunes"))
+    let lack = if campaign.has_readings() { lack(&campaign.recording) } else { Some(Lack::Readings) };
+    lack.map(|lack| format!("{lack}: the result would be the prior, but for measured tunes"))
 }
 
 fn study(campaign: &Campaign) -> Usable {
@@ -207,7 +210,8 @@ fn study(campaign: &Campaign) -> Usable {
     } else {
         format!("all frames, and differences {}", kinds.join(", "))
     };
-    Usable { command: "study", can: true, what }
+    let not_modelled = not_modelled(&campaign.recording);
+    Usable { command: "study", can: not_modelled.is_none(), what: not_modelled.unwrap_or(what) }
 }
 
 fn diagnose(campaign: &Campaign) -> Usable {

@@ -165,7 +165,7 @@ impl DiagnosisResult {
                 heldout_inside_95: score.inside[1],
             })
         };
-        let (next, tunes) = (&found.next, tunes_of(ring, diagnosis));
+        let (next, tunes) = (&found.next, tunes_of(diagnosis));
         Ok(Self {
             recording: recording.name.clone(),
             verdict: diagnosis.verdict.word(),
@@ -268,10 +268,11 @@ impl FindingResult {
     }
 }
 
-/// Tunes of the machine that was found; none if it is unstable.
-fn tunes_of(ring: &Ring, diagnosis: &Diagnosis) -> Option<Tunes> {
-    let factors: Vec<f64> = diagnosis.vars_after.mean.iter().map(|theta| theta.exp()).collect();
-    let ring = ring.with_vars(&factors);
+/// Tunes of the machine that was found, at the recording's mean supply currents; none if it is unstable.
+fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
+    let data = &diagnosis.found.data;
+    let strengths = data.ring.strengths(diagnosis.vars_after.mean.as_slice(), &data.supplies);
+    let ring = data.ring.with_strengths(&strengths);
     let machine = Machine::new(ring, Rf::FixedMomentum, &diagnosis.effects()).ok()?;
     let tunes = machine.response().ok()?.tunes;
     Some(Tunes { x: tunes.x, y: tunes.y })

@@ -7,7 +7,7 @@ use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
 
-use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
+use super::{CommandError, check_outputs, deliver, expect_modelled, machine_with, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
 use crate::result::FitResult;
 use crate::{fit_page, output};
@@ -64,6 +64,7 @@ fn fitted(options: &Fit, ring: &Ring, recording: &Recording) -> Result<(Campaign
 
 /// NUTS about the Laplace approximation.
 fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
+    expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
     let (campaign, fit) = fitted(options, ring, recording)?;
     let reduced = Reduced::of(campaign, fit)?;

@@ -18,6 +18,7 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use inference::recording::BelievedRf;
 use inference::{BatchError, Recording, RecordingError, stream, with_priors};
 use serde::Serialize;
 use training::Tables;
@@ -157,6 +158,27 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
         output::json(path, result)?;
     }
     if common.speaks() { Ok(output::say(result)?) } else { Ok(()) }
+}
+
+/// What the header believes to be held that is not the momentum, so that only the exact twin models it.
+fn not_modelled(recording: &Recording) -> Option<String> {
+    let (key, what) = match recording.header.believed_rf {
+        BelievedRf::FixedMomentum => return None,
+        BelievedRf::FixedFrequency => ("fixed_frequency", "a fixed RF frequency"),
+        BelievedRf::RadialLoop => ("radial_loop", "a radial loop"),
+    };
+    let known_by = "orbitcal fit --method map and orbitcal diagnose do";
+    Some(format!("{}: header.toml, believed_rf = {key:?}: this does not model {what}; {known_by}", recording.name))
+}
+
+/// The same as an error, where results would be wrong without a word.
+fn expect_modelled(recording: &Recording) -> Result<(), CommandError> {
+    not_modelled(recording).map_or(Ok(()), |why| Err(CommandError::Input(why)))
+}
+
+/// The same as a line on stderr, of a core that goes on.
+fn warn_if_not_modelled(recording: &Recording) {
+    not_modelled(recording).into_iter().for_each(output::warn);
 }
 
 fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {

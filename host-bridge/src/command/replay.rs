@@ -2,7 +2,10 @@
 
 use inference::stream::{self, Core};
 
-use super::{CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables};
+use super::{
+    CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables,
+    warn_if_not_modelled,
+};
 use crate::cli::Replay;
 use crate::record::Names;
 use crate::result::FitResult;
@@ -17,6 +20,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
+    warn_if_not_modelled(&recording);
     let powered = recording.powered(&ring);
     let tables = tables(&powered, options.model_file.as_deref())?;
     let core = Core::with_tables(tables, stream::setup(&powered, &recording, options.process_noise)?)?;

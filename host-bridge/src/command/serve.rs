@@ -5,7 +5,9 @@ use inference::{Recording, stream};
 use training::LINE;
 use twin::Ring;
 
-use super::{CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables};
+use super::{
+    CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables, warn_if_not_modelled,
+};
 use crate::cli::{CoreModel, Serve};
 use crate::record::Names;
 use crate::result::FitResult;
@@ -61,6 +63,7 @@ fn feed(
     recording: &Recording,
     mut link: Link<Box<dyn Line>>,
 ) -> Result<(), CommandError> {
+    warn_if_not_modelled(recording);
     let powered = recording.powered(ring);
     let setup = stream::setup(&powered, recording, options.process_noise)?;
     let CoreModel::Green = options.model;

@@ -2,7 +2,7 @@
 
 use studies::{self, Options};
 
-use super::{CommandError, check_outputs, machine_with, progress, recording};
+use super::{CommandError, check_outputs, expect_modelled, machine_with, progress, recording};
 use crate::cli::Study;
 use crate::output;
 
@@ -14,6 +14,7 @@ pub fn run(options: &Study) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), Some(&options.report)])?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
+    expect_modelled(&recording)?;
     let bar = progress(1, "", options.common.quiet);
     let mut report = |what: &str, done: usize, total: usize| {
         bar.set_message(what.to_owned());

@@ -4,6 +4,7 @@ use core::fmt;
 
 use serde::Serialize;
 use training::SurrogateError;
+use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::{Surrogate, SurrogateAction};
@@ -34,11 +35,21 @@ pub fn run(options: &Surrogate) -> Result<(), CommandError> {
     let SurrogateAction::Check { common, samples, seed } = &options.action;
     check_outputs([common.json.as_deref()])?;
     let ring = machine(common.machine.as_deref())?;
+    check_ring(&ring)?;
     let green = training::green::tables(&ring).map_err(|error| CommandError::Input(error.to_string()))?;
     let bar = progress(*samples, "vars", common.quiet);
     let planes = training::check(&ring, &green, *samples, *seed, || bar.inc(1));
     bar.finish_and_clear();
     deliver(common, &Check { surrogates: planes.iter().map(Entry::of).collect() })
+}
+
+/// A core predicts what monitors read, given vars.
+fn check_ring(ring: &Ring) -> Result<(), CommandError> {
+    let counts = [("no monitor to predict", ring.read_monitors.len()), ("nothing to fit", ring.parameters.len())];
+    match counts.into_iter().find(|(_, count)| *count == 0) {
+        Some((what, _)) => Err(CommandError::Input(format!("{}: {what}", ring.name))),
+        None => Ok(()),
+    }
 }
 
 impl Entry {

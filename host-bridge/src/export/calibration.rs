@@ -17,6 +17,8 @@ pub struct Calibration {
     pub recording: String,
     /// Names and factors of the params that were fitted.
     pub strengths: Vec<(String, f64)>,
+    /// Tunes at the recording's mean supply currents, if they are known.
+    pub tunes: Option<[f64; 2]>,
     /// What was found beyond them, with its sentence.
     pub findings: Vec<(EffectText, String)>,
     /// Findings that are not certain, or that no effect of the library describes.
@@ -87,8 +89,15 @@ struct ResultFile {
     recording: serde_json::Value,
     vars: Option<Vec<Var>>,
     vars_after: Option<Vec<Var>>,
+    tunes: Option<Tunes>,
     #[serde(default)]
     findings: Vec<Finding>,
+}
+
+#[derive(Deserialize)]
+struct Tunes {
+    x: f64,
+    y: f64,
 }
 
 #[derive(Deserialize)]
@@ -136,7 +145,8 @@ impl Calibration {
             }
         }
         let strengths = vars.into_iter().map(|var| (var.name, var.mean)).collect();
-        Ok(Self { recording: recordings(&file.recording), strengths, findings, open })
+        let tunes = file.tunes.map(|tunes| [tunes.x, tunes.y]);
+        Ok(Self { recording: recordings(&file.recording), strengths, tunes, findings, open })
     }
 
     /// The factors in the order of the ring's params.

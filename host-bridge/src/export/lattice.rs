@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use twin::{
-    Class, CorrectorEffect, Effect, EffectError, Element, Kind, Machine, Misalignment, MonitorEffect, Particle, Plane,
-    Rf, Ring, Site,
+    Class, CorrectorEffect, Effect, EffectError, Element, Hold, Kind, Machine, Misalignment, MonitorEffect, Optics,
+    Particle, Plane, Rf, Ring, Site,
 };
 
 use super::calibration::{Calibration, CalibrationError};
@@ -93,6 +93,7 @@ impl Lattice {
         let mut lattice = Self::plain(machine.ring());
         let version = env!("CARGO_PKG_VERSION");
         lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));
+        lattice.remarks.extend(result.tunes.map(|measured| currents(machine.ring(), measured)));
         for (effect, (_, sentence)) in effects.iter().zip(&result.findings) {
             let included = lattice.apply(effect);
             lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
@@ -207,6 +208,18 @@ impl Lattice {
         }
         true
     }
+}
+
+/// At which currents the strengths hold, and what that makes of the tunes; `measured_at` are those at the recording's mean currents.
+fn currents(ring: &Ring, measured_at: [f64; 2]) -> String {
+    let words = |[x, y]: [f64; 2]| format!("{x:.4} {y:.4}");
+    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 });
+    let tunes = optics.and_then(|optics| optics.tunes()).map(|tunes| words([tunes.x, tunes.y]));
+    format!(
+        "strengths are those at the supplies' nominal currents: tunes {}; at the recording's mean currents {}",
+        tunes.unwrap_or_else(|_| "of no stable ring".into()),
+        words(measured_at)
+    )
 }
 
 /// A comment ends with its line, whatever the names in it hold.

@@ -12,7 +12,7 @@ use super::Var;
 /// Standard deviations between a measured tune and the model's that noise does not explain.
 const DISAGREE: f64 = 4.0;
 
-/// Tunes of the twin at the means.
+/// Tunes of the twin at the means, at the recording's mean supply currents.
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct Tunes {
@@ -80,10 +80,10 @@ pub(super) fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
     tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
 }
 
-/// Tunes of the twin at the means; none if that ring is unstable.
-pub(super) fn tunes(ring: &Ring, vars: &[Var]) -> Option<Tunes> {
-    let means: Vec<f64> = vars.iter().map(|v| v.mean).collect();
-    let ring = ring.with_vars(&means);
+/// Tunes of the twin at the means and at these supplies, `ln` of their factors; none if that ring is unstable.
+pub(super) fn tunes(ring: &Ring, vars: &[Var], supplies: &[f64]) -> Option<Tunes> {
+    let params: Vec<f64> = vars.iter().map(|v| v.mean.ln()).collect();
+    let ring = ring.with_strengths(&ring.strengths(&params, supplies));
     let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
     Some(Tunes { x: tunes.x, y: tunes.y })
 }

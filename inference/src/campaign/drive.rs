@@ -2,7 +2,7 @@
 
 use nalgebra::DVector;
 
-use crate::recording::{Header, Row};
+use crate::recording::{Header, Recording, Row};
 
 /// What supplies and correctors do in one frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +34,12 @@ impl Drive {
             rf_offset: row.rf_offset,
         }
     }
+}
+
+/// Mean `ln` of each supply's factor over a recording [F]: the currents at which its tunes were measured.
+pub fn supplies_of(recording: &Recording) -> Vec<f64> {
+    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    mean_supplies(&drives)
 }
 
 /// Mean `ln` of each supply's factor over all frames [F]; none without frames.

@@ -1,7 +1,7 @@
 //! The exact ring at given params and mean supplies, and to first order about them: what predictions of frames are made of.
 
 use nalgebra::{DMatrix, DVector, DVectorView};
-use twin::{ClosedOrbit, Hold, Optics, OrbitError, Plane, Ring, Tunes};
+use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
 use super::drive::Drive;
 
@@ -37,10 +37,17 @@ struct RfOrbit {
 }
 
 impl Linearised {
-    /// About params and supplies, for the RF offsets of some frames.
-    pub fn of(ring: &Ring, params: &DVector<f64>, supplies: &[f64], drives: &[Drive]) -> Result<Self, OrbitError> {
-        let ring = &ring.with_strengths(&ring.strengths(params.as_slice(), supplies));
+    /// About params and supplies, for the RF offsets of some frames. Kicks move the beam with what the machine holds constant; an RF
+    /// offset overrides that.
+    pub fn of(
+        machine: &Machine,
+        params: &DVector<f64>,
+        supplies: &[f64],
+        drives: &[Drive],
+    ) -> Result<Self, OrbitError> {
+        let ring = &machine.ring().with_strengths(&machine.ring().strengths(params.as_slice(), supplies));
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+        let held = machine.held_of(ring, &optics)?;
         let (observers, sources, gradients) = (optics.read_monitors(), optics.correctors(), optics.quadrupoles());
         let k1 = ring.gradients();
         let by_param = |m: usize| ring.quadrupoles[m].parameter;
@@ -50,7 +57,8 @@ impl Linearised {
         let mut slopes = vec![DMatrix::zeros(params, correctors); monitors];
         let mut supply_slopes = vec![DMatrix::zeros(supply_count, correctors); monitors];
         // d/d ln k = k1 d/dk1
-        for (m, slope) in optics.response_jacobian(&observers, &sources, &gradients).iter().enumerate() {
+        for (m, gradient) in gradients.iter().enumerate() {
+            let slope = held.jacobian(&optics, &observers, &sources, gradient);
             for (to, index) in [(&mut slopes, by_param(m)), (&mut supply_slopes, by_supply(m))] {
                 let Some(index) = index else { continue };
                 for (b, to) in to.iter_mut().enumerate() {
@@ -83,7 +91,7 @@ impl Linearised {
             })
         };
         Ok(Self {
-            response: optics.response(&observers, &sources),
+            response: held.response(&optics, &observers, &sources),
             slopes,
             supply_slopes,
             rf: offsets(drives).into_iter().map(rf).collect::<Result<_, OrbitError>>()?,

@@ -11,12 +11,12 @@ mod setting;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{OrbitError, Ring, spurious_dispersion};
+use twin::{Machine, OrbitError, Rf, Ring, spurious_dispersion};
 
 use crate::prior::Prior;
 use crate::recording::Recording;
 
-pub use drive::Drive;
+pub use drive::{Drive, supplies_of};
 pub(crate) use linear::Linearised;
 pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
@@ -30,6 +30,8 @@ pub use setting::Settings;
 pub struct Campaign {
     /// The ring as designed, powered as the recording has it.
     pub ring: Ring,
+    /// The same, with what the header believes to be held.
+    pub held: Machine,
     /// The recording.
     pub recording: Recording,
     /// What is known of the params beforehand.
@@ -67,14 +69,20 @@ impl Campaign {
     ///
     /// # Errors
     /// [`OrbitError`] if the ring as designed, or displaced by a fraction of a millimetre, has no stable orbit.
+    ///
+    /// # Panics
+    /// If the recording is of another ring.
     pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let ring = recording.powered(ring).into_owned();
+        let believed = recording.header.believed(&ring).expect("the header is checked against its ring");
+        let held = Machine::new(ring.clone(), Rf::FixedMomentum, &believed).expect("its sites are resolved");
         let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
         let supplies = drive::mean_supplies(&drives);
         let settings = Settings::of(&drives, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
         let (prior, spurious) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
+            held: &held,
             ring: &ring,
             prior: &prior,
             drives: &drives,
@@ -87,7 +95,7 @@ impl Campaign {
             spurious,
         };
         let Seen { screened, params, baselines } = screener.run()?;
-        let linearised = Linearised::of(&ring, &params, &supplies, &drives)?;
+        let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
         let mut campaign = Self {
             meters: [None, None],
             orbit: rms_by_plane(&ring, &baselines),
@@ -95,6 +103,7 @@ impl Campaign {
             time: recording.times(),
             recording: recording.clone(),
             ring,
+            held,
             prior,
             drives,
             supplies,

@@ -6,9 +6,9 @@
 
 use std::collections::BTreeMap;
 
-use estimator::{Gate, Health, Monitor, PositionCode, Verdict};
+use estimator::{Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{OrbitError, Ring};
+use twin::{Machine, OrbitError, Ring};
 
 use super::drive::{self, Drive};
 use super::linear::Linearised;
@@ -29,6 +29,8 @@ pub struct Screened {
 /// What a campaign is screened by.
 pub(super) struct Screener<'c> {
     pub ring: &'c Ring,
+    /// The ring with what is held constant.
+    pub held: &'c Machine,
     pub prior: &'c Prior,
     pub drives: &'c [Drive],
     pub supplies: &'c [f64],
@@ -151,6 +153,7 @@ impl Screener<'_> {
             screening.linearise_if_due(frame);
             screening.take(frame);
         }
+        screening.drop_stuck();
         let Screening { accepted, monitors, model, best, normal, .. } = screening;
         let baselines = (0..monitors.len()).map(|b| normal.baseline(b, &best.step)).collect();
         let health = monitors.iter().map(Monitor::health).collect();
@@ -158,7 +161,7 @@ impl Screener<'_> {
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
-        let linearised = Linearised::of(self.ring, &params, self.supplies, self.drives)?;
+        let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
         let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
         let to_mean_drive = self.to_mean_drive(&orbit);
         Ok(Model { params, orbit, slope, to_mean_drive })
@@ -347,6 +350,23 @@ impl<'c> Screening<'c> {
             self.model = model;
             self.rebuild(frames);
         }
+    }
+
+    /// Take back every reading of a monitor that ends dead and does report: those before it was found to be stuck are no better.
+    /// One that went silent was sound as long as it spoke.
+    fn drop_stuck(&mut self) {
+        let frames = self.of.drives.len();
+        let is_stuck = |b: usize| {
+            let reported = (0..frames).rev().map(|i| self.of.readings[(i, b)]).filter(|reading| !reading.is_nan());
+            let last: Vec<f64> = reported.take(2).collect();
+            self.monitors[b].health().state == MonitorState::Dead && last.len() == 2 && last[0] == last[1]
+        };
+        let stuck: Vec<usize> = (0..self.monitors.len()).filter(|&b| is_stuck(b)).collect();
+        if stuck.is_empty() {
+            return;
+        }
+        stuck.into_iter().for_each(|b| self.accepted.column_mut(b).fill(false));
+        self.rebuild(frames);
     }
 
     /// The normal equations of the accepted readings of the first frames.

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
-use twin::Ring;
+use twin::{Effect, EffectError, EffectKind, Ring};
 
 use super::error::{Part, Place, RecordingError};
 use super::limit::{POSITIVE, from_milli, in_milli};
@@ -47,7 +47,7 @@ pub struct Header {
     ///
     /// `k1 = var k1_design p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`
     pub transfer: Vec<Vec<f64>>,
-    /// The two monitors whose mean a radial loop holds; always present where one is believed on.
+    /// The two monitors whose mean a radial loop holds, horizontal ones of the machine; always present where one is believed on.
     pub radial_loop_monitors: Option<[String; 2]>,
     /// Remarks.
     pub note: String,
@@ -148,7 +148,27 @@ impl Header {
             return Err(text.refuse(0..0, "missing field `radial_loop_monitors`, needed as believed_rf is radial_loop"));
         }
         text.check_machine(&header, ring)?;
+        text.check_loop(&header, ring)?;
         Ok(header)
+    }
+
+    /// What is believed to be held instead of the momentum, as an effect.
+    ///
+    /// # Errors
+    /// [`EffectError`] if the ring does not have the monitors of a radial loop.
+    pub fn believed(&self, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
+        let held = match self.believed_rf {
+            BelievedRf::FixedMomentum => return Ok(Vec::new()),
+            BelievedRf::FixedFrequency => Some(Effect::at(EffectKind::FixedRfFrequency, "", 1.0, ring)),
+            BelievedRf::RadialLoop => self.radial_loop(ring),
+        };
+        held.into_iter().collect()
+    }
+
+    /// A loop that holds the monitors that are named, if they are.
+    fn radial_loop(&self, ring: &Ring) -> Option<Result<Effect, EffectError>> {
+        let pair = self.radial_loop_monitors.as_ref()?;
+        Some(Effect::at(EffectKind::RadialLoop, &pair.join(","), 1.0, ring))
     }
 
     /// The file's text, in format 2.
@@ -194,6 +214,11 @@ impl Header {
 /// How a recording is written, by its header.
 pub(super) fn format(file: &Path, text: &str) -> Result<Format, RecordingError> {
     Text { file, text }.format()
+}
+
+/// What is wrong with the value of a key.
+pub(super) fn refuse(file: &Path, text: &str, key: &str, what: &str) -> RecordingError {
+    Text { file, text }.refuse_key(key, what)
 }
 
 /// A header as text, and where it comes from.
@@ -336,6 +361,12 @@ impl Text<'_> {
             return refuse("kinetic_energy_GeV", &expected, &found);
         }
         Ok(())
+    }
+
+    /// A radial loop holds two horizontal monitors of the ring.
+    fn check_loop(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
+        let held = header.radial_loop(ring).transpose();
+        held.map(drop).map_err(|error| self.refuse_key("radial_loop_monitors", &error.to_string()))
     }
 
     fn refuse(&self, span: Range<usize>, message: &str) -> RecordingError {

@@ -9,6 +9,7 @@ mod frames;
 mod header;
 mod limit;
 mod names;
+mod plausible;
 mod write;
 
 use std::borrow::Cow;
@@ -39,7 +40,7 @@ impl Recording {
     /// Read `header.toml` and `frames.csv` of a campaign's folder.
     ///
     /// # Errors
-    /// The first fault met, the header's before the frames'.
+    /// The first fault met, the header's before the frames'; last what of the header the frames contradict.
     pub fn read(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
         let [file, frames_file] = ["header.toml", "frames.csv"].map(|file| folder.join(file));
         let header_text = text(&file)?;
@@ -47,7 +48,10 @@ impl Recording {
         let names = Names::of(&ring);
         let header = Header::parse(&file, &header_text, &ring, &names)?;
         let (rows, other) = frames::parse(&frames_file, &text(&frames_file)?, &header, &ring, &names)?;
-        Ok(Self { name: name(folder), header, other, rows })
+        let recording = Self { name: name(folder), header, other, rows };
+        let refuse = |(key, what): (&str, String)| header::refuse(&file, &header_text, key, &what);
+        plausible::check(&recording).map_err(refuse)?;
+        Ok(recording)
     }
 
     /// The ring as the recording's supplies power it: its own in format 2; in format 1 one for the focusing quadrupoles and

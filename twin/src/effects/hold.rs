@@ -134,7 +134,7 @@ fn is_horizontal(ring: &Ring, pair: [usize; 2]) -> bool {
 
 /// Linear responses of a ring that holds something.
 #[derive(Debug)]
-pub(super) struct Held<'r> {
+pub struct Held<'r> {
     /// Optics at constant frequency, and the share of it.
     frequency: Option<(Optics<'r>, f64)>,
     /// The two monitors, and the share of the loop.
@@ -143,7 +143,7 @@ pub(super) struct Held<'r> {
 
 impl<'r> Held<'r> {
     /// On a ring of these optics at constant momentum.
-    pub fn of(ring: &'r Ring, optics: &Optics, holding: Holding) -> Result<Self, OrbitError> {
+    pub(super) fn of(ring: &'r Ring, optics: &Optics, holding: Holding) -> Result<Self, OrbitError> {
         let share = holding.frequency_share;
         let offset = optics.frequency_offset();
         let held = || Ok((Optics::of(ring, Hold::Frequency { offset })?, share));

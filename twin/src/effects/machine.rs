@@ -111,9 +111,17 @@ impl Machine {
         Ok(MachineResponse { x, y, dispersion, tunes: optics.tunes()?, gamma_transition: optics.gamma_transition() })
     }
 
+    /// Linear responses of a ring with what this machine holds constant, given the ring's optics at constant momentum.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring does not close at the frequency that is held.
+    pub fn held_of<'r>(&self, ring: &'r Ring, optics: &Optics) -> Result<Held<'r>, OrbitError> {
+        Held::of(ring, optics, self.hold)
+    }
+
     /// Response of x and y at the monitors with what this machine holds constant.
     pub(super) fn held(&self, ring: &Ring, optics: &Optics) -> Result<[DMatrix<f64>; 2], OrbitError> {
-        let held = Held::of(ring, optics, self.hold)?;
+        let held = self.held_of(ring, optics)?;
         let sources = optics.correctors();
         Ok([Plane::X, Plane::Y].map(|plane| held.response(optics, &optics.monitor_places(plane), &sources)))
     }

@@ -1,0 +1,70 @@
+//! Numbers of a header that its frames contradict by so much that they are errors of the header, not faults of the machine.
+
+use super::Recording;
+use super::limit::in_milli;
+use crate::campaign::{Drive, Settings};
+
+/// A key of the header, and what is wrong with its value.
+type Fault = (&'static str, String);
+
+/// Ratio of noise by repeats and by header, or its inverse, that no machine explains: monitors are noisy one by one, not all at once.
+const CONTRADICTS: f64 = 30.0;
+/// Largest kick that a corrector may make [rad]: a beam turned by more leaves the beam pipe.
+const LARGEST_KICK: f64 = 0.1;
+/// Change of a supply's strength from one frame to the next above which it was moved: ripple is 2e-4.
+const MOVED: f64 = 1e-3;
+/// Fewest differences of repeats that tell a monitor's noise.
+const ENOUGH: usize = 8;
+/// Median size of the difference of two numbers of a normal distribution of standard deviation 1: `sqrt(2)` times 0.6745.
+const MEDIAN: f64 = 0.9539;
+
+/// Look for such numbers.
+///
+/// # Errors
+/// The first one.
+pub(super) fn check(recording: &Recording) -> Result<(), Fault> {
+    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    check_kick(&drives)?;
+    check_noise(recording, &drives)
+}
+
+fn check_kick(drives: &[Drive]) -> Result<(), Fault> {
+    let largest = drives.iter().map(|drive| drive.kick.amax()).fold(0.0, f64::max);
+    if largest <= LARGEST_KICK {
+        return Ok(());
+    }
+    Err(("kick_mrad_per_A", format!("expected kicks up to {:?} mrad, found {largest:.2} rad", LARGEST_KICK * 1e3)))
+}
+
+/// The noise of a monitor in the middle of all, by repeats and by the header.
+fn check_noise(recording: &Recording, drives: &[Drive]) -> Result<(), Fault> {
+    let pairs = repeats(drives, &Settings::of(drives, recording.nominal_kick()));
+    let noise = |(b, stated): (usize, &f64)| Some((noise_of(recording, &pairs, b)?, *stated));
+    let mut all: Vec<(f64, f64)> = recording.header.noise.iter().enumerate().filter_map(noise).collect();
+    all.sort_by(|one, other| (one.0 / one.1).total_cmp(&(other.0 / other.1)));
+    let Some(&(found, stated)) = all.get(all.len() / 2) else { return Ok(()) };
+    if (found / stated).ln().abs() <= CONTRADICTS.ln() {
+        return Ok(());
+    }
+    let found = found * 1e3;
+    let found = if found < 0.01 { format!("{found:.1e}") } else { format!("{found:.3}") };
+    Err(("bpm_sigma_mm", format!("{:?} mm, the repeats say {found} mm", in_milli(stated))))
+}
+
+/// Each frame with the last one before it of the same setting, supplies included.
+fn repeats(drives: &[Drive], settings: &Settings) -> Vec<[usize; 2]> {
+    let mut last = vec![None; settings.count];
+    let steady = |[before, here]: &[usize; 2]| (&drives[*here].strength - &drives[*before].strength).amax() < MOVED;
+    let pair = |(frame, setting): (usize, &Option<usize>)| Some([last[(*setting)?].replace(frame)?, frame]);
+    settings.of_frame.iter().enumerate().filter_map(pair).filter(steady).collect()
+}
+
+/// Robust noise of a monitor [m]; none of one that has few repeats. Equal readings are those of a stuck one.
+fn noise_of(recording: &Recording, repeats: &[[usize; 2]], b: usize) -> Option<f64> {
+    let difference = |[before, here]: &[usize; 2]| {
+        Some((recording.rows[*here].reading[b]? - recording.rows[*before].reading[b]?).abs())
+    };
+    let mut sizes: Vec<f64> = repeats.iter().filter_map(difference).filter(|size| *size > 0.0).collect();
+    sizes.sort_by(f64::total_cmp);
+    (sizes.len() >= ENOUGH).then(|| sizes[sizes.len() / 2] / MEDIAN)
+}
