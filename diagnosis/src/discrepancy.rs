@@ -127,10 +127,10 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     for (quadrupole, plane, pattern) in patterns {
         all.push(linearised.judge(Location::Ring(quadrupole, plane), &weighted(&sums, &active, &pattern), sites));
     }
-    let of_vars = signatures.of_vars();
-    for (q, signature) in of_vars.iter().enumerate() {
+    let of_quadrupoles = signatures.of_quadrupoles();
+    for (q, signature) in of_quadrupoles.iter().enumerate() {
         let pattern = data.stepped(signature, fitted, &stretches, &active);
-        all.push(linearised.judge(Location::QuadrupoleInTime(q), &pattern, of_vars.len()));
+        all.push(linearised.judge(Location::QuadrupoleInTime(q), &pattern, of_quadrupoles.len()));
     }
     let tunes: Vec<Sums> =
         [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &miss, fitted, &stretches)).collect();

@@ -37,7 +37,7 @@ pub enum Location {
 pub const SORTS: usize = 12;
 
 impl Location {
-    /// The name of the place: a monitor, a corrector, a half-cell, or a stretch.
+    /// The name of the place: a monitor, a corrector, the label of a quadrupole, or a stretch.
     pub fn label(&self, data: &Data) -> String {
         let ring = &data.ring;
         match *self {
@@ -47,7 +47,7 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
-            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.var_names()[q].clone(),
+            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.label(ring.quadrupoles[q].element).to_owned(),
             Self::Time => "time".into(),
             Self::Tunes => "tunes".into(),
             Self::Everywhere => "everywhere".into(),

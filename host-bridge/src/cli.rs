@@ -419,6 +419,15 @@ pub enum CoreModel {
     Green,
 }
 
+impl CoreModel {
+    /// Its word on the command line and in the JSON.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Green => "green",
+        }
+    }
+}
+
 /// Predictions that the batch fit can make.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FitModel {

@@ -3,6 +3,7 @@
 pub mod shared_memory;
 pub mod trace;
 
+use crate::output;
 use crate::record::EstimateRecord;
 
 /// Why a sink did not take an estimate.
@@ -63,7 +64,7 @@ impl Sinks {
         let mut failed = Ok(());
         self.0.retain_mut(|member| match member.sink.take(record) {
             Err(error) if member.is_optional => {
-                eprintln!("orbitcal: {error}; the rest is not published");
+                output::warn(format_args!("{error}; the rest is not published"));
                 false
             }
             taken => {

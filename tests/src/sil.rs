@@ -82,7 +82,7 @@ pub fn compare(
         different,
         status,
         counts,
-        result: FitResult::of_core(ring, recording, &last, quality, timing),
+        result: FitResult::of_core(CoreModel::Green, ring, recording, &last, quality, timing),
     })
 }
 

@@ -26,10 +26,10 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     }
     let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(ring) });
     let caption = if diagnosis.findings.is_empty() {
-        "The ring; nothing was found, so nothing is marked. Names inside the path are half-cells."
+        "The ring; nothing was found, so nothing is marked. Names inside the path are labels."
     } else {
-        "The ring; filled squares are findings, open circles alternatives to them. Names inside the path are half-cells: a quadrupole, \
-         monitor or corrector is named after the one it stands in."
+        "The ring; filled squares are findings, open circles alternatives to them. Names inside the path are labels: a quadrupole, \
+         monitor or corrector is named by its label."
     };
     Section { heading: "Location".into(), figures: vec![(caption.into(), figure)], ..Section::default() }
 }

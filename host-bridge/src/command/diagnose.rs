@@ -131,11 +131,13 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     if let Some(path) = options.report.as_ref().filter(|_| options.common.speaks()) {
         output::say(format_args!("\n{}", path.display()))?;
     }
-    options.model_out.as_deref().map_or(Ok(()), |path| write_model(&ring, &diagnosis, path))
+    options.model_out.as_deref().map_or(Ok(()), |path| write_model(&diagnosis, path))
 }
 
 /// Write the core's tables of the machine that was found, if they can hold all of it.
-fn write_model(ring: &Ring, diagnosis: &Diagnosis, path: &Path) -> Result<(), CommandError> {
+fn write_model(diagnosis: &Diagnosis, path: &Path) -> Result<(), CommandError> {
+    // with the supplies that the recording has
+    let ring = &diagnosis.found.data.ring;
     let failed = |why: String| CommandError::Other(format!("{}: not written: {why}", path.display()));
     let effects = diagnosis.effects();
     if effects.is_empty() {

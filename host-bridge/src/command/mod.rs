@@ -24,7 +24,7 @@ use serde::Serialize;
 use training::Tables;
 use twin::{LatticeError, Ring};
 
-use crate::cli::{Common, Priors, Publishing};
+use crate::cli::{Common, CoreModel, Priors, Publishing};
 use crate::model_file::{self, ModelFileError};
 use crate::output::{self, OutputError};
 use crate::record::{EstimateRecord, Names};
@@ -109,10 +109,10 @@ fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeErr
 }
 
 /// The core's tables: those of a model file, or of the ring as designed.
-fn tables(ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
-    match file {
-        Some(path) => Ok(model_file::read(path, &ring.name)?),
-        None => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
+fn tables(model: CoreModel, ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
+    match (model, file) {
+        (CoreModel::Green, Some(path)) => Ok(model_file::read(path, &ring.name)?),
+        (CoreModel::Green, None) => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
     }
 }
 

@@ -22,7 +22,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let recording = recording(&options.recording, &ring)?;
     warn_if_not_modelled(&recording);
     let powered = recording.powered(&ring);
-    let tables = tables(&powered, options.model_file.as_deref())?;
+    let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     let core = Core::with_tables(tables, stream::setup(&powered, &recording, options.process_noise)?)?;
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);
@@ -31,5 +31,5 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(&ring, &recording, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(options.model, &ring, &recording, &last, quality, timing))
 }

@@ -8,7 +8,7 @@ use twin::Ring;
 use super::{
     CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables, warn_if_not_modelled,
 };
-use crate::cli::{CoreModel, Serve};
+use crate::cli::Serve;
 use crate::record::Names;
 use crate::result::FitResult;
 use crate::serve::serve;
@@ -66,8 +66,7 @@ fn feed(
     warn_if_not_modelled(recording);
     let powered = recording.powered(ring);
     let setup = stream::setup(&powered, recording, options.process_noise)?;
-    let CoreModel::Green = options.model;
-    let tables = tables(&powered, options.model_file.as_deref())?;
+    let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {
         // restarted already: there are no frames of somebody before us that they would have to describe
@@ -83,7 +82,7 @@ fn feed(
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(ring, recording, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(options.model, ring, recording, &last, quality, timing))
 }
 
 /// A device uses the tables that it has, whatever their ring.
