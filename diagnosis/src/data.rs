@@ -292,7 +292,7 @@ impl Data {
             Err(DataError::TooLittle { recording: recording.name.clone(), what, expected, found })
         };
         let active = |channel: &&Channel| channel.frames.len() > channel.basis.ncols();
-        enough("monitors with readings", LEAST, self.channels.iter().filter(active).count())?;
+        enough("monitors with enough readings that count", LEAST, self.channels.iter().filter(active).count())?;
         enough("correctors that were moved", LEAST, self.driven_correctors().len())
     }
 

@@ -249,8 +249,9 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => {
             let last = findings.last().map_or("", |finding| finding.phrase.as_str());
-            let named = findings.iter().take(findings.len().saturating_sub(1)).map(|finding| finding.phrase.as_str());
-            let named: Vec<&str> = named.collect();
+            // what is less than certain stands in the table, with its probability
+            let named = findings.iter().take(findings.len().saturating_sub(1)).filter(|f| f.probability >= DECISIVE);
+            let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
             let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
             format!("{named}{last}, which no effect of the library describes")
         }

@@ -9,7 +9,7 @@ use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
 
-use super::{CommandError, check_outputs, deliver, machine, not_modelled, recording};
+use super::{CommandError, campaign, check_outputs, deliver, machine, not_modelled, recording};
 use crate::cli::Check;
 use crate::output::{lines, table};
 use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
@@ -94,7 +94,7 @@ pub fn run(options: &Check) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
-    let campaign = Campaign::of(&ring, &recording)?;
+    let campaign = campaign(&ring, &recording)?;
     deliver(&options.common, &CheckResult::of(&ring, &campaign))
 }
 
@@ -157,11 +157,13 @@ impl Settings {
 
 impl Noise {
     fn of(campaign: &Campaign) -> Self {
+        let is_repeated = Settings::of(campaign).repeats[2] > 1;
         let plane = |plane: usize| {
             let own: Vec<usize> =
                 (0..campaign.monitors()).filter(|&b| campaign.plane(b) == plane && campaign.is_ok(b)).collect();
             PlaneNoise {
-                of_repeats_mm: median(own.iter().map(|&b| f64::from(campaign.screened.health[b].noise) * 1e3)),
+                of_repeats_mm: median(own.iter().map(|&b| f64::from(campaign.screened.health[b].noise) * 1e3))
+                    .filter(|_| is_repeated),
                 of_header_mm: median(own.iter().map(|&b| campaign.recording.header.noise[b] * 1e3)),
             }
         };
@@ -269,6 +271,7 @@ impl CheckResult {
         let [fewest, median, most] = settings.repeats;
         let noise = |plane: &PlaneNoise| match (plane.of_repeats_mm, plane.of_header_mm) {
             (Some(found), Some(stated)) => format!("{found:.3} mm, the header says {stated:.3} mm"),
+            (None, Some(stated)) => format!("no repeats, the header says {stated:.3} mm"),
             _ => "no monitor in state ok".into(),
         };
         let lost =

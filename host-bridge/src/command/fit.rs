@@ -7,7 +7,7 @@ use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
 
-use super::{CommandError, check_outputs, deliver, expect_modelled, machine_with, progress, recording};
+use super::{CommandError, campaign, check_outputs, deliver, expect_modelled, machine_with, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
 use crate::result::FitResult;
 use crate::{fit_page, output};
@@ -54,7 +54,7 @@ fn by_steps(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
 /// The campaign and its batch fit, measured tunes as readings.
 fn fitted(options: &Fit, ring: &Ring, recording: &Recording) -> Result<(Campaign, BatchFit), CommandError> {
     let spinner = spinner(options);
-    let campaign = Campaign::of(ring, recording)?;
+    let campaign = campaign(ring, recording)?;
     let fit = BatchFit::of(&campaign, TuneUse::Readings, |step| {
         spinner.set_message(format!("Gauss-Newton step {step}"));
     });

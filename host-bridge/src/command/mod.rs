@@ -19,7 +19,7 @@ use std::path::Path;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use inference::recording::BelievedRf;
-use inference::{BatchError, Recording, RecordingError, stream, with_priors};
+use inference::{BatchError, Campaign, Recording, RecordingError, stream, with_priors};
 use serde::Serialize;
 use training::Tables;
 use twin::{LatticeError, Ring};
@@ -158,6 +158,27 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
         output::json(path, result)?;
     }
     if common.speaks() { Ok(output::say(result)?) } else { Ok(()) }
+}
+
+/// A recording of a ring, screened.
+///
+/// # Errors
+/// [`CommandError::Input`] if its currents leave no stable ring, with the supply that is furthest from its nominal one.
+fn campaign(ring: &Ring, recording: &Recording) -> Result<Campaign, CommandError> {
+    Campaign::of(ring, recording).map_err(|error| {
+        let header = &recording.header;
+        let mean = |f: usize| recording.rows.iter().map(|row| row.supply[f]).sum::<f64>() / recording.rows.len() as f64;
+        let away = |f: &usize| (mean(*f) / header.nominal[*f]).ln().abs();
+        let furthest = (0..header.nominal.len()).max_by(|one, other| away(one).total_cmp(&away(other)));
+        let supply = furthest.map_or_else(String::new, |f| {
+            let name = &recording.powered(ring).supplies[f].name;
+            format!("; supply {name} is at {:.1} A, its nominal current is {:.1} A", mean(f), header.nominal[f])
+        });
+        CommandError::Input(format!(
+            "{}: no stable ring {} at its currents: {error}{supply}",
+            recording.name, ring.name
+        ))
+    })
 }
 
 /// What the header believes to be held that is not the momentum, so that only the exact twin models it.

@@ -43,7 +43,7 @@ pub fn run(options: &Response) -> Result<(), CommandError> {
     let effects = options.effects.iter().map(|effect| effect.resolve(&ring)).collect::<Result<Vec<_>, _>>();
     let effects = effects.map_err(input)?;
     let machine = Machine::new(ring.clone(), options.rf.into(), &effects).map_err(input)?;
-    let response = machine.response().map_err(|error| CommandError::Other(format!("{}: {error}", ring.name)))?;
+    let response = machine.response().map_err(|error| CommandError::Input(format!("{}: {error}", ring.name)))?;
     let effects = effects.iter().map(|effect| effect.text(&ring).to_string()).collect();
     deliver(&options.common, &ResponseResult::of(&ring, effects, &response))
 }

@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Row;
 use inference::{FittedTune, Meter, Recording};
 use serde::Serialize;
@@ -11,6 +12,8 @@ use super::Var;
 
 /// Standard deviations between a measured tune and the model's that noise does not explain.
 const DISAGREE: f64 = 4.0;
+/// Uncertainty of a measured tune, in calibration errors of a meter, above which it is its readings that are at fault.
+const SCATTERS: f64 = 30.0;
 
 /// Tunes of the twin at the means, at the recording's mean supply currents.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -52,6 +55,10 @@ impl TunesMeasured {
 
     /// What is wrong with the model's, if anything is.
     pub(super) fn remark(&self, model: &Tunes) -> Option<String> {
+        let largest = [self.x, self.y].into_iter().flatten().map(|tune| tune.sigma).fold(0.0, f64::max);
+        if largest > SCATTERS * TUNE_CALIBRATION {
+            return Some(format!("the readings of the tune meter scatter: their mean is known to {largest:.4} only"));
+        }
         let away = |plane: &str, measured: Option<TuneMeasured>, model: f64| {
             let pull = measured.map(|tune| (tune.mean - model) / tune.sigma)?;
             (pull.abs() > DISAGREE).then(|| format!("tune {plane} by {pull:+.1} standard deviations"))

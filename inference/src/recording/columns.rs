@@ -119,7 +119,7 @@ fn check_order(file: &Path, expected: &[String], known: &[String], found: &[&str
 /// What is the matter at column `i`, the first whose name is not the expected one.
 fn order_error(expected: &[String], known: &[String], i: usize) -> fn(Mismatch) -> RecordingError {
     let Some(found) = known.get(i) else { return RecordingError::MissingColumn };
-    if known[..i].contains(found) {
+    if known.iter().filter(|column| *column == found).count() > 1 {
         RecordingError::DuplicateColumn
     } else if expected.iter().any(|column| is_other_unit(column, found) && !known.contains(column)) {
         RecordingError::ColumnUnit

@@ -60,6 +60,10 @@ pub(super) fn parse(
     ring: &Ring,
     names: &Names,
 ) -> Result<(Vec<Row>, Vec<String>), RecordingError> {
+    if text.trim().is_empty() {
+        let at = Place::new(file, 1, Part::Whole);
+        return Err(RecordingError::NoFrames(at.mismatch("columns and frames", "an empty file")));
+    }
     let mut lines = text.lines();
     let columns = Columns::parse(file, lines.next().unwrap_or_default(), header, ring, names)?;
     let mut rows: Vec<Row> = Vec::new();

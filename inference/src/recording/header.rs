@@ -140,6 +140,7 @@ const DEFAULT: &str = "default";
 impl Header {
     pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
         let text = Text { file, text };
+        text.check_name(ring)?;
         let header = match text.format()? {
             Format::One => text.first(ring)?,
             Format::Two => text.second(names)?,
@@ -342,14 +343,25 @@ impl Text<'_> {
         values.into_iter().collect::<Option<_>>().ok_or_else(missing)
     }
 
-    /// Machine, lattice, particle and energy have to be the ring's.
+    /// The machine has to be the ring's, whatever else may be wrong: the header of another one lacks this one's supplies.
+    fn check_name(&self, ring: &Ring) -> Result<(), RecordingError> {
+        #[derive(Deserialize)]
+        struct Probe {
+            machine: Option<toml::Value>,
+        }
+        // what is wrong elsewhere is found by the strict reading
+        let Ok(Probe { machine: Some(toml::Value::String(name)) }) = toml::from_str(self.text) else { return Ok(()) };
+        if begins(&ring.name, &name) {
+            return Ok(());
+        }
+        Err(RecordingError::Machine(self.key("machine").mismatch(format!("{:?}", ring.name), format!("{name:?}"))))
+    }
+
+    /// Lattice, particle and energy have to be the ring's.
     fn check_machine(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
         let refuse = |key, expected: &dyn fmt::Display, found: &dyn fmt::Display| {
             Err(RecordingError::Machine(self.key(key).mismatch(expected, found)))
         };
-        if !begins(&ring.name, &header.machine) {
-            return refuse("machine", &format!("{:?}", ring.name), &format!("{:?}", header.machine));
-        }
         if header.lattice != ring.file {
             return refuse("lattice", &format!("{:?}", ring.file), &format!("{:?}", header.lattice));
         }

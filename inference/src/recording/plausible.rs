@@ -1,7 +1,7 @@
 //! Numbers of a header that its frames contradict by so much that they are errors of the header, not faults of the machine.
 
-use super::Recording;
 use super::limit::in_milli;
+use super::{Recording, Row};
 use crate::campaign::{Drive, Settings};
 
 /// A key of the header, and what is wrong with its value.
@@ -24,12 +24,16 @@ const MEDIAN: f64 = 0.9539;
 /// The first one.
 pub(super) fn check(recording: &Recording) -> Result<(), Fault> {
     let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
-    check_kick(&drives)?;
+    check_kick(recording)?;
     check_noise(recording, &drives)
 }
 
-fn check_kick(drives: &[Drive]) -> Result<(), Fault> {
-    let largest = drives.iter().map(|drive| drive.kick.amax()).fold(0.0, f64::max);
+fn check_kick(recording: &Recording) -> Result<(), Fault> {
+    let kicks = |row: &Row| {
+        let kicks = row.corrector_current.iter().zip(&recording.header.kick_per_ampere).map(|(a, k)| (a * k).abs());
+        kicks.fold(0.0, f64::max)
+    };
+    let largest = recording.rows.iter().map(kicks).fold(0.0, f64::max);
     if largest <= LARGEST_KICK {
         return Ok(());
     }

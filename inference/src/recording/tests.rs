@@ -481,3 +481,27 @@ fn what_is_written_reads_the_same() {
         assert_eq!(again.rows, recording.rows);
     }
 }
+
+#[test]
+fn an_empty_file_is_said_to_be_empty() {
+    let error = read(block("toml").as_bytes(), b"\n").expect_err("there is nothing in it");
+    assert_eq!(error, "toy/frames.csv, line 1: expected columns and frames, found an empty file");
+}
+
+#[test]
+fn a_column_that_stands_twice_is_not_called_missing() {
+    let named = columns().join(",").replacen("x_A2_mm", "y_A1_mm", 1);
+    let twice = block("csv").replacen(&columns().join(","), &named, 1);
+    let error = read(block("toml").as_bytes(), twice.as_bytes()).expect_err("y_A1_mm stands twice");
+    assert!(error.ends_with(", found \"y_A1_mm\", which is there already"), "{error}");
+}
+
+#[test]
+fn another_machine_is_named_before_what_it_lacks() {
+    let other = block("toml").replace("machine = \"toy\"", "machine = \"other\"").replace("qh = ", "QH = ");
+    let error = read(other.as_bytes(), block("csv").as_bytes()).expect_err("it is of another machine");
+    assert!(
+        error.contains("key machine: expected ") && error.ends_with("the recording is of another machine"),
+        "{error}"
+    );
+}
