@@ -3,6 +3,7 @@
 use core::error::Error;
 
 use estimator::wire::link::Status;
+use host_bridge::cli::CoreModel;
 use host_bridge::record::{EstimateRecord, Names};
 use host_bridge::result::FitResult;
 use host_bridge::source::device::Fed;

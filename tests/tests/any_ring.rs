@@ -3,9 +3,9 @@
 
 use diagnosis::score::{Grade, Truth};
 use diagnosis::{Diagnosis, Verdict};
-use inference::{BatchFit, Campaign, Recording, TuneUse, stream};
+use inference::{BatchFit, Campaign, Recording, TuneUse, simulate, stream};
 use system_tests::repository;
-use twin::Ring;
+use twin::{Effect, Ring};
 
 fn read(folder: &str, name: &str) -> (Ring, Recording, Truth) {
     let home = repository("recordings").join(folder);
@@ -63,4 +63,31 @@ fn a_plain_campaign_is_consistent_and_a_gain_is_named_with_its_amplitude() {
         let pulls = truth.pulls(&diagnosis);
         assert!(pulls.len() == 1 && pulls[0].abs() < 3.0, "{folder}: {pulls:?}"); // one of 400 is further off
     }
+}
+
+/// The Booster with a quadrupole that is not fitted.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn an_effect_is_named_where_not_every_quadrupole_is_fitted() {
+    let text = std::fs::read_to_string(repository("machines/booster.json")).unwrap();
+    let design: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut not_fitted = design.clone();
+    let elements = not_fitted["elements"].as_array_mut().unwrap();
+    elements.iter_mut().find(|element| element["name"] == "QH_A2").unwrap()["fit"] = false.into();
+    let file = folder.path().join("booster.json"); // as the header says
+    std::fs::write(&file, not_fitted.to_string()).unwrap();
+    let ring = Ring::read(&file).unwrap();
+    assert_eq!(ring.parameters.len(), 47);
+    let template = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
+    let vars = simulate::vars(&ring, true, 3).unwrap();
+    let effects = [Effect::parse("quad_roll@D8=0.012", &ring).unwrap()];
+    let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };
+    let recording =
+        simulate::campaign(&template, &ring, &truth, &simulate::Hardware::shipped(&ring, &template), 3).unwrap();
+    let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+    assert_eq!(diagnosis.verdict, Verdict::Identified, "{}", diagnosis.sentence);
+    let found = diagnosis.effects();
+    assert!(found.len() == 1 && found[0].site == effects[0].site, "{}", diagnosis.sentence);
+    assert!((found[0].amplitude / 0.012 - 1.0).abs() < 0.3, "{}", diagnosis.sentence); // three error bars of some 10 %
 }
