@@ -3,6 +3,7 @@
 use core::fmt;
 use std::path::Path;
 
+use comfy_table::ColumnConstraint;
 use diagnosis::average::Vars;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
@@ -214,6 +215,10 @@ impl fmt::Display for DiagnosisResult {
             finding.alternatives.iter().take(5).for_each(|other| {
                 table.add_row(other.row("or "));
             });
+        }
+        // a word of the library is looked for elsewhere, so that it is not broken
+        if let Some(words) = table.column_mut(0) {
+            words.set_constraint(ColumnConstraint::ContentWidth);
         }
         if !self.findings.is_empty() {
             writeln!(f, "{table}\n{}\n", fill(COLUMNS))?;
