@@ -6,8 +6,10 @@
 use std::path::Path;
 
 use estimator::{FrameError, Parcel, ParcelError, Tables as _};
+use training::green::{Difference, difference};
 use training::rooms::large::{PACKET, Request};
-use training::{AnyParcel, LINE, Tables};
+use training::{AnyParcel, LINE, Tables, TrainingError};
+use twin::Ring;
 
 use crate::output::{self, OutputError};
 
@@ -39,6 +41,19 @@ pub enum ModelFileError {
         /// The machine at hand.
         machine: String,
     },
+    /// It is of a machine of the same name that has other quadrupoles, params, supplies or priors.
+    #[error("{path}: a model of another {machine:?}: {difference}")]
+    Ring {
+        /// The file.
+        path: String,
+        /// The name of both.
+        machine: String,
+        /// What differs.
+        difference: Difference,
+    },
+    /// There is no model for the machine at hand.
+    #[error(transparent)]
+    Training(#[from] TrainingError),
     /// One of its packets is not what it should be.
     #[error("{path}, packet {packet}: {fault}")]
     Packet {
@@ -98,11 +113,12 @@ fn wire(parcel: AnyParcel) -> Vec<u8> {
     bytes
 }
 
-/// The tables of a file, which has to be of this machine.
+/// The tables of a file, which has to be of this machine, as its supplies are recorded: [`inference::Recording::powered`].
 ///
 /// # Errors
 /// [`ModelFileError`].
-pub fn read(path: &Path, machine: &str) -> Result<Tables, ModelFileError> {
+pub fn read(path: &Path, ring: &Ring) -> Result<Tables, ModelFileError> {
+    let machine = &ring.name;
     let name = || path.display().to_string();
     let mut bytes = std::fs::read(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
     let end = bytes.iter().position(|byte| *byte == b'\n').ok_or_else(|| ModelFileError::Kind { path: name() })?;
@@ -111,7 +127,12 @@ pub fn read(path: &Path, machine: &str) -> Result<Tables, ModelFileError> {
     if found != line(machine) {
         return Err(ModelFileError::Machine { path: name(), found: found.into(), machine: machine.into() });
     }
-    tables(&mut bytes[end + 1..]).map_err(|(packet, fault)| ModelFileError::Packet { path: name(), packet, fault })
+    let tables = tables(&mut bytes[end + 1..]);
+    let tables = tables.map_err(|(packet, fault)| ModelFileError::Packet { path: name(), packet, fault })?;
+    match difference(ring, &tables)? {
+        Some(difference) => Err(ModelFileError::Ring { path: name(), machine: machine.clone(), difference }),
+        None => Ok(tables),
+    }
 }
 
 /// The tables of packets; or which of them, from 1, is wrong.
@@ -164,7 +185,7 @@ fn take(tables: &mut Tables, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
 #[cfg(test)]
 mod tests {
     use estimator::Sizes;
-    use twin::{Effect, Ring};
+    use twin::Effect;
 
     use super::*;
 
@@ -176,12 +197,17 @@ mod tests {
 
     const MACHINE: &str = "a machine";
 
+    /// The Booster by another name.
+    fn machine() -> Ring {
+        Ring { name: MACHINE.into(), ..Ring::booster() }
+    }
+
     /// What is said of a file with these bytes, without its path.
     fn refused_whole(bytes: &[u8]) -> String {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model");
         std::fs::write(&path, bytes).unwrap();
-        let error = read(&path, MACHINE).unwrap_err().to_string();
+        let error = read(&path, &machine()).unwrap_err().to_string();
         error.strip_prefix(&path.display().to_string()).unwrap().to_owned()
     }
 
@@ -195,7 +221,7 @@ mod tests {
         let (folder, tables) = (tempfile::tempdir().unwrap(), extended());
         let path = folder.path().join("model");
         write(&path, MACHINE, &tables).unwrap();
-        assert_eq!(read(&path, MACHINE).unwrap(), tables);
+        assert_eq!(read(&path, &machine()).unwrap(), tables);
         let packets = std::fs::read(&path).unwrap().split_inclusive(|byte| *byte == 0).count();
         assert_eq!(packets, tables.parcels::<LINE>().count());
     }
@@ -208,7 +234,28 @@ mod tests {
         for bytes in [&b""[..], b"{}", b"{}\n", &wire(extended().parcels::<LINE>().next().unwrap())] {
             assert_eq!(refused_whole(bytes), expected);
         }
-        assert_eq!(read(Path::new("/nonexistent"), MACHINE).unwrap_err().to_string(), "/nonexistent: file not found");
+        assert_eq!(
+            read(Path::new("/nonexistent"), &machine()).unwrap_err().to_string(),
+            "/nonexistent: file not found"
+        );
+    }
+
+    #[test]
+    fn a_file_is_for_the_same_params_and_priors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model");
+        write(&path, MACHINE, &extended()).unwrap();
+        let refused = |ring: &Ring| read(&path, ring).unwrap_err().to_string();
+        let mut other = machine();
+        other.parameters[7].prior.width = 0.01;
+        let name = &other.parameters[7].name;
+        let expected = format!(
+            "{}: a model of another \"a machine\": the prior of {name} is not the one that it has in this machine",
+            path.display()
+        );
+        assert_eq!(refused(&other), expected);
+        other.parameters.pop();
+        assert!(refused(&other).contains("params, supplies are [15, 18, 24, 24, 48, 48, 2]"), "{}", refused(&other));
     }
 
     #[test]

@@ -93,31 +93,62 @@ pub fn like(
 pub const TUNE_CUT: f64 = 0.05;
 
 /// Distance of a tune from the next half integer that a ring needs to keep its beam: supplies that fluctuate by 2e-4, and
-/// occasionally by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again.
+/// occasionally by 8e-4, move a tune by 0.005, and the half integer's stop band is as wide again. Half the design's own distance
+/// where that is less: a machine that is run there does keep its beam.
 const STOP_BAND: f64 = 0.03;
+
+/// Rings that are drawn before it is said that none is as asked for; of the Booster's, every second one is.
+const TRIES: usize = 10_000;
+
+/// Why there are no vars.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum VarsError {
+    /// The design has no tunes.
+    #[error(transparent)]
+    Orbit(#[from] OrbitError),
+    /// The prior is too wide for the design.
+    #[error(
+        "{ring}: of {TRIES} rings drawn from the prior of the vars none keeps its beam with tunes near the design's {:.4} {:.4}; \
+         a narrower prior_width has some", .tunes[0], .tunes[1]
+    )]
+    Rare {
+        /// The machine.
+        ring: String,
+        /// Tunes of the design.
+        tunes: [f64; 2],
+    },
+}
+
+/// Which tunes a ring may have in a plane.
+struct Window {
+    design: f64,
+    tune_cut: bool,
+}
+
+impl Window {
+    fn holds(&self, tune: f64) -> bool {
+        let below = (2.0 * self.design).floor() / 2.0;
+        let own = (self.design - below).min(below + 0.5 - self.design);
+        let band = STOP_BAND.min(0.5 * own);
+        (band..=0.5 - band).contains(&(tune - below)) && (!self.tune_cut || (tune - self.design).abs() < TUNE_CUT)
+    }
+}
 
 /// Vars drawn from the truncated priors of a ring's params; with the tune cut, those whose ring's tunes are within
 /// [`TUNE_CUT`] of the design's. Without it, those of rings that keep their beam: both tunes between the same half integers
 /// as the design's, and not on one.
 ///
 /// # Errors
-/// [`OrbitError`] if the design has no tunes.
-pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, OrbitError> {
+/// [`VarsError`].
+pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsError> {
     let mut random = StdRng::seed_from_u64(seed);
     let design = tunes(ring)?;
-    loop {
-        let vars: Vec<f64> = ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
-        let near = |at: f64, design: f64| {
-            let from_below = at - (2.0 * design).floor() / 2.0;
-            (STOP_BAND..=0.5 - STOP_BAND).contains(&from_below) && (!tune_cut || (at - design).abs() < TUNE_CUT)
-        };
-        if let Ok(at) = tunes(&ring.with_vars(&vars))
-            && near(at.x, design.x)
-            && near(at.y, design.y)
-        {
-            return Ok(vars);
-        }
-    }
+    let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
+    let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
+    let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| x.holds(at.x) && y.holds(at.y));
+    let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);
+    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [design.x, design.y] })
 }
 
 /// A factor from its truncated lognormal prior.
@@ -140,4 +171,45 @@ fn tunes(ring: &Ring) -> Result<Tunes, OrbitError> {
 pub fn seeds(seed: u64) -> impl Iterator<Item = u64> {
     let mut random = StdRng::seed_from_u64(seed);
     core::iter::repeat_with(move || random.random())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::prior::with_priors;
+
+    /// The Booster with all of its horizontally focusing quadrupoles stronger, to a horizontal tune of 4.984.
+    fn next_to_an_integer() -> Ring {
+        let ring = Ring::booster();
+        let focusing = ring.gradients().into_iter().map(|k1| k1 > 0.0);
+        let focusing: Vec<bool> = focusing.collect();
+        let at = |factor: f64| {
+            ring.with_strengths(&focusing.iter().map(|focuses| if *focuses { factor } else { 1.0 }).collect::<Vec<_>>())
+        };
+        let (mut low, mut high) = (1.0, 1.1);
+        for _ in 0..40 {
+            let middle = 0.5 * (low + high);
+            let below = tunes(&at(middle)).is_ok_and(|tunes| tunes.x < 4.984);
+            (low, high) = if below { (middle, high) } else { (low, middle) };
+        }
+        at(low)
+    }
+
+    /// 0.0005 moves the tune by some 0.0005, a thirtieth of its distance from the integer.
+    #[test]
+    fn a_design_near_a_half_integer_has_rings_like_it() {
+        let ring = with_priors(&next_to_an_integer(), Some(0.0005), None);
+        assert!((tunes(&ring).unwrap().x - 4.984).abs() < 1e-6);
+        for tune_cut in [false, true] {
+            let vars = vars(&ring, tune_cut, 1).unwrap();
+            assert!((tunes(&ring.with_vars(&vars)).unwrap().x - 4.984).abs() < 0.008);
+        }
+    }
+
+    #[test]
+    fn a_prior_without_a_stable_ring_is_said() {
+        let ring = with_priors(&Ring::booster(), Some(5.0), Some([1e-3, 1e3]));
+        let said = vars(&ring, true, 1).unwrap_err().to_string();
+        assert!(said.contains("of 10000 rings drawn from the prior of the vars none keeps its beam"), "{said}");
+    }
 }

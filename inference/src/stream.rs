@@ -215,10 +215,19 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
     let beyond =
         |what, value| StreamError::Range { recording: recording.name.clone(), sequence: row.sequence, what, value };
     let current = |value| CurrentCode::nearest(value).ok_or_else(|| beyond("current", value));
+    let time = |what, seconds: f64, most| {
+        let steps = (seconds * 1e6).round();
+        if (0.0..=most).contains(&steps) { Ok(steps) } else { Err(beyond(what, seconds)) }
+    };
+    // what is less than a step would be no beam
+    let intensity = |particles: f64| {
+        let code = IntensityCode::nearest(particles).filter(|code| code.steps() > 0 || particles == 0.0);
+        code.ok_or_else(|| beyond("intensity", particles))
+    };
     let mut frame = large::Frame {
         sequence: row.sequence,
-        time_us: (row.time * 1e6).round() as u64,
-        cycle_time_us: (row.cycle_time * 1e6).round() as u32,
+        time_us: time("time", row.time, u64::MAX as f64)? as u64,
+        cycle_time_us: time("time in the cycle", row.cycle_time, f64::from(u32::MAX))? as u32,
         corrector: [CurrentCode::default(); large::CORRECTORS],
         magnets: MagnetCurrents {
             dipole: current(row.dipole.unwrap_or(0.0))?,
@@ -227,7 +236,7 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
         rf_offset: RfCode::nearest(row.rf_offset).ok_or_else(|| beyond("rf offset", row.rf_offset))?,
         reading: [PositionCode::default(); large::MONITORS],
         tune: row.tune.map(|t| t.and_then(TuneCode::nearest)),
-        intensity: row.intensity.and_then(IntensityCode::nearest),
+        intensity: row.intensity.map(intensity).transpose()?,
         valid: Mask::NONE,
     };
     for (to, &from) in frame.corrector.iter_mut().zip(&row.corrector_current) {
@@ -264,4 +273,35 @@ pub fn replay(
         hear(row, &estimate);
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    /// What is said of the first row of a recording with one of its values changed; nothing if a frame carries it.
+    fn refused(change: impl Fn(&mut Row)) -> Option<String> {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
+        let ring = Ring::read(&folder.join("ring.json")).unwrap();
+        let recording = Recording::read(&folder.join("plain"), &ring).unwrap();
+        let mut row = recording.rows[0].clone();
+        change(&mut row);
+        wire(&recording, &row).err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn what_a_frame_cannot_carry_is_said_and_not_changed() {
+        let said = |what: &str| Some(format!("plain, frame 0: {what} is beyond what a frame can carry"));
+        for carried in [None, Some(0.0), Some(5e5), Some(2e15)] {
+            assert_eq!(refused(|row| row.intensity = carried), None);
+        }
+        assert_eq!(refused(|row| row.intensity = Some(1.5)), said("intensity 1.5"));
+        assert_eq!(refused(|row| row.intensity = Some(3e15)), said("intensity 3000000000000000"));
+        assert_eq!(refused(|row| row.time = -0.5), said("time -0.5"));
+        assert_eq!(refused(|row| row.cycle_time = -1e-3), said("time in the cycle -0.001"));
+        assert_eq!(refused(|row| row.cycle_time = 4295.0), said("time in the cycle 4295"));
+        assert_eq!(refused(|row| row.corrector_current[0] = 2e4), said("current 20000"));
+    }
 }

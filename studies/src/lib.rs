@@ -18,6 +18,7 @@ mod trimming;
 
 use inference::nuts::{NutsError, NutsSettings};
 use inference::posterior::LaplaceError;
+use inference::simulate::VarsError;
 use inference::{BatchError, Campaign, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
 use report::Page;
 use serde::Serialize;
@@ -139,6 +140,9 @@ pub enum StudyError {
     /// The ring at a point has no closed orbit.
     #[error(transparent)]
     Orbit(#[from] twin::OrbitError),
+    /// The prior has no rings to predict with.
+    #[error(transparent)]
+    Vars(#[from] VarsError),
     /// The core refuses the recording.
     #[error(transparent)]
     Stream(#[from] StreamError),

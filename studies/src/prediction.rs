@@ -3,8 +3,9 @@
 
 use core::ops::Range;
 
+use inference::Pair;
 use inference::diagnostics::quantile;
-use inference::{Pair, simulate};
+use inference::simulate::{self, VarsError};
 use nalgebra::DMatrix;
 use report::{Axes, Figure, Panel, Reference, Section, Series};
 use statrs::distribution::{ContinuousCDF, Normal};
@@ -114,7 +115,7 @@ fn posterior_draws(fitted: &Sampled) -> Vec<Vec<f64>> {
     fitted.vars.row_iter().step_by(every).map(|row| row.iter().copied().collect()).collect()
 }
 
-fn prior_draws(sampling: &Sampling, seed: u64) -> Result<Vec<Vec<f64>>, OrbitError> {
+fn prior_draws(sampling: &Sampling, seed: u64) -> Result<Vec<Vec<f64>>, VarsError> {
     let ring = &sampling.campaign().ring;
     simulate::seeds(seed).take(DRAWS).map(|seed| simulate::vars(ring, false, seed)).collect()
 }

@@ -64,7 +64,7 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
     let by_file = |vars: &[f64]| {
         let extended = training::extended::tables(ring, effects, vars).unwrap();
         model_file::write(path.path(), &ring.name, &extended.tables).unwrap();
-        let core = Core::with_tables(model_file::read(path.path(), &ring.name).unwrap(), setup.clone()).unwrap();
+        let core = Core::with_tables(model_file::read(path.path(), ring).unwrap(), setup.clone()).unwrap();
         replay(core, recording, truth)
     };
     let first = by_file(&design.vars);

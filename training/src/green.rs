@@ -1,7 +1,7 @@
 //! Green's function tables of a ring, from its twin.
 
 use estimator::surrogate::{List, NONE, Table};
-use estimator::{GROUPS, Sizes};
+use estimator::{GROUPS, ParcelError, Sizes};
 use twin::{
     ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source,
     spurious_dispersion,
@@ -47,6 +47,23 @@ pub enum TrainingError {
     Unstable {
         /// The machine.
         ring: String,
+    },
+}
+
+/// What tables state otherwise than those of a ring.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Difference {
+    /// How many there are of everything: [`ParcelError::Sizes`].
+    #[error(transparent)]
+    Sizes(ParcelError),
+    /// Which param or supply a quadrupole has, or which prior a param.
+    #[error("the {what} of {of} is not the one that it has in this machine")]
+    Wiring {
+        /// What they have.
+        what: &'static str,
+        /// The first quadrupole or param that has another.
+        of: String,
     },
 }
 
@@ -157,6 +174,26 @@ fn wiring(ring: &Ring, tables: &mut Tables) -> Result<(), TrainingError> {
     Ok(())
 }
 
+/// What tables, of a file say, state otherwise than those of a ring; none if they are for this ring.
+///
+/// # Errors
+/// [`TrainingError`] if there are no tables for the ring.
+pub fn difference(ring: &Ring, tables: &Tables) -> Result<Option<Difference>, TrainingError> {
+    let (own, got) = (sizes(ring)?, tables.sizes());
+    if own != got {
+        return Ok(Some(Difference::Sizes(ParcelError::Sizes { room: own, got })));
+    }
+    let mut wired = Tables::zeros(own);
+    wiring(ring, &mut wired)?;
+    let quadrupole = |i: usize| ring.elements[ring.quadrupoles[i].element].name.clone();
+    let param = |i: usize| ring.parameters[i].name.clone();
+    let name: [(_, _, &dyn Fn(usize) -> String); 3] =
+        [("param", Table::Param, &quadrupole), ("supply", Table::Supply, &quadrupole), ("prior", Table::Group, &param)];
+    let first =
+        |table: Table| wired.lines(table)[0].iter().zip(&tables.lines(table)[0]).position(|(own, of)| own != of);
+    Ok(name.into_iter().find_map(|(what, table, name)| Some(Difference::Wiring { what, of: name(first(table)?) })))
+}
+
 fn nodes(ring: &Ring) -> Vec<Place> {
     let at = |element: usize| NODES.map(|node| Place { element, depth: node * ring.elements[element].length });
     ring.quadrupoles.iter().flat_map(|q| at(q.element)).collect()
@@ -231,6 +268,34 @@ fn fill(tables: &mut Tables, list: List, value: impl Fn(usize) -> f64) {
 mod tests {
     use super::*;
     use crate::testing::rings;
+
+    /// What tables of the Booster as designed state otherwise than those of a changed one.
+    fn said(change: impl Fn(&mut Ring)) -> Option<String> {
+        let design = Ring::booster();
+        let mut ring = design.clone();
+        change(&mut ring);
+        difference(&ring, &tables(&design).unwrap()).unwrap().map(|difference| difference.to_string())
+    }
+
+    #[test]
+    fn tables_are_those_of_a_ring_with_the_same_params_supplies_and_priors() {
+        assert_eq!(said(|ring| ring.name = "renamed".into()), None);
+        assert_eq!(said(|ring| ring.parameters.iter_mut().for_each(|one| one.prior.width = 0.01)), None);
+        let of = |what: &str, of: &str| Some(format!("the {what} of {of} is not the one that it has in this machine"));
+        assert_eq!(
+            said(|ring| ring.parameters[3].prior.width = 0.01),
+            of("prior", &Ring::booster().parameters[3].name)
+        );
+        let names = |i: usize| Ring::booster().elements[Ring::booster().quadrupoles[i].element].name.clone();
+        let exchanged = |ring: &mut Ring| {
+            (ring.quadrupoles[5].parameter, ring.quadrupoles[6].parameter) =
+                (ring.quadrupoles[6].parameter, ring.quadrupoles[5].parameter);
+        };
+        assert_eq!(said(exchanged), of("param", &names(5)));
+        assert_eq!(said(|ring| ring.quadrupoles[7].supply = None), of("supply", &names(7)));
+        let fewer = said(|ring| drop(ring.parameters.pop())).unwrap();
+        assert!(fewer.ends_with("48, 48, 2], this machine's [15, 18, 24, 24, 48, 47, 2]"), "{fewer}");
+    }
 
     #[test]
     fn each_ring_states_an_error_of_its_own() {

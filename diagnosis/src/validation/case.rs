@@ -54,7 +54,7 @@ impl Case {
     pub fn draw(ring: &Ring, template: &Recording, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
         let mut streams = simulate::seeds(seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let mut stream = || streams.next().expect("seeds do not end");
-        let vars = simulate::vars(ring, true, stream()).expect("a design has tunes");
+        let vars = simulate::vars(ring, true, stream()).expect("a design has tunes, and rings like it");
         let mut random = StdRng::seed_from_u64(stream());
         let kinds: Vec<EffectKind> =
             EffectKind::ALL.iter().copied().filter(|kind| terms.iter().any(|term| term.kind == *kind)).collect();

@@ -111,7 +111,7 @@ fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeErr
 /// The core's tables: those of a model file, or of the ring as designed.
 fn tables(model: CoreModel, ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
     match (model, file) {
-        (CoreModel::Green, Some(path)) => Ok(model_file::read(path, &ring.name)?),
+        (CoreModel::Green, Some(path)) => Ok(model_file::read(path, ring)?),
         (CoreModel::Green, None) => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
     }
 }

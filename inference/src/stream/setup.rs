@@ -16,8 +16,8 @@ const SHARE: f64 = 0.05;
 /// Priors, noise and calibration: [`estimator::Setup`] for a ring of any size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setup {
-    /// Priors of `theta = ln var`; which of them a param has stands in the tables. From 1 to [`GROUPS`].
-    pub priors: Vec<Prior>,
+    /// Priors of `theta = ln var`; which of them a param has stands in the tables. Those that no param has repeat the first.
+    pub priors: [Prior; GROUPS],
     /// Kick of each corrector at nominal momentum [rad/A] [C].
     pub kick_per_ampere: Vec<f32>,
     /// Nominal current of the dipoles [A]; without one their read-back does not count.
@@ -58,10 +58,8 @@ pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<S
         transfer.iter_mut().zip(coefficients).for_each(|(to, from)| *to = *from as f32);
         Ok(SupplyCalibration { nominal: *nominal as f32, transfer })
     };
-    let (priors, _) = training::green::prior_groups(ring)?;
-    let prior = |prior: &twin::ParameterPrior| Prior::lognormal(prior.width as f32, prior.range.map(|v| v as f32));
     Ok(Setup {
-        priors: priors.iter().map(prior).collect(),
+        priors: priors(ring)?,
         kick_per_ampere: single(&header.kick_per_ampere),
         dipole: header.nominal_dipole.map(|a| a as f32),
         supplies: header.nominal.iter().zip(&header.transfer).map(supply).collect::<Result<_, _>>()?,
@@ -71,6 +69,15 @@ pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<S
         process_noise,
         tune_calibration: Some(TUNE_CALIBRATION as f32),
     })
+}
+
+/// The priors that a ring's params have, each once, in the order in which tables count them.
+fn priors(ring: &Ring) -> Result<[Prior; GROUPS], StreamError> {
+    let (groups, _) = training::green::prior_groups(ring)?;
+    // of a ring without params nobody asks for one
+    let mut all = [groups.first().copied().unwrap_or_default(); GROUPS];
+    all[..groups.len()].copy_from_slice(&groups);
+    Ok(all.map(|prior| Prior::lognormal(prior.width as f32, prior.range.map(|v| v as f32))))
 }
 
 impl Setup {
@@ -98,7 +105,7 @@ impl Setup {
     ) -> estimator::Setup<B, C, F> {
         let supplies = self.supplies.iter().copied().chain(core::iter::repeat(SupplyCalibration::IDLE));
         estimator::Setup {
-            prior: core::array::from_fn::<_, GROUPS, _>(|group| *self.priors.get(group).unwrap_or(&self.priors[0])),
+            prior: self.priors,
             calibration: Calibration {
                 kick_per_ampere: each(&self.kick_per_ampere, corrector),
                 dipole: self.dipole,
