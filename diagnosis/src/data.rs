@@ -15,8 +15,8 @@ use nalgebra::{DMatrix, DVector, RowVector2, Vector2};
 use twin::{Cycle, Drives, Effect, EffectError, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked, Tunes};
 
 use super::baseline::Baseline;
+use super::error::FitError;
 use super::evidence::Units;
-use super::fit::FitError;
 use super::settings::Settings;
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};

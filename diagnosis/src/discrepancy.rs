@@ -16,7 +16,8 @@ use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
 use twin::{Plane, Signatures};
 
 use super::data::Data;
-use super::fit::{FitError, Fitted};
+use super::error::FitError;
+use super::fit::Fitted;
 use super::location::Location;
 use super::settings::Settings;
 

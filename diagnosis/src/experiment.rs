@@ -7,7 +7,8 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
-use super::fit::{FitError, Fitted};
+use super::error::FitError;
+use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Rivals;
 

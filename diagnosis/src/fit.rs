@@ -11,9 +11,10 @@ use core::ops::{Div, Sub};
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, Machine, OrbitError, Signature, Signatures};
+use twin::{Drives, EffectError, Machine, Signature, Signatures};
 
 use super::data::Data;
+use super::error::FitError;
 use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Unknown};
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
@@ -68,24 +69,6 @@ struct Point {
     u: DVector<f64>,
     residual: DVector<f64>,
     cost: f64,
-}
-
-/// Why a hypothesis has no fit.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum FitError {
-    /// No stable machine where the fit begins, or an effect that is not defined for this ring.
-    #[error(transparent)]
-    Effect(#[from] EffectError),
-    /// A derivative is so large, or not a number, that the normal matrix is not positive.
-    #[error("the normal matrix of a fit is not positive")]
-    Degenerate,
-}
-
-impl From<OrbitError> for FitError {
-    fn from(error: OrbitError) -> Self {
-        Self::Effect(error.into())
-    }
 }
 
 impl Fitted {

@@ -19,7 +19,8 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 
 use super::data::Data;
-use super::fit::{FitError, Fitted};
+use super::error::FitError;
+use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Recording;

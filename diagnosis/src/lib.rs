@@ -11,6 +11,7 @@ pub mod average;
 pub mod baseline;
 pub mod data;
 pub mod discrepancy;
+pub mod error;
 pub mod evidence;
 pub mod experiment;
 pub mod fit;

@@ -9,7 +9,8 @@ use twin::Place;
 use twin::{Signatures, Thin};
 
 use super::data::Data;
-use super::fit::{FitError, Fitted};
+use super::error::FitError;
+use super::fit::Fitted;
 use super::scan::{BATCH, Projection, SignatureScore};
 
 /// Longest segment [m], and longest where the gradient may be.

@@ -11,7 +11,8 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{EffectKind, Signatures, Site};
 
 use super::data::Data;
-use super::fit::{FitError, Fitted};
+use super::error::FitError;
+use super::fit::Fitted;
 use super::hypothesis::{Term, members};
 
 /// One candidate.

@@ -5,8 +5,8 @@ use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
 use super::data::Data;
+use super::error::FitError;
 use super::experiment::Menu;
-use super::fit::FitError;
 use super::heldout::{Fold, Score, VALIDATED};
 use super::hypothesis::{Scatter, Term};
 use super::place_scan::{Interval, PlaceScan};

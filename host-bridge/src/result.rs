@@ -21,7 +21,6 @@ use tunes::{measured, tunes};
 use var::covariance;
 pub use var::{Var, vars_of};
 
-use crate::cli::CoreModel;
 use crate::output::{fill, table};
 use crate::record::EstimateRecord;
 
@@ -82,7 +81,7 @@ pub struct Sampling {
 impl FitResult {
     /// What a core says after its last frame, here or on a device.
     pub fn of_core(
-        model: CoreModel,
+        model: &'static str,
         ring: &Ring,
         recording: &Recording,
         last: &EstimateRecord,
@@ -98,7 +97,7 @@ impl FitResult {
         Self {
             recording: recording.name.clone(),
             method: "laplace",
-            model: model.word(),
+            model,
             frames: last.frames as usize,
             rejected_frames: last.rejected_frames,
             covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),

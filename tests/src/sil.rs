@@ -83,7 +83,7 @@ pub fn compare(
         different,
         status,
         counts,
-        result: FitResult::of_core(CoreModel::Green, ring, recording, &last, quality, timing),
+        result: FitResult::of_core(CoreModel::Green.word(), ring, recording, &last, quality, timing),
     })
 }
 

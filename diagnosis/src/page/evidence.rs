@@ -1,6 +1,6 @@
 //! The leading candidates of the first search, and the correction for their number.
 
-use crate::fit::FitError;
+use crate::error::FitError;
 
 use crate::Diagnosis;
 use crate::discrepancy;

@@ -1,6 +1,6 @@
 //! The undecided causes, and the measurement that would separate them.
 
-use crate::fit::FitError;
+use crate::error::FitError;
 
 use super::table;
 use crate::{Diagnosis, Verdict, verdict};

@@ -1,6 +1,6 @@
 //! The findings, each with its alternatives.
 
-use crate::fit::FitError;
+use crate::error::FitError;
 
 use super::{signed, table};
 use crate::{Diagnosis, Finding, Verdict};

@@ -13,7 +13,7 @@ mod residuals;
 mod ring;
 mod vars;
 
-use crate::fit::FitError;
+use crate::error::FitError;
 
 use super::Diagnosis;
 use inference::recording::Recording;

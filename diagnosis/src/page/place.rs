@@ -3,7 +3,7 @@
 use twin::{Element, Ring, Thin};
 
 use super::signed;
-use crate::fit::FitError;
+use crate::error::FitError;
 use crate::place_scan::{Interval, PlaceScan};
 use crate::{Diagnosis, Finding, Verdict};
 use report::{Axes, Figure, Reference, Section, Series};

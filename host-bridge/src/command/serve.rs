@@ -82,7 +82,7 @@ fn feed(
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(options.model, ring, recording, &last, quality, timing))
+    deliver(&options.common, &FitResult::of_core(options.model.word(), ring, recording, &last, quality, timing))
 }
 
 /// A device uses the tables that it has, whatever their ring.

@@ -2,7 +2,6 @@
 
 use super::limit::in_milli;
 use super::{Recording, Row};
-use crate::campaign::{Drive, Settings};
 
 /// A key of the header, and what is wrong with its value.
 type Fault = (&'static str, String);
@@ -11,8 +10,10 @@ type Fault = (&'static str, String);
 const CONTRADICTS: f64 = 30.0;
 /// Largest kick that a corrector may make [rad]: a beam turned by more leaves the beam pipe.
 const LARGEST_KICK: f64 = 0.1;
-/// Change of a supply's strength from one frame to the next above which it was moved: ripple is 2e-4.
+/// Relative change of a supply's current between two frames above which it was moved: ripple is 2e-4.
 const MOVED: f64 = 1e-3;
+/// Difference of a corrector's read-backs in two frames of one setting, as a share of the largest read-back: they scatter by 1e-3.
+const SCATTER: f64 = 1e-2;
 /// Fewest differences of repeats that tell a monitor's noise.
 const ENOUGH: usize = 8;
 /// Median size of the difference of two numbers of a normal distribution of standard deviation 1: `sqrt(2)` times 0.6745.
@@ -23,9 +24,8 @@ const MEDIAN: f64 = 0.9539;
 /// # Errors
 /// The first one.
 pub(super) fn check(recording: &Recording) -> Result<(), Fault> {
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
     check_kick(recording)?;
-    check_noise(recording, &drives)
+    check_noise(recording)
 }
 
 fn check_kick(recording: &Recording) -> Result<(), Fault> {
@@ -41,8 +41,8 @@ fn check_kick(recording: &Recording) -> Result<(), Fault> {
 }
 
 /// The noise of a monitor in the middle of all, by repeats and by the header.
-fn check_noise(recording: &Recording, drives: &[Drive]) -> Result<(), Fault> {
-    let pairs = repeats(drives, &Settings::of(drives, recording.nominal_kick()));
+fn check_noise(recording: &Recording) -> Result<(), Fault> {
+    let pairs = repeats(&recording.rows);
     let noise = |(b, stated): (usize, &f64)| Some((noise_of(recording, &pairs, b)?, *stated));
     let mut all: Vec<(f64, f64)> = recording.header.noise.iter().enumerate().filter_map(noise).collect();
     all.sort_by(|one, other| (one.0 / one.1).total_cmp(&(other.0 / other.1)));
@@ -55,12 +55,19 @@ fn check_noise(recording: &Recording, drives: &[Drive]) -> Result<(), Fault> {
     Err(("bpm_sigma_mm", format!("{:?} mm, the repeats say {found} mm", in_milli(stated))))
 }
 
-/// Each frame with the last one before it of the same setting, supplies included.
-fn repeats(drives: &[Drive], settings: &Settings) -> Vec<[usize; 2]> {
-    let mut last = vec![None; settings.count];
-    let steady = |[before, here]: &[usize; 2]| (&drives[*here].strength - &drives[*before].strength).amax() < MOVED;
-    let pair = |(frame, setting): (usize, &Option<usize>)| Some([last[(*setting)?].replace(frame)?, frame]);
-    settings.of_frame.iter().enumerate().filter_map(pair).filter(steady).collect()
+/// Each frame with the last one before it that was driven alike, by the read-backs.
+fn repeats(rows: &[Row]) -> Vec<[usize; 2]> {
+    let largest = rows.iter().flat_map(|row| &row.corrector_current).fold(0.0, |most: f64, a| most.max(a.abs()));
+    let near = |one: &[f64], other: &[f64]| one.iter().zip(other).all(|(a, b)| (a - b).abs() <= SCATTER * largest);
+    let steady = |one: &[f64], other: &[f64]| one.iter().zip(other).all(|(a, b)| (a - b).abs() <= MOVED * b.abs());
+    let alike = |one: &Row, other: &Row| {
+        one.rf_offset == other.rf_offset
+            && near(&one.corrector_current, &other.corrector_current)
+            && steady(&one.supply, &other.supply)
+            && steady(one.dipole.as_slice(), other.dipole.as_slice())
+    };
+    let pair = |here: usize| Some([(0..here).rev().find(|&before| alike(&rows[before], &rows[here]))?, here]);
+    (1..rows.len()).filter_map(pair).collect()
 }
 
 /// Robust noise of a monitor [m]; none of one that has few repeats. Equal readings are those of a stuck one.

@@ -11,6 +11,7 @@ mod drift;
 mod drives;
 mod field;
 mod hold;
+mod linear;
 mod machine;
 mod mechanism;
 mod monitor;
