@@ -278,6 +278,12 @@ fn tunes_are_those_of_the_recorded_currents() {
     let (result, lattice) = (result.display().to_string(), lattice.display().to_string());
     let said = text(&["export", &result, "--as", "madx", "--out", &lattice]).replace('\n', " ");
     let written = std::fs::read_to_string(&lattice).unwrap();
+    let exported = json(&["export", &result, "--as", "madx", "--out", &lattice]);
+    assert_eq!((exported["file"].as_str(), exported["format"].as_str()), (Some(lattice.as_str()), Some("madx")));
+    let nominal = format!("{:.4} {:.4}", number(&exported["tunes"]["x"]), number(&exported["tunes"]["y"]));
+    let remark =
+        exported["remarks"].as_array().unwrap().iter().find_map(|remark| remark.as_str()?.split(": tunes ").nth(1));
+    assert!(remark.unwrap().starts_with(&nominal), "{exported}");
     for text in [said.as_str(), &written] {
         let tunes = format!("{:.4} {:.4}", number(&batch["tunes"]["x"]), number(&batch["tunes"]["y"]));
         assert!(text.contains("at the supplies' nominal currents: tunes "), "{text}");
