@@ -22,6 +22,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
+use inference::campaign::Settings;
 use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Recording;
 
@@ -34,14 +35,13 @@ pub const VALIDATED: f64 = 2.0;
 const FOLDS: usize = 5;
 
 /// One repeat of every setting in each fold.
-pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
+pub fn by_repeat(settings: &Settings) -> Vec<Fold> {
     let mut seen: BTreeMap<_, (usize, usize)> = BTreeMap::new();
     let mut folds = vec![Fold::new(); FOLDS];
-    for (i, row) in recording.rows.iter().enumerate() {
-        let set = row.correctors.iter().map(|(corrector, setting)| (*corrector, setting.to_bits()));
-        let key = (set.collect::<Vec<_>>(), row.rf_offset.to_bits());
-        let settings = seen.len();
-        let (setting, repeat) = seen.entry(key).or_insert((settings, 0));
+    for (i, setting) in settings.of_frame.iter().enumerate() {
+        let known = seen.len();
+        // a frame of no setting is one without repeats
+        let (setting, repeat) = seen.entry(setting.ok_or(i)).or_insert((known, 0));
         // settings begin in different folds, so that those without repeats are spread over all folds
         folds[(*setting + *repeat) % FOLDS].push(i);
         *repeat += 1;
@@ -50,7 +50,8 @@ pub fn by_repeat(recording: &Recording) -> Vec<Fold> {
     folds
 }
 
-/// All frames of every fifth corrector in each fold; frames in which several are set go with the first of them.
+/// All frames of every fifth corrector in each fold; frames in which several are set go with the first of them. None of a
+/// recording that names no correctors.
 pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
     let mut order: Vec<usize> = Vec::new();
     let mut folds = vec![Fold::new(); FOLDS];

@@ -74,13 +74,14 @@ impl Diagnosis {
     /// [`DataError`].
     pub fn of(ring: &Ring, recording: &Recording, mut progress: impl FnMut(&str)) -> Result<Self, DataError> {
         progress("reading");
-        let data = Data::of(&Campaign::of(ring, recording)?)?;
+        let campaign = Campaign::of(ring, recording)?;
+        let data = Data::of(&campaign)?;
         let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
         progress("searching");
         let found = Search::new(candidates).run(data)?;
         let data = &found.data;
         progress("held-out frames");
-        let folds = heldout::by_repeat(recording);
+        let folds = heldout::by_repeat(&campaign.settings);
         let before = Score::of(data, &found.null, &folds)?;
         let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
         let gains = verdict::gains(data, &found, &before, &after, &folds)?;
@@ -89,8 +90,8 @@ impl Diagnosis {
         progress("held-out correctors");
         let whole =
             !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
-        let correctors = if whole {
-            let folds = heldout::by_corrector(recording);
+        let folds = heldout::by_corrector(recording);
+        let correctors = if whole && !folds.is_empty() {
             let scored = |fitted| Score::of(data, fitted, &folds).ok();
             scored(&found.null).zip(scored(&found.best))
         } else {
@@ -125,5 +126,27 @@ impl Diagnosis {
     /// Gain of held-out log predictive density by all effects, and its standard error.
     pub fn gain(&self) -> (f64, f64) {
         if self.found.competitions.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    /// A recording of format 2 need not name the correctors that were set: held-out settings are those of the read-backs, and no
+    /// corrector is held out.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn without_names_of_correctors_none_is_held_out() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
+        let ring = Ring::read(&folder.join("ring.json")).unwrap();
+        let mut recording = Recording::read(&folder.join("gain"), &ring).unwrap();
+        let named = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        recording.rows.iter_mut().for_each(|row| row.correctors.clear());
+        let unnamed = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        assert!(named.correctors.is_some() && unnamed.correctors.is_none());
+        assert!(named.gain().0 > 10.0 && (unnamed.gain().0 / named.gain().0 - 1.0).abs() < 1e-6);
     }
 }

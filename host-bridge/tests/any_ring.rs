@@ -66,6 +66,26 @@ fn check_says_what_is_there_and_what_can_be_done() {
     assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
 }
 
+/// Every frame moves two correctors in a way of its own, as a feedback does.
+#[test]
+fn frames_that_nothing_repeats_are_no_settings() {
+    let home = tempfile::tempdir().unwrap();
+    let row = core::cell::Cell::new(0);
+    let current = |step: i32| format!("{:.4}", 0.3 * 1.2f64.powi(step));
+    let folder = edited(home.path(), |column, cell| match column {
+        "seq" => {
+            row.set(cell.parse().unwrap());
+            cell.to_owned()
+        }
+        "ic_01F_A" => current(row.get() % 11),
+        "ic_02F_A" => current(row.get() / 11),
+        _ if column.starts_with("ic_") => "0.0000".into(),
+        _ => cell.to_owned(),
+    });
+    let settings = &json(&["check", folder.to_str().unwrap()])["settings"];
+    assert_eq!((number(&settings["count"]), number(&settings["repeats"][0])), (0.0, 0.0));
+}
+
 #[test]
 fn stream_and_batch_fit_agree_and_stand_beside_the_measured_tunes() {
     let stream = json(&["replay", PLAIN, "--no-publish"]);
@@ -263,6 +283,12 @@ fn tunes_are_those_of_the_recorded_currents() {
     let (result, lattice) = (result.display().to_string(), lattice.display().to_string());
     let said = text(&["export", &result, "--as", "madx", "--out", &lattice]).replace('\n', " ");
     let written = std::fs::read_to_string(&lattice).unwrap();
+    let exported = json(&["export", &result, "--as", "madx", "--out", &lattice]);
+    assert_eq!((exported["file"].as_str(), exported["format"].as_str()), (Some(lattice.as_str()), Some("madx")));
+    let nominal = format!("{:.4} {:.4}", number(&exported["tunes"]["x"]), number(&exported["tunes"]["y"]));
+    let remark =
+        exported["remarks"].as_array().unwrap().iter().find_map(|remark| remark.as_str()?.split(": tunes ").nth(1));
+    assert!(remark.unwrap().starts_with(&nominal), "{exported}");
     for text in [said.as_str(), &written] {
         let tunes = format!("{:.4} {:.4}", number(&batch["tunes"]["x"]), number(&batch["tunes"]["y"]));
         assert!(text.contains("at the supplies' nominal currents: tunes "), "{text}");

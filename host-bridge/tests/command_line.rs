@@ -68,6 +68,7 @@ fn outputs_are_checked_before_work_starts() {
         ("--report", &["diagnose", "/nowhere"]),
         ("--model-out", &["diagnose", "/nowhere"]),
         ("--json", &["response"]),
+        ("--json", &["export", "/nowhere", "--as", "madx"]),
         ("--json", &["surrogate", "check"]),
     ] {
         let output = orbitcal(&[command, &[option, "/nonexistent/a"]].concat());

@@ -115,8 +115,12 @@ impl Reduced {
 
     /// Number of frames that repeat each frame's setting, itself included.
     fn repeats(&self) -> Vec<usize> {
-        let rows = &self.campaign.recording.rows;
-        rows.iter().map(|row| rows.iter().filter(|other| row.repeats(other)).count()).collect()
+        let of_frame = &self.campaign.settings.of_frame;
+        let repeats = |setting: &Option<usize>| match setting {
+            Some(_) => of_frame.iter().filter(|other| *other == setting).count(),
+            None => 1,
+        };
+        of_frame.iter().map(repeats).collect()
     }
 
     /// The forms of all monitors beside tunes and circuits.
@@ -258,5 +262,32 @@ impl Form {
             self.moment.axpy(-pull / weight, slope, 1.0);
             self.square -= pull * pull / weight;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use twin::Ring;
+
+    use super::*;
+    use crate::recording::Recording;
+
+    /// A recording of format 2 need not name the correctors that were set.
+    #[test]
+    fn frames_repeat_each_other_by_their_read_backs() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
+        let ring = Ring::read(&folder.join("ring.json")).unwrap();
+        let mut recording = Recording::read(&folder.join("plain"), &ring).unwrap();
+        let repeats = |recording: &Recording| {
+            let campaign = Campaign::of(&ring, recording).unwrap();
+            let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
+            Reduced::of(campaign, fit).unwrap().repeats()
+        };
+        let named = repeats(&recording);
+        recording.rows.iter_mut().for_each(|row| row.correctors.clear());
+        assert_eq!(repeats(&recording), named);
+        assert_eq!(named.iter().max(), Some(&40)); // the frames without a kick
     }
 }

@@ -43,7 +43,7 @@ struct CheckResult {
 /// What was asked of the machine.
 #[derive(Debug, Serialize)]
 struct Settings {
-    /// Different ones, by read-back.
+    /// Different ones, by read-back; several things moved at once are one only where a frame repeats them.
     count: usize,
     /// Frames of a setting: fewest, median and most.
     repeats: [usize; 3],
@@ -145,7 +145,7 @@ impl Settings {
         offsets.sort_by(f64::total_cmp);
         offsets.dedup();
         Self {
-            count: campaign.settings.count,
+            count: repeats.len(),
             repeats: [at(0), at(repeats.len() / 2), at(repeats.len().saturating_sub(1))],
             correctors: [names.len() - unused.len(), names.len()],
             unused: unused.into_iter().map(|c| names[c].clone()).collect(),

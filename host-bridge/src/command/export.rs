@@ -1,31 +1,68 @@
 //! `orbitcal export`: the calibrated ring as a lattice file of another code.
 
-use std::path::Path;
+use core::fmt;
+use std::path::{Path, PathBuf};
 
-use super::{CommandError, check_outputs, machine};
-use crate::cli::Export;
+use serde::Serialize;
+
+use super::{CommandError, check_outputs, deliver, machine};
+use crate::cli::{Export, Format};
 use crate::export::{self, Calibration, ExportError, Lattice};
 use crate::output;
+use crate::result::Tunes;
+
+/// What was written. Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+struct ExportResult<'l> {
+    file: PathBuf,
+    format: Format,
+    machine: &'l str,
+    elements: usize,
+    /// At the supplies' nominal currents; none without a stable ring.
+    tunes: Option<Tunes>,
+    remarks: &'l [String],
+}
 
 /// Run it.
 ///
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Export) -> Result<(), CommandError> {
-    check_outputs([Some(options.out.as_path())])?;
-    let ring = machine(options.machine.as_deref())?;
+    let (out, json) = (options.out.as_path(), options.common.json.as_deref());
+    let to_stdout = out == Path::new("-");
+    if to_stdout && json == Some(out) {
+        return Err(CommandError::Input("--json - needs --out FILE: both would go to stdout".into()));
+    }
+    check_outputs([Some(out), json])?;
+    let ring = machine(options.common.machine.as_deref())?;
     let input = |error: ExportError| CommandError::Input(error.to_string());
     let calibration = Calibration::read(&options.result).map_err(|error| input(error.into()))?;
     let lattice = Lattice::of(&ring, &calibration, &options.result).map_err(input)?;
-    let text = export::text(&lattice, options.format);
-    if options.out == Path::new("-") {
-        return Ok(output::say(text.trim_end())?);
+    let (text, result) = (export::text(&lattice, options.format), ExportResult::of(&lattice, options));
+    if to_stdout {
+        output::say(text.trim_end())?;
+        return Ok(json.map_or(Ok(()), |path| output::json(path, &result))?);
     }
-    output::bytes(&options.out, text.as_bytes())?;
-    if !options.quiet {
-        let remarks: Vec<String> = lattice.remarks.iter().map(|remark| output::fill(remark)).collect();
-        output::say(remarks.join("\n"))?;
-        output::say(format_args!("{}: {} elements", options.out.display(), lattice.elements.len()))?;
+    output::bytes(out, text.as_bytes())?;
+    deliver(&options.common, &result)
+}
+
+impl<'l> ExportResult<'l> {
+    fn of(lattice: &'l Lattice, options: &Export) -> Self {
+        Self {
+            file: options.out.clone(),
+            format: options.format,
+            machine: &lattice.machine,
+            elements: lattice.elements.len(),
+            tunes: lattice.tunes.map(|[x, y]| Tunes { x, y }),
+            remarks: &lattice.remarks,
+        }
     }
-    Ok(())
+}
+
+impl fmt::Display for ExportResult<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.remarks.iter().try_for_each(|remark| writeln!(f, "{}", output::fill(remark)))?;
+        write!(f, "{}: {} elements", self.file.display(), self.elements)
+    }
 }

@@ -27,6 +27,8 @@ pub struct Lattice {
     pub monitors: Vec<Channel>,
     /// Planes of correctors: horizontal in beam order, then vertical.
     pub correctors: Vec<Channel>,
+    /// Tunes at the supplies' nominal currents, x and y; none without a stable ring.
+    pub tunes: Option<[f64; 2]>,
     /// Where the strengths come from, what was found, and what of it no element carries; one sentence each.
     pub remarks: Vec<String>,
 }
@@ -93,7 +95,7 @@ impl Lattice {
         let mut lattice = Self::plain(machine.ring());
         let version = env!("CARGO_PKG_VERSION");
         lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));
-        lattice.remarks.extend(result.tunes.map(|measured| currents(machine.ring(), measured)));
+        lattice.remarks.extend(result.tunes.map(|measured| currents(lattice.tunes, measured)));
         for (effect, (_, sentence)) in effects.iter().zip(&result.findings) {
             let included = lattice.apply(effect);
             lattice.remarks.push(format!("{}: {sentence}", if included { "found" } else { "found, not in this file" }));
@@ -143,6 +145,7 @@ impl Lattice {
             elements,
             monitors,
             correctors,
+            tunes: tunes(ring),
             remarks,
         }
     }
@@ -210,14 +213,17 @@ impl Lattice {
     }
 }
 
+fn tunes(ring: &Ring) -> Option<[f64; 2]> {
+    let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
+    Some([tunes.x, tunes.y])
+}
+
 /// At which currents the strengths hold, and what that makes of the tunes; `measured_at` are those at the recording's mean currents.
-fn currents(ring: &Ring, measured_at: [f64; 2]) -> String {
+fn currents(tunes: Option<[f64; 2]>, measured_at: [f64; 2]) -> String {
     let words = |[x, y]: [f64; 2]| format!("{x:.4} {y:.4}");
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 });
-    let tunes = optics.and_then(|optics| optics.tunes()).map(|tunes| words([tunes.x, tunes.y]));
     format!(
         "strengths are those at the supplies' nominal currents: tunes {}; at the recording's mean currents {}",
-        tunes.unwrap_or_else(|_| "of no stable ring".into()),
+        tunes.map_or_else(|| "of no stable ring".into(), words),
         words(measured_at)
     )
 }

@@ -41,11 +41,6 @@ pub struct Row {
 }
 
 impl Row {
-    /// True if two rows ask for the same: correctors, settings and RF frequency.
-    pub fn repeats(&self, other: &Self) -> bool {
-        self.correctors == other.correctors && self.rf_offset == other.rf_offset
-    }
-
     /// The setting of a corrector, if it was set [A].
     pub fn setting(&self, corrector: usize) -> Option<f64> {
         self.correctors.iter().find(|(c, _)| *c == corrector).map(|(_, setting)| *setting)
