@@ -220,7 +220,7 @@ mod tests {
             result.unwrap_err().to_string()
         };
         assert_eq!(
-            message(r#"{"tunes": 1}"#),
+            message(r#"{"tunes": {"x": 4.83, "y": 4.68}}"#),
             "fit.json: expected vars, as fit and replay write them, or vars_after of diagnose; found neither"
         );
         assert_eq!(
