@@ -25,12 +25,12 @@ struct Calibrated<'r> {
     sigma: (Vec<Twiss>, Tunes),
 }
 
-/// The report.
+/// The report, at `ln` of the supplies' factors [F] at which the tunes were measured.
 ///
 /// # Errors
 /// [`OrbitError`] where the design or the calibrated ring has no stable motion.
-pub fn page(ring: &Ring, result: &FitResult) -> Result<Page, OrbitError> {
-    let calibrated = Calibrated::of(ring, result)?;
+pub fn page(ring: &Ring, supplies: &[f64], result: &FitResult) -> Result<Page, OrbitError> {
+    let calibrated = Calibrated::of(ring, supplies, result)?;
     Ok(Page {
         title: format!("{}: optics from {}", ring.name, result.recording),
         lead: calibrated.lead(),
@@ -46,10 +46,10 @@ pub fn page(ring: &Ring, result: &FitResult) -> Result<Page, OrbitError> {
 }
 
 impl<'r> Calibrated<'r> {
-    fn of(ring: &'r Ring, result: &'r FitResult) -> Result<Self, OrbitError> {
+    fn of(ring: &'r Ring, supplies: &[f64], result: &'r FitResult) -> Result<Self, OrbitError> {
         let means: Vec<f64> = result.vars.iter().map(|var| var.mean).collect();
         let params: Vec<f64> = means.iter().map(|mean| mean.ln()).collect();
-        let optics = CalibratedOptics::of(ring, &params, &[])?;
+        let optics = CalibratedOptics::of(ring, &params, supplies)?;
         // result.covariance is that of the factors
         let of_params = |i: usize, j: usize| result.covariance[i][j] / (means[i] * means[j]);
         let sigma = optics.sigma(&DMatrix::from_fn(means.len(), means.len(), of_params));
@@ -90,7 +90,9 @@ impl<'r> Calibrated<'r> {
             ]
         };
         let header = ["plane", "design", "calibrated", "less design", "measured"].map(str::to_owned).to_vec();
-        let caption = "Tunes with their integer part; errors are standard deviations.".into();
+        let caption = "Tunes with their integer part, calibrated ones at the recording's mean supply currents; errors are standard \
+                       deviations."
+            .into();
         let measured = self.result.tunes_measured;
         let rows = vec![row("x", |t| t.x, measured.x), row("y", |t| t.y, measured.y)];
         Section { heading: "Tunes".into(), tables: vec![Table { caption, header, rows }], ..Section::default() }

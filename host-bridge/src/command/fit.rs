@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use indicatif::ProgressBar;
+use inference::campaign::supplies_of;
 use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use twin::Ring;
@@ -25,7 +26,7 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
         Method::Nuts => by_draws(options, &ring, &recording)?,
     };
     if let Some(path) = &options.report {
-        let page = fit_page::page(&ring, &result);
+        let page = fit_page::page(&recording.powered(&ring), &supplies_of(&recording), &result);
         let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
         output::bytes(path, page.render().as_bytes())?;
     }

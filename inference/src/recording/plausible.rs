@@ -1,5 +1,7 @@
 //! Numbers of a header that its frames contradict by so much that they are errors of the header, not faults of the machine.
 
+use std::collections::HashMap;
+
 use super::limit::in_milli;
 use super::{Recording, Row};
 
@@ -12,7 +14,7 @@ const CONTRADICTS: f64 = 30.0;
 const LARGEST_KICK: f64 = 0.1;
 /// Relative change of a supply's current between two frames above which it was moved: ripple is 2e-4.
 const MOVED: f64 = 1e-3;
-/// Difference of a corrector's read-backs in two frames of one setting, as a share of the largest read-back: they scatter by 1e-3.
+/// Step in which a corrector's read-back is taken, as a share of the largest one: in one setting they scatter by 1e-3.
 const SCATTER: f64 = 1e-2;
 /// Fewest differences of repeats that tell a monitor's noise.
 const ENOUGH: usize = 8;
@@ -58,16 +60,16 @@ fn check_noise(recording: &Recording) -> Result<(), Fault> {
 /// Each frame with the last one before it that was driven alike, by the read-backs.
 fn repeats(rows: &[Row]) -> Vec<[usize; 2]> {
     let largest = rows.iter().flat_map(|row| &row.corrector_current).fold(0.0, |most: f64, a| most.max(a.abs()));
-    let near = |one: &[f64], other: &[f64]| one.iter().zip(other).all(|(a, b)| (a - b).abs() <= SCATTER * largest);
+    let steps = |current: &f64| (current / (SCATTER * largest)).round() as i64;
+    let drive = |row: &Row| (row.rf_offset.to_bits(), row.corrector_current.iter().map(steps).collect::<Vec<_>>());
     let steady = |one: &[f64], other: &[f64]| one.iter().zip(other).all(|(a, b)| (a - b).abs() <= MOVED * b.abs());
-    let alike = |one: &Row, other: &Row| {
-        one.rf_offset == other.rf_offset
-            && near(&one.corrector_current, &other.corrector_current)
-            && steady(&one.supply, &other.supply)
-            && steady(one.dipole.as_slice(), other.dipole.as_slice())
+    let is_steady = |[before, here]: &[usize; 2]| {
+        let (before, here) = (&rows[*before], &rows[*here]);
+        steady(&before.supply, &here.supply) && steady(before.dipole.as_slice(), here.dipole.as_slice())
     };
-    let pair = |here: usize| Some([(0..here).rev().find(|&before| alike(&rows[before], &rows[here]))?, here]);
-    (1..rows.len()).filter_map(pair).collect()
+    let mut last = HashMap::new();
+    let pair = |(here, row): (usize, &Row)| Some([last.insert(drive(row), here)?, here]);
+    rows.iter().enumerate().filter_map(pair).filter(is_steady).collect()
 }
 
 /// Robust noise of a monitor [m]; none of one that has few repeats. Equal readings are those of a stuck one.
