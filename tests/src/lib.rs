@@ -1,7 +1,9 @@
 //! What the system tests share: where the repository's files lie, and the truth behind its recordings.
 
+pub mod machine;
 pub mod qemu;
 pub mod sil;
+pub mod soak;
 
 use std::path::{Path, PathBuf};
 

@@ -1,55 +1,18 @@
 //! The core with bytes that are no frame, frames that no machine sends, settings that never repeat, and a monitor that falls
 //! silent.
 
-use estimator::booster::{self, CORRECTORS, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, Setup};
+use estimator::booster::{self, Frame};
 use estimator::{
-    CurrentCode, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, MonitorState, PositionCode,
-    Prior, RfCode, Surrogate, TuneCode,
+    CurrentCode, FrameError, IngestError, IntensityCode, MagnetCurrents, Mask, MonitorState, PositionCode, Prior,
+    RfCode, TuneCode,
 };
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
-use nalgebra::{DMatrix, DVector};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
+use system_tests::machine::{ALL, LAYOUT, Machine, Random, nees, wire_of};
 use system_tests::{repository, truth};
 use twin::Ring;
-
-/// A Booster in a core of its size.
-const LAYOUT: Layout = Layout { ring: booster::SIZES, room: booster::SIZES };
-
-/// Random numbers, seeded. Source: G. Marsaglia, Xorshift RNGs, J. Stat. Softw. 8 (2003) 14.
-struct Random(u64);
-
-impl Random {
-    fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1)
-    }
-
-    fn bits(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.bits() >> 16) as usize % n
-    }
-
-    fn byte(&mut self) -> u8 {
-        (self.bits() >> 24) as u8
-    }
-
-    fn uniform(&mut self) -> f64 {
-        (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    /// A standard normal number, by Box and Muller.
-    fn normal(&mut self) -> f64 {
-        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        radius * (core::f64::consts::TAU * self.uniform()).cos()
-    }
-}
 
 fn paper_vars() -> (Ring, Recording) {
     let ring = Ring::booster();
@@ -68,9 +31,6 @@ type Body<'a> = (u32, u64, u32, &'a [i32], i32, &'a [i32], i32, &'a [i32], [Opti
 
 /// Currents of the main supplies in a frame that would be good.
 const MAGNETS: (i32, [i32; 2]) = (23_997_850, [17_997_850; 2]);
-/// All monitors are valid.
-const ALL: [u32; 2] = [u32::MAX, 1];
-
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// A frame of any version and body whose length and CRC are right.
@@ -98,13 +58,6 @@ fn plain(wire: &[u8]) -> Vec<u8> {
 
 fn serialised(body: &Body) -> Vec<u8> {
     postcard::to_slice(body, &mut [0; 4096]).unwrap().to_vec()
-}
-
-fn wire_of(frame: &Frame) -> Vec<u8> {
-    let mut wire = vec![0; Frame::MAX_WIRE_BYTES];
-    let n = frame.encode(&LAYOUT, &mut wire).unwrap();
-    wire.truncate(n);
-    wire
 }
 
 /// A frame that would be good but for the lengths of its lists.
@@ -481,97 +434,14 @@ fn extreme_frames_leave_every_estimate_sound() {
 
 // ---- Settings that never repeat ----
 
-/// A machine of known vars that steers with several correctors at once.
-struct Machine {
-    surrogate: Box<Green>,
-    setup: Setup,
-    at: Box<<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised>,
-    prediction: Box<Prediction>,
-    params: [f32; 48],
-    offset: [f64; 33],
-    random: Random,
-}
-
-impl Machine {
-    /// Vars drawn from the prior.
-    fn drawn(core: &Core, seed: u64) -> Self {
-        let mut random = Random::new(seed);
-        let prior = core.prior(0);
-        let mut surrogate = Box::new(Green::BLANK);
-        core.tables.fill(&mut *surrogate).unwrap();
-        let mut theta = || loop {
-            let theta = prior.mean + prior.sigma * random.normal() as f32;
-            if (prior.lower..=prior.upper).contains(&theta) {
-                return theta;
-            }
-        };
-        Self {
-            surrogate,
-            setup: core.setup.in_room(&LAYOUT),
-            at: Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED),
-            prediction: Box::new(Prediction::BLANK),
-            params: core::array::from_fn(|_| theta()),
-            offset: core::array::from_fn(|_| 2e-3 * random.normal()),
-            random,
-        }
-    }
-
-    /// Let every param walk.
-    fn walk(&mut self, sigma: f32) {
-        self.params.iter_mut().for_each(|theta| *theta += sigma * self.random.normal() as f32);
-    }
-
-    /// A cycle with five correctors of 5 to 22 A; the readings are the surrogate's, and noise.
-    fn cycle(&mut self, sequence: u32) -> Frame {
-        let mut corrector = [CurrentCode::default(); 48];
-        let mut powered = 0;
-        while powered < 5 {
-            let c = self.random.below(48);
-            if corrector[c] == CurrentCode::default() {
-                let sign = if self.random.below(2) == 0 { 1.0 } else { -1.0 };
-                corrector[c] = CurrentCode::nearest(sign * (5.0 + 17.0 * self.random.uniform())).unwrap();
-                powered += 1;
-            }
-        }
-        let current = |a: f32| CurrentCode::nearest(f64::from(a)).unwrap();
-        let calibration = &self.setup.calibration;
-        let supply = [0, 1].map(|f| current(calibration.supplies[f].nominal));
-        let magnets = MagnetCurrents { dipole: current(calibration.dipole.unwrap()), supply };
-        let mut frame = Frame {
-            sequence,
-            time_us: 100_000 * u64::from(sequence),
-            cycle_time_us: 92_000,
-            corrector,
-            magnets,
-            rf_offset: RfCode::default(),
-            reading: [PositionCode::default(); 33],
-            tune: [None; 2],
-            intensity: None,
-            valid: Mask::from_words(&ALL),
-        };
-        let surrogate = &*self.surrogate;
-        let linearise = Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise;
-        linearise(surrogate, &self.params, &[0.0; SUPPLIES], &mut self.at).unwrap();
-        self.surrogate.predict(&self.at, &self.setup.calibration.drive(&frame).unwrap(), &mut self.prediction);
-        for b in 0..MONITORS {
-            let noise = f64::from(self.setup.noise.of(b)) * self.random.normal();
-            let position = f64::from(self.prediction.reading[b]) + self.offset[b] + noise;
-            frame.reading[b] = PositionCode::nearest(position).unwrap();
-        }
-        frame
-    }
-}
-
 fn ingest(core: &mut Core, frame: &Frame) -> Estimate {
     core.prepare();
     core.ingest(&mut wire_of(frame)).unwrap()
 }
 
-/// Normalised estimation error squared of the params.
-fn nees(core: &Core, estimate: &Estimate, params: &[f64]) -> f64 {
-    let error = DVector::from_fn(48, |i, _| f64::from(estimate.map_params[i]) - params[i]);
-    let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
-    (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0]
+/// Estimated less true params.
+fn errors(estimate: &Estimate, params: &[f32]) -> [f64; 48] {
+    core::array::from_fn(|i| f64::from(estimate.map_params[i] - params[i]))
 }
 
 /// Sum of NEES over machines, and mean NIS per reading, at the end of a stream of frames that belong to no setting.
@@ -592,7 +462,7 @@ fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
             readings += estimate.readings() as f64;
             last = Some(estimate);
         }
-        total += nees(&core, &last.unwrap(), &machine.params.map(f64::from));
+        total += nees(&errors(&last.unwrap(), &machine.params), |i, j| core.covariance(i, j));
     }
     (total, nis / readings)
 }
@@ -669,8 +539,8 @@ fn a_silent_monitor_is_dead_until_it_reports() {
     let last = last.unwrap();
     assert!(last.accepted[monitor], "it is used again");
     // and the others find the vars
-    let params: Vec<f64> = truth("recordings/paper-vars", &ring).iter().map(|var| var.ln()).collect();
-    let nees = nees(&core, &last, &params) / 48.0;
+    let params: Vec<f32> = truth("recordings/paper-vars", &ring).iter().map(|var| var.ln() as f32).collect();
+    let nees = nees(&errors(&last, &params), |i, j| core.covariance(i, j)) / 48.0;
     // 48 correlated directions: 0.6..1.5 is the 99 % range of chi-square with 48 degrees over 48
     assert!((0.6..1.5).contains(&nees), "NEES/48 {nees:.2}");
 }
