@@ -309,9 +309,9 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
     }
 
     /// Sum of squared deviations of a monitor's repeats from their means [m^2].
-    pub fn scatter(&self, b: usize) -> f32 {
-        let step = PositionCode::METRES_PER_LSB;
-        self.scatter.get(b).map_or(0.0, |&s| s as f32 * step * step)
+    pub fn scatter(&self, b: usize) -> f64 {
+        let step = f64::from(PositionCode::METRES_PER_LSB);
+        self.scatter.get(b).map_or(0.0, |&s| s as f64 * step * step)
     }
 
     /// Mean strength over all frames: where the supplies really stand.

@@ -14,13 +14,12 @@ use serde::{Deserialize, Serialize};
 use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive, Each};
 use crate::estimate::Estimate;
-use crate::gaussian::{Gaussian, Solution};
+use crate::gaussian::{Gaussian, Independent, Solution};
 use crate::linear::column;
 use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor};
 use crate::prior::Prior;
 use crate::sizes::Layout;
-use crate::sum::Sum;
 use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
 use crate::wire::{Frame, FrameError, PositionCode};
@@ -112,7 +111,7 @@ pub struct Estimator<
     campaign: Campaign<B, C, F, S>,
     gaussian: Gaussian<K, N, T>,
     /// The prior, and frames that belong to no setting and are not recent: they cannot be linearised anew.
-    loose: Gaussian<K, N, T>,
+    loose: Gaussian<K, N, T, Independent<K>>,
     /// The last frames that belong to no setting.
     recent: Deque<Loose<B, C, F, W>, RECENT>,
     solution: Solution<N, T, W>,
@@ -121,7 +120,7 @@ pub struct Estimator<
     /// RF offset of the frame at hand.
     rf_offset: f32,
     /// Sum of NIS, and the number of readings in it.
-    nis: (Sum, u32),
+    nis: (f64, u64),
     /// Frames without a setting in a row that surprised all over.
     surprises: u32,
     /// The past has to be weighted anew.
@@ -202,7 +201,7 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Loose<B, C,
 /// the params are uncertain, so is the linearisation.
 ///
 /// Source: W. M. Lear's underweighting; R. Zanetti, K. DeMars and R. Bishop, J. Guid. Control Dyn. 33 (2010) 1670.
-const UNDERWEIGHT: f32 = 0.2;
+const UNDERWEIGHT: f64 = 0.2;
 
 impl<
     G: Surrogate<B, C, F, N>,
@@ -239,7 +238,7 @@ impl<
         solution: Solution::BLANK,
         orbit: [0.0; 2],
         rf_offset: 0.0,
-        nis: (Sum::ZERO, 0),
+        nis: (0.0, 0),
         surprises: 0,
         stale: false,
     };
@@ -254,7 +253,7 @@ impl<
         model.surrogate.linearise(&[0.0; N], &[0.0; F], &mut self.linearised)?;
         (self.last_sequence, self.prepared, self.frames, self.rejected_frames) = (None, true, 0, 0);
         (self.supplies, self.orbit, self.rf_offset) = ([0.0; F], [0.0; 2], 0.0);
-        (self.nis, self.surprises, self.stale, self.news) = ((Sum::ZERO, 0), 0, false, false);
+        (self.nis, self.surprises, self.stale, self.news) = ((0.0, 0), 0, false, false);
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
             monitor.expect(model.setup.noise.of(b));
         }
@@ -264,7 +263,7 @@ impl<
         let calibration = model.setup.tune_calibration.unwrap_or(1.0);
         self.loose
             .reset(|i| prior_of::<G, B, C, F, N>(model, i), |channel| if channel < B { BASELINE } else { calibration });
-        self.gaussian.clone_from(&self.loose);
+        self.gaussian.copy(&self.loose);
         self.gaussian.recentre(&[0.0; N]);
         self.solve(model);
         self.started = true;
@@ -462,22 +461,16 @@ impl<
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
             let (innovation, variance) = self.news_of(model, b, self.innovation(b, code), cell);
             let slope = column(self.prediction.jacobian.as_slice(), N, b);
-            let own = if linearised_once {
-                UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(b, slope).0)
-            } else {
-                0.0
-            };
-            self.gaussian.condition(b, innovation, variance + own, slope);
+            let own = |d: &[f64; N]| if linearised_once { UNDERWEIGHT * self.solution.variance_of(d) } else { 0.0 };
+            self.gaussian.condition(b, innovation, variance, slope, own);
         }
         self.condition_tunes(model, screened);
-        self.gaussian.settle();
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
         self.solve(model);
         let nis = self.solution.cost - before;
-        self.nis.0.add(nis);
-        self.nis.1 = self.nis.1.saturating_add(screened.count());
-        nis
+        self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
+        nis as f32
     }
 
     /// Add the tunes that passed.
@@ -487,12 +480,8 @@ impl<
             let variance = self.tunes.get(plane).and_then(TuneMeter::variance);
             if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
                 let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
-                let own = if linearised_once {
-                    UNDERWEIGHT * self.solution.variance_of(&self.gaussian.effective(B + plane, &slope).0)
-                } else {
-                    0.0
-                };
-                self.gaussian.condition(B + plane, *innovation, variance + own, &slope);
+                let own = |d: &[f64; N]| if linearised_once { UNDERWEIGHT * self.solution.variance_of(d) } else { 0.0 };
+                self.gaussian.condition(B + plane, *innovation, variance, &slope, own);
             }
         }
     }
@@ -514,11 +503,9 @@ impl<
             for b in (0..B).filter(|b| oldest.accepted.has(*b)) {
                 let variance = self.variance(model, b, 1, oldest.drive.rf_offset);
                 let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let own = UNDERWEIGHT * self.solution.variance_of(&self.loose.effective(b, slope).0);
                 let innovation = oldest.innovation(b, &self.prediction.reading);
-                self.loose.condition(b, innovation, variance + own, slope);
+                self.loose.condition(b, innovation, variance, slope, |d| UNDERWEIGHT * self.solution.variance_of(d));
             }
-            self.loose.settle();
         }
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left
@@ -562,7 +549,7 @@ impl<
             restarted: screened.restarted,
             tune_innovation: screened.tune,
             setting: cell,
-            log_evidence: solution.log_evidence,
+            log_evidence: solution.log_evidence as f32,
             linearised,
             health: core::array::from_fn(|b| self.monitors.get(b).map(Monitor::health).unwrap_or_default()),
         };
@@ -581,7 +568,7 @@ impl<
     fn centre(&self, i: usize) -> f32 {
         let clipped = self.solution.clipped.has(i);
         let origin = self.gaussian.origin().get(i).copied().unwrap_or(0.0);
-        let unbounded = origin + self.solution.delta.get(i).copied().unwrap_or(0.0);
+        let unbounded = (f64::from(origin) + self.solution.delta.get(i).copied().unwrap_or(0.0)) as f32;
         if clipped { unbounded } else { self.solution.map_params.get(i).copied().unwrap_or(unbounded) }
     }
 
@@ -592,7 +579,7 @@ impl<
 
     /// Covariance of two params `theta = ln var`.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
-        if i < N && j < N { self.solution.covariance(i, j) } else { 0.0 }
+        if i < N && j < N { self.solution.covariance(i, j) as f32 } else { 0.0 }
     }
 }
 

@@ -21,7 +21,6 @@ mod monitor;
 mod prior;
 mod sizes;
 mod stream;
-mod sum;
 pub mod surrogate;
 mod triangle;
 mod tune;

@@ -1,20 +1,37 @@
-//! The loops that everything else is made of, over plain slices. Sums run in a fixed order, so that host and chip agree
-//! to the bit.
+//! The loops that everything else is made of, over plain slices: in single precision for the surrogate, in double for sums
+//! that grow with every frame. Sums run in a fixed order, so that host and chip agree to the bit.
+
+use core::iter::Sum;
+use core::ops::{Add, AddAssign, Mul};
 
 use nalgebra::{ArrayStorage, SMatrix};
 
+/// `f32` or `f64`.
+pub trait Real: Copy + PartialEq + Add<Output = Self> + AddAssign + Mul<Output = Self> + Sum + 'static {
+    /// 0.
+    const ZERO: Self;
+}
+
+impl Real for f32 {
+    const ZERO: Self = 0.0;
+}
+
+impl Real for f64 {
+    const ZERO: Self = 0.0;
+}
+
 /// `to += factor * from`.
 #[inline]
-pub fn add(to: &mut [f32], factor: f32, from: &[f32]) {
-    to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * from);
+pub fn add<R: Real>(to: &mut [R], factor: R, from: &[R]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * *from);
 }
 
 /// `to += sum of factor * row`, four rows at a time.
 #[inline]
-pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>) {
+pub fn combine<'r, R: Real>(to: &mut [R], terms: impl Iterator<Item = (R, &'r [R])>) {
     let mut terms = terms.fuse();
     while let Some((factor, first)) = terms.next() {
-        let (mut factors, mut rows) = ([factor, 0.0, 0.0, 0.0], [first; 4]);
+        let (mut factors, mut rows) = ([factor, R::ZERO, R::ZERO, R::ZERO], [first; 4]);
         for ((factor, row), term) in factors.iter_mut().zip(&mut rows).skip(1).zip(&mut terms) {
             (*factor, *row) = term;
         }
@@ -25,7 +42,7 @@ pub fn combine<'r>(to: &mut [f32], terms: impl Iterator<Item = (f32, &'r [f32])>
 /// `to += sum of factor * row`, all four in one pass: the cost is in loads and stores of `to`. Rows are at least as long;
 /// entries beyond the end of `to` are ignored.
 #[inline(never)]
-pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
+pub fn add_four<R: Real>(to: &mut [R], factors: [R; 4], rows: [&[R]; 4]) {
     // one length for all, so that the loop below has no bounds to check and becomes vector code
     let n = to.len();
     let [first, second, third, fourth] = rows.map(|row| row.get(..n));
@@ -39,13 +56,13 @@ pub fn add_four(to: &mut [f32], factors: [f32; 4], rows: [&[f32]; 4]) {
 /// [`add_four`] for two at a time: loads of the rows are shared. The few entries of the longer beyond the other's end are
 /// added separately.
 #[inline(never)]
-pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
+pub fn add_four_twice<R: Real>(to: [&mut [R]; 2], factors: [[R; 4]; 2], rows: [&[R]; 4]) {
     let [one, other] = to;
     let n = one.len().min(other.len());
     for (to, factors) in [&mut *one, &mut *other].into_iter().zip(factors) {
         for (i, to) in to.iter_mut().enumerate().skip(n) {
             let terms = rows.iter().zip(factors);
-            *to = terms.fold(*to, |sum, (row, factor)| sum + factor * row.get(i).copied().unwrap_or(0.0));
+            *to = terms.fold(*to, |sum, (row, factor)| sum + factor * row.get(i).copied().unwrap_or(R::ZERO));
         }
     }
     two_by_four(one.get_mut(..n).unwrap_or_default(), other.get_mut(..n).unwrap_or_default(), factors, rows);
@@ -55,7 +72,7 @@ pub fn add_four_twice(to: [&mut [f32]; 2], factors: [[f32; 4]; 2], rows: [&[f32]
 /// from six pointers. The two are separate arguments, so that the compiler knows that they do not alias the rows, and keeps
 /// loaded values.
 #[inline(never)]
-fn two_by_four(one: &mut [f32], other: &mut [f32], factors: [[f32; 4]; 2], rows: [&[f32]; 4]) {
+fn two_by_four<R: Real>(one: &mut [R], other: &mut [R], factors: [[R; 4]; 2], rows: [&[R]; 4]) {
     let n = one.len();
     let Some(other) = other.get_mut(..n) else { return };
     let [first, second, third, fourth] = rows.map(|row| row.get(..n));
@@ -74,32 +91,32 @@ fn two_by_four(one: &mut [f32], other: &mut [f32], factors: [[f32; 4]; 2], rows:
     }
     let each = first.iter().zip(second).zip(third.iter().zip(fourth));
     for ((one, other), ((w, x), (y, z))) in one.iter_mut().zip(other).zip(each) {
-        *one = (((*one + a * w) + b * x) + c * y) + d * z;
-        *other = (((*other + e * w) + f * x) + g * y) + h * z;
+        *one = (((*one + a * *w) + b * *x) + c * *y) + d * *z;
+        *other = (((*other + e * *w) + f * *x) + g * *y) + h * *z;
     }
 }
 
 /// Scalar product, summed in eight lanes; entries of one beyond the other's end are ignored.
 #[inline]
-pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+pub fn dot<R: Real>(a: &[R], b: &[R]) -> R {
     let shared = a.len().min(b.len());
-    let (Some(a), Some(b)) = (a.get(..shared), b.get(..shared)) else { return 0.0 };
+    let (Some(a), Some(b)) = (a.get(..shared), b.get(..shared)) else { return R::ZERO };
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
-    let mut lanes = [0.0; 8];
+    let mut lanes = [R::ZERO; 8];
     for (a, b) in a.iter().zip(b) {
-        lanes.iter_mut().zip(a.iter().zip(b)).for_each(|(lane, (a, b))| *lane += a * b);
+        lanes.iter_mut().zip(a.iter().zip(b)).for_each(|(lane, (a, b))| *lane += *a * *b);
     }
-    let rest: f32 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
-    lanes.iter().sum::<f32>() + rest
+    let rest: R = a_rest.iter().zip(b_rest).map(|(a, b)| *a * *b).sum();
+    lanes.into_iter().sum::<R>() + rest
 }
 
 /// A matrix of zeros, known to the compiler.
-pub const fn zeros<const R: usize, const C: usize>() -> SMatrix<f32, R, C> {
-    SMatrix::from_array_storage(ArrayStorage([[0.0; R]; C]))
+pub const fn zeros<T: Real, const R: usize, const C: usize>() -> SMatrix<T, R, C> {
+    SMatrix::from_array_storage(ArrayStorage([[T::ZERO; R]; C]))
 }
 
 /// Column `index` of a matrix of `rows` rows stored by columns; empty beyond the last.
-pub fn column(matrix: &[f32], rows: usize, index: usize) -> &[f32] {
+pub fn column<R: Real>(matrix: &[R], rows: usize, index: usize) -> &[R] {
     matrix.get(index * rows..(index + 1) * rows).unwrap_or_default()
 }
 

@@ -5,7 +5,6 @@
 
 use crate::campaign::{move_mean, ratio, ratio_steps};
 use crate::monitor::{Gate, Noise};
-use crate::sum::Sum;
 use crate::wire::TuneCode;
 
 /// Order of magnitude of its noise [1]; what is learnt reaches from 3e-5 to 0.1.
@@ -25,14 +24,13 @@ pub struct TuneMeter<const F: usize> {
     /// Mean of `ln` of the supplies' factors over the readings in the mean, in steps.
     strength: [i32; F],
     /// Sum of squared deviations from the mean.
-    scatter: Sum,
+    scatter: f64,
     last: Option<(TuneCode, [f32; F])>,
 }
 
 impl<const F: usize> TuneMeter<F> {
     /// Memory for one.
-    pub const BLANK: Self =
-        Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: Sum::ZERO, last: None };
+    pub const BLANK: Self = Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: 0.0, last: None };
 
     /// Restart without readings.
     pub fn clear(&mut self) {
@@ -61,7 +59,7 @@ impl<const F: usize> TuneMeter<F> {
         let (mean, mut change, before) = self.mean();
         change.iter_mut().zip(strength).for_each(|(change, s)| *change = s - *change);
         let deviation = wrapped(code.value() - mean - ripple(&change));
-        self.scatter.add(deviation * deviation * before as f32 / (before as f32 + 1.0));
+        self.scatter += f64::from(deviation) * f64::from(deviation) * f64::from(before) / (f64::from(before) + 1.0);
         self.count = self.count.saturating_add(1);
         // the whole turns that bring it next to the mean
         let distance = code.steps() - (self.mean >> FRACTION);
@@ -84,8 +82,8 @@ impl<const F: usize> TuneMeter<F> {
     }
 
     /// Sum of squared deviations of the readings that count from their mean [1].
-    pub fn scatter(&self) -> f32 {
-        self.scatter.value()
+    pub fn scatter(&self) -> f64 {
+        self.scatter
     }
 
     /// Mean of the readings that count [1], the mean of `ln` of the supplies' factors over them, and their number.
@@ -133,7 +131,7 @@ mod tests {
             // uniform in ±1e-3: 5.8e-4 rms, and the 68 % quantile of a difference over sqrt 2 is 6.2e-4
             let sigma = libm::sqrtf(meter.variance().unwrap());
             assert!((5e-4..8e-4).contains(&sigma), "{sigma}");
-            let rms = libm::sqrtf(meter.scatter() / count as f32);
+            let rms = libm::sqrt(meter.scatter() / f64::from(count));
             assert!((rms / 5.8e-4 - 1.0).abs() < 0.1, "{rms}"); // 1/sqrt(800)
         }
     }

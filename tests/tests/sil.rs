@@ -41,7 +41,7 @@ fn the_image_fits_its_memory() {
     let sizes = IMAGE.sizes().unwrap();
     // a network of 760 kB has room in what is left of 1 MB
     assert!(sizes.flash <= 256 * 1024, "{} bytes of flash", sizes.flash);
-    assert!(sizes.ram <= 192 * 1024, "{} bytes of RAM", sizes.ram);
+    assert!(sizes.ram <= 224 * 1024, "{} bytes of RAM", sizes.ram);
 }
 
 /// The linker grants 32 kB and starts the stack there, so that a count ends at 32: one that is full has to be told by less.
@@ -78,7 +78,7 @@ fn the_chip_answers_a_campaign_as_the_host_does() {
     check_stack(&run.status);
     let counts = largest(&run.counts);
     let of = |step: &str| counts.iter().find(|(name, _)| *name == step).unwrap().1;
-    assert!(of("ingest") + of("encode") <= 800_000, "{} + {}", of("ingest"), of("encode"));
+    assert!(of("ingest") + of("encode") <= 1_000_000, "{} + {}", of("ingest"), of("encode"));
     check_instructions(&counts);
 }
 

@@ -6,7 +6,6 @@ use crate::estimate::MonitorState;
 use crate::gaussian::{Line, Repeats};
 use crate::linear::{column, dot};
 use crate::monitor::Monitor;
-use crate::sum::Sum;
 use crate::surrogate::Surrogate;
 
 /// How well the model at the MAP describes the readings of monitors in state ok.
@@ -41,8 +40,8 @@ impl FitQuality {
 
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f32 = 0.5;
-/// Growth of chi-square that counts as uphill: more than rounding of a chi-square of 1e5.
-const UPHILL: f32 = 1.0;
+/// Growth of chi-square that counts as uphill: more than rounding of the readings' means.
+const UPHILL: f64 = 1.0;
 /// Halvings of a step that leads uphill or to an unstable ring.
 const HALVINGS: u32 = 4;
 /// While the params have walked less than this share of an error bar, the past still counts as one ring.
@@ -72,7 +71,7 @@ impl<
         let from = *self.gaussian.origin();
         let mut to = self.solution.map_params;
         // A past that is weighted anew has another chi-square; the step is then judged with the next one.
-        let uphill = if self.stale || !self.is_still(model) { f32::MAX } else { self.gaussian.cost() + UPHILL };
+        let uphill = if self.stale || !self.is_still(model) { f64::MAX } else { self.gaussian.cost() + UPHILL };
         self.stale = false;
         for _ in 0..HALVINGS {
             if self.linearise_at(model, &to) && self.gaussian.cost() <= uphill {
@@ -114,7 +113,7 @@ impl<
     fn rebuild(&mut self, model: &Model<'_, G, B, C, F>, params: &[f32; N]) {
         self.gaussian.recentre(params);
         let level = *self.gaussian.baselines();
-        self.gaussian.clone_from(&self.loose);
+        self.gaussian.copy(&self.loose);
         self.gaussian.recentre(params);
         let mut pool = self.gaussian.open(level);
         for (i, first) in self.campaign.cells().iter().enumerate() {
@@ -135,7 +134,7 @@ impl<
                     let (Some(orbit), Some(level), 1..) = (self.prediction.reading.get(b), level.get(b), number) else {
                         continue;
                     };
-                    let residual = mean - orbit - share * dot(&strength, by_supply) - level;
+                    let residual = f64::from(mean - orbit - share * dot(&strength, by_supply)) - level;
                     let variance = self.variance(model, b, number, drive.rf_offset);
                     let repeats = Repeats { number, noise: self.noise_variance(b), variance };
                     self.gaussian.count(line, share, residual, &repeats);
@@ -145,7 +144,7 @@ impl<
                 self.gaussian.add_line(&mut pool, b, line, h);
             }
         }
-        self.gaussian.close(&pool);
+        self.gaussian.close(&mut pool);
         self.count_tunes(model);
         for frame in &self.recent {
             let drive = about(&frame.drive, &self.supplies);
@@ -153,12 +152,12 @@ impl<
             for b in (0..B).filter(|b| frame.accepted.has(*b)) {
                 let slope = column(self.prediction.jacobian.as_slice(), N, b);
                 let innovation = frame.innovation(b, &self.prediction.reading);
-                self.gaussian.condition(b, innovation, self.variance(model, b, 1, drive.rf_offset), slope);
+                let variance = self.variance(model, b, 1, drive.rf_offset);
+                self.gaussian.condition(b, innovation, variance, slope, |_| 0.0);
             }
         }
-        self.gaussian.settle();
         for b in 0..B {
-            self.gaussian.add_scatter(self.campaign.scatter(b) / self.noise_variance(b));
+            self.gaussian.add_scatter(self.campaign.scatter(b) / f64::from(self.noise_variance(b)));
         }
     }
 
@@ -170,8 +169,9 @@ impl<
                 let squares = meter.scatter();
                 let innovation = self.tune_innovation(model, plane, mean, &strength);
                 let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
-                self.gaussian.condition(B + plane, innovation, variance / count as f32, &slope);
-                self.gaussian.add_repeats(count, variance, squares);
+                self.gaussian.condition(B + plane, innovation, variance / count as f32, &slope, |_| 0.0);
+                self.gaussian.add_repeats(count, variance);
+                self.gaussian.add_scatter(squares / f64::from(variance));
             }
         }
     }
@@ -182,15 +182,15 @@ impl<
     /// innovations, each against the vars of its own time, counted in NIS.
     pub fn fit_quality(&mut self, model: &Model<'_, G, B, C, F>) -> FitQuality {
         if !self.is_still(model) {
-            return FitQuality { chi_square: self.nis.0.value(), degrees_of_freedom: self.nis.1 as f32 };
+            return FitQuality { chi_square: self.nis.0 as f32, degrees_of_freedom: self.nis.1 as f32 };
         }
         let layout = model.surrogate.layout();
-        let expected = |b: usize| model.setup.noise.of(b) * model.setup.noise.of(b);
+        let expected = |b: usize| f64::from(model.setup.noise.of(b)) * f64::from(model.setup.noise.of(b));
         let is_spare = |b: usize| (0..layout.monitors()).all(|index| layout.monitor(index) != b);
         let is_ok = |(b, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok && !is_spare(*b);
-        let (mut sum, mut readings, mut baselines) = (Sum::default(), 0.0, 0.0);
+        let (mut sum, mut readings, mut baselines) = (0.0, 0.0, 0.0);
         for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-            sum.add(self.campaign.scatter(b) / expected(b));
+            sum += self.campaign.scatter(b) / expected(b);
             baselines += 1.0;
         }
         for cell in self.campaign.cells() {
@@ -199,12 +199,13 @@ impl<
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
                 let (mean, count) = cell.mean(b);
                 let (d, _) = self.gaussian.effective(b, column(self.prediction.jacobian.as_slice(), N, b));
-                let predicted = self.prediction.reading.get(b).copied().unwrap_or(0.0) + self.gaussian.baseline(b);
-                let residual = mean - predicted - dot(&d, &self.solution.delta);
-                sum.add(count as f32 * residual * residual / expected(b));
-                readings += count as f32;
+                let measured = mean - self.prediction.reading.get(b).copied().unwrap_or(0.0);
+                let residual = f64::from(measured) - self.gaussian.baseline(b) - dot(&d, &self.solution.delta);
+                sum += f64::from(count) * residual * residual / expected(b);
+                readings += f64::from(count);
             }
         }
-        FitQuality { chi_square: sum.value(), degrees_of_freedom: readings - baselines - layout.params() as f32 }
+        let degrees_of_freedom = (readings - baselines - layout.params() as f64) as f32;
+        FitQuality { chi_square: sum as f32, degrees_of_freedom }
     }
 }

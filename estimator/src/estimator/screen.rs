@@ -156,11 +156,11 @@ impl<
     fn is_expected(&self, model: &Model<'_, G, B, C, F>, b: usize, code: i32) -> bool {
         let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
         let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
-        let surprise = self.innovation(b, code) - predicted;
-        let certain = self.variance(model, b, 1, self.rf_offset) + baseline_variance;
+        let surprise = f64::from(self.innovation(b, code)) - predicted;
+        let certain = f64::from(self.variance(model, b, 1, self.rf_offset)) + baseline_variance;
+        let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
         // the uncertainty of the params is only worked out for readings that need it
-        model.setup.gate.expects(surprise, certain)
-            || model.setup.gate.expects(surprise, certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
+        expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
     }
 
     /// A reading as the mean drive of its setting would have made it, in steps.
