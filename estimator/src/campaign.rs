@@ -45,6 +45,13 @@ impl Setting {
         Some(setting)
     }
 
+    /// The part of a frame's kicks that is not the setting's.
+    pub fn idle<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
+        let mut kick = drive.kick;
+        self.corrector.and_then(|c| kick.get_mut(usize::from(c))).into_iter().for_each(|kick| *kick = 0.0);
+        Drive { kick, strength: [0.0; F], rf_offset: 0.0 }
+    }
+
     /// True if two frames repeat one setting.
     pub fn repeats(&self, other: &Self) -> bool {
         let (here, there) = (self.current.steps(), other.current.steps());
@@ -109,6 +116,14 @@ impl Last {
 
     fn waits(self) -> bool {
         self.0 & 1 == 1
+    }
+
+    /// The same reading of a monitor that has moved by so many steps.
+    fn moved(self, by: i32) -> Self {
+        self.code().map_or(Self::NONE, |code| {
+            let moved = code.saturating_add(by);
+            Self::new(moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT), self.waits())
+        })
     }
 }
 
@@ -312,6 +327,20 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
     pub fn scatter(&self, b: usize) -> f64 {
         let step = f64::from(PositionCode::METRES_PER_LSB);
         self.scatter.get(b).map_or(0.0, |&s| s as f64 * step * step)
+    }
+
+    /// The monitors have moved by so much [m]: their readings so far move with them.
+    pub fn move_readings(&mut self, shift: &[f32; B]) {
+        const LIMIT: i32 = PositionCode::LIMIT << FRACTION;
+        for cell in &mut self.cells {
+            for (b, by) in shift.iter().enumerate() {
+                let steps = libm::roundf(by / PositionCode::METRES_PER_LSB) as i32;
+                if let (Some(mean), Some(last)) = (cell.reading.get_mut(b), cell.last.get_mut(b)) {
+                    *mean = mean.saturating_add(steps.saturating_mul(1 << FRACTION)).clamp(-LIMIT, LIMIT);
+                    *last = last.moved(steps);
+                }
+            }
+        }
     }
 
     /// Mean strength over all frames: where the supplies really stand.

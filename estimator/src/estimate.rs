@@ -1,5 +1,7 @@
 //! What leaves the core each cycle: plain data.
 
+use serde::{Deserialize, Serialize};
+
 use crate::mask::Mask;
 use crate::prior::{Marginal, Prior};
 
@@ -45,6 +47,17 @@ pub struct Health {
     pub rejected: u32,
 }
 
+/// What is to be said of a frame as a whole, and of the posterior besides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Remarks {
+    /// No beam, or one that the model does not know: nothing in the frame was used.
+    pub put_aside: bool,
+    /// The baselines have moved; this frame and those put aside before it agree on by how much.
+    pub baselines_moved: bool,
+    /// The information was not positive, and was made so, or given up for the prior.
+    pub unsolved: bool,
+}
+
 /// The vars and the state of the monitors after a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate<const B: usize, const N: usize, const W: usize> {
@@ -86,6 +99,8 @@ pub struct Estimate<const B: usize, const N: usize, const W: usize> {
     pub log_evidence: f32,
     /// The model was relinearised since the last estimate.
     pub linearised: bool,
+    /// What is to be said of the whole.
+    pub remarks: Remarks,
     /// State of every monitor.
     pub health: [Health; B],
 }

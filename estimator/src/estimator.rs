@@ -5,6 +5,7 @@
 
 mod laplace;
 mod screen;
+mod whole;
 
 use core::fmt;
 
@@ -13,12 +14,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive, Each};
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, Remarks};
 use crate::gaussian::{Gaussian, Independent, Solution};
 use crate::linear::column;
 use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor};
 use crate::prior::Prior;
+use crate::quarantine::Quarantine;
 use crate::sizes::Layout;
 use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
@@ -26,6 +28,7 @@ use crate::wire::{Frame, FrameError, PositionCode};
 
 pub use laplace::FitQuality;
 use screen::Screened;
+use whole::Whole;
 
 /// Priors that groups of params can have.
 pub const GROUPS: usize = 8;
@@ -92,7 +95,7 @@ pub struct Estimator<
     const W: usize,
 > {
     started: bool,
-    last_sequence: Option<u32>,
+    last: Option<Cycle>,
     /// All is done that can be before the next frame: linearised if due, and the params walked one cycle ahead.
     prepared: bool,
     frames: u32,
@@ -121,8 +124,14 @@ pub struct Estimator<
     rf_offset: f32,
     /// Sum of NIS, and the number of readings in it.
     nis: (f64, u64),
-    /// Frames without a setting in a row that surprised all over.
-    surprises: u32,
+    /// Frames put aside since the last good one.
+    quarantine: Quarantine<B>,
+    /// Largest beam intensity so far, in steps.
+    most_intense: i32,
+    /// Cycles that the params have walked for.
+    walked: u64,
+    /// A Gaussian was not positive since the last estimate.
+    unsolved: bool,
     /// The past has to be weighted anew.
     stale: bool,
 }
@@ -172,6 +181,34 @@ impl fmt::Display for IngestError {
 
 impl core::error::Error for IngestError {}
 
+/// Which cycle a frame is of.
+#[derive(Debug, Clone, Copy)]
+struct Cycle {
+    epoch: u32,
+    sequence: u32,
+}
+
+impl Cycle {
+    fn of<const B: usize, const C: usize, const F: usize, const W: usize>(frame: &Frame<B, C, F, W>) -> Self {
+        Self { epoch: frame.epoch, sequence: frame.sequence }
+    }
+
+    /// Cycles from this one to a later one: their difference, which wraps. In a new epoch nobody has counted them: one.
+    fn before(&self, later: &Self) -> Result<u32, IngestError> {
+        let (last, got) = (self.sequence, later.sequence);
+        let [epochs, cycles] = [later.epoch.wrapping_sub(self.epoch), got.wrapping_sub(last)];
+        match (epochs, cycles) {
+            (0, 0) => Err(IngestError::Repeated { sequence: last }),
+            (0, 1..=LATER) => Ok(cycles),
+            (1..=LATER, _) => Ok(1),
+            _ => Err(IngestError::OutOfOrder { last, got }),
+        }
+    }
+}
+
+/// Numbers up to this much larger are later ones; what is further ahead is behind, since numbers wrap.
+const LATER: u32 = i32::MAX as u32;
+
 /// A frame that belongs to no setting.
 #[derive(Debug, Clone)]
 struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
@@ -179,6 +216,9 @@ struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
     reading: [PositionCode; B],
     accepted: Mask<W>,
 }
+
+/// Mean square orbit of idle correctors over the noise's below which they count as idle: the scatter of read-backs makes 0.004.
+const IDLE: f32 = 0.1;
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f32 = 0.02;
@@ -220,7 +260,7 @@ impl<
     /// Memory for one, all zero, so that it costs no flash; [`Estimator::restart`] gives it a posterior.
     pub const BLANK: Self = Self {
         started: false,
-        last_sequence: None,
+        last: None,
         prepared: false,
         frames: 0,
         rejected_frames: 0,
@@ -239,7 +279,10 @@ impl<
         orbit: [0.0; 2],
         rf_offset: 0.0,
         nis: (0.0, 0),
-        surprises: 0,
+        quarantine: Quarantine::EMPTY,
+        most_intense: 0,
+        walked: 0,
+        unsolved: false,
         stale: false,
     };
 
@@ -251,9 +294,11 @@ impl<
         let () = Self::FITS;
         self.started = false;
         model.surrogate.linearise(&[0.0; N], &[0.0; F], &mut self.linearised)?;
-        (self.last_sequence, self.prepared, self.frames, self.rejected_frames) = (None, true, 0, 0);
+        (self.last, self.prepared, self.frames, self.rejected_frames) = (None, true, 0, 0);
         (self.supplies, self.orbit, self.rf_offset) = ([0.0; F], [0.0; 2], 0.0);
-        (self.nis, self.surprises, self.stale, self.news) = ((0.0, 0), 0, false, false);
+        (self.nis, self.stale, self.news, self.unsolved) = ((0.0, 0), false, false, false);
+        (self.walked, self.most_intense) = (0, 0);
+        self.quarantine.clear();
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
             monitor.expect(model.setup.noise.of(b));
         }
@@ -283,14 +328,19 @@ impl<
         let (frame, drive) =
             self.decode(model, bytes).inspect_err(|_| self.rejected_frames = self.rejected_frames.saturating_add(1))?;
         self.catch_up(model, &frame);
-        let cell = self.find_setting(model, &frame, &drive);
-        self.predict(model, &drive, cell);
-        let screened = self.screen(model, &frame, &drive, cell);
+        self.predict(model, &drive);
+        let setting = self.setting(model, &frame, &drive);
+        let (whole, expected) = self.judge_whole(model, &frame, setting.is_some());
+        if whole == Whole::Aside {
+            return Ok(self.estimate(model, &frame, None, &Screened::none_of(&frame.valid), 0.0, whole));
+        }
+        let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
+        let screened = self.screen(model, &frame, &drive, cell, whole, &expected.within);
         let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
         }
-        Ok(self.estimate(model, &frame, cell, &screened, nis))
+        Ok(self.estimate(model, &frame, cell, &screened, nis, whole))
     }
 
     /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
@@ -307,9 +357,9 @@ impl<
         linearised
     }
 
-    /// Take the next frame as new, whatever its number: its sender counts anew.
+    /// Take the next frame as new, whatever its number: its sender counts anew without a new epoch.
     pub fn forget_sequence(&mut self) {
-        self.last_sequence = None;
+        self.last = None;
     }
 
     /// Go over to another model of the same machine: all frames so far are weighed anew by it.
@@ -336,10 +386,8 @@ impl<
             return Err(IngestError::NotStarted);
         }
         let frame = Frame::decode(&model.surrogate.layout(), bytes)?;
-        match self.last_sequence {
-            Some(last) if frame.sequence == last => return Err(IngestError::Repeated { sequence: last }),
-            Some(last) if frame.sequence < last => return Err(IngestError::OutOfOrder { last, got: frame.sequence }),
-            _ => {}
+        if let Some(last) = self.last {
+            last.before(&Cycle::of(&frame))?;
         }
         let drive = model.setup.calibration.drive(&frame).map_err(IngestError::Beyond)?;
         Ok((frame, drive))
@@ -347,9 +395,10 @@ impl<
 
     /// Let the params walk for cycles that were lost since the last frame.
     fn catch_up(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
-        let cycles = self.last_sequence.map_or(0, |last| frame.sequence.saturating_sub(last));
+        let this = Cycle::of(frame);
+        let cycles = self.last.and_then(|last| last.before(&this).ok()).unwrap_or(0);
         self.walk(model, cycles.saturating_sub(u32::from(self.prepared)));
-        self.last_sequence = Some(frame.sequence);
+        self.last = Some(this);
         self.frames = self.frames.saturating_add(1);
         self.prepared = false;
     }
@@ -358,6 +407,7 @@ impl<
     fn walk(&mut self, model: &Model<'_, G, B, C, F>, cycles: u32) {
         let noise = model.setup.process_noise;
         if noise > 0.0 && cycles > 0 {
+            self.walked = self.walked.saturating_add(cycles.into());
             // After a long silence the vars are unknown, but not more than the range of the prior allows.
             let room = |(i, sigma): (usize, &f32)| {
                 let prior = prior_of::<G, B, C, F, N>(model, i).sigma;
@@ -372,26 +422,36 @@ impl<
         }
     }
 
-    /// The cell of the frame's setting, its drive counted in. Several correctors at once belong to none.
-    fn find_setting(
+    /// The setting that a frame repeats. Several correctors at once belong to none; nor do idle ones that move the orbit
+    /// noticeably, since what they say of the params is lost in a setting's mean.
+    #[inline(never)]
+    fn setting(
         &mut self,
         model: &Model<'_, G, B, C, F>,
         frame: &Frame<B, C, F, W>,
         drive: &Drive<C, F>,
-    ) -> Option<u16> {
+    ) -> Option<Setting> {
         let setting = Setting::of(frame, model.setup.calibration.powered)?;
-        let index = self.campaign.find(&setting)?;
-        self.campaign.cell_mut(index)?.add_drive(drive);
+        // work space: what the mean drive would have made is not known yet
+        model.surrogate.orbit(&self.linearised, &setting.idle(drive), &mut self.at_mean_drive);
+        let over_noise = |(b, orbit): (usize, &f32)| orbit * orbit / self.noise_variance(b);
+        let moved: f32 = self.at_mean_drive.iter().enumerate().map(over_noise).sum();
+        (moved <= IDLE * model.surrogate.layout().monitors() as f32).then_some(setting)
+    }
+
+    /// The cell of a setting, the frame's drive counted in, and what its mean drive would have made.
+    #[inline(never)]
+    fn find_cell(&mut self, model: &Model<'_, G, B, C, F>, setting: &Setting, drive: &Drive<C, F>) -> Option<u16> {
+        let index = self.campaign.find(setting)?;
+        let cell = self.campaign.cell_mut(index)?;
+        cell.add_drive(drive);
+        model.surrogate.orbit(&self.linearised, &about(&cell.drive(), &self.supplies), &mut self.at_mean_drive);
         Some(index)
     }
 
-    /// Predict what the mean drive of the frame's setting would have made, and the frame.
+    /// Predict the frame.
     #[inline(never)]
-    fn predict(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>, cell: Option<u16>) {
-        let mean = cell.and_then(|index| self.campaign.cells().get(usize::from(index))).map(|cell| cell.drive());
-        if let Some(mean) = mean {
-            model.surrogate.orbit(&self.linearised, &about(&mean, &self.supplies), &mut self.at_mean_drive);
-        }
+    fn predict(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>) {
         self.predict_drive(model, drive);
         self.rf_offset = drive.rf_offset;
     }
@@ -514,7 +574,7 @@ impl<
 
     #[inline(never)]
     fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
-        self.solution.solve(&self.gaussian, |i| prior_of::<G, B, C, F, N>(model, i));
+        self.unsolved |= !self.solution.solve(&self.gaussian, |i| prior_of::<G, B, C, F, N>(model, i));
         let Layout { ring, room } = model.surrogate.layout();
         let ([x, y], [first, _]) = (ring.monitors.map(usize::from), room.monitors.map(usize::from));
         self.orbit = [self.gaussian.orbit(0, x), self.gaussian.orbit(first, first + y)];
@@ -528,8 +588,14 @@ impl<
         cell: Option<u16>,
         screened: &Screened<W>,
         nis: f32,
+        whole: Whole,
     ) -> Estimate<B, N, W> {
         let linearised = core::mem::take(&mut self.news);
+        let remarks = Remarks {
+            put_aside: whole == Whole::Aside,
+            baselines_moved: whole == Whole::Moved,
+            unsolved: core::mem::take(&mut self.unsolved),
+        };
         let solution = &self.solution;
         let mut estimate = Estimate {
             sequence: frame.sequence,
@@ -551,6 +617,7 @@ impl<
             setting: cell,
             log_evidence: solution.log_evidence as f32,
             linearised,
+            remarks,
             health: core::array::from_fn(|b| self.monitors.get(b).map(Monitor::health).unwrap_or_default()),
         };
         for i in 0..N {
@@ -604,4 +671,25 @@ fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
 
 fn metres(code: i32) -> f32 {
     code as f32 * PositionCode::METRES_PER_LSB
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_wrap_and_a_new_epoch_counts_anew() {
+        let before = |[e, s]: [u32; 2], [epoch, sequence]: [u32; 2]| {
+            Cycle { epoch: e, sequence: s }.before(&Cycle { epoch, sequence })
+        };
+        assert_eq!(before([0, 7], [0, 9]), Ok(2));
+        assert_eq!(before([0, u32::MAX], [0, 1]), Ok(2));
+        assert_eq!(before([0, 9], [0, 9]), Err(IngestError::Repeated { sequence: 9 }));
+        assert_eq!(before([0, 9], [0, 7]), Err(IngestError::OutOfOrder { last: 9, got: 7 }));
+        // a number out of the blue: the stream goes on after it
+        assert_eq!(before([0, 9], [0, u32::MAX]), Err(IngestError::OutOfOrder { last: 9, got: u32::MAX }));
+        assert_eq!(before([1, 900], [2, 0]), Ok(1));
+        assert_eq!(before([u32::MAX, 900], [0, 900]), Ok(1));
+        assert_eq!(before([2, 0], [1, 901]), Err(IngestError::OutOfOrder { last: 0, got: 901 }));
+    }
 }

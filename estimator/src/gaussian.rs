@@ -398,6 +398,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.cost += chi_square;
     }
 
+    /// The baselines have moved by so much [m], those of monitors; the readings so far move with them.
+    pub fn move_baselines(&mut self, shift: &[f32]) {
+        self.baseline.iter_mut().zip(shift).for_each(|(baseline, by)| *baseline += f64::from(*by));
+    }
+
     /// Move the origin without changing the distribution.
     pub fn recentre(&mut self, origin: &[f32; N]) {
         let mut step = [0.0; N];

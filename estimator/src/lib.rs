@@ -19,6 +19,7 @@ mod machine;
 mod mask;
 mod monitor;
 mod prior;
+mod quarantine;
 mod sizes;
 mod stream;
 pub mod surrogate;
@@ -28,7 +29,7 @@ pub mod wire;
 
 pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Beyond, Calibration, Drive, Each, SupplyCalibration};
-pub use estimate::{Estimate, Health, MonitorState};
+pub use estimate::{Estimate, Health, MonitorState, Remarks};
 pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Setup};
 pub use gaussian::{Gaussian, Solution};
 pub use mask::{Mask, words};

@@ -225,6 +225,11 @@ impl Monitor {
         if self.jumps { JUMPING * variance } else { variance }
     }
 
+    /// Its state.
+    pub fn state(&self) -> MonitorState {
+        self.state
+    }
+
     /// State, noise and rejections, as an estimate carries them.
     pub fn health(&self) -> Health {
         Health {

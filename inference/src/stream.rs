@@ -225,6 +225,7 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
         code.ok_or_else(|| beyond("intensity", particles))
     };
     let mut frame = large::Frame {
+        epoch: 0,
         sequence: row.sequence,
         time_us: time("time", row.time, u64::MAX as f64)? as u64,
         cycle_time_us: time("time in the cycle", row.cycle_time, f64::from(u32::MAX))? as u32,

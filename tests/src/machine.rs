@@ -86,7 +86,7 @@ pub fn amperes(current: f64) -> CurrentCode {
 }
 
 /// A machine of known vars.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Machine {
     /// Its ring; what it predicts at the true params is the truth.
     pub surrogate: Box<Green>,
@@ -139,6 +139,11 @@ impl Machine {
         self.is_linearised = false;
     }
 
+    /// Let every baseline move [m].
+    pub fn move_baselines(&mut self, sigma: f64) {
+        self.offset.iter_mut().for_each(|offset| *offset += sigma * self.random.normal());
+    }
+
     /// A cycle with five correctors of 5 to 22 A.
     pub fn cycle(&mut self, sequence: u32) -> Frame {
         let corrector = self.random.powered(5, 5.0, 22.0);
@@ -154,6 +159,7 @@ impl Machine {
         let supply = core::array::from_fn(|f| amperes(calibration.supplies[f].nominal.into()));
         let dipole = amperes(calibration.dipole.map_or(0.0, f64::from));
         let mut frame = Frame {
+            epoch: 0,
             sequence,
             time_us: 100_000 * u64::from(sequence),
             cycle_time_us: 92_000,

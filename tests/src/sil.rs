@@ -103,12 +103,13 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
     let health = e.health.iter().flat_map(|h| {
         [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
     });
+    let remarks = [e.remarks.put_aside, e.remarks.baselines_moved, e.remarks.unsolved].map(u64::from);
     let numbers = [e.sequence, e.frames, e.rejected_frames, u32::from(e.linearised)].map(u64::from);
     let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
     let masks = masks.map(|bit| u64::from(*bit));
     let tunes = e.tune_innovation.map(|tune| tune.map_or(u64::MAX, |tune| u64::from(tune.to_bits())));
     let rest = [e.time_us, e.setting.map_or(u64::MAX, u64::from), tunes[0], tunes[1]];
-    numbers.into_iter().chain(masks).chain(rest).chain(floats).chain(health).collect()
+    numbers.into_iter().chain(remarks).chain(masks).chain(rest).chain(floats).chain(health).collect()
 }
 
 /// Most instructions of each region in a run, in the order of [`REGIONS`].

@@ -53,7 +53,7 @@ impl Row {
 /// Params and baselines in double precision, linearised at the truth: information on both, nothing eliminated.
 ///
 /// `delta = theta - truth`, `innovation = h . delta + baseline + noise`; the evidence is that of all readings.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Reference {
     params: Box<SMatrix<f64, PARAMS, PARAMS>>,
     cross: Box<SMatrix<f64, PARAMS, MONITORS>>,
@@ -136,7 +136,7 @@ pub struct Checkpoint {
 }
 
 /// One stream, without end.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Soak {
     /// The machine that it comes from.
     pub machine: Machine,
@@ -144,18 +144,20 @@ pub struct Soak {
     core: Box<Estimator>,
     reference: Reference,
     frames: u32,
+    /// Epoch and number of the next frame.
+    cycle: (u32, u32),
     evidence: f64,
 }
 
 impl Soak {
-    /// A machine, its core at the prior, and nothing seen.
+    /// A machine, its core at the prior, and nothing seen. The reference knows no process noise.
     ///
     /// # Errors
     /// If the recording whose setup is used cannot be read.
-    pub fn new(row: Row, seed: u64) -> Result<Self, Box<dyn Error>> {
+    pub fn new(row: Row, seed: u64, process_noise: f32) -> Result<Self, Box<dyn Error>> {
         let ring = Ring::booster();
         let recording = Recording::read(&repository("recordings/paper-vars"), &ring)?;
-        let mut machine = Machine::drawn(&stream::estimator(&ring, &recording, 0.0)?, seed);
+        let mut machine = Machine::drawn(&stream::estimator(&ring, &recording, process_noise)?, seed);
         // the surrogate is the truth here
         machine.surrogate.stated_error = [0.0; 2];
         machine.setup.tune_calibration = None;
@@ -163,13 +165,25 @@ impl Soak {
         core.restart(&Model { surrogate: &*machine.surrogate, setup: &machine.setup })
             .map_err(|_| "the design has no stable ring")?;
         let reference = Reference::of(&machine);
-        Ok(Self { row, core, reference, frames: 0, evidence: 0.0, machine })
+        Ok(Self { row, core, reference, frames: 0, cycle: (0, 0), evidence: 0.0, machine })
     }
 
     /// The next frame, as the machine sends it.
     pub fn cycle(&mut self) -> Frame {
         let corrector = self.row.drive(self.frames, &mut self.machine.random);
-        self.machine.cycle_with(self.frames, corrector)
+        let (epoch, sequence) = self.cycle;
+        self.cycle.1 = sequence.wrapping_add(1);
+        Frame { epoch, ..self.machine.cycle_with(sequence, corrector) }
+    }
+
+    /// Lose so many cycles.
+    pub fn skip(&mut self, cycles: u32) {
+        self.cycle.1 = self.cycle.1.wrapping_add(cycles);
+    }
+
+    /// The front end counts from 0 again.
+    pub fn restart_front_end(&mut self) {
+        self.cycle = (self.cycle.0 + 1, 0);
     }
 
     /// Let the core take a frame in.
@@ -182,6 +196,12 @@ impl Soak {
         let estimate = self.core.ingest(&model, &mut wire_of(frame)).expect("a good frame");
         self.frames += 1;
         estimate
+    }
+
+    /// Estimated less true params over the error bars of an estimate, squared: NEES over the number of params.
+    pub fn nees(&self, estimate: &Estimate) -> f64 {
+        let error = core::array::from_fn(|i| f64::from(estimate.map_params[i]) - f64::from(self.machine.params[i]));
+        nees(&error, |i, j| self.core.covariance(i, j)) / PARAMS as f64
     }
 
     /// So many frames, and how the core then stands.
@@ -204,11 +224,10 @@ impl Soak {
         let (sigma, evidence) = self.reference.solve();
         let ratio = |i: usize| f64::from(last.params_sigma[i]) / sigma[i];
         let ratios = (0..PARAMS).map(ratio);
-        let error = core::array::from_fn(|i| f64::from(last.map_params[i]) - f64::from(self.machine.params[i]));
-        let gap = last.log_evidence as f64 - evidence;
+        let gap = f64::from(last.log_evidence) - evidence;
         Checkpoint {
             frames: self.frames,
-            nees: nees(&error, |i, j| self.core.covariance(i, j)) / PARAMS as f64,
+            nees: self.nees(&last),
             sigma_ratio: [ratios.clone().fold(f64::MAX, f64::min), ratios.fold(0.0, f64::max)],
             nis: sum / n,
             nis_scatter: (squares / n - (sum / n).powi(2)).sqrt(),

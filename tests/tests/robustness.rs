@@ -27,7 +27,9 @@ fn wires(recording: &Recording) -> Vec<Vec<u8>> {
 // ---- Bytes that are no frame ----
 
 /// The body of a frame, whatever it says.
-type Body<'a> = (u32, u64, u32, &'a [i32], i32, &'a [i32], i32, &'a [i32], [Option<i32>; 2], Option<i32>, &'a [u32]);
+type Body<'a> = (Numbers, &'a [i32], i32, &'a [i32], i32, &'a [i32], [Option<i32>; 2], Option<i32>, &'a [u32]);
+/// Epoch, sequence, time, time in the cycle.
+type Numbers = (u32, u32, u64, u32);
 
 /// Currents of the main supplies in a frame that would be good.
 const MAGNETS: (i32, [i32; 2]) = (23_997_850, [17_997_850; 2]);
@@ -65,7 +67,7 @@ fn miscounted(sequence: u32, monitors: usize, correctors: usize) -> Vec<u8> {
     let (readings, currents) = (vec![1000; monitors], vec![-5; correctors]);
     let (dipole, supply) = MAGNETS;
     let valid = vec![u32::MAX; monitors.div_ceil(32)];
-    let body = (sequence, 1, 2, &currents[..], dipole, &supply[..], 0, &readings[..], [None; 2], None, &valid[..]);
+    let body = ((0, sequence, 1, 2), &currents[..], dipole, &supply[..], 0, &readings[..], [None; 2], None, &valid[..]);
     sealed(Frame::VERSION, &serialised(&body))
 }
 
@@ -88,7 +90,7 @@ fn beyond(sequence: u32, random: &mut Random) -> Vec<u8> {
         _ => tune[random.below(2)] = Some(-1),
     }
     let body =
-        (sequence, 1, 2, &currents[..], dipole, &supply[..], rf_offset, &readings[..], tune, intensity, &ALL[..]);
+        ((0, sequence, 1, 2), &currents[..], dipole, &supply[..], rf_offset, &readings[..], tune, intensity, &ALL[..]);
     sealed(Frame::VERSION, &serialised(&body))
 }
 
@@ -107,7 +109,7 @@ fn faulty(
     use IngestError::{Beyond, Frame, OutOfOrder, Repeated};
     let garbled: fn(&IngestError) -> bool =
         |e| matches!(e, Frame(Framing | Truncated { .. } | Oversized { .. } | Corrupted { .. }));
-    let sequence = u32::MAX - random.below(1000) as u32;
+    let sequence = i32::MAX as u32 - random.below(1000) as u32;
     let mut bytes = next.to_vec();
     let n = bytes.len() - 1;
     match fault {
@@ -150,8 +152,8 @@ fn faulty(
         7 => (Vec::new(), |e| *e == Frame(Truncated { need: 7, got: 0 })),
         8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Framing)),
         9 => {
-            let (plain, other) = (plain(next), 3 + random.below(253) as u8);
-            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 2, .. })))
+            let (plain, other) = (plain(next), 4 + random.below(252) as u8);
+            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 3, .. })))
         }
         10 => {
             let (monitors, correctors) = [(33, 47), (33, 49), (32, 48), (34, 48), (0, 0), (40, 40)][random.below(6)];
@@ -271,12 +273,12 @@ fn bytes_never_panic_and_pass_only_with_their_crc() {
         let (c, r): (Vec<_>, Vec<_>) = (c.iter().map(small).collect(), r.iter().map(small).collect());
         let ([dipole, supply @ ..], [x, y, intensity]) = (m.map(|v| v >> shift), tune.map(|t| t.map(|t| t >> shift)));
         let (sequence, rf) = (sequence, rf >> shift);
-        serialised(&(sequence, time, cycle, &c, dipole, &supply[..], rf, &r, [x, y], intensity, &valid[..]))
+        serialised(&((0, sequence, time, cycle), &c, dipole, &supply[..], rf, &r, [x, y], intensity, &valid[..]))
     });
     let any = prop_oneof![
         bytes(),
-        bytes().prop_map(|body| sealed(2, &body[..body.len().min(Frame::MAX_BYTES)])),
-        frames.prop_map(|body| sealed(2, &body)),
+        bytes().prop_map(|body| sealed(Frame::VERSION, &body[..body.len().min(Frame::MAX_BYTES)])),
+        frames.prop_map(|body| sealed(Frame::VERSION, &body)),
     ];
     proptest!(seeded(1000), |(wire in any)| {
         let taken = core.clone().ingest(&mut wire.clone());
@@ -354,6 +356,7 @@ fn frame() -> impl Strategy<Value = Frame> {
         (tunes(), mask),
     )
         .prop_map(|(sequence, time_us, cycle_time_us, corrector, magnets, rf, reading, (tune, valid))| Frame {
+            epoch: 0,
             sequence,
             time_us,
             cycle_time_us,

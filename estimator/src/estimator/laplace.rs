@@ -101,7 +101,7 @@ impl<
 
     /// True while all frames so far have seen the same ring.
     pub(super) fn is_still(&self, model: &Model<'_, G, B, C, F>) -> bool {
-        let walked = model.setup.process_noise * libm::sqrtf(self.frames as f32);
+        let walked = model.setup.process_noise * libm::sqrtf(self.walked as f32);
         self.solution.sigma.iter().all(|sigma| walked <= WALKED * sigma)
     }
 

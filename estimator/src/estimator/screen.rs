@@ -1,9 +1,9 @@
-//! Which readings of a frame are used: what their repeats say, and where there are none, the model.
+//! Which readings of a good frame are used: what their repeats say, and where there are none, the model.
 
-use super::{Estimator, Model, UNDERWEIGHT};
+use super::whole::Whole;
+use super::{Estimator, Model};
 use crate::campaign::{Verdict, is_moved};
 use crate::drive::Drive;
-use crate::linear::dot;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
@@ -28,14 +28,16 @@ impl<const W: usize> Screened<W> {
         self.restarted.put(b, verdict == Verdict::Confirms { outvotes: true });
     }
 
+    /// None of a frame's readings, which monitors with a 1 have reported.
+    pub fn none_of(valid: &Mask<W>) -> Self {
+        Self { rejected: *valid, ..Self::default() }
+    }
+
     /// Number of readings that are used.
     pub fn count(&self) -> u32 {
         self.accepted.count() + self.tune.iter().flatten().count() as u32
     }
 }
-
-/// Frames in a row that must surprise all over before the model is at fault, and not the beam.
-const CONVINCED: u32 = 3;
 
 impl<
     G: Surrogate<B, C, F, N>,
@@ -57,6 +59,8 @@ impl<
         frame: &Frame<B, C, F, W>,
         drive: &Drive<C, F>,
         cell: Option<u16>,
+        whole: Whole,
+        within: &Mask<W>,
     ) -> Screened<W> {
         let mut screened = Screened::default();
         for b in 0..B {
@@ -65,16 +69,13 @@ impl<
             let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
             if usable {
                 match cell {
-                    Some(index) => self.screen_repeat(model, b, code, index, &mut screened),
-                    None => self.screen_loose(model, b, code, &mut screened),
+                    Some(index) => self.screen_repeat(model, b, code, (index, within.has(b)), &mut screened),
+                    None => self.screen_loose(b, whole == Whole::Persists || within.has(b), &mut screened),
                 }
             }
             if self.monitors.get_mut(b).is_some_and(Monitor::judge) {
                 self.stale = true;
             }
-        }
-        if cell.is_none() {
-            self.excuse(&mut screened);
         }
         self.screen_tunes(model, frame, drive, &mut screened);
         screened
@@ -102,32 +103,16 @@ impl<
         }
     }
 
-    /// Monitors fail one at a time: when more than an eighth of a frame without a setting surprises, the beam was lost or
-    /// the model is at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before
-    /// are not. (In a setting the repeats decide.)
-    fn excuse(&mut self, screened: &mut Screened<W>) {
-        let (accepted, rejected) = (screened.accepted.count(), screened.rejected.count());
-        if 8 * rejected <= accepted + rejected {
-            self.surprises = 0;
-            return;
-        }
-        let each = self.monitors.iter_mut().enumerate();
-        each.filter(|(b, _)| screened.rejected.has(*b)).for_each(|(_, monitor)| monitor.pardon());
-        let (all, none) = (screened.accepted.or(&screened.rejected), Mask::NONE);
-        self.surprises = self.surprises.saturating_add(1);
-        (screened.accepted, screened.rejected) = if self.surprises >= CONVINCED { (all, none) } else { (none, all) };
-    }
-
     /// A reading in a setting is judged by its repeats, the first one by the model.
     fn screen_repeat(
         &mut self,
         model: &Model<'_, G, B, C, F>,
         b: usize,
         code: i32,
-        index: u16,
+        (index, expected): (u16, bool),
         screened: &mut Screened<W>,
     ) {
-        let (expected, moved) = (self.is_expected(model, b, code), self.moved_to_mean_drive(b, code));
+        let moved = self.moved_to_mean_drive(b, code);
         let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
@@ -144,23 +129,12 @@ impl<
     }
 
     /// A reading without a setting passes if the model expects it.
-    fn screen_loose(&mut self, model: &Model<'_, G, B, C, F>, b: usize, code: i32, screened: &mut Screened<W>) {
-        let verdict = if self.is_expected(model, b, code) { Verdict::Accepted } else { Verdict::Held };
+    fn screen_loose(&mut self, b: usize, expected: bool, screened: &mut Screened<W>) {
+        let verdict = if expected { Verdict::Accepted } else { Verdict::Held };
         if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
             monitor.reject();
         }
         screened.note(b, verdict);
-    }
-
-    /// True if the model, with all its uncertainty, expects a reading.
-    fn is_expected(&self, model: &Model<'_, G, B, C, F>, b: usize, code: i32) -> bool {
-        let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
-        let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
-        let surprise = f64::from(self.innovation(b, code)) - predicted;
-        let certain = f64::from(self.variance(model, b, 1, self.rf_offset)) + baseline_variance;
-        let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
-        // the uncertainty of the params is only worked out for readings that need it
-        expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d))
     }
 
     /// A reading as the mean drive of its setting would have made it, in steps.

@@ -54,6 +54,14 @@ code!(
     /// A beam position in steps of 0.1 um, within ±100 mm: offsets reach 10 mm, and jumps more.
     PositionCode, METRES_PER_LSB = 1e-7, limit 1_000_000
 );
+impl PositionCode {
+    /// This position moved by so much [m], up to the limit.
+    pub fn moved(self, by: f32) -> Self {
+        let steps = self.0.saturating_add(libm::roundf(by / Self::METRES_PER_LSB) as i32);
+        Self(steps.clamp(-Self::LIMIT, Self::LIMIT))
+    }
+}
+
 code!(
     /// A magnet or corrector current in steps of 0.1 mA, within ±10 kA.
     CurrentCode, AMPERES_PER_LSB = 1e-4, limit 100_000_000
@@ -85,7 +93,10 @@ pub struct MagnetCurrents<const F: usize> {
 /// value is within its range by its type.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Frame<const B: usize, const C: usize, const F: usize, const W: usize> {
-    /// Number of the cycle; grows from frame to frame, with gaps where cycles were lost.
+    /// Which life of the front end counts the cycles: larger after each restart of it.
+    pub epoch: u32,
+    /// Number of the cycle; grows from frame to frame, with gaps where cycles were lost, and begins at 0 again after the last
+    /// number there is.
     pub sequence: u32,
     /// Time since the start of the stream [us].
     pub time_us: u64,
@@ -110,6 +121,7 @@ pub struct Frame<const B: usize, const C: usize, const F: usize, const W: usize>
 /// The body on the wire: lists carry their length, so that a frame of another machine is told from damage.
 #[derive(Serialize, Deserialize)]
 struct Body<const B: usize, const C: usize, const F: usize, const W: usize> {
+    epoch: u32,
     sequence: u32,
     time_us: u64,
     cycle_time_us: u32,
@@ -126,6 +138,7 @@ struct Body<const B: usize, const C: usize, const F: usize, const W: usize> {
 /// What the body of any machine begins with; read when the lists do not fit this one.
 #[derive(Deserialize)]
 struct Lists {
+    _epoch: u32,
     _sequence: u32,
     _time_us: u64,
     _cycle_time_us: u32,
@@ -163,9 +176,9 @@ impl<'de> Deserialize<'de> for Counted {
 
 impl<const B: usize, const C: usize, const F: usize, const W: usize> Frame<B, C, F, W> {
     /// Version of the format.
-    pub const VERSION: u8 = 2;
+    pub const VERSION: u8 = 3;
     /// Largest body: every number at its longest.
-    pub const MAX_BYTES: usize = VARINT_32 * (C + F + B + W + 4) + VARINT_64 + 3 * (1 + VARINT_32) + 4 * LENGTH;
+    pub const MAX_BYTES: usize = VARINT_32 * (C + F + B + W + 5) + VARINT_64 + 3 * (1 + VARINT_32) + 4 * LENGTH;
     /// A buffer of this many bytes holds any encoded frame.
     pub const MAX_WIRE_BYTES: usize = packet::wire_bytes(Self::MAX_BYTES);
 
@@ -198,6 +211,7 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Frame<B, C,
         let monitors = 0..layout.monitors();
         monitors.clone().for_each(|b| valid.put(b, self.valid.has(layout.monitor(b))));
         Body {
+            epoch: self.epoch,
             sequence: self.sequence,
             time_us: self.time_us,
             cycle_time_us: self.cycle_time_us,
@@ -247,7 +261,9 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Body<B, C, 
             |b| layout.monitor(b),
             |index, got| {
                 let beyond = FrameError::Range { field: "reading", index, limit: PositionCode::LIMIT, got };
-                PositionCode::try_new(got).ok_or(beyond)
+                // of a monitor that did not report the reading means nothing, whatever it is
+                let unread = (!sent.has(index)).then(PositionCode::default);
+                PositionCode::try_new(got).or(unread).ok_or(beyond)
             },
         )?;
         // after the lists, whose counts say more
@@ -257,6 +273,7 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Body<B, C, 
         let got = self.rf_offset;
         let beyond = FrameError::Range { field: "rf offset", index: 0, limit: RfCode::LIMIT, got };
         Ok(Frame {
+            epoch: self.epoch,
             sequence: self.sequence,
             time_us: self.time_us,
             cycle_time_us: self.cycle_time_us,
@@ -328,6 +345,7 @@ mod tests {
 
     fn frame() -> Small {
         Frame {
+            epoch: 1,
             sequence: 7,
             time_us: 28_000_000,
             cycle_time_us: 92_000,
@@ -409,7 +427,7 @@ mod tests {
         assert!(matches!(decode(std::vec![1; 5000]), FrameError::Oversized { got: 5000, .. }));
         assert!(matches!(decode(std::vec![9, 1]), FrameError::Framing));
         assert!(matches!(decode(std::vec![]), FrameError::Truncated { got: 0, .. }));
-        assert_eq!(decode(resealed(|p| p[0] = 1)), FrameError::Version { supported: 2, got: 1 });
+        assert_eq!(decode(resealed(|p| p[0] = 1)), FrameError::Version { supported: 3, got: 1 });
         let longer = resealed(|p| p.push(0));
         assert_eq!(decode(longer), FrameError::Malformed);
         let far = Frame { reading: [PositionCode(0), PositionCode(2_000_000)], ..frame() };
@@ -420,6 +438,19 @@ mod tests {
             FrameError::Range { field: "reading", index: 1, limit: 1_000_000, got: 2_000_000 }
         );
         assert_eq!(frame().encode(&LAYOUT, &mut [0; 20]), Err(FrameError::Space { got: 20 }));
+    }
+
+    #[test]
+    fn a_sentinel_in_a_reading_that_is_not_valid_means_nothing() {
+        let sentinel = Frame { reading: [28_900, i32::MIN].map(PositionCode), ..frame() };
+        let mut out = [0; Small::MAX_WIRE_BYTES];
+        let mut decoded = |valid: u32| {
+            let frame = Frame { valid: Mask::from_words(&[valid]), ..sentinel.clone() };
+            let n = frame.encode(&LAYOUT, &mut out).unwrap();
+            Small::decode(&LAYOUT, &mut out[..n])
+        };
+        assert_eq!(decoded(0b01).unwrap().reading, [28_900, 0].map(PositionCode));
+        assert!(matches!(decoded(0b11), Err(FrameError::Range { field: "reading", index: 1, .. })));
     }
 
     #[test]
@@ -442,7 +473,7 @@ mod tests {
         let mut out = [0; 4096];
         let n = frame.encode(&Layout { ring: sizes, room: sizes }, &mut out).unwrap();
         // as a buffer of this machine's: what is longer than any of its frames is refused before
-        let body = packet::open(2, n, &mut out[..n]).unwrap();
+        let body = packet::open(Small::VERSION, n, &mut out[..n]).unwrap();
         match postcard::take_from_bytes::<Body<2, 3, 2, 1>>(body) {
             Ok((body, [])) => body.frame(&LAYOUT).unwrap_err(),
             _ => miscounted(body, &LAYOUT),
@@ -453,6 +484,7 @@ mod tests {
         reading: [PositionCode; B],
     ) -> Frame<B, C, F, W> {
         Frame {
+            epoch: 0,
             sequence: 0,
             time_us: 0,
             cycle_time_us: 0,
@@ -483,6 +515,7 @@ mod tests {
     #[test]
     fn the_largest_frame_fits() {
         let full = Frame::<256, 256, 8, 8> {
+            epoch: u32::MAX,
             sequence: u32::MAX,
             time_us: u64::MAX,
             cycle_time_us: u32::MAX,

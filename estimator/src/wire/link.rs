@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
 use super::{FrameError, ParcelError};
-use crate::estimate::{Estimate, Health, MonitorState};
+use crate::estimate::{Estimate, Health, MonitorState, Remarks};
 use crate::estimator::{GROUPS, IngestError, Setup};
 use crate::mask::Mask;
 
-/// First byte of a request: kind 1 of version 2.
-pub const REQUEST: u8 = 0x12;
+/// First byte of a request: kind 1 of version 3.
+pub const REQUEST: u8 = 0x13;
 /// First byte of a reply.
-pub const REPLY: u8 = 0x22;
+pub const REPLY: u8 = 0x23;
 /// Most entries of a covariance in one piece.
 pub const PIECE: usize = 56;
 /// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
@@ -187,6 +187,7 @@ pub struct Answer<const B: usize, const N: usize, const W: usize> {
     pub setting: Option<u16>,
     pub log_evidence: f32,
     pub linearised: bool,
+    pub remarks: Remarks,
     pub health: Vec<(u8, f32, f32, u32), B>,
 }
 
@@ -214,6 +215,7 @@ impl<const B: usize, const N: usize, const W: usize> From<&Estimate<B, N, W>> fo
             setting: e.setting,
             log_evidence: e.log_evidence,
             linearised: e.linearised,
+            remarks: e.remarks,
             health: e.health.iter().map(|h| (h.state as u8, h.noise, h.weighted_as, h.rejected)).collect(),
         }
     }
@@ -225,7 +227,7 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
         + 5 * (LENGTH + VARINT_32 * W) // masks
         + LENGTH + B * (1 + 8 + VARINT_32) // health
         + 3 * VARINT_32 + VARINT_64 // the frame, and how many
-        + 2 * 4 + 2 * 5 + 4 + 1; // nis, log_evidence, tunes, setting, linearised
+        + 2 * 4 + 2 * 5 + 4 + 4; // nis, log_evidence, tunes, setting, linearised and remarks
 
     /// The estimate, if every list is whole.
     pub fn estimate(&self) -> Option<Estimate<B, N, W>> {
@@ -257,6 +259,7 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
             setting: self.setting,
             log_evidence: self.log_evidence,
             linearised: self.linearised,
+            remarks: self.remarks,
             health,
         })
     }

@@ -1,6 +1,6 @@
 //! The estimate of a core after a frame, for a ring of any size.
 
-use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior};
+use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior, Remarks};
 use training::rooms::large;
 
 /// The vars and the state of the monitors after a frame: [`estimator::Estimate`] without spare slots.
@@ -28,6 +28,7 @@ pub struct Estimate {
     pub setting: Option<u16>,
     pub log_evidence: f32,
     pub linearised: bool,
+    pub remarks: Remarks,
     pub health: Vec<Health>,
 }
 
@@ -71,6 +72,7 @@ impl Estimate {
             setting: e.setting,
             log_evidence: e.log_evidence,
             linearised: e.linearised,
+            remarks: e.remarks,
             health: slots.clone().map(|b| e.health[b]).collect(),
         }
     }
@@ -113,6 +115,7 @@ impl Estimate {
             setting: answer.setting,
             log_evidence: answer.log_evidence,
             linearised: answer.linearised,
+            remarks: answer.remarks,
             health: answer.health.iter().map(health).collect::<Option<_>>()?,
         })
     }

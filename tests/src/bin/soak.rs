@@ -36,7 +36,7 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     for row in Row::ALL.into_iter().filter(|row| arguments.row.is_none_or(|only| only == *row)) {
         println!("{row:?}, seed {}", arguments.seed);
-        let mut soak = Soak::new(row, arguments.seed)?;
+        let mut soak = Soak::new(row, arguments.seed, 0.0)?;
         for _ in 0..arguments.frames / arguments.every.max(1) {
             let c = soak.run(arguments.every);
             println!(

@@ -1,0 +1,148 @@
+//! A frame as a whole, before any of it counts: is there a beam in it that the model knows?
+
+use super::{Estimator, Model, UNDERWEIGHT};
+use crate::estimate::MonitorState;
+use crate::linear::dot;
+use crate::mask::Mask;
+use crate::monitor::Monitor;
+use crate::surrogate::Surrogate;
+use crate::wire::Frame;
+
+/// One in so many monitors may surprise before the whole frame is in doubt: they fail one at a time.
+const FEW: u32 = 8;
+/// A beam of less than one part in so many of the largest so far is lost.
+const LOST: i64 = 100;
+/// An orbit resembles the one expected if the squares of the surprises are at most one part in so many of its own.
+const RESEMBLES: f32 = 4.0;
+
+/// What a frame is as a whole.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Whole {
+    /// Its readings are judged one by one.
+    Good,
+    /// The same, once the baselines are where its readings and those of the frames before say.
+    Moved,
+    /// Most of it surprises, as for many frames before: the model is at fault, and where no repeat tells, all readings count.
+    Persists,
+    /// None of its readings counts.
+    Aside,
+}
+
+/// What the model makes of each reading.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Expected<const B: usize, const W: usize> {
+    /// Measured minus expected [m]; 0 where none is reported.
+    surprise: [f32; B],
+    /// Those within the gate.
+    pub within: Mask<W>,
+}
+
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const W: usize,
+> Estimator<G, B, C, F, N, S, K, T, W>
+{
+    /// Judge a frame as a whole, and put it aside if need be.
+    #[inline(never)]
+    pub(super) fn judge_whole(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        in_setting: bool,
+    ) -> (Whole, Expected<B, W>) {
+        let expected = self.expected(model, frame);
+        if self.is_beam_lost(frame) {
+            return (Whole::Aside, expected);
+        }
+        // in a setting the repeats decide, of an orbit that might be one
+        if self.is_expected_but_for_a_few(frame, &expected) || (in_setting && self.resembles(frame, &expected)) {
+            self.quarantine.clear();
+            return (Whole::Good, expected);
+        }
+        self.put_aside(frame, &expected);
+        let variance = |b: usize| self.noise_variance(b);
+        if let Some(shift) = self.quarantine.shift(variance) {
+            self.quarantine.clear();
+            self.move_baselines(&shift);
+            return (Whole::Moved, self.expected(model, frame));
+        }
+        (if self.quarantine.persists() { Whole::Persists } else { Whole::Aside }, expected)
+    }
+
+    /// What the model, with all its uncertainty, makes of each reading.
+    fn expected(&self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) -> Expected<B, W> {
+        let mut expected = Expected { surprise: [0.0; B], within: Mask::NONE };
+        let each = expected.surprise.iter_mut().zip(&frame.reading).enumerate();
+        for (b, (to, reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
+            let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
+            let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
+            let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
+            let certain = f64::from(self.variance(model, b, 1, self.rf_offset)) + baseline_variance;
+            let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
+            // the uncertainty of the params is only worked out for readings that need it
+            let within = expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d));
+            *to = surprise as f32;
+            expected.within.put(b, within);
+        }
+        expected
+    }
+
+    /// True if the front end counts particles, and hardly any are there.
+    fn is_beam_lost(&mut self, frame: &Frame<B, C, F, W>) -> bool {
+        let Some(intensity) = frame.intensity.map(|intensity| intensity.steps()) else { return false };
+        self.most_intense = self.most_intense.max(intensity);
+        LOST * i64::from(intensity) <= i64::from(self.most_intense)
+    }
+
+    /// Readings that count in a judgement of the whole: of monitors that report and are not dead.
+    fn alive(&self, frame: &Frame<B, C, F, W>) -> impl Iterator<Item = (usize, &Monitor)> {
+        let valid = frame.valid;
+        self.monitors.iter().enumerate().filter(move |(b, m)| valid.has(*b) && m.state() != MonitorState::Dead)
+    }
+
+    fn is_expected_but_for_a_few(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
+        let (mut all, mut surprising) = (0, 0);
+        for (b, _) in self.alive(frame) {
+            all += 1;
+            surprising += u32::from(!expected.within.has(b));
+        }
+        FEW * surprising <= all
+    }
+
+    fn resembles(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
+        let (mut surprises, mut orbit) = (0.0, 0.0);
+        for (b, _) in self.alive(frame) {
+            if let (Some(surprise), Some(reading)) = (expected.surprise.get(b), frame.reading.get(b)) {
+                surprises += surprise * surprise;
+                orbit += (reading.value() - surprise) * (reading.value() - surprise);
+            }
+        }
+        RESEMBLES * surprises <= orbit
+    }
+
+    fn put_aside(&mut self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) {
+        self.quarantine.add();
+        for (b, (surprise, reading)) in expected.surprise.iter().zip(&frame.reading).enumerate() {
+            if frame.valid.has(b) {
+                self.quarantine.note(b, *surprise, reading.value());
+            }
+        }
+    }
+
+    /// Take the baselines as moved: all that was read before is moved with them.
+    fn move_baselines(&mut self, shift: &[f32; B]) {
+        self.gaussian.move_baselines(shift);
+        self.loose.move_baselines(shift);
+        self.campaign.move_readings(shift);
+        for frame in &mut self.recent {
+            frame.reading.iter_mut().zip(shift).for_each(|(reading, by)| *reading = reading.moved(*by));
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! Frames that were put aside because too many readings surprised at once: what they have in common.
+//!
+//! Monitors fail one at a time. When many readings surprise, the beam was lost, or the baselines have moved, or the model is at
+//! fault. Moved baselines leave every reading off by the same amount whatever the correctors do; a beam that is not there
+//! leaves the readings where they are.
+
+/// Frames that must agree before the baselines have moved.
+const ENOUGH: u32 = 10;
+/// Frames in a row after which the model is at fault, and not the beam.
+const PERSISTS: u32 = 30;
+/// Scatter over noise, in variance, up to which a monitor's surprises are one and the same: 99.9 % of those of ten frames.
+const SAME: f32 = 3.0;
+/// Factor by which the readings must scatter more than the surprises, in variance, to tell a moved baseline from a lost beam.
+const FOLLOWS: f32 = 2.0;
+
+/// Mean of some numbers, and the sum of their squared deviations from it.
+#[derive(Debug, Clone, Copy)]
+struct Spread {
+    mean: f32,
+    squares: f32,
+}
+
+impl Spread {
+    const NONE: Self = Self { mean: 0.0, squares: 0.0 };
+
+    /// Count the `n`-th number. Source: B. P. Welford, Technometrics 4 (1962) 419.
+    fn add(&mut self, value: f32, n: f32) {
+        let step = value - self.mean;
+        self.mean += step / n;
+        self.squares += step * (value - self.mean);
+    }
+}
+
+/// What a monitor has said in the frames put aside.
+#[derive(Debug, Clone, Copy)]
+struct Said {
+    number: u32,
+    /// Measured minus expected [m].
+    surprise: Spread,
+    reading: Spread,
+}
+
+/// The frames put aside in a row, of `B` monitors.
+#[derive(Debug, Clone)]
+pub struct Quarantine<const B: usize> {
+    frames: u32,
+    said: [Said; B],
+}
+
+impl<const B: usize> Quarantine<B> {
+    /// None.
+    pub const EMPTY: Self =
+        Self { frames: 0, said: [Said { number: 0, surprise: Spread::NONE, reading: Spread::NONE }; B] };
+
+    /// A good frame has come.
+    pub fn clear(&mut self) {
+        if self.frames > 0 {
+            *self = Self::EMPTY;
+        }
+    }
+
+    /// Put a frame aside.
+    pub fn add(&mut self) {
+        self.frames = self.frames.saturating_add(1);
+    }
+
+    /// What a monitor said in it: its surprise, and its reading [m].
+    pub fn note(&mut self, b: usize, surprise: f32, reading: f32) {
+        let Some(said) = self.said.get_mut(b) else { return };
+        said.number = said.number.saturating_add(1);
+        said.surprise.add(surprise, said.number as f32);
+        said.reading.add(reading, said.number as f32);
+    }
+
+    /// So many in a row that the model is at fault.
+    pub fn persists(&self) -> bool {
+        self.frames > PERSISTS
+    }
+
+    /// How far each baseline has moved [m], if that explains all frames put aside; `variance` is that of a surprise.
+    ///
+    /// Three quarters of the monitors must be off by the same in all frames, while their readings have followed the
+    /// correctors.
+    pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[f32; B]> {
+        if self.frames < ENOUGH {
+            return None;
+        }
+        let (mut heard, mut steady, mut surprises, mut readings) = (0, 0, 0.0, 0.0);
+        for (b, said) in self.said.iter().enumerate().filter(|(_, said)| said.number >= ENOUGH) {
+            heard += 1;
+            let (allowed, variance) = (SAME * (said.number - 1) as f32, variance(b));
+            if said.surprise.squares <= allowed * variance {
+                steady += 1;
+                surprises += said.surprise.squares / variance;
+                readings += said.reading.squares / variance;
+            }
+        }
+        let explained = heard > 0 && 4 * steady >= 3 * heard && readings >= FOLLOWS * surprises;
+        explained.then(|| self.said.map(|said| said.surprise.mean))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOISE: f32 = 1e-4;
+
+    /// So many frames of a machine whose correctors move the orbit by `orbit`; a monitor reads this of the orbit and of its noise.
+    fn quarantine(frames: u32, orbit: f32, reads: impl Fn(usize, f32, f32) -> f32) -> Quarantine<8> {
+        let mut quarantine = Quarantine::EMPTY;
+        for i in 0..frames {
+            quarantine.add();
+            for b in 0..8 {
+                let t = (8 * i) as f32 + b as f32;
+                let (orbit, noise) = (orbit * libm::sinf(1.3 * t), 1.4 * NOISE * libm::sinf(12.9 * t * t));
+                let reading = reads(b, orbit, noise);
+                quarantine.note(b, reading - orbit, reading);
+            }
+        }
+        quarantine
+    }
+
+    fn shift(quarantine: &Quarantine<8>) -> Option<[f32; 8]> {
+        quarantine.shift(|_| NOISE * NOISE)
+    }
+
+    #[test]
+    fn baselines_that_moved_are_told_from_a_beam_that_is_lost() {
+        let moved = |b: usize, orbit: f32, noise: f32| orbit + noise + 1e-3 * (b as f32 - 3.0);
+        let found = shift(&quarantine(10, 1e-3, moved)).unwrap();
+        assert!(found.iter().enumerate().all(|(b, to)| (to - 1e-3 * (b as f32 - 3.0)).abs() < NOISE));
+        assert_eq!(shift(&quarantine(9, 1e-3, moved)), None);
+        // one monitor jumps besides
+        let jumps = |b: usize, orbit: f32, noise: f32| moved(b, orbit, if b == 2 { 50.0 * noise } else { noise });
+        assert!(shift(&quarantine(10, 1e-3, jumps)).is_some());
+        // readings of no beam: their noise about 0, or nothing at all, or anything
+        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)), None);
+        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)), None);
+        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| 50.0 * noise)), None);
+        // correctors that stand still do not tell
+        assert_eq!(shift(&quarantine(20, 0.0, moved)), None);
+    }
+
+    #[test]
+    fn a_good_frame_ends_it() {
+        let mut quarantine = quarantine(31, 1e-3, |_, _, noise| noise);
+        assert!(quarantine.persists());
+        quarantine.clear();
+        assert!(!quarantine.persists() && quarantine.said.iter().all(|said| said.number == 0));
+    }
+}
