@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive, Each};
 use crate::estimate::{Estimate, Remarks};
-use crate::gaussian::{Gaussian, Independent, Solution};
+use crate::gaussian::{Gaussian, Independent, Reading, Solution};
 use crate::linear::column;
 use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor};
@@ -126,7 +126,7 @@ pub struct Estimator<
     nis: (f64, u64),
     /// Frames put aside since the last good one.
     quarantine: Quarantine<B>,
-    /// Largest beam intensity so far, in steps.
+    /// Largest beam intensity lately, in steps.
     most_intense: i32,
     /// Cycles that the params have walked for.
     walked: u64,
@@ -228,12 +228,19 @@ const BASELINE: f32 = 0.02;
 const RECENT: usize = 16;
 
 impl<const B: usize, const C: usize, const F: usize, const W: usize> Loose<B, C, F, W> {
-    /// Measured minus predicted, before the baseline [m].
-    fn innovation(&self, b: usize, predicted: &[f32; B]) -> f32 {
-        match (self.reading.get(b), predicted.get(b)) {
-            (Some(reading), Some(predicted)) => reading.value() - predicted,
-            _ => 0.0,
-        }
+    /// Its readings that are used, each of a variance, as a prediction linearises them.
+    fn readings<'h, const N: usize>(
+        &'h self,
+        variances: &'h [f32; B],
+        prediction: &'h Prediction<B, F, N>,
+    ) -> impl Iterator<Item = Reading<'h>> {
+        let each = self.reading.iter().zip(&prediction.reading).zip(variances).enumerate();
+        each.filter(|(b, _)| self.accepted.has(*b)).map(|(channel, ((reading, predicted), &variance))| Reading {
+            channel,
+            innovation: reading.value() - predicted,
+            variance,
+            slope: column(prediction.jacobian.as_slice(), N, channel),
+        })
     }
 }
 
@@ -517,13 +524,19 @@ impl<
     ) -> f32 {
         let before = self.solution.cost;
         let linearised_once = cell.is_none() || !self.is_still(model);
-        for b in (0..B).filter(|b| screened.accepted.has(*b)) {
-            let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
-            let (innovation, variance) = self.news_of(model, b, self.innovation(b, code), cell);
-            let slope = column(self.prediction.jacobian.as_slice(), N, b);
-            let own = |d: &[f64; N]| if linearised_once { UNDERWEIGHT * self.solution.variance_of(d) } else { 0.0 };
-            self.gaussian.condition(b, innovation, variance, slope, own);
+        let mut news = [(0.0, 0.0); B];
+        for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
+            *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
         }
+        let used = news.iter().enumerate().filter(|(b, _)| screened.accepted.has(*b));
+        let readings = used.map(|(channel, &(innovation, variance))| Reading {
+            channel,
+            innovation,
+            variance,
+            slope: column(self.prediction.jacobian.as_slice(), N, channel),
+        });
+        let own = |d: &[f64; N]| if linearised_once { UNDERWEIGHT * self.solution.variance_of(d) } else { 0.0 };
+        self.gaussian.condition(readings, own);
         self.condition_tunes(model, screened);
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
@@ -541,7 +554,8 @@ impl<
             if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
                 let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
                 let own = |d: &[f64; N]| if linearised_once { UNDERWEIGHT * self.solution.variance_of(d) } else { 0.0 };
-                self.gaussian.condition(B + plane, *innovation, variance, &slope, own);
+                let reading = Reading { channel: B + plane, innovation: *innovation, variance, slope: &slope };
+                self.gaussian.condition([reading], own);
             }
         }
     }
@@ -560,12 +574,9 @@ impl<
         {
             self.loose.recentre(self.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
-            for b in (0..B).filter(|b| oldest.accepted.has(*b)) {
-                let variance = self.variance(model, b, 1, oldest.drive.rf_offset);
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let innovation = oldest.innovation(b, &self.prediction.reading);
-                self.loose.condition(b, innovation, variance, slope, |d| UNDERWEIGHT * self.solution.variance_of(d));
-            }
+            let variances: [f32; B] = core::array::from_fn(|b| self.variance(model, b, 1, oldest.drive.rf_offset));
+            let readings = oldest.readings(&variances, &self.prediction);
+            self.loose.condition(readings, |d| UNDERWEIGHT * self.solution.variance_of(d));
         }
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left

@@ -36,6 +36,19 @@ pub struct Line {
     xr: f64,
 }
 
+/// A reading, linearised.
+#[derive(Debug, Clone, Copy)]
+pub struct Reading<'h> {
+    /// Of which monitor, or of which tune.
+    pub channel: usize,
+    /// Measured minus predicted, before the baseline [m].
+    pub innovation: f32,
+    /// Its variance [m^2].
+    pub variance: f32,
+    /// Its derivative `h` [m].
+    pub slope: &'h [f32],
+}
+
 /// Repeats of a reading that enter as their mean.
 #[derive(Debug, Clone, Copy)]
 pub struct Repeats {
@@ -275,27 +288,21 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.baseline.get(b).copied().unwrap_or(0.0)
     }
 
-    /// Add a reading of monitor `b`: its innovation [m], its variance [m^2], and `h` [m]; `own` is what the uncertain
-    /// linearisation adds to the variance, for a difference of reading and baseline of this derivative.
-    pub fn condition(
-        &mut self,
-        b: usize,
-        innovation: f32,
-        variance: f32,
-        h: &[f32],
-        own: impl FnOnce(&[f64; N]) -> f64,
-    ) {
-        let Some(&mean) = self.baseline.get(b) else { return };
-        let (d, baseline_variance) = self.effective(b, h);
-        let s = f64::from(variance) + own(&d) + baseline_variance;
-        let e = f64::from(innovation) - mean;
-        for (row, factor) in self.information.rows_mut().zip(&d) {
-            add(row, factor / s, &d);
+    /// Add the readings of a frame, of one channel each; `own` is what the uncertain linearisation adds to a variance, for a
+    /// difference of reading and baseline of this derivative.
+    pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, own: impl Fn(&[f64; N]) -> f64) {
+        let mut staged = Staged::NONE;
+        for Reading { channel, innovation, variance, slope } in readings {
+            let (d, baseline_variance) = self.effective(channel, slope);
+            let s = f64::from(variance) + own(&d) + baseline_variance;
+            let e = f64::from(innovation) - self.baseline(channel);
+            staged.push(&d, 1.0 / s, &mut self.information);
+            add(&mut self.vector, e / s, &d);
+            self.cost += e * e / s;
+            self.volume += ln_density(s);
+            self.learn_baselines(channel, &d, e, s);
         }
-        add(&mut self.vector, e / s, &d);
-        self.cost += e * e / s;
-        self.volume += ln_density(s);
-        self.learn_baselines(b, &d, e, s);
+        staged.settle(&mut self.information);
     }
 
     /// Move the baselines: without process noise that of monitor `b` alone, else all, for they are correlated.
@@ -675,12 +682,16 @@ mod tests {
     }
 
     const VARIANCE: f32 = 1.5e-4 * 1.5e-4;
+    fn reading(channel: usize, innovation: f32, slope: &[f32]) -> Reading<'_> {
+        Reading { channel, innovation, variance: VARIANCE, slope }
+    }
+
     const SINGLE: Repeats = Repeats { number: 1, noise: VARIANCE, variance: VARIANCE };
 
     fn conditioned() -> Gaussian<2, 2, 3> {
         let mut gaussian = prior();
         for (b, innovation, h) in readings() {
-            gaussian.condition(b, innovation, VARIANCE, &h, |_| 0.0);
+            gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
         }
         gaussian
     }
@@ -730,15 +741,16 @@ mod tests {
         let residual = |b: usize, i: usize| 3e-3 + 2e-4 * libm::sinf((7 * b + i) as f32);
         let share = |i: usize| [1.0, -0.9, 0.0, 0.4][i % 4];
         for (b, innovation, h) in readings().into_iter().take(4) {
-            one_by_one.condition(b, innovation, VARIANCE, &h, |_| 0.0);
-            pooled.condition(b, innovation, VARIANCE, &h, |_| 0.0);
+            one_by_one.condition([reading(b, innovation, &h)], |_| 0.0);
+            pooled.condition([reading(b, innovation, &h)], |_| 0.0);
         }
         let mut pool = pooled.open([2.9e-3, 0.0]);
         for b in 0..2 {
             let (mut line, level) = (Line::default(), pool.level[b]);
             for i in 0..20 {
                 pooled.count(&mut line, share(i), f64::from(residual(b, i)) - level, &SINGLE);
-                one_by_one.condition(b, residual(b, i), VARIANCE, &derivative(b).map(|h| share(i) * h), |_| 0.0);
+                let h = derivative(b).map(|h| share(i) * h);
+                one_by_one.condition([reading(b, residual(b, i), &h)], |_| 0.0);
             }
             pooled.add_line(&mut pool, b, &line, &derivative(b));
         }
@@ -779,7 +791,7 @@ mod tests {
                 solution.solve(&gaussian, |_| WIDE);
                 gaussian.walk(2e-2, &mut solution);
             }
-            gaussian.condition(b, innovation, VARIANCE, &h, |_| 0.0);
+            gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
         }
         assert_equal(&gaussian, &[10, 25], 2e-2);
     }
@@ -795,7 +807,7 @@ mod tests {
             let s = f64::from(VARIANCE) + baseline + solution.variance_of(&d);
             let e = f64::from(innovation) - gaussian.baseline(b) - d[0] * solution.delta[0] - d[1] * solution.delta[1];
             log_density -= 0.5 * (e * e / s + ln_density(s));
-            gaussian.condition(b, innovation, VARIANCE, &h, |_| 0.0);
+            gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
         }
         solution.solve(&gaussian, |_| WIDE);
         assert!((solution.log_evidence - log_density).abs() < 1e-9, "{} {log_density}", solution.log_evidence);
@@ -821,8 +833,7 @@ mod tests {
         gaussian.reset(|_| WIDE, |_| BASELINE);
         let n = 500_000;
         for _ in 0..n {
-            gaussian.condition(0, 1e-4, VARIANCE, &[0.03], |_| 0.0);
-            gaussian.condition(0, -1e-4, VARIANCE, &[-0.03], |_| 0.0);
+            gaussian.condition([reading(0, 1e-4, &[0.03]), reading(0, -1e-4, &[-0.03])], |_| 0.0);
         }
         let precision = 1.0 / f64::from(VARIANCE);
         let expected = 1.0 / square(WIDE.sigma) + 2.0 * f64::from(n) * square(0.03) * precision;

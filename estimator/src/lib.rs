@@ -31,7 +31,7 @@ pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Beyond, Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
 pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Setup};
-pub use gaussian::{Gaussian, Solution};
+pub use gaussian::{Gaussian, Reading, Solution};
 pub use mask::{Mask, words};
 pub use monitor::{Gate, Monitor, Noise};
 pub use prior::{Marginal, Prior};

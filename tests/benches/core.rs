@@ -4,7 +4,7 @@ use divan::{Bencher, black_box};
 use estimator::booster::{
     self, CHANNELS, CORRECTORS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
 };
-use estimator::{Gaussian, Layout, Prior, Solution, Surrogate};
+use estimator::{Gaussian, Layout, Prior, Reading, Solution, Surrogate};
 use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
@@ -146,10 +146,9 @@ fn prior() -> Box<Posterior> {
 
 /// A frame's 33 readings enter the Gaussian.
 fn condition_all(gaussian: &mut Posterior, prediction: &Prediction) {
-    for (b, slope) in prediction.jacobian.as_slice().chunks_exact(PARAMS).enumerate() {
-        gaussian.condition(b, black_box(1e-3), 2.25e-8, slope);
-    }
-    gaussian.settle();
+    let slopes = prediction.jacobian.as_slice().chunks_exact(PARAMS).enumerate();
+    let reading = |(channel, slope)| Reading { channel, innovation: black_box(1e-3), variance: 2.25e-8, slope };
+    gaussian.condition(slopes.map(reading), |_| 0.0);
 }
 
 /// All readings of a frame, 33 updates of the Gaussian.

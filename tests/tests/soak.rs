@@ -1,8 +1,8 @@
 //! Streams as long as weeks, and what happens in them: the core beside the same Gaussian in double precision, and the truth.
 //! `cargo run --release -p system-tests --bin soak` streams for hours.
 
-use estimator::PositionCode;
 use estimator::booster::{Estimate, Frame, PARAMS};
+use estimator::{IntensityCode, PositionCode};
 use system_tests::soak::{Row, Soak};
 
 /// A stream of 100,000 frames, beside double precision and the truth.
@@ -97,6 +97,23 @@ fn frames_without_beam_are_flagged_and_change_nothing() {
             assert!((0.5..1.6).contains(&soak.nees(&last)), "{row:?}, kind {kind}: NEES/48 {}", soak.nees(&last));
         }
     }
+}
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn a_frame_without_particles_is_flagged_whatever_it_reads() {
+    let mut soak = Soak::new(Row::Several, 6, 0.0).unwrap();
+    let particles = |at| match at {
+        40 => 0.0,
+        50 => 4e13, // a wrong reading, 90 times the others
+        99 => 1e7,
+        _ => 4.5e11,
+    };
+    let flagged = (0..100).filter(|at| {
+        let frame = Frame { intensity: IntensityCode::nearest(particles(*at)), ..soak.cycle() };
+        soak.ingest(&frame).remarks.put_aside
+    });
+    assert_eq!(flagged.collect::<Vec<i32>>(), [40, 99]);
 }
 
 #[test]

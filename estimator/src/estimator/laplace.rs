@@ -3,7 +3,7 @@
 use super::{Estimator, Model, about};
 use crate::drive::Drive;
 use crate::estimate::MonitorState;
-use crate::gaussian::{Line, Repeats};
+use crate::gaussian::{Line, Reading, Repeats};
 use crate::linear::{column, dot};
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
@@ -149,12 +149,8 @@ impl<
         for frame in &self.recent {
             let drive = about(&frame.drive, &self.supplies);
             model.surrogate.predict(&self.linearised, &drive, &mut self.prediction);
-            for b in (0..B).filter(|b| frame.accepted.has(*b)) {
-                let slope = column(self.prediction.jacobian.as_slice(), N, b);
-                let innovation = frame.innovation(b, &self.prediction.reading);
-                let variance = self.variance(model, b, 1, drive.rf_offset);
-                self.gaussian.condition(b, innovation, variance, slope, |_| 0.0);
-            }
+            let variances: [f32; B] = core::array::from_fn(|b| self.variance(model, b, 1, drive.rf_offset));
+            self.gaussian.condition(frame.readings(&variances, &self.prediction), |_| 0.0);
         }
         for b in 0..B {
             self.gaussian.add_scatter(self.campaign.scatter(b) / f64::from(self.noise_variance(b)));
@@ -169,7 +165,8 @@ impl<
                 let squares = meter.scatter();
                 let innovation = self.tune_innovation(model, plane, mean, &strength);
                 let (_, slope) = model.surrogate.tune(&self.linearised, plane, &[0.0; F]);
-                self.gaussian.condition(B + plane, innovation, variance / count as f32, &slope, |_| 0.0);
+                let mean = Reading { channel: B + plane, innovation, variance: variance / count as f32, slope: &slope };
+                self.gaussian.condition([mean], |_| 0.0);
                 self.gaussian.add_repeats(count, variance);
                 self.gaussian.add_scatter(squares / f64::from(variance));
             }

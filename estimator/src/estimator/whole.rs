@@ -10,8 +10,10 @@ use crate::wire::Frame;
 
 /// One in so many monitors may surprise before the whole frame is in doubt: they fail one at a time.
 const FEW: u32 = 8;
-/// A beam of less than one part in so many of the largest so far is lost.
+/// A beam of less than one part in so many of the largest lately is lost.
 const LOST: i64 = 100;
+/// The largest lately is forgotten by one part in `2^6` a frame: a wrong reading of it is overcome in some hundred frames.
+const FORGOTTEN: u32 = 6;
 /// An orbit resembles the one expected if the squares of the surprises are at most one part in so many of its own.
 const RESEMBLES: f32 = 4.0;
 
@@ -97,7 +99,7 @@ impl<
     /// True if the front end counts particles, and hardly any are there.
     fn is_beam_lost(&mut self, frame: &Frame<B, C, F, W>) -> bool {
         let Some(intensity) = frame.intensity.map(|intensity| intensity.steps()) else { return false };
-        self.most_intense = self.most_intense.max(intensity);
+        self.most_intense = intensity.max(self.most_intense - (self.most_intense >> FORGOTTEN));
         LOST * i64::from(intensity) <= i64::from(self.most_intense)
     }
 
