@@ -173,7 +173,8 @@ impl Machine {
         };
         if !self.is_linearised {
             let linearise = Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise;
-            linearise(&*self.surrogate, &self.params, &[0.0; SUPPLIES], &mut self.at).expect("a stable ring");
+            let surrogate: &Green = &self.surrogate;
+            linearise(surrogate, &self.params, &[0.0; SUPPLIES], &mut self.at).expect("a stable ring");
             self.is_linearised = true;
         }
         let drive = calibration.drive(&frame).expect("a drive within the model");
