@@ -30,7 +30,7 @@ pub mod wire;
 pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Beyond, Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
-pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Setup};
+pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Setup, Walk};
 pub use gaussian::{Gaussian, Reading, Solution};
 pub use mask::{Mask, words};
 pub use monitor::{Gate, Monitor, Noise};

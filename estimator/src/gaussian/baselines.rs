@@ -18,6 +18,9 @@ pub trait Covariance<const B: usize>: Copy {
     /// Variance of a monitor's.
     fn variance(&self, b: usize) -> f64;
 
+    /// Add to the variance of a monitor's.
+    fn spread(&mut self, b: usize, variance: f64);
+
     /// Take a reading of monitor `b` off, of innovation variance `s`. Returns the gain of each baseline from `from` on.
     fn condition(&mut self, b: usize, s: f64) -> Gain<B>;
 }
@@ -55,6 +58,10 @@ impl<const B: usize> Covariance<B> for Independent<B> {
         self.get(b).copied().unwrap_or(0.0)
     }
 
+    fn spread(&mut self, b: usize, variance: f64) {
+        self.get_mut(b).into_iter().for_each(|own| *own += variance);
+    }
+
     fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
         let mut gain = [0.0; B];
         if let (Some(variance), Some(gain)) = (self.get_mut(b), gain.get_mut(b)) {
@@ -82,6 +89,11 @@ impl<const B: usize> Covariance<B> for Correlated<B> {
 
     fn variance(&self, b: usize) -> f64 {
         column(self.matrix.as_slice(), B, b).get(b).copied().unwrap_or(0.0)
+    }
+
+    fn spread(&mut self, b: usize, variance: f64) {
+        let own = self.matrix.as_mut_slice().chunks_exact_mut(B).nth(b);
+        own.and_then(|column| column.get_mut(b)).into_iter().for_each(|own| *own += variance);
     }
 
     fn condition(&mut self, b: usize, s: f64) -> Gain<B> {

@@ -174,6 +174,16 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.cost += chi_square;
     }
 
+    /// Variance of a baseline, params given [m^2].
+    pub fn baseline_variance(&self, b: usize) -> f64 {
+        self.covariance.variance(b)
+    }
+
+    /// Let the first `monitors` baselines walk at random by a variance [m^2].
+    pub fn spread_baselines(&mut self, variance: f64, monitors: usize) {
+        (0..monitors).for_each(|b| self.covariance.spread(b, variance));
+    }
+
     /// The baselines have moved by so much [m], those of monitors; the readings so far move with them.
     pub fn move_baselines(&mut self, shift: &[f32]) {
         self.baseline.iter_mut().zip(shift).for_each(|(baseline, by)| *baseline += f64::from(*by));
