@@ -13,6 +13,7 @@ mod campaign;
 mod drive;
 mod estimate;
 mod estimator;
+mod following;
 mod gaussian;
 mod linear;
 mod machine;

@@ -1,8 +1,9 @@
 //! Linearising anew: the Gaussian at the MAP, rebuilt from all frames so far, and how well it describes them.
 
-use super::{Estimator, Model, about};
+use super::{Estimator, Model, about, follow, ripple_of};
 use crate::drive::Drive;
 use crate::estimate::MonitorState;
+use crate::following;
 use crate::gaussian::{Line, Reading, Repeats};
 use crate::linear::{column, dot};
 use crate::monitor::Monitor;
@@ -17,18 +18,16 @@ pub struct FitQuality {
     pub degrees_of_freedom: f32,
 }
 
-/// Share of chi-square that the baseline orbit's dance with the supplies makes on a machine that is as its model (`docs/model.md`).
-const ORDINARY: f32 = 0.008;
 /// Standard deviations of chi-square beyond which model and machine disagree: one campaign in 700 by chance.
 const DISAGREES: f32 = 3.0;
 
 impl FitQuality {
-    /// How far chi-square is above what a true model leaves, in its standard deviations: `(chi2/dof - 1 - 0.008)/sqrt(2/dof)`.
+    /// How far chi-square is above what a true model leaves, in its standard deviations: `(chi2/dof - 1)/sqrt(2/dof)`.
     pub fn excess(&self) -> f32 {
         if self.degrees_of_freedom < 1.0 {
             return 0.0;
         }
-        (self.chi_square / self.degrees_of_freedom - 1.0 - ORDINARY) / libm::sqrtf(2.0 / self.degrees_of_freedom)
+        (self.chi_square / self.degrees_of_freedom - 1.0) / libm::sqrtf(2.0 / self.degrees_of_freedom)
     }
 
     /// The mismatch alarm: the readings of healthy monitors are further off than noise explains. It sees all effects together and
@@ -99,6 +98,7 @@ impl<
             return false;
         }
         self.tangent.supplies = supplies;
+        self.tangent.ripple = [0, 1].map(|plane| ripple_of(model.surrogate, &self.tangent.linearised, plane));
         if self.posterior.is_still::<B>(&model.setup.walk) {
             self.rebuild(model, params);
         } else {
@@ -131,14 +131,17 @@ impl<
                 let strength = about(&drive, &self.tangent.supplies).strength;
                 let direct = Drive { strength: [0.0; F], ..drive };
                 model.surrogate.orbit(&self.tangent.linearised, &direct, &mut self.predicted.prediction.reading);
-                for (b, (line, by_supply)) in lines.iter_mut().zip(&by_supply).enumerate() {
+                for (b, ((line, by_supply), following)) in
+                    lines.iter_mut().zip(&by_supply).zip(&self.following).enumerate()
+                {
                     let (mean, number) = cell.mean(b);
                     let (Some(orbit), Some(level), 1..) =
                         (self.predicted.prediction.reading.get(b), level.get(b), number)
                     else {
                         continue;
                     };
-                    let residual = f64::from(mean - orbit - share * dot(&strength, by_supply)) - level;
+                    let orbit = orbit + share * dot(&strength, by_supply) + following.shift(&strength);
+                    let residual = f64::from(mean - orbit) - level;
                     let variance = self.variance(model, b, number, drive.rf_offset);
                     let repeats = Repeats { number, noise: self.noise_variance(b), variance };
                     self.posterior.gaussian.count(line, share, residual, &repeats);
@@ -155,11 +158,13 @@ impl<
         for frame in &self.past.recent {
             let drive = about(&frame.drive, &self.tangent.supplies);
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
-            let variances: [f32; B] = core::array::from_fn(|b| self.variance(model, b, 1, drive.rf_offset));
+            follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
+            let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, b, &drive));
             self.posterior.gaussian.condition(frame.readings(&variances, &self.predicted.prediction), |_| 0.0);
         }
-        for b in 0..B {
-            self.posterior.gaussian.add_scatter(self.past.campaign.scatter(b) / f64::from(self.noise_variance(b)));
+        for (b, following) in self.following.iter().enumerate() {
+            let expected = self.follows(model, b);
+            self.posterior.gaussian.add_scatter(following.chi_square(&expected), following.volume(&expected));
         }
     }
 
@@ -174,7 +179,7 @@ impl<
                 let mean = Reading { channel: B + plane, innovation, variance: variance / count as f32, slope: &slope };
                 self.posterior.gaussian.condition([mean], |_| 0.0);
                 self.posterior.gaussian.add_repeats(count, variance);
-                self.posterior.gaussian.add_scatter(squares / f64::from(variance));
+                self.posterior.gaussian.add_scatter(squares / f64::from(variance), 0.0);
             }
         }
     }
@@ -192,13 +197,15 @@ impl<
         let is_spare = |b: usize| (0..layout.monitors()).all(|index| layout.monitor(index) != b);
         let is_ok = |(b, monitor): &(usize, &Monitor)| monitor.health().state == MonitorState::Ok && !is_spare(*b);
         let (mut sum, mut readings, mut baselines) = (0.0, 0.0, 0.0);
-        for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-            sum += self.past.campaign.scatter(b) / expected(b);
+        for ((b, _), following) in self.monitors.iter().enumerate().zip(&self.following).filter(|(m, _)| is_ok(m)) {
+            sum +=
+                following.chi_square(&following::Expected { variance: expected(b) as f32, ..self.follows(model, b) });
             baselines += 1.0;
         }
         for cell in self.past.campaign.cells() {
             let drive = about(&cell.drive(), &self.tangent.supplies);
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
+            follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
                 let (mean, count) = cell.mean(b);
                 let (d, _) =

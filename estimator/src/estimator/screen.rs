@@ -77,6 +77,10 @@ impl<
                 self.past.stale = true;
             }
         }
+        for b in 0..B {
+            let expected = self.follows(model, b);
+            self.following.get_mut(b).into_iter().for_each(|following| following.learn(&expected));
+        }
         self.screen_tunes(model, frame, drive, &mut screened);
         screened
     }
@@ -120,14 +124,16 @@ impl<
             monitor.noise.learn(difference);
         }
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
-        let scatter = cell.take(b, code, moved, verdict);
+        let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
+        if let Some(following) = following {
+            cell.take(b, code, moved, verdict, |deviation, n| following.add_repeat(deviation, off_mean, n));
+        }
         match verdict {
             Verdict::Accepted => {}
             Verdict::Confirms { .. } => monitor.pardon(),
             Verdict::Held => monitor.reject(),
         }
         screened.note(b, verdict);
-        self.past.campaign.add_scatter(b, scatter);
     }
 
     /// A reading without a setting passes if the model expects it.

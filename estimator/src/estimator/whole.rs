@@ -101,7 +101,10 @@ impl<
             let (d, baseline_variance) = self.posterior.gaussian.effective(b, self.slope(b));
             let predicted = self.posterior.gaussian.baseline(b) + dot(&d, &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
-            let certain = f64::from(self.variance(model, b, 1, self.predicted.rf_offset)) + baseline_variance;
+            let certain = f64::from(
+                self.own_variance(model, b, &self.predicted.strength)
+                    + self.shared_variance(model, b, self.predicted.rf_offset),
+            ) + baseline_variance;
             let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
             // the uncertainty of the params is only worked out for readings that need it
             let within =

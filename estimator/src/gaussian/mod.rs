@@ -169,9 +169,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.volume += libm::log(n) + (n - 1.0) * ln_density(variance.into());
     }
 
-    /// Squared deviations of repeats from their means, over their variance.
-    pub fn add_scatter(&mut self, chi_square: f64) {
+    /// Squared deviations of repeats from their means, over their variance; `volume` is what the evidence pays for slopes that made
+    /// them smaller, twice.
+    pub fn add_scatter(&mut self, chi_square: f64, volume: f64) {
         self.cost += chi_square;
+        self.volume += volume;
     }
 
     /// Variance of a baseline, params given [m^2].
