@@ -5,6 +5,7 @@
 
 mod laplace;
 mod posterior;
+mod reference;
 mod screen;
 mod sequence;
 mod whole;
@@ -30,6 +31,7 @@ use crate::wire::{Frame, FrameError, PositionCode};
 pub use laplace::FitQuality;
 use posterior::Posterior;
 pub use posterior::Walk;
+use reference::Reference;
 use screen::Screened;
 use sequence::Sequence;
 use whole::{Whole, WholeFrames};
@@ -152,6 +154,7 @@ struct Past<
     const W: usize,
 > {
     campaign: Campaign<B, C, F, S>,
+    reference: Reference<C>,
     /// The last frames that belong to no setting.
     recent: Deque<Loose<B, C, F, W>, RECENT>,
     /// The prior, and older ones: they cannot be linearised anew.
@@ -213,9 +216,6 @@ struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
     accepted: Mask<W>,
 }
 
-/// Mean square orbit of idle correctors over the noise's below which they count as idle: the scatter of read-backs makes 0.004.
-const IDLE: f32 = 0.1;
-
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f32 = 0.02;
 
@@ -276,7 +276,13 @@ impl<
         monitors: [const { Monitor::BLANK }; B],
         following: [Following::NONE; B],
         tunes: [const { TuneMeter::BLANK }; 2],
-        past: Past { campaign: Campaign::BLANK, recent: Deque::new(), loose: Gaussian::BLANK, stale: false },
+        past: Past {
+            campaign: Campaign::BLANK,
+            reference: Reference::ZERO,
+            recent: Deque::new(),
+            loose: Gaussian::BLANK,
+            stale: false,
+        },
         posterior: Posterior::BLANK,
         whole: WholeFrames::NONE,
         nis: (0.0, 0),
@@ -300,6 +306,7 @@ impl<
         self.following = [Following::NONE; B];
         self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.past.campaign.clear();
+        self.past.reference = Reference::ZERO;
         self.past.recent.clear();
         let calibration = model.setup.tune_calibration.unwrap_or(1.0);
         self.past
@@ -350,6 +357,8 @@ impl<
         }
         self.prepared = true;
         let linearised = self.is_due() && self.linearise_anew(model);
+        self.seek_reference(model);
+        self.retire(model);
         self.tangent.is_new |= linearised;
         let seconds = self.sequence.expect_next();
         self.walk(model, seconds);
@@ -400,23 +409,6 @@ impl<
     fn walk(&mut self, model: &Model<'_, G, B, C, F>, seconds: f32) {
         let prior = |i| prior_of::<G, B, C, F, N>(model, i);
         self.posterior.walk::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior);
-    }
-
-    /// The setting that a frame repeats. Several correctors at once belong to none; nor do idle ones that move the orbit
-    /// noticeably, since what they say of the params is lost in a setting's mean.
-    #[inline(never)]
-    fn setting(
-        &mut self,
-        model: &Model<'_, G, B, C, F>,
-        frame: &Frame<B, C, F, W>,
-        drive: &Drive<C, F>,
-    ) -> Option<Setting> {
-        let setting = Setting::of(frame, model.setup.calibration.powered)?;
-        // work space: what the mean drive would have made is not known yet
-        model.surrogate.orbit(&self.tangent.linearised, &setting.idle(drive), &mut self.predicted.at_mean_drive);
-        let over_noise = |(b, orbit): (usize, &f32)| orbit * orbit / self.noise_variance(b);
-        let moved: f32 = self.predicted.at_mean_drive.iter().enumerate().map(over_noise).sum();
-        (moved <= IDLE * model.surrogate.layout().monitors() as f32).then_some(setting)
     }
 
     /// The cell of a setting, the frame's drive counted in, and what its mean drive would have made.
@@ -583,6 +575,7 @@ impl<
             let readings = oldest.readings(&variances, &self.predicted.prediction);
             self.past.loose.condition(readings, |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
         }
+        self.past.reference.wait();
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
