@@ -278,6 +278,12 @@ pub enum Verdict {
     Held,
 }
 
+/// A sum of squared steps [m^2].
+pub fn squares(squared_steps: u64) -> f64 {
+    let step = f64::from(PositionCode::METRES_PER_LSB);
+    squared_steps as f64 * step * step
+}
+
 /// All settings, at most `S`, and the scatter of repeats within them.
 #[derive(Debug, Clone)]
 pub struct Campaign<const B: usize, const C: usize, const F: usize, const S: usize> {
@@ -325,8 +331,7 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
 
     /// Sum of squared deviations of a monitor's repeats from their means [m^2].
     pub fn scatter(&self, b: usize) -> f64 {
-        let step = f64::from(PositionCode::METRES_PER_LSB);
-        self.scatter.get(b).map_or(0.0, |&s| s as f64 * step * step)
+        self.scatter.get(b).copied().map_or(0.0, squares)
     }
 
     /// The monitors have moved by so much [m]: their readings so far move with them.

@@ -3,7 +3,9 @@
 //!
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
+mod anew;
 mod laplace;
+mod pooling;
 mod posterior;
 mod screen;
 mod sequence;
@@ -26,6 +28,8 @@ use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
 use crate::wire::{Frame, FrameError, PositionCode};
 
+pub use anew::Prepared;
+use anew::{Anew, Work};
 pub use laplace::FitQuality;
 use posterior::Posterior;
 pub use posterior::Walk;
@@ -82,8 +86,8 @@ pub struct Model<'a, G, const B: usize, const C: usize, const F: usize> {
 }
 
 /// The posterior that frames have made of a model: `B` monitors, `C` correctors, `F` supplies, `N` params, `S` settings; `K`
-/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `W` words have a bit for each
-/// monitor or param.
+/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `U` one of `K`, `W` words have a bit
+/// for each monitor or param.
 #[derive(Debug, Clone)]
 pub struct Estimator<
     G: Surrogate<B, C, F, N>,
@@ -94,18 +98,22 @@ pub struct Estimator<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
 > {
     started: bool,
     sequence: Sequence,
-    /// All is done that can be before the next frame: linearised if due, and the params walked until then.
-    prepared: bool,
+    /// No frame has come since the last look at whether to linearise anew.
+    looked: bool,
+    /// Slices of work between frames since the last estimate.
+    slices: u32,
     tangent: Tangent<G::Linearised, F>,
+    anew: Anew<G::Linearised, G::Progress, B, C, F, N, S, K, T, W>,
     predicted: Predicted<B, F, N>,
     monitors: [Monitor; B],
     tunes: [TuneMeter<F>; 2],
     past: Past<B, C, F, N, S, K, T, W>,
-    posterior: Posterior<K, N, T, W>,
+    posterior: Posterior<K, N, T, U, W>,
     whole: WholeFrames<B>,
     /// Sum of NIS, and the number of readings in it.
     nis: (f64, u64),
@@ -119,6 +127,20 @@ struct Tangent<L, const F: usize> {
     supplies: [f32; F],
     /// Linearised since the last estimate.
     is_new: bool,
+}
+
+impl<L, const F: usize> Tangent<L, F> {
+    /// Measured minus predicted tune at `ln` of the supplies' factors.
+    fn tune_innovation<G: Surrogate<B, C, F, N, Linearised = L>, const B: usize, const C: usize, const N: usize>(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        plane: usize,
+        tune: f32,
+        strength: &[f32; F],
+    ) -> f32 {
+        let (predicted, _) = model.surrogate.tune(&self.linearised, plane, &less(strength, &self.supplies));
+        wrapped(tune - predicted)
+    }
 }
 
 /// What the surrogate makes of the frame at hand.
@@ -246,8 +268,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     const FITS: () = assert!(K == B + 2, "a channel for each monitor and for each tune");
 
@@ -255,8 +278,10 @@ impl<
     pub const BLANK: Self = Self {
         started: false,
         sequence: Sequence::EMPTY,
-        prepared: false,
+        looked: false,
+        slices: 0,
         tangent: Tangent { linearised: G::UNLINEARISED, supplies: [0.0; F], is_new: false },
+        anew: Anew::blank(G::UNLINEARISED),
         predicted: Predicted { prediction: Prediction::BLANK, at_mean_drive: [0.0; B], rf_offset: 0.0 },
         monitors: [const { Monitor::BLANK }; B],
         tunes: [const { TuneMeter::BLANK }; 2],
@@ -273,9 +298,9 @@ impl<
     pub fn restart(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         let () = Self::FITS;
         self.started = false;
-        model.surrogate.linearise(&[0.0; N], &[0.0; F], &mut self.tangent.linearised)?;
+        self.linearise_design(model)?;
         (self.tangent.supplies, self.tangent.is_new, self.predicted.rf_offset) = ([0.0; F], false, 0.0);
-        (self.sequence, self.whole, self.prepared) = (Sequence::EMPTY, WholeFrames::NONE, true);
+        (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
         self.posterior.clear();
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
@@ -317,6 +342,9 @@ impl<
         }
         let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
         let screened = self.screen(model, &frame, &drive, cell, whole, &expected.within);
+        if let Some(cell) = cell {
+            self.note_late(model, &frame, &drive, cell, &screened);
+        }
         let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
@@ -324,19 +352,24 @@ impl<
         Ok(self.estimate(model, &frame, cell, &screened, nis, whole))
     }
 
-    /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
-    /// it was done), and let the params walk for one cycle. To be called after each frame; a second call does nothing.
+    /// One slice of what can be done between frames, so that the next one is answered at once: let the params walk for one
+    /// cycle, and linearise anew if that is due. To be called until there is [`Prepared::Nothing`] to do, or a frame has come:
+    /// that is answered with the old linearisation, and counts in the new one.
     #[inline(never)]
-    pub fn prepare(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
-        if !self.started || self.prepared {
-            return false;
+    pub fn prepare(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
+        if !self.started {
+            return Prepared::Nothing;
         }
-        self.prepared = true;
-        let linearised = self.is_due() && self.linearise_anew(model);
-        self.tangent.is_new |= linearised;
         let seconds = self.sequence.expect_next();
-        self.walk(model, seconds);
-        linearised
+        let walked = self.walk(model, seconds);
+        if !walked && !self.anew.under_way {
+            if core::mem::replace(&mut self.looked, true) || !self.is_due() {
+                return Prepared::Nothing;
+            }
+            self.begin();
+        }
+        self.slices = self.slices.saturating_add(1);
+        if walked { Prepared::Slice } else { self.slice(model) }
     }
 
     /// Take the next frame as new, whatever its number: its sender counts anew without a new epoch.
@@ -344,16 +377,23 @@ impl<
         self.sequence.forget();
     }
 
-    /// Go over to another model of the same machine: all frames so far are weighed anew by it.
+    /// Go over to another model of the same machine, all slices at once: all frames so far are weighed anew by it.
     ///
     /// # Errors
     /// [`Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
     pub fn adopt(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         self.past.stale = true;
-        if self.started && !self.linearise_anew(model) {
-            return Err(Unstable);
+        if self.started { self.linearise_anew(model) } else { Ok(()) }
+    }
+
+    /// Linearise at vars = 1, all steps at once.
+    fn linearise_design(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
+        (self.anew.work, self.anew.under_way) = (Work::Surrogate(G::BEGIN), false);
+        while let Work::Surrogate(progress) = &mut self.anew.work {
+            if model.surrogate.advance(&[0.0; N], &[0.0; F], progress, &mut self.tangent.linearised)? {
+                break;
+            }
         }
-        self.tangent.is_new |= self.started;
         Ok(())
     }
 
@@ -377,12 +417,13 @@ impl<
     fn catch_up(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
         let seconds = self.sequence.advance(frame);
         self.walk(model, seconds);
-        self.prepared = false;
+        self.looked = false;
     }
 
-    fn walk(&mut self, model: &Model<'_, G, B, C, F>, seconds: f32) {
+    /// Let params and baselines walk for a time [s]; false if nothing has to.
+    fn walk(&mut self, model: &Model<'_, G, B, C, F>, seconds: f32) -> bool {
         let prior = |i| prior_of::<G, B, C, F, N>(model, i);
-        self.posterior.walk::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior);
+        self.posterior.walk::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior)
     }
 
     /// The setting that a frame repeats. Several correctors at once belong to none; nor do idle ones that move the orbit
@@ -434,13 +475,6 @@ impl<
     /// Measured minus predicted at the origin, before the baseline [m].
     fn innovation(&self, b: usize, code: i32) -> f32 {
         metres(code) - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0)
-    }
-
-    /// Measured minus predicted tune at `ln` of the supplies' factors.
-    fn tune_innovation(&self, model: &Model<'_, G, B, C, F>, plane: usize, tune: f32, strength: &[f32; F]) -> f32 {
-        let (predicted, _) =
-            model.surrogate.tune(&self.tangent.linearised, plane, &less(strength, &self.tangent.supplies));
-        wrapped(tune - predicted)
     }
 
     fn slope(&self, b: usize) -> &[f32] {
@@ -540,6 +574,7 @@ impl<
         if self.past.recent.is_full()
             && let Some(oldest) = self.past.recent.pop_front()
         {
+            self.note_leaving(model, &oldest);
             self.past.loose.recentre(self.posterior.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
             let variances: [f32; B] = core::array::from_fn(|b| self.variance(model, b, 1, oldest.drive.rf_offset));
@@ -570,6 +605,7 @@ impl<
             put_aside: whole == Whole::Aside,
             baselines_moved: whole == Whole::Moved,
             unsolved: core::mem::take(&mut self.posterior.unsolved),
+            slices: core::mem::take(&mut self.slices),
         };
         let solution = &self.posterior.solution;
         let mut estimate = Estimate {
@@ -646,4 +682,43 @@ fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
 
 fn metres(code: i32) -> f32 {
     code as f32 * PositionCode::METRES_PER_LSB
+}
+#[cfg(test)]
+mod size_tests {
+    extern crate std;
+    use super::*;
+    use crate::booster::*;
+    use crate::gaussian::*;
+    #[test]
+    fn print_sizes() {
+        type G = crate::booster::Green;
+        type L = <G as Surrogate<33, 48, 2, 48>>::Linearised;
+        type P = <G as Surrogate<33, 48, 2, 48>>::Progress;
+        std::println!("estimator {}", size_of::<crate::booster::Estimator>());
+        std::println!("linearised {} progress {}", size_of::<L>(), size_of::<P>());
+        std::println!(
+            "gaussian {} independent {}",
+            size_of::<Gaussian<35, 48, 1176, Correlated<35, 630>>>(),
+            size_of::<Gaussian<35, 48, 1176, Independent<35>>>()
+        );
+        std::println!("correlated {}", size_of::<Correlated<35, 630>>());
+        std::println!("solution {}", size_of::<crate::gaussian::Solution<48, 1176, 2>>());
+        std::println!("pooling {}", size_of::<pooling::Pooling<99, 35, 48, 1176>>());
+        std::println!("late {}", size_of::<pooling::Late<33, 48, 2, 2>>());
+        std::println!("loose {}", size_of::<Loose<33, 48, 2, 2>>());
+        std::println!("anew {}", size_of::<Anew<L, P, 33, 48, 2, 48, 99, 35, 1176, 2>>());
+        std::println!("campaign {} cell {}", size_of::<Campaign<33, 48, 2, 99>>(), size_of::<crate::Cell<33, 48, 2>>());
+        std::println!(
+            "prediction {} predicted {}",
+            size_of::<crate::Prediction<33, 2, 48>>(),
+            size_of::<Predicted<33, 2, 48>>()
+        );
+        std::println!(
+            "monitor {} whole {} tunes {}",
+            size_of::<Monitor>() * 33,
+            size_of::<WholeFrames<33>>(),
+            2 * size_of::<TuneMeter<2>>()
+        );
+        std::println!("green {}", size_of::<G>());
+    }
 }

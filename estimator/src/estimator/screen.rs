@@ -2,7 +2,7 @@
 
 use super::whole::Whole;
 use super::{Estimator, Model};
-use crate::campaign::{Verdict, is_moved};
+use crate::campaign::{Verdict, is_moved, squares};
 use crate::drive::Drive;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
@@ -16,6 +16,8 @@ pub(super) struct Screened<const W: usize> {
     pub rejected: Mask<W>,
     pub confirmed: Mask<W>,
     pub restarted: Mask<W>,
+    /// Growth of the repeats' squared deviations from the means of their settings, over the noise.
+    pub scatter: f64,
     /// Innovation of each tune that is used [1].
     pub tune: [Option<f32>; 2],
 }
@@ -48,8 +50,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// Decide which readings to use, and learn each monitor's noise from its repeats.
     #[inline(never)]
@@ -98,7 +101,7 @@ impl<
             let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
             let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
             self.past.stale |= meter.judge();
-            let innovation = self.tune_innovation(model, plane, code.value(), &drive.strength);
+            let innovation = self.tangent.tune_innovation(model, plane, code.value(), &drive.strength);
             screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
         }
     }
@@ -121,12 +124,14 @@ impl<
         }
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
         let scatter = cell.take(b, code, moved, verdict);
+        let variance = f64::from(monitor.variance());
         match verdict {
             Verdict::Accepted => {}
             Verdict::Confirms { .. } => monitor.pardon(),
             Verdict::Held => monitor.reject(),
         }
         screened.note(b, verdict);
+        screened.scatter += squares(scatter) / variance;
         self.past.campaign.add_scatter(b, scatter);
     }
 

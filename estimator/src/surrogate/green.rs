@@ -18,12 +18,10 @@
 //! Source: the resolvent (Dyson) form of the perturbed Green's function, by successive rank-one updates (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
-use nalgebra::SMatrix;
-
 use super::quantised::Column;
 use super::{Block, LowRank, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, add_four, add_four_twice, combine, dot, zeros};
+use crate::linear::{add, add_four, add_four_twice, dot};
 use crate::sizes::Sizes;
 use crate::triangle::Triangle;
 
@@ -99,7 +97,7 @@ pub struct Green<
     pub stated_error: [f32; 2],
 }
 
-/// One plane at given strengths. What only derivatives and ripple depend on is quantised: half the memory.
+/// One plane at given strengths, quantised column by column: half the memory, and errors within those of the tables.
 #[derive(Debug, Clone)]
 struct PlaneLinearised<const B: usize, const C: usize, const M: usize, const Q: usize> {
     /// Nodes to monitors, `Z_qb`.
@@ -107,7 +105,7 @@ struct PlaneLinearised<const B: usize, const C: usize, const M: usize, const Q: 
     /// Nodes to correctors, `Z_qc`.
     driven: [Column<Q>; C],
     /// Monitors to correctors, `R`.
-    response: SMatrix<f32, B, C>,
+    response: [Column<B>; C],
     /// Tune up to an integer [1].
     tune: f32,
     /// Derivative of the tune with respect to `ln` of each quadrupole's strength.
@@ -140,7 +138,7 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
     const BLANK: Self = Self {
         seen: [Column::ZERO; B],
         driven: [Column::ZERO; C],
-        response: zeros(),
+        response: [Column::ZERO; C],
         tune: 0.0,
         tune_slope: [0.0; M],
     };
@@ -214,16 +212,6 @@ impl<
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const M: usize, const Q: usize>
     GreenLinearised<BX, BY, CX, CY, M, Q>
 {
-    /// Response of the horizontal monitors to the horizontal correctors [m/rad].
-    pub fn response_x(&self) -> &SMatrix<f32, BX, CX> {
-        &self.x.response
-    }
-
-    /// Response of the vertical monitors to the vertical correctors [m/rad].
-    pub fn response_y(&self) -> &SMatrix<f32, BY, CY> {
-        &self.y.response
-    }
-
     /// Relative momentum that an RF offset makes.
     fn delta<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> f32 {
         -drive.rf_offset / self.slip
@@ -517,11 +505,13 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
                 if to < pairs { Step::Pairs(to) } else { Step::Seen(0) }
             }
             Step::Seen(from) => {
-                fill(at.seen.get_mut(from..).unwrap_or_default(), from, &self.seen, mutual, excess);
+                let table = self.seen.codes.get(from..).unwrap_or_default();
+                fill(at.seen.get_mut(from..).unwrap_or_default(), (self.seen.scale, table), mutual, excess);
                 if from + COLUMNS < B { Step::Seen(from + COLUMNS) } else { Step::Driven(0) }
             }
             Step::Driven(from) => {
-                fill(at.driven.get_mut(from..).unwrap_or_default(), from, &self.driven, mutual, excess);
+                let table = self.driven.codes.get(from..).unwrap_or_default();
+                fill(at.driven.get_mut(from..).unwrap_or_default(), (self.driven.scale, table), mutual, excess);
                 if from + COLUMNS < C { Step::Driven(from + COLUMNS) } else { Step::Response }
             }
             Step::Response => {
@@ -535,11 +525,13 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
 
     /// `R = G_bc - Z_bq D G_qc`.
     fn respond<const M: usize>(&self, excess: &[f32; Q], at: &mut PlaneLinearised<B, C, M, Q>) {
-        for (c, response) in at.response.as_mut_slice().chunks_exact_mut(B).enumerate() {
+        for (c, to) in at.response.iter_mut().enumerate() {
             let kick = product(excess, self.driven.column(c));
-            for ((to, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(&at.seen) {
-                *to = direct - seen.dot(&kick);
+            let mut response = [0.0; B];
+            for ((response, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(&at.seen) {
+                *response = direct - seen.dot(&kick);
             }
+            to.quantise(&response);
         }
     }
 }
@@ -576,7 +568,7 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
     /// Readings for kicks of correctors.
     fn read(&self, kick: &[f32], reading: &mut [f32]) {
         reading.fill(0.0);
-        combine(reading, acting(kick, self.response.as_slice().chunks_exact(B)));
+        acting(kick, self.response.iter()).for_each(|(kick, response)| response.add_to(kick, reading));
     }
 
     /// Add readings for kicks of nodes.
@@ -590,26 +582,25 @@ fn acting<'a, V>(kick: &'a [f32], columns: impl Iterator<Item = V>) -> impl Iter
     kick.iter().copied().zip(columns).filter(|(kick, _)| *kick != 0.0)
 }
 
-/// Columns of a table, [`COLUMNS`] of them at most, `from` on, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a
+/// The first [`COLUMNS`] columns, at most, of a part of a table, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a
 /// time.
 #[inline(never)]
-fn fill<const Q: usize, const M: usize, const T: usize>(
+fn fill<const Q: usize, const T: usize>(
     to: &mut [Column<Q>],
-    from: usize,
-    table: &Block<Q, M>,
+    (scale, table): (f32, &[[i16; Q]]),
     mutual: &Triangle<Q, T>,
     excess: &[f32; Q],
 ) {
     let mut columns = [[0.0; Q]; COLUMNS];
-    for (m, column) in (from..).zip(&mut columns) {
-        column.iter_mut().zip(table.column(m)).for_each(|(to, g)| *to = g);
+    for (column, codes) in columns.iter_mut().zip(table) {
+        column.iter_mut().zip(codes).for_each(|(to, code)| *to = scale * f32::from(*code));
     }
     let mut rows = [[0.0; Q]; 4];
     for first in (0..Q).step_by(4) {
         let mut errors = [0.0; 4];
         for ((n, row), error) in (first..Q).zip(&mut rows).zip(&mut errors) {
             mutual.copy_row(n, row);
-            *error = -table.scale * excess.get(n).copied().unwrap_or(0.0);
+            *error = -scale * excess.get(n).copied().unwrap_or(0.0);
         }
         let rows = rows.each_ref().map(<[f32; Q]>::as_slice);
         let kicks = |codes: &[i16; Q]| {
@@ -617,7 +608,7 @@ fn fill<const Q: usize, const M: usize, const T: usize>(
             kicks.iter_mut().zip(codes.iter().skip(first)).for_each(|(k, code)| *k *= f32::from(*code));
             kicks
         };
-        let mut each = columns.iter_mut().zip(table.codes.iter().skip(from));
+        let mut each = columns.iter_mut().zip(table);
         while let Some((one, codes)) = each.next() {
             match each.next() {
                 Some((other, others)) => add_four_twice([one, other], [kicks(codes), kicks(others)], rows),

@@ -34,6 +34,7 @@ impl<const R: usize> Column<R> {
     pub const ZERO: Self = Self { scale: 0.0, codes: [0; R] };
 
     /// Become these values, which must be finite.
+    #[inline(never)]
     pub fn quantise(&mut self, values: &[f32; R]) {
         self.scale = step(values.iter().copied().map(f64::from));
         self.codes.iter_mut().zip(values).for_each(|(to, value)| *to = code((*value).into(), self.scale));
@@ -45,7 +46,7 @@ impl<const R: usize> Column<R> {
     }
 
     /// `to += factor` times the column.
-    pub fn add_to(&self, factor: f32, to: &mut [f32; R]) {
+    pub fn add_to(&self, factor: f32, to: &mut [f32]) {
         let step = factor * self.scale;
         to.iter_mut().zip(&self.codes).for_each(|(to, code)| *to += step * f32::from(*code));
     }

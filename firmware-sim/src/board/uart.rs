@@ -7,7 +7,7 @@ use core::cell::RefCell;
 use core::sync::atomic::{AtomicU32, Ordering};
 
 use cortex_m::{asm, interrupt, interrupt::Mutex};
-use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use heapless::spsc::{Consumer, Producer, Queue};
 use static_cell::ConstStaticCell;
 
@@ -123,6 +123,12 @@ impl Read for Receiver<'_> {
         }
         let filled = buffer.iter_mut().zip(core::iter::from_fn(|| self.bytes.dequeue()));
         Ok(filled.map(|(slot, byte)| *slot = byte).count())
+    }
+}
+
+impl ReadReady for Receiver<'_> {
+    fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+        Ok(!self.bytes.is_empty())
     }
 }
 
