@@ -1,5 +1,6 @@
 //! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate. What decides on readings stands
-//! in `screen.rs`, what linearises anew in `laplace.rs`, both below this file.
+//! in `screen.rs`, what linearises anew between frames in `anew.rs` and
+//! `pooling.rs`, all below this file.
 //!
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
@@ -682,43 +683,4 @@ fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
 
 fn metres(code: i32) -> f32 {
     code as f32 * PositionCode::METRES_PER_LSB
-}
-#[cfg(test)]
-mod size_tests {
-    extern crate std;
-    use super::*;
-    use crate::booster::*;
-    use crate::gaussian::*;
-    #[test]
-    fn print_sizes() {
-        type G = crate::booster::Green;
-        type L = <G as Surrogate<33, 48, 2, 48>>::Linearised;
-        type P = <G as Surrogate<33, 48, 2, 48>>::Progress;
-        std::println!("estimator {}", size_of::<crate::booster::Estimator>());
-        std::println!("linearised {} progress {}", size_of::<L>(), size_of::<P>());
-        std::println!(
-            "gaussian {} independent {}",
-            size_of::<Gaussian<35, 48, 1176, Correlated<35, 630>>>(),
-            size_of::<Gaussian<35, 48, 1176, Independent<35>>>()
-        );
-        std::println!("correlated {}", size_of::<Correlated<35, 630>>());
-        std::println!("solution {}", size_of::<crate::gaussian::Solution<48, 1176, 2>>());
-        std::println!("pooling {}", size_of::<pooling::Pooling<99, 35, 48, 1176>>());
-        std::println!("late {}", size_of::<pooling::Late<33, 48, 2, 2>>());
-        std::println!("loose {}", size_of::<Loose<33, 48, 2, 2>>());
-        std::println!("anew {}", size_of::<Anew<L, P, 33, 48, 2, 48, 99, 35, 1176, 2>>());
-        std::println!("campaign {} cell {}", size_of::<Campaign<33, 48, 2, 99>>(), size_of::<crate::Cell<33, 48, 2>>());
-        std::println!(
-            "prediction {} predicted {}",
-            size_of::<crate::Prediction<33, 2, 48>>(),
-            size_of::<Predicted<33, 2, 48>>()
-        );
-        std::println!(
-            "monitor {} whole {} tunes {}",
-            size_of::<Monitor>() * 33,
-            size_of::<WholeFrames<33>>(),
-            2 * size_of::<TuneMeter<2>>()
-        );
-        std::println!("green {}", size_of::<G>());
-    }
 }

@@ -1,7 +1,7 @@
 //! A recording through the emulated chip and through the core in process, side by side.
 
 use core::error::Error;
-use estimator::Walk;
+use estimator::{Prepared, Walk};
 
 use estimator::wire::link::Status;
 use host_bridge::cli::CoreModel;
@@ -35,6 +35,8 @@ pub struct Comparison {
     pub frames: usize,
     /// Sequence numbers of frames whose estimates differ in any bit.
     pub different: Vec<u32>,
+    /// Frames that the chip answered while it was getting ready for them.
+    pub interrupting: usize,
     /// How the device was at the end.
     pub status: Status,
     /// Instructions of each region.
@@ -65,9 +67,13 @@ pub fn compare(
     link.restart(&core.setup)?;
     let (names, clock) = (Names::of(ring), Clock::new(Rate::Max, &Stop::default()));
     let mut fed = Fed::new(recording, &names, &mut link, clock);
-    let (mut different, mut last) = (Vec::new(), None);
+    let (mut different, mut interrupting, mut last) = (Vec::new(), 0, None);
     for row in &recording.rows {
         let heard = fed.advance().map_err(|error| error.to_string())?.expect("one reply a row");
+        for _ in 0..heard.estimate.remarks.slices {
+            let _ = core.slice();
+        }
+        interrupting += usize::from(core.clone().slice() != Prepared::Nothing);
         if !is_same(&mut core, stream::wire(recording, row)?, &heard) {
             different.push(row.sequence);
         }
@@ -81,18 +87,15 @@ pub fn compare(
     Ok(Comparison {
         frames: recording.rows.len(),
         different,
+        interrupting,
         status,
         counts,
         result: FitResult::of_core(CoreModel::Green.word(), ring, recording, &last, quality, timing),
     })
 }
 
-/// True if the core in process, after as many slices between frames, gives the same for a frame, bit for bit: the whole
-/// estimate, and the covariance.
+/// True if the core in process gives the same for a frame, bit for bit: the whole estimate, and the covariance.
 fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
-    for _ in 0..heard.estimate.remarks.slices {
-        let _ = core.slice();
-    }
     let Ok(estimate) = core.ingest(&mut wire) else { return false };
     let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));
     bits(&estimate) == bits(&heard.estimate)
