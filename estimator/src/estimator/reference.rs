@@ -52,8 +52,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// The setting that a frame repeats. Several correctors at once belong to none, unless the reference drive has them, or all but one
     /// of them move the orbit by less than is noticed: what a setting's mean says of the params would lose it.
