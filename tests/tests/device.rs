@@ -4,7 +4,7 @@
 use embedded_io::{ErrorKind, ErrorType, Read, Write};
 use estimator::booster::{Answer, Estimator, Green, LINE, PACKET, Parcel, Reply, Request, TRIANGLE};
 use estimator::surrogate::Table;
-use estimator::wire::link::{Refusal, Status, Taken, Vitals};
+use estimator::wire::link::{Refusal, Status, Taken, UNASKED, Vitals};
 use estimator::{ParcelError, Tables as _};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
@@ -71,12 +71,12 @@ fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
     let mut panel = Panel::new(Dark, Dark, Dark);
     let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
     run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default).unwrap();
-    sink.0.split_inclusive_mut(|byte| *byte == 0).map(|packet| Reply::decode(packet).unwrap()).collect()
+    sink.0.split_inclusive_mut(|byte| *byte == 0).map(|packet| Reply::decode(packet).1.unwrap()).collect()
 }
 
 fn request(request: &Request) -> Vec<Option<u8>> {
     let mut bytes = vec![0; PACKET];
-    let n = request.encode(&mut bytes).unwrap();
+    let n = request.encode(1, &mut bytes).unwrap();
     heard(&bytes[..n])
 }
 
@@ -101,7 +101,7 @@ fn start(core: &Core) -> Vec<Option<u8>> {
 /// As a host that talks to devices of any size.
 fn restart(setup: &stream::Setup) -> Vec<Option<u8>> {
     let mut bytes = vec![0; rooms::large::PACKET];
-    let n = rooms::large::Request::Restart(setup.on_wire()).encode(&mut bytes).unwrap();
+    let n = rooms::large::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
     heard(&bytes[..n])
 }
 
@@ -115,8 +115,8 @@ fn in_flash(tables: &Tables) -> Box<Green> {
 /// A reply as read by a host that serves devices of any size.
 fn estimate_of(sent: &Answer) -> Estimate {
     let mut bytes = vec![0; PACKET];
-    let n = Reply::Estimate(sent.clone()).encode(&mut bytes).unwrap();
-    let rooms::large::Reply::Estimate(sent) = rooms::large::Reply::decode(&mut bytes[..n]).unwrap() else {
+    let n = Reply::Estimate(sent.clone()).encode(UNASKED, &mut bytes).unwrap();
+    let (UNASKED, Ok(rooms::large::Reply::Estimate(sent))) = rooms::large::Reply::decode(&mut bytes[..n]) else {
         panic!("another reply")
     };
     Estimate::of_answer(&sent).unwrap()

@@ -8,11 +8,13 @@ use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
 use estimator::Tables as _;
+use estimator::booster::Frame;
 use estimator::wire::link::{Refusal, Status};
 use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use system_tests::qemu::{Emulator, Image, Options};
+use system_tests::machine::LAYOUT;
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
 use training::LINE;
@@ -30,6 +32,11 @@ fn read(name: &str) -> (Ring, Recording) {
 
 fn wires(recording: &Recording) -> Vec<Vec<u8>> {
     recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
+}
+
+/// Number of a frame.
+fn sequence(wire: &[u8]) -> u32 {
+    Frame::decode(&LAYOUT, &mut wire.to_vec()).unwrap().sequence
 }
 
 fn start() -> Emulator {
@@ -109,7 +116,7 @@ impl<'e> Pair<'e> {
 
     /// A good frame, answered alike; the device may count refusals that the core has not seen.
     fn agree(&mut self, wire: &[u8]) {
-        let heard = self.link.ingest(wire).unwrap();
+        let heard = self.link.ingest(sequence(wire), wire).unwrap();
         self.expect(wire, heard.estimate);
     }
 
@@ -121,7 +128,7 @@ impl<'e> Pair<'e> {
     }
 
     fn refused(&mut self) -> Refusal {
-        match self.link.next().unwrap() {
+        match self.link.next().unwrap().1 {
             Reply::Refused { why, .. } => why,
             other => panic!("{other:?}"),
         }
@@ -196,7 +203,7 @@ fn frames_that_come_during_an_update_are_not_lost() {
         let burst = good[at..at + 13].concat();
         pair.link.write(&burst).unwrap();
         for wire in &good[at..at + 13] {
-            let Reply::Estimate(answer) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
+            let (_, Reply::Estimate(answer)) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
             pair.expect(wire, Estimate::of_answer(&answer).unwrap());
         }
         at += 13;
@@ -215,10 +222,10 @@ fn a_storm_of_frames_is_survived() {
     let mut pair = Pair::start(&emulator, &ring, &recording);
     // covariances with every frame keep the chip busy sending; meanwhile its queue fills
     let mut request = vec![0; PACKET];
-    let n = Request::Covariance.encode(&mut request).unwrap();
+    let n = Request::Covariance.encode(1, &mut request).unwrap();
     let storm: Vec<u8> = good[..200].iter().flat_map(|wire| [&request[..n], wire].concat()).collect();
     let status = {
-        let n = Request::Status.encode(&mut request).unwrap();
+        let n = Request::Status.encode(2, &mut request).unwrap();
         [&[0], &request[..n]].concat()
     };
     let mut uart = emulator.uart().try_clone().unwrap();
@@ -235,7 +242,7 @@ fn a_storm_of_frames_is_survived() {
     });
     let (mut answered, mut refused) = (0, 0);
     let status = loop {
-        match pair.link.next().unwrap() {
+        match pair.link.next().unwrap().1 {
             Reply::Estimate(answer) => {
                 let answer = Estimate::of_answer(&answer).unwrap();
                 pair.expect(&good[answer.sequence as usize], answer);
@@ -256,7 +263,7 @@ fn a_storm_of_frames_is_survived() {
     // the device is as it was
     pair.link.write(&good[200]).unwrap();
     loop {
-        match pair.link.next().unwrap() {
+        match pair.link.next().unwrap().1 {
             Reply::Estimate(answer) => break pair.expect(&good[200], Estimate::of_answer(&answer).unwrap()),
             Reply::Status(_) | Reply::Covariance { .. } => {} // asked for during the storm
             other => panic!("{other:?}"),
@@ -304,9 +311,10 @@ fn the_log_is_decoded_and_a_fault_reported() {
     assert_eq!(run.status, Some(1));
 }
 
-/// A panic handler that calls a function that exists nowhere: a path from the core to a panic would not link.
+/// A panic handler that calls a function that exists nowhere: a path to a panic, from the bytes that come in to those that go
+/// out, would not link.
 #[test]
-fn no_path_leads_from_the_core_to_a_panic() {
+fn no_path_leads_from_bytes_to_a_panic() {
     let link = |example: &str| {
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let build = ["build", "--locked", "--profile", "firmware", "-p", "firmware-sim", "--example", example];
@@ -318,5 +326,5 @@ fn no_path_leads_from_the_core_to_a_panic() {
     let (linked, message) = link("never_panics");
     assert!(linked, "{message}");
     let (linked, message) = link("can_panic");
-    assert!(!linked && message.contains("undefined symbol: the_core_can_panic"), "{message}");
+    assert!(!linked && message.contains("undefined symbol: the_loop_can_panic"), "{message}");
 }
