@@ -259,8 +259,7 @@ impl<
     }
 
     fn values<const L: usize>(&self, list: List) -> Vec<f32, L> {
-        let (d, of) =
-            (&self.dispersion, |values: &[f32], size: u16| listed(values.iter().take(size.into()).copied()));
+        let (d, of) = (&self.dispersion, |values: &[f32], size: u16| listed(values.iter().take(size.into()).copied()));
         let (quadrupoles, monitors) = (self.sizes.quadrupoles, self.sizes.monitors[0]);
         match list {
             List::Steps => listed(self.x.steps().into_iter().chain(self.y.steps())),

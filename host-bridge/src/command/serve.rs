@@ -91,7 +91,9 @@ fn expect_tables<L: Line>(link: &mut Link<L>, tables: &Tables) -> Result<(), Com
     if status.ring != tables.sizes() {
         let (has, needs) = (status.ring.all(), tables.sizes().all());
         let counts = "monitors x, y, correctors x, y, quadrupoles, params, supplies";
-        return Err(CommandError::Other(format!("the device is for a ring of {has:?} {counts}, this one has {needs:?}")));
+        return Err(CommandError::Other(format!(
+            "the device is for a ring of {has:?} {counts}, this one has {needs:?}"
+        )));
     }
     let (got, expected) = (status.tables, tables.digest::<LINE>());
     let wrong = || format!("the device uses tables {got:08x}, this model has {expected:08x}; --load sends them");
