@@ -14,7 +14,8 @@ mod uart;
 use core::sync::atomic::{AtomicU32, Ordering};
 
 use defmt_rtt as _; // the logger
-use embassy_stm32::gpio::{Level, Output, Speed};
+use embassy_stm32::Peri;
+use embassy_stm32::gpio::{AnyPin, Level, Output, Speed};
 use embassy_stm32::wdg::IndependentWatchdog;
 use estimator::Tables as _;
 use estimator::wire::link::Vitals;
@@ -40,7 +41,7 @@ fn main() -> ! {
     memory::start(cortex_m::Peripherals::take().expect("taken once"));
     let (receiver, mut sender) = uart::start(part.USART3, part.PD9, part.PD8, part.DMA1_CH0, part.DMA1_CH1);
     let mut source = Bursts::<_, BURST>::new(receiver, &LOST);
-    let low = |pin| Output::new(pin, Level::Low, Speed::Low);
+    let low = |pin: Peri<'static, AnyPin>| Output::new(pin, Level::Low, Speed::Low);
     let mut watchdog = IndependentWatchdog::new(part.IWDG1, WATCHDOG_US);
     watchdog.unleash();
     let supervisor = Supervisor::new(low(part.PG0.into()), || watchdog.pet());
