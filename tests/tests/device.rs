@@ -10,7 +10,7 @@ use estimator::booster::{
 };
 use estimator::surrogate::Table;
 use estimator::wire::link::{self, Form, REPLY, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
-use estimator::{Gate, Parcel as AnyParcel, ParcelError, Sizes, Tables as _};
+use estimator::{Gate, Parcel as AnyParcel, ParcelError, Sizes, Tables as _, Walk};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
@@ -155,7 +155,7 @@ fn estimates(replies: &[Reply]) -> Vec<Estimate> {
 #[test]
 fn the_loop_replies_as_the_core_in_process() {
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut bytes = start(&core);
     for (at, wire) in wires(&recording).iter().enumerate() {
         if at % 100 == 0 {
@@ -190,7 +190,7 @@ fn the_loop_replies_as_the_core_in_process() {
 #[test]
 fn bad_bytes_are_counted_and_change_no_estimate() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let (mut clean, mut faulty) = (start(&core), start(&core));
     let mut faults = Vec::new();
@@ -264,7 +264,7 @@ fn other_tables(ring: &Ring) -> Tables {
 #[test]
 fn new_tables_change_the_estimate_as_they_do_in_process() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let other = other_tables(&ring);
     let mut bytes = start(&core);
@@ -294,7 +294,7 @@ fn new_tables_change_the_estimate_as_they_do_in_process() {
 #[test]
 fn damaged_tables_are_rejected_whole() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let parcels: Vec<Parcel> = other_tables(&ring).parcels().collect();
     let mut clean = start(&core);
@@ -340,7 +340,7 @@ fn last_status(replies: &[Reply]) -> Status {
 fn tables_that_cannot_be_left_stay_in_use() {
     // given tables in flash that are right at vars = 1 and have no stable ring anywhere else
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut steep = in_flash(&core.tables);
     steep.weight.iter_mut().for_each(|weight| *weight *= 1e4);
     // when frames by other tables have moved the vars, and the device is to go back
@@ -371,7 +371,7 @@ fn tables_that_cannot_be_left_stay_in_use() {
 fn a_restart_with_tables_without_a_design_goes_back_to_those_in_flash() {
     // given tables whose Green's function between nodes is beyond all numbers
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     // when they come before the first setup, and then it
@@ -397,7 +397,7 @@ fn a_restart_with_tables_without_a_design_goes_back_to_those_in_flash() {
 #[test]
 fn a_device_without_a_design_says_so() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     let bytes = [start(&core), heard(&wires(&recording)[0])].concat();
@@ -409,7 +409,7 @@ fn a_device_without_a_design_says_so() {
 #[test]
 fn a_front_end_that_restarts_its_counter_is_accepted_after_a_request() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let mut bytes = start(&core);
     bytes.extend(heard(&good[10]));
@@ -424,7 +424,7 @@ fn a_front_end_that_restarts_its_counter_is_accepted_after_a_request() {
 #[test]
 fn a_device_says_what_it_lacks() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut bytes = heard(&wires(&recording)[0]);
     bytes.extend(restart(&stream::Setup { noise: vec![0.0; 33], ..core.setup.clone() }));
     let replies = replies(&in_flash(&core.tables), &bytes);
@@ -435,7 +435,7 @@ fn a_device_says_what_it_lacks() {
 #[test]
 fn tables_of_another_ring_are_refused() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     // given a ring with one monitor less, for which there would be room
     let mut smaller = ring.clone();
     smaller.read_monitors.pop();
@@ -450,7 +450,7 @@ fn tables_of_another_ring_are_refused() {
 #[test]
 fn a_reply_repeats_the_number_of_its_request() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let wire = &wires(&recording)[0];
     let mut bytes = start(&core); // whose number is 1
     bytes.extend(heard(&packet(9, &Request::Covariance)));
@@ -475,7 +475,7 @@ fn a_reply_repeats_the_number_of_its_request() {
 #[test]
 fn a_device_says_its_version_and_its_ring() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let status = last_status(&replies(&in_flash(&core.tables), &request(&Request::Status)));
     assert_eq!((status.version, status.frame_version), (link::VERSION, Frame::VERSION));
     assert_eq!((status.ring, status.room), (core.tables.sizes(), SIZES));
@@ -484,7 +484,7 @@ fn a_device_says_its_version_and_its_ring() {
 #[test]
 fn a_short_reply_says_what_the_estimate_says() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let all = |form: Form| {
         let mut bytes = start(&core);
@@ -624,7 +624,7 @@ impl FrontEnd {
         match random.below(8) {
             0 => setup.prior[random.below(8)].sigma = wrong,
             1 => setup.gate = Gate { sigmas: wrong },
-            2 => setup.process_noise = wrong,
+            2 => setup.walk.params = wrong,
             3 => setup.tune_calibration = Some(wrong),
             4 => setup.noise.all = wrong,
             5 => setup.calibration.powered = wrong,
@@ -723,7 +723,7 @@ impl Write for Heard {
 fn a_hundred_thousand_frames_with_a_fault_before_each_are_those_frames_alone() {
     const FRAMES: usize = 100_000;
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let built_in = in_flash(&core.tables);
     let hear = |faults: Option<Random>| {
         let (mut sent, mut heard) = (Sent(FrontEnd::new(&core, faults), FRAMES), Heard::default());
