@@ -14,6 +14,7 @@ use estimator::wire::link::{Refusal, Status};
 use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use system_tests::endurance::endure;
 use system_tests::machine::LAYOUT;
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
@@ -185,6 +186,17 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
     let status = pair.link.status().unwrap();
     assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (61, 61, 0));
     assert!(status.vitals.silent_cycles > after.silent_cycles);
+}
+
+/// `make endure` sends twenty times as many.
+#[test]
+fn a_long_feedback_on_a_bad_line_is_the_same_on_the_chip() {
+    let endured = endure(&IMAGE, 1000, || ()).unwrap();
+    assert!(endured.different.is_empty(), "{:?}", endured.different);
+    let status = &endured.status;
+    assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (1000, endured.refused, 0));
+    assert!(endured.refused > 300, "a fault in three frames: {} refused", endured.refused);
+    check_stack(status);
 }
 
 /// 13 frames of 260 bytes come in 37 ms at 921,600 baud, longer than linearising anew takes, and far more than a front end
