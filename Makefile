@@ -4,9 +4,10 @@
 TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
+BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench peers exports validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure train bench peers exports validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -35,12 +36,21 @@ test: setup ## format, lint, tests in debug and release, docs, and the core for 
 	cargo build --locked --release -p estimator --target $(TARGET)
 	cargo build --locked --release -p firmware-sim --lib --target $(TARGET) # the core with its log lines, and the loop
 	cargo clippy --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET) -- -D warnings
+	$(MAKE) board
 
-firmware: toolchain ## the image for the chip; MACHINE=FILE makes it for another machine, PART=stm32h743 links it for that part
+firmware: toolchain ## the image for the emulated chip; MACHINE=FILE makes it for another machine
 	cargo build --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET)
+
+board: toolchain ## the image for an STM32H743, at target/$(TARGET)/release/stm32h743; built, never run on a board
+	cargo fmt --manifest-path boards/stm32h743/Cargo.toml --check
+	cargo clippy --locked $(BOARD) -- -D warnings
+	cargo build --locked $(BOARD)
 
 sil: setup ## recordings through the image in the emulator, beside the core in process; numbers in target/sil.json
 	cargo run --locked --release -p system-tests --bin sil
+
+endure: setup ## 20,000 simulated feedback frames on a bad line through the image in the emulator, beside the core in process; minutes
+	cargo run --locked --release -p system-tests --bin endure
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check

@@ -12,19 +12,13 @@ use training::Tables;
 use twin::Ring;
 
 fn main() {
-    println!("cargo::rerun-if-env-changed=PART");
     println!("cargo::rerun-if-env-changed=MACHINE");
     println!("cargo::rerun-if-changed=../memory.x");
-    println!("cargo::rerun-if-changed=memory");
     match machine() {
         Ok((ring, tables)) => write(&ring, &tables),
         Err(error) => println!("cargo::error={error}"),
     }
     if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os == "none") {
-        // Another part's addresses come first: memory.x, which link.x includes, asks for them.
-        if let Ok(part) = env::var("PART") {
-            link(&format!("-T{}/memory/{part}.x", env!("CARGO_MANIFEST_DIR")));
-        }
         link("-Tlink.x"); // cortex-m-rt: vector table and sections
         link("-Tdefmt.x"); // defmt: the texts of log lines stay in the ELF file and take no flash
         link("--nmagic"); // sections are not aligned to pages, which a chip does not have

@@ -138,7 +138,8 @@ pub struct Cell<const B: usize, const C: usize, const F: usize> {
     strength: [i32; F],
     rf_offset: i32,
     reading: [i32; B],
-    count: [u32; B],
+    /// Readings in each mean; beyond the largest number, later ones count as much as that one.
+    count: [u16; B],
     last: [Last; B],
 }
 
@@ -209,7 +210,7 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     /// Mean reading of a monitor [m] and the number of readings in it.
     pub fn mean(&self, b: usize) -> (f32, u32) {
         match (self.reading.get(b), self.count.get(b)) {
-            (Some(&mean), Some(&count)) => (mean as f32 / READING, count),
+            (Some(&mean), Some(&count)) => (mean as f32 / READING, count.into()),
             _ => (0.0, 0),
         }
     }
@@ -271,8 +272,8 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     fn add(&mut self, b: usize, code: i32, moved: i32, scatter: &mut impl FnMut(f32, u32)) {
         let (Some(mean), Some(count)) = (self.reading.get_mut(b), self.count.get_mut(b)) else { return };
         *count = count.saturating_add(1);
-        scatter(moved.saturating_sub(*mean >> FRACTION) as f32 * PositionCode::METRES_PER_LSB, *count);
-        move_mean(mean, code << FRACTION, *count);
+        scatter(moved.saturating_sub(*mean >> FRACTION) as f32 * PositionCode::METRES_PER_LSB, (*count).into());
+        move_mean(mean, code << FRACTION, (*count).into());
     }
 }
 

@@ -57,6 +57,7 @@ macro_rules! machine {
         pub const PACKET: usize = $crate::packet::wire_bytes($crate::largest(&[
             Frame::MAX_BYTES,
             Answer::MAX_BYTES,
+            $crate::wire::link::Short::<Setpoints>::MAX_BYTES,
             Setup::MAX_BYTES,
             Parcel::MAX_BYTES,
             $crate::wire::link::OTHER_BYTES,
@@ -102,7 +103,9 @@ macro_rules! machine {
         pub type Parcel = $crate::Parcel<LINE>;
         /// A request of its host.
         pub type Request = $crate::wire::link::Request<Setup, Parcel>;
+        /// Setpoints of its correctors.
+        pub type Setpoints = $crate::wire::link::Setpoints<CORRECTORS>;
         /// A reply of its device.
-        pub type Reply = $crate::wire::link::Reply<Answer>;
+        pub type Reply = $crate::wire::link::Reply<Answer, Setpoints>;
     };
 }

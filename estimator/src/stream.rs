@@ -5,8 +5,10 @@ use serde::de::DeserializeOwned;
 
 use crate::estimate::Estimate;
 use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
+use crate::sizes::Sizes;
 use crate::surrogate::{Surrogate, Tables, Unstable};
-use crate::wire::link::Answer;
+use crate::wire::Frame;
+use crate::wire::link::{Answer, Setpoints, Short};
 
 /// A core with its types; see [`Estimator`] for what each method does.
 #[allow(missing_docs)] // those of `Estimator`
@@ -19,9 +21,15 @@ pub trait Core: Sized {
     type Estimate;
     /// The same on the wire.
     type Answer: Serialize + DeserializeOwned + for<'e> From<&'e Self::Estimate>;
+    /// Setpoints of the correctors, or none.
+    type Setpoints: Serialize + DeserializeOwned + Default;
 
     /// Memory for one, all zero.
     const BLANK: Self;
+    /// What it has room for.
+    const ROOM: Sizes;
+    /// Version of its frames.
+    const FRAME_VERSION: u8;
 
     fn is_sound(setup: &Self::Setup) -> bool;
     fn restart(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Result<(), Unstable>;
@@ -39,6 +47,8 @@ pub trait Core: Sized {
     fn covariance(&self, i: usize, j: usize) -> f32;
     /// Number of the frame that an estimate is of.
     fn sequence(estimate: &Self::Estimate) -> u32;
+    /// What feedback needs of an estimate, with setpoints; `mismatch` is for the caller to know.
+    fn short(estimate: &Self::Estimate, mismatch: bool, setpoints: Self::Setpoints) -> Short<Self::Setpoints>;
     /// True if an operator should look: a monitor is not ok, or a var is clipped.
     fn needs_attention(estimate: &Self::Estimate) -> bool;
 }
@@ -60,8 +70,11 @@ impl<
     type Setup = Setup<B, C, F>;
     type Estimate = Estimate<B, N, W>;
     type Answer = Answer<B, N, W>;
+    type Setpoints = Setpoints<C>;
 
     const BLANK: Self = Self::BLANK;
+    const ROOM: Sizes = Sizes { supplies: F as u16, ..G::ROOM };
+    const FRAME_VERSION: u8 = Frame::<B, C, F, W>::VERSION;
 
     fn is_sound(setup: &Self::Setup) -> bool {
         setup.is_sound()
@@ -101,6 +114,11 @@ impl<
 
     fn sequence(estimate: &Self::Estimate) -> u32 {
         estimate.sequence
+    }
+
+    fn short(e: &Self::Estimate, mismatch: bool, setpoints: Self::Setpoints) -> Short<Self::Setpoints> {
+        let attention = Self::needs_attention(e);
+        Short { sequence: e.sequence, remarks: e.remarks, mismatch, attention, nis: e.nis, setpoints }
     }
 
     fn needs_attention(estimate: &Self::Estimate) -> bool {

@@ -7,12 +7,12 @@ mod chip {
     use core::hint::black_box;
 
     unsafe extern "C" {
-        fn the_core_can_panic() -> !;
+        fn the_loop_can_panic() -> !;
     }
 
     #[panic_handler]
     fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
-        unsafe { the_core_can_panic() }
+        unsafe { the_loop_can_panic() }
     }
 
     #[unsafe(no_mangle)]

@@ -2,14 +2,13 @@
 
 use estimator::Tables as _;
 use estimator::wire::link::Vitals;
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
 use firmware_sim::{Device, Panel};
 use static_cell::ConstStaticCell;
 
 use crate::board::clock::Clock;
 use crate::board::pins::Pins;
-use crate::board::watchdog::Watchdog;
-use crate::board::{stack, uart};
-use crate::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
+use crate::board::{stack, uart, watchdog};
 
 /// The posterior. All zero at first, so that it takes no flash.
 static CORE: ConstStaticCell<Estimator> = ConstStaticCell::new(Estimator::BLANK);
@@ -29,7 +28,7 @@ fn main() -> ! {
     let clock = Clock::start::<CYCLE_US>(core.SYST);
     let pins = Pins::start();
     let (mut receiver, mut sender) = uart::start(BAUD, &clock);
-    let mut panel = Panel::new(pins.heartbeat, pins.attention, Watchdog::start(WATCHDOG_S, pins.supervisor));
+    let mut panel = Panel::new(pins.heartbeat, pins.attention, watchdog::start(WATCHDOG_S, pins.supervisor));
     let mut device = Device::<_, LINE>::new(CORE.take(), &BUILT_IN, SLOT.take());
     let vitals = || Vitals {
         lost_bytes: uart::lost(),

@@ -3,13 +3,12 @@
 //! Each answer is a function of its own, not inlined, so that the stack holds the buffers of one of them at a time.
 
 use estimator::surrogate::Unstable;
-use estimator::wire::link::{PIECE, REQUEST, Refusal, Status, Taken, Vitals};
-use estimator::wire::{ParcelError, link};
-use estimator::{Core, Parcel, Prepared, Tables, packet};
-use heapless::Vec;
+use estimator::wire::link::{Form, PIECE, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
+use estimator::wire::{ParcelError, link, listed};
+use estimator::{Core, Layout, Parcel, Prepared, Tables, packet};
 
 /// What a device of this core says.
-pub type Reply<E> = link::Reply<<E as Core>::Answer>;
+pub type Reply<E> = link::Reply<<E as Core>::Answer, <E as Core>::Setpoints>;
 /// What it is asked; a line of its tables has at most `L` entries.
 pub type Request<E, const L: usize> = link::Request<<E as Core>::Setup, Parcel<L>>;
 
@@ -22,7 +21,11 @@ pub struct Device<'m, E: Core, const L: usize> {
     slot: &'m mut E::Tables,
     contents: Contents,
     setup: Option<E::Setup>,
-    wants_covariance: bool,
+    form: Form,
+    /// Number of the request for a covariance that is due.
+    wants_covariance: Option<u32>,
+    /// See [`estimator::FitQuality::is_mismatch`]; looked at when the core has linearised.
+    mismatch: bool,
     refused: u32,
 }
 
@@ -40,16 +43,26 @@ enum Contents {
 impl<'m, E: Core, const L: usize> Device<'m, E, L> {
     /// A device that waits for its setup.
     pub fn new(core: &'m mut E, built_in: &'m E::Tables, slot: &'m mut E::Tables) -> Self {
-        Self { core, built_in, slot, contents: Contents::Nothing, setup: None, wants_covariance: false, refused: 0 }
+        Self {
+            core,
+            built_in,
+            slot,
+            contents: Contents::Nothing,
+            setup: None,
+            form: Form::Full,
+            wants_covariance: None,
+            mismatch: false,
+            refused: 0,
+        }
     }
 
-    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first. Returns that answer.
-    /// `vitals` is asked if the packet asks for the status.
+    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first, and of which request it is. Returns that
+    /// answer. `vitals` is asked if the packet asks for the status.
     pub fn hear(
         &mut self,
         bytes: &mut [u8],
         vitals: impl FnOnce() -> Vitals,
-        reply: &mut impl FnMut(&Reply<E>),
+        reply: &mut impl FnMut(u32, &Reply<E>),
     ) -> Option<E::Estimate> {
         if packet::kind(bytes) == Some(REQUEST) {
             self.obey(bytes, vitals, reply);
@@ -61,7 +74,12 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
     /// One slice of what can be done between packets. See [`estimator::Estimator::prepare`].
     pub fn prepare(&mut self) -> Prepared {
         let Some(setup) = &self.setup else { return Prepared::Nothing };
-        self.core.prepare(tables(self.contents, self.built_in, self.slot), setup)
+        let tables = tables(self.contents, self.built_in, self.slot);
+        let prepared = self.core.prepare(tables, setup);
+        if prepared == Prepared::Linearised && self.form == Form::Short {
+            self.mismatch = self.core.fit_quality(tables, setup).is_mismatch();
+        }
+        prepared
     }
 
     /// Packets refused so far.
@@ -70,88 +88,112 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
     }
 
     /// Count a packet that was none, and say so.
+    pub fn refuse(&mut self, why: Refusal, reply: &mut impl FnMut(u32, &Reply<E>)) {
+        self.refuse_to(UNASKED, why, reply);
+    }
+
+    /// Count a request that is not met, or a frame that is not used, and say so.
     #[inline(never)]
-    pub fn refuse(&mut self, why: impl Into<Refusal>, reply: &mut impl FnMut(&Reply<E>)) {
+    fn refuse_to(&mut self, number: u32, why: impl Into<Refusal>, reply: &mut impl FnMut(u32, &Reply<E>)) {
         self.refused = self.refused.saturating_add(1);
-        reply(&link::Reply::Refused { why: why.into(), count: self.refused });
+        reply(number, &link::Reply::Refused { why: why.into(), count: self.refused });
     }
 
     /// A frame: the answer, and what was asked for with it.
     #[inline(never)]
-    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply<E>)) -> Option<E::Estimate> {
+    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Option<E::Estimate> {
         let Some(setup) = &self.setup else {
-            self.refuse(estimator::IngestError::NotStarted, reply);
+            self.refuse(Refusal::NotStarted, reply);
             return None;
         };
         match self.core.ingest(tables(self.contents, self.built_in, self.slot), setup, bytes) {
             Ok(estimate) => {
-                say(|| link::Reply::Estimate((&estimate).into()), reply);
-                if core::mem::take(&mut self.wants_covariance) {
-                    self.send_covariance(E::sequence(&estimate), reply);
+                match self.form {
+                    Form::Full => reply(UNASKED, &link::Reply::Estimate((&estimate).into())),
+                    Form::Short => reply(UNASKED, &link::Reply::Short(self.short(&estimate))),
+                }
+                if let Some(number) = self.wants_covariance.take() {
+                    self.send_covariance(number, E::sequence(&estimate), reply);
                 }
                 Some(estimate)
             }
             Err(error) => {
-                self.refuse(error, reply);
+                self.refuse(error.into(), reply);
                 None
             }
         }
     }
 
     #[inline(never)]
-    fn send_covariance(&self, sequence: u32, reply: &mut impl FnMut(&Reply<E>)) {
+    fn short(&mut self, estimate: &E::Estimate) -> link::Short<E::Setpoints> {
+        let setpoints = self.steer(estimate);
+        E::short(estimate, self.mismatch, setpoints)
+    }
+
+    /// Setpoints of the correctors after a frame: none, since nothing here steers.
+    fn steer(&mut self, _: &E::Estimate) -> E::Setpoints {
+        E::Setpoints::default()
+    }
+
+    #[inline(never)]
+    fn send_covariance(&self, number: u32, sequence: u32, reply: &mut impl FnMut(u32, &Reply<E>)) {
         let params = self.built_in.layout().params();
         let mut places = (0..params).flat_map(|i| (0..=i).map(move |j| (i, j)));
         for first in (0..(params * (params + 1) / 2) as u16).step_by(PIECE) {
-            let entries: Vec<f32, PIECE> =
-                places.by_ref().take(PIECE).map(|(i, j)| self.core.covariance(i, j)).collect();
-            reply(&link::Reply::Covariance { sequence, first, entries });
+            let entries = listed(places.by_ref().take(PIECE).map(|(i, j)| self.core.covariance(i, j)));
+            reply(number, &link::Reply::Covariance { sequence, first, entries });
         }
     }
 
     #[inline(never)]
-    fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(&Reply<E>)) {
-        match Request::<E, L>::decode(bytes) {
-            Ok(link::Request::Restart(setup)) => self.restart(setup, reply),
+    fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(u32, &Reply<E>)) {
+        let (number, request) = Request::<E, L>::decode(bytes);
+        match request {
+            Ok(link::Request::Restart(setup)) => self.restart(number, setup, reply),
             Ok(link::Request::ForgetSequence) => {
                 self.core.forget_sequence();
-                say(|| link::Reply::SequenceForgotten, reply);
+                say(number, || link::Reply::SequenceForgotten, reply);
             }
-            Ok(link::Request::Covariance) => self.wants_covariance = true,
+            Ok(link::Request::Covariance) => self.wants_covariance = Some(number),
             Ok(link::Request::Status) => {
                 let status = self.status(vitals());
-                say(|| link::Reply::Status(status), reply);
+                say(number, || link::Reply::Status(status), reply);
             }
             Ok(link::Request::Model(parcel)) => {
                 let taken = self.load(&parcel);
-                say(|| link::Reply::Model(taken), reply);
+                say(number, || link::Reply::Model(taken), reply);
             }
             Ok(link::Request::BuiltIn) => {
                 let taken = self.go_back();
-                say(|| link::Reply::Model(taken), reply);
+                say(number, || link::Reply::Model(taken), reply);
             }
-            Err(error) => self.refuse(error, reply),
+            Ok(link::Request::Form(form)) => {
+                self.form = form;
+                say(number, || link::Reply::Form(form), reply);
+            }
+            Err(error) => self.refuse_to(number, error, reply),
         }
     }
 
     #[inline(never)]
-    fn restart(&mut self, setup: E::Setup, reply: &mut impl FnMut(&Reply<E>)) {
+    fn restart(&mut self, number: u32, setup: E::Setup, reply: &mut impl FnMut(u32, &Reply<E>)) {
         if !E::is_sound(&setup) {
-            self.refuse(Refusal::Setup, reply);
+            self.refuse_to(number, Refusal::Setup, reply);
             return;
         }
         let mut began = self.begin(&setup);
         if began.is_err() && self.contents == Contents::InUse {
             // not the setup's fault: the tables that came over the wire have no design, those in flash do
             self.contents = Contents::Nothing;
-            say(|| link::Reply::Model(Err(ParcelError::Unstable)), reply);
+            say(number, || link::Reply::Model(Err(ParcelError::Unstable)), reply);
             began = self.begin(&setup);
         }
         // a core that has not begun has lost its posterior: it waits for a setup again
         self.setup = began.is_ok().then_some(setup);
+        (self.form, self.mismatch) = (Form::Full, false);
         match began {
-            Ok(()) => say(|| link::Reply::Restarted, reply),
-            Err(Unstable) => self.refuse(Refusal::NoDesign, reply),
+            Ok(()) => say(number, || link::Reply::Restarted, reply),
+            Err(Unstable) => self.refuse_to(number, Refusal::NoDesign, reply),
         }
     }
 
@@ -209,7 +251,12 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
     fn status(&mut self, vitals: Vitals) -> Status {
         let tables = tables(self.contents, self.built_in, self.slot);
         let quality = self.setup.as_ref().map(|setup| self.core.fit_quality(tables, setup));
+        let Layout { ring, .. } = self.built_in.layout();
         Status {
+            version: link::VERSION,
+            frame_version: E::FRAME_VERSION,
+            ring,
+            room: E::ROOM,
             frames: self.core.frames(),
             refused: self.refused,
             vitals,
@@ -224,8 +271,8 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
 /// Say something. Not inlined: room for a reply is more than a kilobyte, which is not to lie on the stack while the core
 /// takes a frame in or goes over to other tables.
 #[inline(never)]
-fn say<A>(what: impl FnOnce() -> link::Reply<A>, reply: &mut impl FnMut(&link::Reply<A>)) {
-    reply(&what());
+fn say<R>(number: u32, what: impl FnOnce() -> R, reply: &mut impl FnMut(u32, &R)) {
+    reply(number, &what());
 }
 
 /// The tables in use.

@@ -5,9 +5,8 @@ use std::io::{self, Read as _, Write as _};
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::wire::link::Vitals;
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
 use firmware_sim::{Device, Panel};
-
-use crate::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
 
 /// Run until standard input ends.
 pub fn run() -> io::Result<()> {

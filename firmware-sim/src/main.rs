@@ -8,7 +8,6 @@ mod board;
 mod chip;
 #[cfg(not(target_os = "none"))]
 mod host;
-mod machine;
 
 #[cfg(not(target_os = "none"))]
 fn main() -> std::io::Result<()> {

@@ -28,9 +28,9 @@ pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: us
         let silent_cycles = inbox.silent_cycles();
         let event = inbox.next(source)?;
         let mut sent = Ok(());
-        let mut reply = |reply: &Reply<E>| {
+        let mut reply = |number, reply: &Reply<E>| {
             if sent.is_ok() {
-                sent = send::<E, W, P>(sink, reply);
+                sent = send::<E, W, P>(sink, number, reply);
             }
         };
         let refused = device.refused();
@@ -54,9 +54,16 @@ pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: us
 }
 
 #[inline(never)] // its buffers are not to lie on the stack meanwhile
-fn send<E: Core, W: Write, const P: usize>(sink: &mut W, reply: &Reply<E>) -> Result<(), W::Error> {
+fn send<E: Core, W: Write, const P: usize>(sink: &mut W, number: u32, reply: &Reply<E>) -> Result<(), W::Error> {
     let mut outbox = [0; P];
     // a reply always fits its buffer
-    let bytes = reply.encode(&mut outbox).ok().and_then(|n| outbox.get(..n)).unwrap_or_default();
-    sink.write_all(bytes)
+    let mut rest = reply.encode(number, &mut outbox).ok().and_then(|n| outbox.get(..n)).unwrap_or_default();
+    // `write_all` panics at a sink that takes nothing
+    while !rest.is_empty() {
+        match sink.write(rest)? {
+            0 => break,
+            taken => rest = rest.get(taken..).unwrap_or_default(),
+        }
+    }
+    Ok(())
 }

@@ -5,6 +5,7 @@
 
 use std::path::Path;
 
+use estimator::wire::link::UNASKED;
 use estimator::{FrameError, Parcel, ParcelError, Tables as _};
 use training::green::{Difference, difference};
 use training::rooms::large::{PACKET, Request};
@@ -108,7 +109,7 @@ fn line(name: &str) -> String {
 
 fn wire(parcel: AnyParcel) -> Vec<u8> {
     let mut bytes = vec![0; PACKET];
-    let length = Request::Model(parcel).encode(&mut bytes).expect("a parcel fits a packet");
+    let length = Request::Model(parcel).encode(UNASKED, &mut bytes).expect("a parcel fits a packet");
     bytes.truncate(length);
     bytes
 }
@@ -170,7 +171,7 @@ impl Due {
 /// Take one packet in; returns what is due then.
 fn take(tables: &mut Tables, due: Due, wire: &mut [u8]) -> Result<Due, Fault> {
     let found = |found| Fault::Order { expected: due.words(), found };
-    let Request::Model(parcel) = Request::decode(wire)? else { return Err(found("another request")) };
+    let Request::Model(parcel) = Request::decode(wire).1? else { return Err(found("another request")) };
     let next = match (due, &parcel) {
         (Due::Head, Parcel::Head { .. }) => Due::Rest,
         (Due::Rest, Parcel::Codes { .. } | Parcel::Values { .. }) => Due::Rest,

@@ -146,9 +146,9 @@ impl Shared<'_> {
     /// The front end sends a packet, after which the host asks for covariances this many times.
     fn send(&mut self, mut bytes: Vec<u8>, requests: u32) {
         let (host, spoiled) = (&mut self.host, &mut self.spoiled);
-        self.device.hear(&mut bytes, Vitals::default, &mut |reply| {
+        self.device.hear(&mut bytes, Vitals::default, &mut |number, reply| {
             let mut bytes = [0; PACKET];
-            let n = reply.encode(&mut bytes).unwrap();
+            let n = reply.encode(number, &mut bytes).unwrap();
             *spoiled = spoiled.and_then(|left| left.checked_sub(1).or_else(|| flip(&mut bytes[5])));
             host.write_all(&bytes[..n]).unwrap();
         });
@@ -159,9 +159,9 @@ impl Shared<'_> {
         for _ in 0..requests {
             let mut source = Socket(self.host.try_clone().unwrap());
             let Event::Packet(bytes) = self.inbox.next(&mut source).unwrap() else { panic!("no request") };
-            let request = Request::decode(&mut bytes.to_vec()).unwrap();
+            let request = Request::decode(&mut bytes.to_vec()).1.unwrap();
             assert_eq!(request, Request::Covariance);
-            self.device.hear(bytes, Vitals::default, &mut |reply| panic!("{reply:?}"));
+            self.device.hear(bytes, Vitals::default, &mut |_, reply| panic!("{reply:?}"));
         }
     }
 }
@@ -175,14 +175,14 @@ fn flip(byte: &mut u8) -> Option<u32> {
 /// The setup as a host sends it, in packets that are the same for a machine of any size.
 fn restart(setup: &stream::Setup) -> Vec<u8> {
     let mut bytes = vec![0; large::PACKET];
-    let n = large::Request::Restart(setup.on_wire()).encode(&mut bytes).unwrap();
+    let n = large::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
     bytes.truncate(n);
     bytes
 }
 
 fn request(request: &Request) -> Vec<u8> {
     let mut bytes = vec![0; PACKET];
-    let n = request.encode(&mut bytes).unwrap();
+    let n = request.encode(2, &mut bytes).unwrap();
     bytes.truncate(n);
     bytes
 }

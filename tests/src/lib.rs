@@ -1,5 +1,7 @@
 //! What the system tests share: where the repository's files lie, and the truth behind its recordings.
 
+pub mod endurance;
+pub mod faults;
 pub mod machine;
 pub mod qemu;
 pub mod sil;

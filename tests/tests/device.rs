@@ -1,14 +1,21 @@
 //! A device on the host: the loop that a chip runs, fed with recorded frames, bad bytes and new tables, beside the core in
 //! process.
 
+use std::collections::{BTreeMap, VecDeque};
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
-use estimator::booster::{Answer, Estimator, Green, LINE, PACKET, Parcel, Reply, Request, TRIANGLE};
+use estimator::booster::{
+    Answer, Estimator, Frame, Green, LINE, PACKET, Parcel, Reply, Request, SIZES, Setup, TRIANGLE,
+};
 use estimator::surrogate::Table;
-use estimator::wire::link::{Refusal, Status, Taken, Vitals};
-use estimator::{ParcelError, Tables as _, Walk};
+use estimator::wire::link::{self, Form, REPLY, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
+use estimator::{Gate, Parcel as AnyParcel, ParcelError, Sizes, Tables as _, Walk};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use system_tests::faults::{Body, FAULTS, faulty, sealed};
+use system_tests::machine::{LAYOUT, Machine, Random, wire_of};
 use system_tests::repository;
 use training::{Tables, rooms};
 use twin::Ring;
@@ -70,21 +77,36 @@ impl embedded_hal::digital::OutputPin for Dark {
     }
 }
 
-/// Replies of a device with these tables in flash to these bytes.
-fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
+/// Run a device with these tables in flash until its source ends.
+fn run<R: Read<Error = ErrorKind>, W: Write<Error = ErrorKind>>(built_in: &Green, source: &mut R, sink: &mut W) {
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
     let mut device = Device::<_, LINE>::new(&mut *core, built_in, &mut *slot);
-    let (mut source, mut sink) = (Source(bytes.iter().rev().copied().collect()), Sink(Vec::new()));
     let mut panel = Panel::new(Dark, Dark, Dark);
     let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
-    run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default).unwrap();
-    sink.0.split_inclusive_mut(|byte| *byte == 0).map(|packet| Reply::decode(packet).unwrap()).collect()
+    run(&mut device, source, sink, &mut panel, Vitals::default).unwrap();
+}
+
+/// Replies of a device with these tables in flash to these bytes, each with the number of its request.
+fn numbered(built_in: &Green, bytes: &[Option<u8>]) -> Vec<(u32, Reply)> {
+    let (mut source, mut sink) = (Source(bytes.iter().rev().copied().collect()), Sink(Vec::new()));
+    run(built_in, &mut source, &mut sink);
+    let packets = sink.0.split_inclusive_mut(|byte| *byte == 0).map(Reply::decode);
+    packets.map(|(number, reply)| (number, reply.unwrap())).collect()
+}
+
+fn replies(built_in: &Green, bytes: &[Option<u8>]) -> Vec<Reply> {
+    numbered(built_in, bytes).into_iter().map(|(_, reply)| reply).collect()
 }
 
 fn request(request: &Request) -> Vec<Option<u8>> {
+    heard(&packet(7, request))
+}
+
+fn packet(number: u32, request: &Request) -> Vec<u8> {
     let mut bytes = vec![0; PACKET];
-    let n = request.encode(&mut bytes).unwrap();
-    heard(&bytes[..n])
+    let n = request.encode(number, &mut bytes).unwrap();
+    bytes.truncate(n);
+    bytes
 }
 
 fn heard(bytes: &[u8]) -> Vec<Option<u8>> {
@@ -108,7 +130,7 @@ fn start(core: &Core) -> Vec<Option<u8>> {
 /// As a host that talks to devices of any size.
 fn restart(setup: &stream::Setup) -> Vec<Option<u8>> {
     let mut bytes = vec![0; rooms::large::PACKET];
-    let n = rooms::large::Request::Restart(setup.on_wire()).encode(&mut bytes).unwrap();
+    let n = rooms::large::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
     heard(&bytes[..n])
 }
 
@@ -122,8 +144,8 @@ fn in_flash(tables: &Tables) -> Box<Green> {
 /// A reply as read by a host that serves devices of any size.
 fn estimate_of(sent: &Answer) -> Estimate {
     let mut bytes = vec![0; PACKET];
-    let n = Reply::Estimate(sent.clone()).encode(&mut bytes).unwrap();
-    let rooms::large::Reply::Estimate(sent) = rooms::large::Reply::decode(&mut bytes[..n]).unwrap() else {
+    let n = Reply::Estimate(sent.clone()).encode(UNASKED, &mut bytes).unwrap();
+    let (UNASKED, Ok(rooms::large::Reply::Estimate(sent))) = rooms::large::Reply::decode(&mut bytes[..n]) else {
         panic!("another reply")
     };
     Estimate::of_answer(&sent).unwrap()
@@ -430,4 +452,306 @@ fn tables_of_another_ring_are_refused() {
     let replies = replies(&in_flash(&core.tables), &bytes);
     let got = other.sizes();
     assert_eq!(replies[1], Reply::Model(Err(ParcelError::Sizes { room: core.tables.sizes(), got })));
+}
+
+#[test]
+fn a_reply_repeats_the_number_of_its_request() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+    let wire = &wires(&recording)[0];
+    let mut bytes = start(&core); // whose number is 1
+    bytes.extend(heard(&packet(9, &Request::Covariance)));
+    bytes.extend(heard(&packet(u32::MAX, &Request::Status)));
+    bytes.extend(heard(wire));
+    // one that this version does not know, and one whose number is damaged with the rest
+    bytes.extend(heard(&sealed(REQUEST, &[12, 99])));
+    bytes.extend(heard(&sealed(REQUEST, &[0x80])));
+    bytes.extend(heard(&packet(13, &Request::Form(Form::Short))));
+    bytes.extend(heard(wire));
+    let replies = numbered(&in_flash(&core.tables), &bytes);
+    let malformed = |count| Reply::Refused { why: Refusal::Malformed, count };
+    assert_eq!(replies[0], (1, Reply::Restarted));
+    assert!(matches!(replies[1], (u32::MAX, Reply::Status(_))));
+    assert!(matches!(replies[2], (UNASKED, Reply::Estimate(_))));
+    assert!(replies[3..24].iter().all(|reply| matches!(reply, (9, Reply::Covariance { sequence: 0, .. }))));
+    assert_eq!(replies[24..26], [(12, malformed(1)), (UNASKED, malformed(2))]);
+    assert_eq!(replies[26], (13, Reply::Form(Form::Short)));
+    assert_eq!(replies[27..], [(UNASKED, Reply::Refused { why: Refusal::Repeated, count: 3 })]);
+}
+
+#[test]
+fn a_device_says_its_version_and_its_ring() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+    let status = last_status(&replies(&in_flash(&core.tables), &request(&Request::Status)));
+    assert_eq!((status.version, status.frame_version), (link::VERSION, Frame::VERSION));
+    assert_eq!((status.ring, status.room), (core.tables.sizes(), SIZES));
+}
+
+#[test]
+fn a_short_reply_says_what_the_estimate_says() {
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+    let good = wires(&recording);
+    let all = |form: Form| {
+        let mut bytes = start(&core);
+        bytes.extend(request(&Request::Form(form)));
+        good.iter().for_each(|wire| bytes.extend(heard(wire)));
+        bytes.extend(request(&Request::Status));
+        replies(&in_flash(&core.tables), &bytes)
+    };
+    let (full, short) = (all(Form::Full), all(Form::Short));
+    assert_eq!((full.len(), short.len()), (349, 349));
+    assert_eq!(last_status(&short), last_status(&full));
+    for (full, short) in full[2..348].iter().zip(&short[2..348]) {
+        let (Reply::Estimate(full), Reply::Short(short)) = (full, short) else { panic!("{short:?}") };
+        assert_eq!((short.sequence, short.nis, short.remarks), (full.sequence, full.nis, full.remarks));
+        let faulty = full.health.iter().any(|(state, ..)| *state != 0) || full.clipped.iter().any(|word| *word != 0);
+        assert_eq!(short.attention, faulty, "frame {}", short.sequence);
+        assert!(short.setpoints.is_empty(), "nothing here steers");
+        let mut bytes = [0; PACKET];
+        assert!(Reply::Short(short.clone()).encode(UNASKED, &mut bytes).unwrap() < 40, "short it is");
+    }
+    // a model whose response is 10 % too large does not describe the frames: chi2/dof 1.16
+    let mut wrong = in_flash(&core.tables);
+    wrong.x.direct.scale *= 1.1;
+    wrong.y.direct.scale *= 1.1;
+    let alarm = |tables: &Green| {
+        let mut bytes = [start(&core), request(&Request::Form(Form::Short))].concat();
+        good.iter().for_each(|wire| bytes.extend(heard(wire)));
+        matches!(replies(tables, &bytes).last(), Some(Reply::Short(short)) if short.mismatch)
+    };
+    assert_eq!((alarm(&in_flash(&core.tables)), alarm(&wrong)), (false, true));
+    // a restart ends it: the next host may not know of it
+    let mut bytes = request(&Request::Form(Form::Short));
+    bytes.extend([start(&core), heard(&good[0])].concat());
+    assert!(matches!(replies(&in_flash(&core.tables), &bytes)[..], [_, Reply::Restarted, Reply::Estimate(_)]));
+}
+
+// ---- A bad line ----
+
+/// What comes between good frames besides what [`faulty`] makes of them.
+const STRANGE: usize = 12;
+
+/// A front end whose frames come alone, or on a bad line.
+struct FrontEnd {
+    machine: Machine,
+    /// Of the line; none on a good one.
+    faults: Option<Random>,
+    setup: Setup,
+    sequence: u32,
+    frames: usize,
+    first: Vec<u8>,
+    last: Vec<u8>,
+    waiting: VecDeque<Option<u8>>,
+}
+
+impl FrontEnd {
+    fn new(core: &Core, faults: Option<Random>) -> Self {
+        let (machine, setup) = (Machine::drawn(core, 3), core.setup.in_room(&LAYOUT));
+        let waiting = restart(&core.setup).into();
+        Self { machine, faults, setup, sequence: 0, frames: 0, first: Vec::new(), last: Vec::new(), waiting }
+    }
+
+    /// One frame, and before it on a bad line a fault.
+    fn send(&mut self) {
+        let count = 1 + self.machine.random.below(6);
+        let corrector = self.machine.random.powered(count, 1.0, 10.0);
+        self.sequence += 1 + u32::from(self.frames % 50 == 0); // cycles may be lost
+        let mut frame = self.machine.cycle_with(self.sequence, corrector);
+        let silent = (self.frames % 7 == 0).then(|| self.machine.random.below(33));
+        silent.into_iter().for_each(|monitor| frame.valid.put(monitor, false));
+        let mut wire = wire_of(&frame);
+        if let Some(mut random) = self.faults.take() {
+            self.go_wrong(&wire, &mut random);
+            // a front end may write anything for a monitor that did not report
+            let mut body = Body::of(&wire);
+            silent.into_iter().for_each(|monitor| body.reading[monitor] = [i32::MIN, i32::MAX][random.below(2)]);
+            wire = body.wire();
+            self.faults = Some(random);
+        }
+        self.say(&wire);
+        if self.first.is_empty() {
+            self.first = wire.clone();
+        }
+        (self.last, self.frames) = (wire, self.frames + 1);
+    }
+
+    /// Send bytes; a zero first, so that whatever came before ends there.
+    fn say(&mut self, bytes: &[u8]) {
+        self.waiting.push_back(Some(0));
+        self.waiting.extend(bytes.iter().copied().map(Some));
+    }
+
+    fn go_wrong(&mut self, next: &[u8], random: &mut Random) {
+        let last = if self.last.is_empty() { next } else { &self.last };
+        let bytes = match self.frames % (FAULTS + STRANGE) {
+            // what repeats a frame has to come after it
+            13 | 14 | 16 if self.first.is_empty() => Vec::new(),
+            fault if fault < FAULTS => faulty(fault, last, next, &self.first, random).0,
+            strange => self.strange(strange - FAULTS, next, random),
+        };
+        self.say(&bytes);
+        if self.frames % (FAULTS + STRANGE) == FAULTS {
+            self.waiting.extend([None, None]); // the rest of it does not come
+        }
+    }
+
+    fn strange(&mut self, what: usize, next: &[u8], random: &mut Random) -> Vec<u8> {
+        let number = random.below(1 << 30) as u32;
+        match what {
+            0 => next[..1 + random.below(next.len() - 2)].to_vec(),
+            1 => (0..random.below(2 * PACKET)).map(|_| random.byte()).collect(),
+            2 => (0..PACKET + random.below(4 * PACKET)).map(|_| random.byte() | 1).collect(),
+            // requests that this version does not know, of another version, cut off, or damaged
+            3 => sealed(REQUEST, &[5, 7 + random.below(100) as u8, 1, 2, 3]),
+            4 => sealed(REQUEST ^ 1, &[5, 3]),
+            5 => sealed(REQUEST, &[5, 0, 1, 2, 3]),
+            6 => {
+                let mut bytes = packet(number, &Request::Restart(self.setup.clone()));
+                let at = random.below(bytes.len() - 1);
+                bytes[at] ^= 1 << random.below(8);
+                bytes
+            }
+            7 => packet(number, &Request::Restart(self.unsound(random))),
+            // parts of tables without their head, and the head of another ring's
+            8 => packet(number, &Request::Model(AnyParcel::Seal { crc: 7 })),
+            9 => packet(number, &Request::Model(AnyParcel::Head { version: 3, sizes: Sizes { params: 47, ..SIZES } })),
+            // an echo of its own replies
+            10 => sealed(REPLY, &[0, 3]),
+            // a front end of an earlier life
+            _ => Body { epoch: u32::MAX, ..Body::of(next) }.wire(),
+        }
+    }
+
+    /// A setup in which one number is none, or not positive.
+    fn unsound(&self, random: &mut Random) -> Setup {
+        let mut setup = self.setup.clone();
+        let wrong = [f32::NAN, f32::INFINITY, -1.0][random.below(3)];
+        match random.below(8) {
+            0 => setup.prior[random.below(8)].sigma = wrong,
+            1 => setup.gate = Gate { sigmas: wrong },
+            2 => setup.walk.params = wrong,
+            3 => setup.tune_calibration = Some(wrong),
+            4 => setup.noise.all = wrong,
+            5 => setup.calibration.powered = wrong,
+            6 => setup.calibration.dipole = Some(wrong),
+            _ => setup.calibration.supplies[0].nominal = wrong,
+        }
+        setup
+    }
+}
+
+/// So many frames, then a request for the covariance before the last one, and the status.
+struct Sent(FrontEnd, usize);
+
+impl ErrorType for Sent {
+    type Error = ErrorKind;
+}
+
+impl Read for Sent {
+    fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
+        let Self(front_end, frames) = self;
+        if front_end.waiting.is_empty() && front_end.frames < *frames {
+            if front_end.frames + 1 == *frames {
+                front_end.say(&packet(1, &Request::Covariance));
+            }
+            front_end.send();
+            if front_end.frames == *frames {
+                front_end.say(&packet(2, &Request::Status));
+            }
+        }
+        let Some(next) = front_end.waiting.pop_front() else { return Ok(0) };
+        to[0] = next.ok_or(ErrorKind::TimedOut)?;
+        Ok(1)
+    }
+}
+
+/// What a device says, in few bytes.
+#[derive(Default)]
+struct Heard {
+    packet: Vec<u8>,
+    /// Of each estimate but for the number of refused frames, to the bit.
+    estimates: Vec<u64>,
+    /// Each piece of a covariance.
+    covariance: Vec<u64>,
+    refused: BTreeMap<String, u32>,
+    status: Option<Status>,
+}
+
+impl Heard {
+    fn hear(&mut self, reply: Reply) {
+        let bits = |reply: &Reply| {
+            let (mut hasher, mut bytes) = (DefaultHasher::new(), [0; PACKET]);
+            let n = reply.encode(UNASKED, &mut bytes).unwrap();
+            bytes[..n].hash(&mut hasher);
+            hasher.finish()
+        };
+        match reply {
+            Reply::Estimate(estimate) => {
+                self.estimates.push(bits(&Reply::Estimate(Answer { rejected_frames: 0, ..estimate })));
+            }
+            Reply::Covariance { .. } => self.covariance.push(bits(&reply)),
+            Reply::Refused { why, count } => {
+                *self.refused.entry(format!("{why:?}")).or_default() += 1;
+                assert_eq!(self.refused.values().sum::<u32>(), count, "each is counted, and said");
+            }
+            Reply::Status(status) => self.status = Some(status),
+            Reply::Restarted | Reply::Model(Err(_)) => {}
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+impl ErrorType for Heard {
+    type Error = ErrorKind;
+}
+
+impl Write for Heard {
+    fn write(&mut self, bytes: &[u8]) -> Result<usize, ErrorKind> {
+        for byte in bytes {
+            self.packet.push(*byte);
+            if *byte == 0 {
+                let reply = Reply::decode(&mut self.packet).1.unwrap();
+                self.packet.clear();
+                self.hear(reply);
+            }
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> Result<(), ErrorKind> {
+        Ok(())
+    }
+}
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_hundred_thousand_frames_with_a_fault_before_each_are_those_frames_alone() {
+    const FRAMES: usize = 100_000;
+    let (ring, recording) = paper_vars();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+    let built_in = in_flash(&core.tables);
+    let hear = |faults: Option<Random>| {
+        let (mut sent, mut heard) = (Sent(FrontEnd::new(&core, faults), FRAMES), Heard::default());
+        run(&built_in, &mut sent, &mut heard);
+        heard
+    };
+    let (alone, mixed) = std::thread::scope(|scope| {
+        let alone = scope.spawn(|| hear(None));
+        let mixed = hear(Some(Random::new(5)));
+        (alone.join().unwrap(), mixed)
+    });
+    assert_eq!((alone.estimates.len(), alone.covariance.len(), alone.refused.len()), (FRAMES, 21, 0));
+    let different = alone.estimates.iter().zip(&mixed.estimates).position(|(alone, mixed)| alone != mixed);
+    assert_eq!((different, mixed.estimates.len()), (None, FRAMES));
+    assert_eq!(alone.covariance, mixed.covariance);
+    // nothing else of the device has moved either, but for the cycles in which a sender has stalled
+    let (alone, mixed_status) = (alone.status.unwrap(), mixed.status.unwrap());
+    assert_eq!(Status { refused: 0, vitals: alone.vitals, ..mixed_status }, alone);
+    // each kind of refusal stands for a kind of fault, of which there is one in 32 frames
+    let kinds: Vec<(&str, bool)> = mixed.refused.iter().map(|(why, count)| (why.as_str(), *count > 1000)).collect();
+    let all =
+        "Beyond Corrupted Count Framing Malformed OutOfOrder Oversized Range Repeated Setup Stalled Truncated Version";
+    assert_eq!(kinds, all.split(' ').map(|why| (why, true)).collect::<Vec<_>>(), "{:?}", mixed.refused);
 }

@@ -1,16 +1,16 @@
 //! The core with bytes that are no frame, frames that no machine sends, settings that never repeat, and a monitor that falls
 //! silent.
 
-use estimator::booster::{self, Frame};
+use estimator::booster::Frame;
 use estimator::{
-    CurrentCode, FrameError, IngestError, IntensityCode, MagnetCurrents, Mask, MonitorState, PositionCode, Prior,
-    RfCode, TuneCode, Walk,
+    CurrentCode, IngestError, MagnetCurrents, Mask, MonitorState, PositionCode, Prior, RfCode, TuneCode, Walk,
 };
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use system_tests::machine::{ALL, LAYOUT, Machine, Random, nees, walk_per_cycle, wire_of};
+use system_tests::faults::{Body, FAULTS, faulty, is_sealed, sealed, serialised};
+use system_tests::machine::{LAYOUT, Machine, Random, nees, walk_per_cycle, wire_of};
 use system_tests::{repository, truth};
 use twin::Ring;
 
@@ -25,166 +25,6 @@ fn wires(recording: &Recording) -> Vec<Vec<u8>> {
 }
 
 // ---- Bytes that are no frame ----
-
-/// The body of a frame, whatever it says.
-type Body<'a> = (Numbers, &'a [i32], i32, &'a [i32], i32, &'a [i32], [Option<i32>; 2], Option<i32>, &'a [u32]);
-/// Epoch, sequence, time, time in the cycle.
-type Numbers = (u32, u32, u64, u32);
-
-/// Currents of the main supplies in a frame that would be good.
-const MAGNETS: (i32, [i32; 2]) = (23_997_850, [17_997_850; 2]);
-const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
-
-/// A frame of any version and body whose length and CRC are right.
-fn sealed(version: u8, body: &[u8]) -> Vec<u8> {
-    let mut plain = vec![version, body.len() as u8, (body.len() >> 8) as u8];
-    plain.extend_from_slice(body);
-    plain.extend_from_slice(&CRC.checksum(&plain).to_le_bytes());
-    framed(&plain)
-}
-
-fn framed(plain: &[u8]) -> Vec<u8> {
-    let mut wire = vec![0; cobs::max_encoding_length(plain.len()) + 1];
-    let n = cobs::encode(plain, &mut wire);
-    wire.truncate(n + 1);
-    wire
-}
-
-/// What stands in a wire frame, without COBS.
-fn plain(wire: &[u8]) -> Vec<u8> {
-    let mut plain = wire[..wire.len() - 1].to_vec();
-    let n = cobs::decode_in_place(&mut plain).unwrap();
-    plain.truncate(n);
-    plain
-}
-
-fn serialised(body: &Body) -> Vec<u8> {
-    postcard::to_slice(body, &mut [0; 4096]).unwrap().to_vec()
-}
-
-/// A frame that would be good but for the lengths of its lists.
-fn miscounted(sequence: u32, monitors: usize, correctors: usize) -> Vec<u8> {
-    let (readings, currents) = (vec![1000; monitors], vec![-5; correctors]);
-    let (dipole, supply) = MAGNETS;
-    let valid = vec![u32::MAX; monitors.div_ceil(32)];
-    let body = ((0, sequence, 1, 2), &currents[..], dipole, &supply[..], 0, &readings[..], [None; 2], None, &valid[..]);
-    sealed(Frame::VERSION, &serialised(&body))
-}
-
-/// A frame that would be good but for one value.
-fn beyond(sequence: u32, random: &mut Random) -> Vec<u8> {
-    let (mut currents, (mut dipole, mut supply), mut rf_offset, mut readings) = ([0; 48], MAGNETS, 0, [1000; 33]);
-    let (mut tune, mut intensity) = ([Some(800_000), None], None);
-    let far = |limit: i32, random: &mut Random| {
-        let steps = limit + 1 + random.below((i32::MAX - limit) as usize) as i32;
-        if random.below(2) == 0 { steps } else { -steps }
-    };
-    match random.below(8) {
-        0 => currents[random.below(48)] = far(CurrentCode::LIMIT, random),
-        1 => dipole = far(CurrentCode::LIMIT, random),
-        2 => supply[random.below(2)] = far(CurrentCode::LIMIT, random),
-        3 => rf_offset = far(RfCode::LIMIT, random),
-        4 => readings[random.below(33)] = far(PositionCode::LIMIT, random),
-        5 => tune[random.below(2)] = Some(far(TuneCode::LIMIT, random)),
-        6 => intensity = Some(far(IntensityCode::LIMIT, random)),
-        _ => tune[random.below(2)] = Some(-1),
-    }
-    let body =
-        ((0, sequence, 1, 2), &currents[..], dipole, &supply[..], rf_offset, &readings[..], tune, intensity, &ALL[..]);
-    sealed(Frame::VERSION, &serialised(&body))
-}
-
-/// The faults thrown at the core.
-const FAULTS: usize = 18;
-
-/// A faulty frame between two good ones, and whether an error is the one to expect of it.
-fn faulty(
-    fault: usize,
-    last: &[u8],
-    next: &[u8],
-    first: &[u8],
-    random: &mut Random,
-) -> (Vec<u8>, fn(&IngestError) -> bool) {
-    use FrameError::{Corrupted, Count, Framing, Malformed, Oversized, Range, Truncated, Version};
-    use IngestError::{Beyond, Frame, OutOfOrder, Repeated};
-    let garbled: fn(&IngestError) -> bool =
-        |e| matches!(e, Frame(Framing | Truncated { .. } | Oversized { .. } | Corrupted { .. }));
-    let sequence = i32::MAX as u32 - random.below(1000) as u32;
-    let mut bytes = next.to_vec();
-    let n = bytes.len() - 1;
-    match fault {
-        0 => {
-            bytes.truncate(random.below(n));
-            (bytes, |e| matches!(e, Frame(Framing | Truncated { .. })))
-        }
-        1 => {
-            bytes[random.below(n)] ^= 1 << random.below(8);
-            (bytes, garbled)
-        }
-        2 => {
-            for _ in 0..2 + random.below(20) {
-                bytes[random.below(n)] ^= 1 + (random.byte() & 0x7f);
-            }
-            (bytes, garbled)
-        }
-        3 => {
-            let (i, j) = loop {
-                let (i, j) = (random.below(n), random.below(n));
-                if bytes[i] != bytes[j] {
-                    break (i, j);
-                }
-            };
-            bytes.swap(i, j);
-            (bytes, garbled)
-        }
-        4 => ((0..random.below(600)).map(|_| random.byte()).collect(), garbled),
-        5 => {
-            let long = booster::Frame::MAX_WIRE_BYTES + 1 + random.below(3000);
-            ((0..long).map(|_| random.byte()).collect(), |e| {
-                matches!(e, Frame(Oversized { limit: booster::Frame::MAX_WIRE_BYTES, .. }))
-            })
-        }
-        6 => {
-            let mut plain = plain(next);
-            plain.extend((0..1 + random.below(20)).map(|_| random.byte()));
-            (framed(&plain), |e| matches!(e, Frame(Oversized { limit, got }) if got > limit))
-        }
-        7 => (Vec::new(), |e| *e == Frame(Truncated { need: 7, got: 0 })),
-        8 => (vec![0; 2 + random.below(400)], |e| *e == Frame(Framing)),
-        9 => {
-            let (plain, other) = (plain(next), 4 + random.below(252) as u8);
-            (sealed(other, &plain[3..plain.len() - 4]), |e| matches!(e, Frame(Version { supported: 3, .. })))
-        }
-        10 => {
-            let (monitors, correctors) = [(33, 47), (33, 49), (32, 48), (34, 48), (0, 0), (40, 40)][random.below(6)];
-            (miscounted(sequence, monitors, correctors), |e| matches!(e, Frame(Count { .. })))
-        }
-        11 => (beyond(sequence, random), |e| matches!(e, Frame(Range { .. }))),
-        12 => {
-            let mut plain = plain(next);
-            plain.truncate(plain.len() - 5); // the last byte of the mask
-            (sealed(booster::Frame::VERSION, &plain[3..]), |e| *e == Frame(Malformed))
-        }
-        13 => (last.to_vec(), |e| matches!(e, Repeated { .. })),
-        14 => (first.to_vec(), |e| matches!(e, OutOfOrder { .. } | Repeated { .. })),
-        15 => {
-            let mut frame = booster::Frame::decode(&LAYOUT, &mut bytes).unwrap();
-            match random.below(4) {
-                0 => frame.magnets.dipole = CurrentCode::default(),
-                1 => frame.magnets.supply[1] = CurrentCode::try_new(-17_900_000).unwrap(),
-                2 => frame.corrector = [CurrentCode::try_new(CurrentCode::LIMIT).unwrap(); 48],
-                _ => frame.rf_offset = RfCode::try_new(-RfCode::LIMIT).unwrap(),
-            }
-            frame.sequence = sequence;
-            (wire_of(&frame), |e| matches!(e, Beyond(_)))
-        }
-        16 => ([&last[..last.len() - 1], next].concat(), garbled),
-        _ => {
-            let cut = n / 4 + random.below(n / 2);
-            ([&last[..cut.min(last.len() - 1)], &next[cut..]].concat(), garbled)
-        }
-    }
-}
 
 /// All of an estimate, to the bit, but the number of refused frames.
 fn bits(core: &Core, estimate: &Estimate) -> Vec<u64> {
@@ -252,15 +92,6 @@ fn seasoned() -> (Core, Estimate) {
     (core, last.unwrap())
 }
 
-/// The CRC of whatever these bytes hold is right.
-fn is_sealed(wire: &[u8]) -> bool {
-    let mut plain = wire.strip_suffix(&[0]).unwrap_or(wire).to_vec();
-    let decoded = cobs::decode_in_place(&mut plain).ok().and_then(|n| plain.get(..n));
-    decoded
-        .and_then(<[u8]>::split_last_chunk::<4>)
-        .is_some_and(|(covered, crc)| CRC.checksum(covered).to_le_bytes() == *crc)
-}
-
 #[test]
 fn bytes_never_panic_and_pass_only_with_their_crc() {
     let (core, _) = seasoned();
@@ -273,7 +104,10 @@ fn bytes_never_panic_and_pass_only_with_their_crc() {
         let (c, r): (Vec<_>, Vec<_>) = (c.iter().map(small).collect(), r.iter().map(small).collect());
         let ([dipole, supply @ ..], [x, y, intensity]) = (m.map(|v| v >> shift), tune.map(|t| t.map(|t| t >> shift)));
         let (sequence, rf) = (sequence, rf >> shift);
-        serialised(&((0, sequence, time, cycle), &c, dipole, &supply[..], rf, &r, [x, y], intensity, &valid[..]))
+        let (supply, valid) = (supply.to_vec(), valid.to_vec());
+        let body =
+            Body { epoch: 0, sequence, time_us: time, cycle_time_us: cycle, corrector: c, dipole, ..Body::good(0) };
+        serialised(&Body { supply, rf_offset: rf, reading: r, tune: [x, y], intensity, valid, ..body })
     });
     let any = prop_oneof![
         bytes(),

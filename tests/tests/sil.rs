@@ -9,10 +9,13 @@ use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
 use estimator::Tables as _;
+use estimator::booster::Frame;
 use estimator::wire::link::{Refusal, Status};
 use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use system_tests::endurance::endure;
+use system_tests::machine::LAYOUT;
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
@@ -31,6 +34,11 @@ fn read(name: &str) -> (Ring, Recording) {
 
 fn wires(recording: &Recording) -> Vec<Vec<u8>> {
     recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
+}
+
+/// Number of a frame.
+fn sequence(wire: &[u8]) -> u32 {
+    Frame::decode(&LAYOUT, &mut wire.to_vec()).unwrap().sequence
 }
 
 fn start() -> Emulator {
@@ -114,7 +122,7 @@ impl<'e> Pair<'e> {
 
     /// A good frame, answered alike; the device may count refusals that the core has not seen.
     fn agree(&mut self, wire: &[u8]) {
-        let heard = self.link.ingest(wire).unwrap();
+        let heard = self.link.ingest(sequence(wire), wire).unwrap();
         self.expect(wire, heard.estimate);
     }
 
@@ -128,7 +136,7 @@ impl<'e> Pair<'e> {
     }
 
     fn refused(&mut self) -> Refusal {
-        match self.link.next().unwrap() {
+        match self.link.next().unwrap().1 {
             Reply::Refused { why, .. } => why,
             other => panic!("{other:?}"),
         }
@@ -184,6 +192,17 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
     assert!(status.vitals.silent_cycles > after.silent_cycles);
 }
 
+/// `make endure` sends twenty times as many.
+#[test]
+fn a_long_feedback_on_a_bad_line_is_the_same_on_the_chip() {
+    let endured = endure(&IMAGE, 1000, || ()).unwrap();
+    assert!(endured.different.is_empty(), "{:?}", endured.different);
+    let status = &endured.status;
+    assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (1000, endured.refused, 0));
+    assert!(endured.refused > 300, "a fault in three frames: {} refused", endured.refused);
+    check_stack(status);
+}
+
 /// 13 frames of 260 bytes come in 37 ms at 921,600 baud, longer than all slices together take, and far more than a front end
 /// sends in a cycle. The emulated UART has no rate: they are sent at once, just as the chip begins to linearise.
 #[test]
@@ -203,7 +222,7 @@ fn frames_that_come_during_an_update_are_not_lost() {
         let burst = good[at..at + 13].concat();
         pair.link.write(&burst).unwrap();
         for wire in &good[at..at + 13] {
-            let Reply::Estimate(answer) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
+            let (_, Reply::Estimate(answer)) = pair.link.next().unwrap() else { panic!("a burst frame was refused") };
             pair.expect(wire, Estimate::of_answer(&answer).unwrap());
         }
         at += 13;
@@ -222,10 +241,10 @@ fn a_storm_of_frames_is_survived() {
     let mut pair = Pair::start(&emulator, &ring, &recording);
     // covariances with every frame keep the chip busy sending; meanwhile its queue fills
     let mut request = vec![0; PACKET];
-    let n = Request::Covariance.encode(&mut request).unwrap();
+    let n = Request::Covariance.encode(1, &mut request).unwrap();
     let storm: Vec<u8> = good[..200].iter().flat_map(|wire| [&request[..n], wire].concat()).collect();
     let status = {
-        let n = Request::Status.encode(&mut request).unwrap();
+        let n = Request::Status.encode(2, &mut request).unwrap();
         [&[0], &request[..n]].concat()
     };
     let mut uart = emulator.uart().try_clone().unwrap();
@@ -242,7 +261,7 @@ fn a_storm_of_frames_is_survived() {
     });
     let (mut answered, mut refused) = (0, 0);
     let status = loop {
-        match pair.link.next().unwrap() {
+        match pair.link.next().unwrap().1 {
             Reply::Estimate(answer) => {
                 let answer = Estimate::of_answer(&answer).unwrap();
                 pair.expect(&good[answer.sequence as usize], answer);
@@ -263,7 +282,7 @@ fn a_storm_of_frames_is_survived() {
     // the device is as it was
     pair.link.write(&good[200]).unwrap();
     loop {
-        match pair.link.next().unwrap() {
+        match pair.link.next().unwrap().1 {
             Reply::Estimate(answer) => break pair.expect(&good[200], Estimate::of_answer(&answer).unwrap()),
             Reply::Status(_) | Reply::Covariance { .. } => {} // asked for during the storm
             other => panic!("{other:?}"),
@@ -311,9 +330,10 @@ fn the_log_is_decoded_and_a_fault_reported() {
     assert_eq!(run.status, Some(1));
 }
 
-/// A panic handler that calls a function that exists nowhere: a path from the core to a panic would not link.
+/// A panic handler that calls a function that exists nowhere: a path to a panic, from the bytes that come in to those that go
+/// out, would not link.
 #[test]
-fn no_path_leads_from_the_core_to_a_panic() {
+fn no_path_leads_from_bytes_to_a_panic() {
     let link = |example: &str| {
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let build = ["build", "--locked", "--profile", "firmware", "-p", "firmware-sim", "--example", example];
@@ -325,5 +345,5 @@ fn no_path_leads_from_the_core_to_a_panic() {
     let (linked, message) = link("never_panics");
     assert!(linked, "{message}");
     let (linked, message) = link("can_panic");
-    assert!(!linked && message.contains("undefined symbol: the_core_can_panic"), "{message}");
+    assert!(!linked && message.contains("undefined symbol: the_loop_can_panic"), "{message}");
 }

@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::{Green, GreenPlane, LowRank, TERMS, Tables};
 use crate::sizes::{Layout, Sizes};
-use crate::wire::{Parcel, ParcelError};
+use crate::wire::{Parcel, ParcelError, listed};
 
 /// The version of Green's function tables that is written and read here.
 pub const VERSION: u16 = 3;
@@ -259,11 +259,10 @@ impl<
     }
 
     fn values<const L: usize>(&self, list: List) -> Vec<f32, L> {
-        let (d, of) =
-            (&self.dispersion, |values: &[f32], size: u16| values.iter().take(size.into()).copied().collect());
+        let (d, of) = (&self.dispersion, |values: &[f32], size: u16| listed(values.iter().take(size.into()).copied()));
         let (quadrupoles, monitors) = (self.sizes.quadrupoles, self.sizes.monitors[0]);
         match list {
-            List::Steps => self.x.steps().into_iter().chain(self.y.steps()).collect(),
+            List::Steps => listed(self.x.steps().into_iter().chain(self.y.steps())),
             List::Weight => of(&self.weight, quadrupoles),
             List::MonitorDispersion => of(&d.monitor, monitors),
             List::NodeDispersion => of(&d.node, 2 * quadrupoles),
@@ -271,7 +270,7 @@ impl<
             List::Ring => {
                 let momentum = [d.compaction, d.inverse_gamma_squared, d.circumference];
                 let all = d.spurious.into_iter().chain(momentum).chain(self.tune).chain(self.stated_error);
-                all.collect()
+                listed(all)
             }
             List::TermScale => of(&self.low_rank.scale, TERMS as u16),
             List::TermRfOffset => of(&self.low_rank.rf_offset, TERMS as u16),

@@ -7,10 +7,10 @@ use core::fmt;
 
 use heapless::Vec;
 use serde::de::{SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::FrameError;
 use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
+use super::{FrameError, listed};
 use crate::mask::Mask;
 use crate::sizes::Layout;
 
@@ -66,6 +66,21 @@ code!(
     /// A magnet or corrector current in steps of 0.1 mA, within ±10 kA.
     CurrentCode, AMPERES_PER_LSB = 1e-4, limit 100_000_000
 );
+
+/// On the wire a current is its number of steps.
+impl Serialize for CurrentCode {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.0.serialize(serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for CurrentCode {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let beyond = || serde::de::Error::custom("a current beyond its range");
+        Self::try_new(i32::deserialize(deserializer)?).ok_or_else(beyond)
+    }
+}
+
 code!(
     /// A relative offset of the RF frequency in steps of 1e-9, within ±1 %.
     RfCode, RATIO_PER_LSB = 1e-9, limit 10_000_000
@@ -215,17 +230,16 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Frame<B, C,
             sequence: self.sequence,
             time_us: self.time_us,
             cycle_time_us: self.cycle_time_us,
-            corrector: (0..layout.correctors())
-                .filter_map(|c| self.corrector.get(layout.corrector(c)))
-                .map(|c| c.0)
-                .collect(),
+            corrector: listed(
+                (0..layout.correctors()).filter_map(|c| self.corrector.get(layout.corrector(c))).map(|c| c.0),
+            ),
             dipole: self.magnets.dipole.0,
-            supply: self.magnets.supply.iter().take(layout.supplies()).map(|s| s.0).collect(),
+            supply: listed(self.magnets.supply.iter().take(layout.supplies()).map(|s| s.0)),
             rf_offset: self.rf_offset.0,
-            reading: monitors.filter_map(|b| self.reading.get(layout.monitor(b))).map(|r| r.0).collect(),
+            reading: listed(monitors.filter_map(|b| self.reading.get(layout.monitor(b))).map(|r| r.0)),
             tune: self.tune.map(|t| t.map(|t| t.0)),
             intensity: self.intensity.map(|i| i.0),
-            valid: valid.as_words().iter().take(crate::mask::words(layout.monitors())).copied().collect(),
+            valid: listed(valid.as_words().iter().take(crate::mask::words(layout.monitors())).copied()),
         }
     }
 }

@@ -5,22 +5,28 @@ use heapless::Vec;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
-use super::{FrameError, ParcelError};
+use super::packet::{self, LENGTH, VARINT_16, VARINT_32, VARINT_64};
+use super::{CurrentCode, FrameError, ParcelError, listed};
 use crate::estimate::{Estimate, Health, MonitorState, Remarks};
 use crate::estimator::{GROUPS, IngestError, Setup};
 use crate::mask::Mask;
+use crate::sizes::Sizes;
 
-/// First byte of a request: kind 1 of version 3.
-pub const REQUEST: u8 = 0x13;
+/// Version of requests and replies.
+pub const VERSION: u8 = 3;
+/// First byte of a request.
+pub const REQUEST: u8 = 0x10 | VERSION;
 /// First byte of a reply.
-pub const REPLY: u8 = 0x23;
+pub const REPLY: u8 = 0x20 | VERSION;
+/// Number of replies that no request has asked for: those to frames, and to what was neither. No request should have it.
+pub const UNASKED: u32 = 0;
 /// Most entries of a covariance in one piece.
 pub const PIECE: usize = 56;
 /// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
-pub const OTHER_BYTES: usize = 1 + VARINT_32 + 3 + LENGTH + 4 * PIECE;
+pub const OTHER_BYTES: usize = VARINT_32 + 1 + VARINT_32 + VARINT_16 + LENGTH + 4 * PIECE;
 
-/// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables.
+/// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables. On the wire its number comes first, which
+/// the reply repeats, so that a host never takes the reply to an earlier request for that to a later one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
 pub enum Request<S, P> {
@@ -36,12 +42,25 @@ pub enum Request<S, P> {
     Model(P),
     /// Use the tables in flash again, which frees the slot.
     BuiltIn,
+    /// Reply to frames in this form, until told otherwise or restarted.
+    Form(Form),
 }
 
-/// A reply of a device: `A` is its core's estimate on the wire.
+/// How a device replies to frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub enum Form {
+    /// By the estimate: see [`Reply::Estimate`].
+    #[default]
+    Full,
+    /// By what feedback needs: see [`Reply::Short`].
+    Short,
+}
+
+/// A reply of a device: `A` is its core's estimate on the wire, `U` are setpoints. On the wire the number of the request comes first,
+/// or [`UNASKED`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
-pub enum Reply<A> {
+pub enum Reply<A, U> {
     /// The estimate after a frame.
     Estimate(A),
     /// A part of the covariance of `theta = ln var`, lower triangle row by row.
@@ -68,6 +87,35 @@ pub enum Reply<A> {
     Model(Result<Taken, ParcelError>),
     /// How the device is.
     Status(Status),
+    /// What feedback needs after a frame.
+    Short(Short<U>),
+    /// Frames are replied to in this form.
+    Form(Form),
+}
+
+/// What feedback needs after a frame: may the setpoints be used, and which are they?
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Short<U> {
+    /// Sequence number of the frame.
+    pub sequence: u32,
+    /// What is to be said of the frame and of the posterior, see [`Remarks`].
+    pub remarks: Remarks,
+    /// The model did not describe the frames so far when it was last linearised, see [`crate::FitQuality::is_mismatch`].
+    pub mismatch: bool,
+    /// An operator should look, see [`crate::Core::needs_attention`].
+    pub attention: bool,
+    /// Normalised innovation squared of the readings used.
+    pub nis: f32,
+    /// Currents that the correctors should have, in their order; none where the device does not steer, or holds them.
+    pub setpoints: U,
+}
+
+/// Setpoints of `C` correctors, or none.
+pub type Setpoints<const C: usize> = Vec<CurrentCode, C>;
+
+impl<const C: usize> Short<Setpoints<C>> {
+    /// Largest body of a reply that holds one.
+    pub const MAX_BYTES: usize = VARINT_32 + 1 + VARINT_32 + 5 + 4 + LENGTH + VARINT_32 * C;
 }
 
 /// What became of a part of new tables.
@@ -148,6 +196,14 @@ pub struct Vitals {
 /// How the device is.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Status {
+    /// Version of its requests and replies, [`VERSION`].
+    pub version: u8,
+    /// Version of its frames, [`crate::Frame::VERSION`].
+    pub frame_version: u8,
+    /// How many of everything the ring has that it is for.
+    pub ring: Sizes,
+    /// What its core has room for.
+    pub room: Sizes,
     /// Frames used so far.
     pub frames: u32,
     /// Packets refused so far.
@@ -193,18 +249,17 @@ pub struct Answer<const B: usize, const N: usize, const W: usize> {
 
 impl<const B: usize, const N: usize, const W: usize> From<&Estimate<B, N, W>> for Answer<B, N, W> {
     fn from(e: &Estimate<B, N, W>) -> Self {
-        let list = |values: &[f32; N]| values.iter().copied().collect();
-        let mask = |mask: &Mask<W>, bits| mask.as_words().iter().take(crate::mask::words(bits)).copied().collect();
+        let mask = |mask: &Mask<W>, bits| listed(mask.as_words().iter().take(crate::mask::words(bits)).copied());
         Self {
             sequence: e.sequence,
             time_us: e.time_us,
             frames: e.frames,
             rejected_frames: e.rejected_frames,
-            mean: list(&e.mean),
-            sigma: list(&e.sigma),
-            map_params: list(&e.map_params),
-            centre: list(&e.centre),
-            params_sigma: list(&e.params_sigma),
+            mean: listed(e.mean),
+            sigma: listed(e.sigma),
+            map_params: listed(e.map_params),
+            centre: listed(e.centre),
+            params_sigma: listed(e.params_sigma),
             clipped: mask(&e.clipped, N),
             nis: e.nis,
             accepted: mask(&e.accepted, B),
@@ -216,14 +271,14 @@ impl<const B: usize, const N: usize, const W: usize> From<&Estimate<B, N, W>> fo
             log_evidence: e.log_evidence,
             linearised: e.linearised,
             remarks: e.remarks,
-            health: e.health.iter().map(|h| (h.state as u8, h.noise, h.weighted_as, h.rejected)).collect(),
+            health: listed(e.health.iter().map(|h| (h.state as u8, h.noise, h.weighted_as, h.rejected))),
         }
     }
 }
 
 impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
     /// Largest body of a reply that holds one.
-    pub const MAX_BYTES: usize = 1 + 5 * (LENGTH + 4 * N) // mean .. params_sigma
+    pub const MAX_BYTES: usize = VARINT_32 + 1 + 5 * (LENGTH + 4 * N) // mean .. params_sigma
         + 5 * (LENGTH + VARINT_32 * W) // masks
         + LENGTH + B * (1 + 8 + VARINT_32) // health
         + 3 * VARINT_32 + VARINT_64 // the frame, and how many
@@ -267,7 +322,7 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
 
 impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
     /// Largest body of a request that holds one.
-    pub const MAX_BYTES: usize = 1 + 16 * GROUPS // priors
+    pub const MAX_BYTES: usize = VARINT_32 + 1 + 16 * GROUPS // priors
         + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
         + 5 + LENGTH + 28 * F // dipole, supplies
         + 3 * 4 + 5; // gate, both walks, tunes
@@ -278,38 +333,44 @@ impl<S: Serialize, P: Serialize> Request<S, P> {
     ///
     /// # Errors
     /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
-    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
-        packet::seal(REQUEST, self, out)
+    pub fn encode(&self, number: u32, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REQUEST, &(number, self), out)
     }
 }
 
 impl<S: DeserializeOwned, P: DeserializeOwned> Request<S, P> {
-    /// Read a request; `bytes` is used as work space.
-    ///
-    /// # Errors
-    /// [`FrameError`].
-    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
-        packet::unseal(REQUEST, bytes.len(), bytes)
+    /// Read a request and its number, which is [`UNASKED`] where that is damaged; `bytes` is used as work space.
+    pub fn decode(bytes: &mut [u8]) -> (u32, Result<Self, FrameError>) {
+        unseal(REQUEST, bytes)
     }
 }
 
-impl<A: Serialize> Reply<A> {
+impl<A: Serialize, U: Serialize> Reply<A, U> {
     /// Write the reply as a packet; returns its bytes.
     ///
     /// # Errors
     /// [`FrameError::Space`]; the machine's `PACKET` bytes always suffice.
     #[inline(never)] // so that a count of instructions leaves out the waiting for the line
-    pub fn encode(&self, out: &mut [u8]) -> Result<usize, FrameError> {
-        packet::seal(REPLY, self, out)
+    pub fn encode(&self, number: u32, out: &mut [u8]) -> Result<usize, FrameError> {
+        packet::seal(REPLY, &(number, self), out)
     }
 }
 
-impl<A: DeserializeOwned> Reply<A> {
-    /// Read a reply; `bytes` is used as work space.
-    ///
-    /// # Errors
-    /// [`FrameError`].
-    pub fn decode(bytes: &mut [u8]) -> Result<Self, FrameError> {
-        packet::unseal(REPLY, bytes.len(), bytes)
+impl<A: DeserializeOwned, U: DeserializeOwned> Reply<A, U> {
+    /// Read a reply and the number of its request; `bytes` is used as work space.
+    pub fn decode(bytes: &mut [u8]) -> (u32, Result<Self, FrameError>) {
+        unseal(REPLY, bytes)
+    }
+}
+
+/// The number first, so that a body which this version does not know is tied to its sender's request all the same.
+fn unseal<T: DeserializeOwned>(kind: u8, bytes: &mut [u8]) -> (u32, Result<T, FrameError>) {
+    let body = match packet::open(kind, bytes.len(), bytes) {
+        Ok(body) => body,
+        Err(error) => return (UNASKED, Err(error)),
+    };
+    match postcard::take_from_bytes(body) {
+        Ok((number, rest)) => (number, packet::whole(rest)),
+        Err(_) => (UNASKED, Err(FrameError::Malformed)),
     }
 }

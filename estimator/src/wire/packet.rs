@@ -112,12 +112,12 @@ fn unstuff(bytes: &mut [u8]) -> Option<usize> {
     matches!(state.feed(0), Ok(DecodeResult::DataComplete)).then_some(length)
 }
 
-/// A packet's body; the packet has at most `limit` bytes.
+/// What all of these bytes say.
 ///
 /// # Errors
-/// [`FrameError`]; [`FrameError::Malformed`] if the body is sound but not of this type.
-pub fn unseal<'b, T: Deserialize<'b>>(kind: u8, limit: usize, bytes: &'b mut [u8]) -> Result<T, FrameError> {
-    match postcard::take_from_bytes(open(kind, limit, bytes)?) {
+/// [`FrameError::Malformed`] if they are not of this type, or there are more.
+pub fn whole<'b, T: Deserialize<'b>>(body: &'b [u8]) -> Result<T, FrameError> {
+    match postcard::take_from_bytes(body) {
         Ok((body, [])) => Ok(body),
         _ => Err(FrameError::Malformed),
     }
@@ -164,10 +164,10 @@ mod tests {
         let body = [7_u32, 0, 300];
         let n = seal(0x11, &body, &mut out).unwrap();
         assert_eq!(kind(&out[..n]), Some(0x11));
-        assert_eq!(unseal(0x11, MOST, &mut { out }[..n]), Ok(body));
+        assert_eq!(open(0x11, MOST, &mut { out }[..n]).and_then(whole), Ok(body));
         let other = FrameError::Version { supported: 1, got: 0x11 };
-        assert_eq!(unseal::<[u32; 3]>(1, MOST, &mut { out }[..n]), Err(other));
-        assert_eq!(unseal::<[u32; 2]>(0x11, MOST, &mut out[..n]), Err(FrameError::Malformed));
+        assert_eq!(open(1, MOST, &mut { out }[..n]), Err(other));
+        assert_eq!(open(0x11, MOST, &mut out[..n]).and_then(whole::<[u32; 2]>), Err(FrameError::Malformed));
     }
 
     #[test]

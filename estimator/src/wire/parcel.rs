@@ -6,7 +6,8 @@ use core::fmt;
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use super::packet::{LENGTH, VARINT_16};
+use super::listed;
+use super::packet::{LENGTH, VARINT_16, VARINT_32};
 use crate::sizes::Sizes;
 
 const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
@@ -45,17 +46,17 @@ pub enum Parcel<const L: usize> {
 }
 
 impl<const L: usize> Parcel<L> {
-    /// Largest body of a packet that holds a parcel, behind the number of a request.
-    pub const MAX_BYTES: usize = 2 + LENGTH + 4 * L + 8 * VARINT_16;
+    /// Largest body of a packet that holds a parcel, behind number and kind of a request.
+    pub const MAX_BYTES: usize = VARINT_32 + 2 + LENGTH + 4 * L + 8 * VARINT_16;
 
     /// One line of a table.
     pub fn codes(table: u8, line: usize, codes: impl IntoIterator<Item = i16>) -> Self {
-        Self::Codes { table, line: line as u16, codes: codes.into_iter().take(L).collect() }
+        Self::Codes { table, line: line as u16, codes: listed(codes) }
     }
 
     /// A list of numbers.
     pub fn values(list: u8, values: &[f32]) -> Self {
-        Self::Values { list, values: values.iter().copied().take(L).collect() }
+        Self::Values { list, values: listed(values.iter().copied()) }
     }
 
     /// CRC-32 (ISO-HDLC) of parcels in postcard, one after the other.

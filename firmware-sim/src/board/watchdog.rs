@@ -4,7 +4,8 @@
 //! the second time resets the machine.
 
 use cortex_m_rt::exception;
-use embedded_hal::digital::{ErrorType, OutputPin};
+use embedded_hal::digital::OutputPin;
+use firmware_sim::Supervisor;
 
 use super::registers::{WATCHDOG_CONTROL, WATCHDOG_INTCLR, WATCHDOG_LOAD, WATCHDOG_LOCK};
 use super::{SYSCLK_HZ, fault};
@@ -17,44 +18,20 @@ const RESET_ENABLE: u32 = 1 << 1;
 const UNLOCK: u32 = 0x1ACC_E551;
 const LOCK: u32 = 0;
 
-/// The running watchdog, and the pin that feeds an external one beside it. Neither can be stopped: an edge of the pin feeds
-/// both.
-pub struct Watchdog<P> {
-    supervisor: P,
+/// Start it; it must be fed more often than this [s], by an edge of the pin to an external one. Neither can be stopped.
+pub fn start<P: OutputPin>(seconds: u32, supervisor: P) -> Supervisor<P, fn()> {
+    WATCHDOG_LOCK.write(UNLOCK);
+    WATCHDOG_LOAD.write(seconds * SYSCLK_HZ);
+    WATCHDOG_CONTROL.write(INTERRUPT_ENABLE | RESET_ENABLE);
+    WATCHDOG_LOCK.write(LOCK);
+    Supervisor::new(supervisor, feed)
 }
 
-impl<P: OutputPin> Watchdog<P> {
-    /// Start it; it must be fed more often than this [s].
-    pub fn start(seconds: u32, supervisor: P) -> Self {
-        WATCHDOG_LOCK.write(UNLOCK);
-        WATCHDOG_LOAD.write(seconds * SYSCLK_HZ);
-        WATCHDOG_CONTROL.write(INTERRUPT_ENABLE | RESET_ENABLE);
-        WATCHDOG_LOCK.write(LOCK);
-        Self { supervisor }
-    }
-
-    /// Restart the count.
-    fn feed(&mut self) {
-        WATCHDOG_LOCK.write(UNLOCK);
-        WATCHDOG_INTCLR.write(1);
-        WATCHDOG_LOCK.write(LOCK);
-    }
-}
-
-impl<P: OutputPin> ErrorType for Watchdog<P> {
-    type Error = P::Error;
-}
-
-impl<P: OutputPin> OutputPin for Watchdog<P> {
-    fn set_low(&mut self) -> Result<(), P::Error> {
-        self.feed();
-        self.supervisor.set_low()
-    }
-
-    fn set_high(&mut self) -> Result<(), P::Error> {
-        self.feed();
-        self.supervisor.set_high()
-    }
+/// Restart the count.
+fn feed() {
+    WATCHDOG_LOCK.write(UNLOCK);
+    WATCHDOG_INTCLR.write(1);
+    WATCHDOG_LOCK.write(LOCK);
 }
 
 #[exception]

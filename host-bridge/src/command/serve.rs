@@ -3,7 +3,7 @@
 use estimator::Tables as _;
 use estimator::Walk;
 use inference::{Recording, stream};
-use training::LINE;
+use training::{LINE, Tables};
 use twin::Ring;
 
 use super::{
@@ -76,7 +76,7 @@ fn feed(
         bar.finish_and_clear();
         link.restart(&setup).map_err(CommandError::other)?;
     }
-    expect_tables(&mut link, tables.digest::<LINE>())?;
+    expect_tables(&mut link, &tables)?;
     let (names, stop) = (Names::of(ring), Stop::on_signals().map_err(CommandError::other)?);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
     let mut source = Fed::new(recording, &names, &mut link, Clock::new(options.rate, &stop));
@@ -87,8 +87,16 @@ fn feed(
 }
 
 /// A device uses the tables that it has, whatever their ring.
-fn expect_tables<L: Line>(link: &mut Link<L>, expected: u32) -> Result<(), CommandError> {
-    let got = link.status().map_err(CommandError::other)?.tables;
+fn expect_tables<L: Line>(link: &mut Link<L>, tables: &Tables) -> Result<(), CommandError> {
+    let status = link.status().map_err(CommandError::other)?;
+    if status.ring != tables.sizes() {
+        let (has, needs) = (status.ring.all(), tables.sizes().all());
+        let counts = "monitors x, y, correctors x, y, quadrupoles, params, supplies";
+        return Err(CommandError::Other(format!(
+            "the device is for a ring of {has:?} {counts}, this one has {needs:?}"
+        )));
+    }
+    let (got, expected) = (status.tables, tables.digest::<LINE>());
     let wrong = || format!("the device uses tables {got:08x}, this model has {expected:08x}; --load sends them");
     if got == expected { Ok(()) } else { Err(CommandError::Other(wrong())) }
 }

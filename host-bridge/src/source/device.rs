@@ -46,7 +46,7 @@ impl<'r, L: Read + Write> Fed<'r, L> {
         self.next += 1;
         let wire = stream::wire(self.recording, row)?;
         self.clock.wait();
-        let heard = self.times.of(|| self.link.ingest(&wire));
+        let heard = self.times.of(|| self.link.ingest(row.sequence, &wire));
         Ok(Some(heard.map_err(|error| format!("frame {}: {error}", row.sequence))?))
     }
 

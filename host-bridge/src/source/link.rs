@@ -1,15 +1,17 @@
 //! The host's end of a device's line: requests and frames out, replies in.
 
+use core::hash::BuildHasher as _;
 use core::time::Duration;
+use std::hash::RandomState;
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::time::Instant;
 
-use estimator::wire::link::{Refusal, Status, Taken};
+use estimator::wire::link::{Form, Refusal, Short, Status, Taken, UNASKED};
 use estimator::{FrameError, ParcelError, Tables as _};
 use inference::stream::{Estimate, Setup};
-use training::rooms::large::{PACKET, Reply, Request};
+use training::rooms::large::{PACKET, Reply, Request, Setpoints};
 use training::{LINE, Tables};
 
 use super::address::Address;
@@ -124,8 +126,8 @@ fn triangle(estimate: &Estimate) -> usize {
 enum Event {
     /// An estimate.
     Heard(Box<Heard>),
-    /// A reply that is no part of an estimate.
-    Other(Box<Reply>),
+    /// A reply that is no part of an estimate, and the number of its request.
+    Other(u32, Box<Reply>),
 }
 
 impl Heard {
@@ -146,6 +148,8 @@ pub struct Link<L> {
     line: L,
     received: Vec<u8>,
     coming: Option<Coming>,
+    /// Number of the last request.
+    number: u32,
 }
 
 impl Link<Box<dyn Line>> {
@@ -181,7 +185,9 @@ fn connect(address: &Address) -> io::Result<Box<dyn Line>> {
 impl<L: Read + Write> Link<L> {
     /// A device on a line that is open already. A read of it is to time out now and then, or nothing here ends.
     pub fn new(line: L) -> Self {
-        Self { line, received: Vec::new(), coming: None }
+        // replies to somebody before us may be on their way: their numbers are not those of ours
+        let number = RandomState::new().hash_one(()) as u32;
+        Self { line, received: Vec::new(), coming: None, number }
     }
 
     /// Let the device begin at the prior.
@@ -191,19 +197,29 @@ impl<L: Read + Write> Link<L> {
     pub fn restart(&mut self, setup: &Setup) -> Result<(), LinkError> {
         // a zero first: half a packet of somebody before us may be waiting
         self.write(&[0])?;
-        self.send(&Request::Restart(setup.on_wire()))?;
+        let number = self.send(&Request::Restart(setup.on_wire()))?;
         self.coming = None;
         let deadline = Instant::now() + PATIENCE;
         loop {
-            match self.next_before(deadline, PATIENCE) {
+            match self.reply_to(number, deadline) {
                 Ok(Reply::Restarted) => return Ok(()),
-                Ok(Reply::Refused { why: why @ (Refusal::Setup | Refusal::NoDesign), .. }) => {
-                    return Err(LinkError::Refused { what: "its setup", why });
-                }
-                // replies to somebody before us, and the half of one that was on its way when the line was opened
-                Ok(_) | Err(LinkError::Reply(_)) => {}
+                Ok(Reply::Refused { why, .. }) => return Err(LinkError::Refused { what: "its setup", why }),
+                // the tables in its slot have no design; or the half of a reply that was on its way when the line was opened
+                Ok(Reply::Model(_)) | Err(LinkError::Reply(_)) => {}
+                Ok(other) => return Err(unexpected("a word on the setup", &other)),
                 Err(error) => return Err(error),
             }
+        }
+    }
+
+    /// Let the device reply to frames in full or in short, until it is restarted.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn form(&mut self, form: Form) -> Result<(), LinkError> {
+        match self.ask(&Request::Form(form))? {
+            Reply::Form(got) if got == form => Ok(()),
+            other => Err(unexpected("the form of its replies", &other)),
         }
     }
 
@@ -211,19 +227,45 @@ impl<L: Read + Write> Link<L> {
     ///
     /// # Errors
     /// [`LinkError`].
-    pub fn ingest(&mut self, wire: &[u8]) -> Result<Heard, LinkError> {
-        self.send(&Request::Covariance)?;
+    pub fn ingest(&mut self, sequence: u32, wire: &[u8]) -> Result<Heard, LinkError> {
+        let number = self.send(&Request::Covariance)?;
         self.write(wire)?;
-        match self.gather(Instant::now() + PATIENCE, PATIENCE)? {
-            Event::Heard(heard) if heard.covariance.is_some() => Ok(*heard),
-            Event::Heard(heard) => Err(LinkError::Unexpected {
-                expected: "an estimate and its covariance",
-                found: format!("only the estimate of frame {}", heard.estimate.sequence),
-            }),
-            Event::Other(other) => Err(match *other {
-                Reply::Refused { why, .. } => LinkError::Refused { what: "a frame", why },
-                other => unexpected("an estimate", &other),
-            }),
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match self.gather(deadline, PATIENCE)? {
+                // of a frame that somebody before us has sent
+                Event::Heard(heard) if heard.estimate.sequence != sequence => {}
+                Event::Heard(heard) if heard.covariance.is_some() => return Ok(*heard),
+                Event::Heard(_) => {
+                    let found = format!("only the estimate of frame {sequence}");
+                    return Err(LinkError::Unexpected { expected: "an estimate and its covariance", found });
+                }
+                Event::Other(of, other) if of == number || of == UNASKED => {
+                    return Err(match *other {
+                        Reply::Refused { why, .. } => LinkError::Refused { what: "a frame", why },
+                        other => unexpected("an estimate", &other),
+                    });
+                }
+                Event::Other(..) => {}
+            }
+        }
+    }
+
+    /// Send a frame to a device that replies in short, and wait for that.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn feedback(&mut self, sequence: u32, wire: &[u8]) -> Result<Short<Setpoints>, LinkError> {
+        self.write(wire)?;
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match self.reply_to(UNASKED, deadline)? {
+                Reply::Short(short) if short.sequence == sequence => return Ok(short),
+                // of a frame that somebody before us has sent
+                Reply::Short(_) => {}
+                Reply::Refused { why, .. } => return Err(LinkError::Refused { what: "a frame", why }),
+                other => return Err(unexpected("a short reply", &other)),
+            }
         }
     }
 
@@ -238,7 +280,7 @@ impl<L: Read + Write> Link<L> {
         loop {
             match self.gather(deadline, LULL)? {
                 Event::Heard(heard) => return Ok(*heard),
-                Event::Other(other) => {
+                Event::Other(_, other) => {
                     if let Reply::Refused { why, .. } = *other {
                         return Err(LinkError::Refused { what: "a packet", why });
                     } // else a reply to somebody else
@@ -251,13 +293,13 @@ impl<L: Read + Write> Link<L> {
     fn gather(&mut self, deadline: Instant, patience: Duration) -> Result<Event, LinkError> {
         loop {
             match self.next_before(deadline, patience) {
-                Ok(Reply::Estimate(reply)) => {
+                Ok((_, Reply::Estimate(reply))) => {
                     let estimate = Estimate::of_answer(&reply).ok_or(LinkError::Reply(FrameError::Malformed))?;
                     if let Some(former) = self.coming.replace(Coming::new(estimate)) {
                         return Ok(Event::Heard(Box::new(former.heard())));
                     }
                 }
-                Ok(Reply::Covariance { sequence, first, entries }) => {
+                Ok((_, Reply::Covariance { sequence, first, entries })) => {
                     if let Some(coming) = &mut self.coming {
                         coming.add(sequence, first, &entries);
                     }
@@ -265,7 +307,7 @@ impl<L: Read + Write> Link<L> {
                         return Ok(Event::Heard(Box::new(whole.heard())));
                     }
                 }
-                Ok(other) => return Ok(Event::Other(Box::new(other))),
+                Ok((number, other)) => return Ok(Event::Other(number, Box::new(other))),
                 Err(error @ LinkError::Reply(_)) => return Err(error),
                 // no more will come of it
                 Err(error) => {
@@ -280,8 +322,7 @@ impl<L: Read + Write> Link<L> {
     /// # Errors
     /// [`LinkError`].
     pub fn status(&mut self) -> Result<Status, LinkError> {
-        self.send(&Request::Status)?;
-        match self.next()? {
+        match self.ask(&Request::Status)? {
             Reply::Status(status) => Ok(status),
             other => Err(unexpected("its status", &other)),
         }
@@ -292,19 +333,16 @@ impl<L: Read + Write> Link<L> {
     /// # Errors
     /// [`LinkError::Tables`] if the device did not take them, in which case it keeps the former ones.
     pub fn load(&mut self, tables: &Tables, mut progress: impl FnMut()) -> Result<(), LinkError> {
-        self.send(&Request::BuiltIn)?;
-        self.taken()?;
-        let mut last = Taken::BuiltIn;
+        let mut last = self.taken(&Request::BuiltIn)?;
         for parcel in tables.parcels::<LINE>() {
-            self.send(&Request::Model(parcel))?;
-            last = self.taken()?;
+            last = self.taken(&Request::Model(parcel))?;
             progress();
         }
         if last == Taken::InUse { Ok(()) } else { Err(unexpected("tables in use", &Reply::Model(Ok(last)))) }
     }
 
-    fn taken(&mut self) -> Result<Taken, LinkError> {
-        match self.next()? {
+    fn taken(&mut self, request: &Request) -> Result<Taken, LinkError> {
+        match self.ask(request)? {
             Reply::Model(taken) => taken.map_err(LinkError::Tables),
             other => Err(unexpected("a word on tables", &other)),
         }
@@ -329,32 +367,50 @@ impl<L: Read + Write> Link<L> {
         Ok(())
     }
 
-    /// Send a request.
+    /// Send a request; returns its number.
     ///
     /// # Errors
     /// [`LinkError`].
-    pub fn send(&mut self, request: &Request) -> Result<(), LinkError> {
+    pub fn send(&mut self, request: &Request) -> Result<u32, LinkError> {
+        self.number = self.number.checked_add(1).unwrap_or(UNASKED + 1);
         let mut bytes = [0; PACKET];
-        let n = request.encode(&mut bytes)?;
-        self.write(&bytes[..n])
+        let n = request.encode(self.number, &mut bytes)?;
+        self.write(&bytes[..n])?;
+        Ok(self.number)
     }
 
-    /// Wait for the next reply.
+    /// Send a request and wait for its reply; replies to others are skipped.
+    fn ask(&mut self, request: &Request) -> Result<Reply, LinkError> {
+        let number = self.send(request)?;
+        self.reply_to(number, Instant::now() + PATIENCE)
+    }
+
+    fn reply_to(&mut self, number: u32, deadline: Instant) -> Result<Reply, LinkError> {
+        loop {
+            let (of, reply) = self.next_before(deadline, PATIENCE)?;
+            if of == number {
+                return Ok(reply);
+            }
+        }
+    }
+
+    /// Wait for the next reply, and the number of its request.
     ///
     /// # Errors
     /// [`LinkError`].
     #[allow(clippy::should_implement_trait)] // an iterator that ends with the first error would hide it
-    pub fn next(&mut self) -> Result<Reply, LinkError> {
+    pub fn next(&mut self) -> Result<(u32, Reply), LinkError> {
         self.next_before(Instant::now() + PATIENCE, PATIENCE)
     }
 
     /// Wait for the next reply until a deadline, after some `patience`.
-    fn next_before(&mut self, deadline: Instant, patience: Duration) -> Result<Reply, LinkError> {
+    fn next_before(&mut self, deadline: Instant, patience: Duration) -> Result<(u32, Reply), LinkError> {
         loop {
             if let Some(end) = self.received.iter().position(|byte| *byte == 0) {
                 let mut packet: Vec<u8> = self.received.drain(..=end).collect();
                 if packet.len() > 1 {
-                    return Ok(Reply::decode(&mut packet)?);
+                    let (number, reply) = Reply::decode(&mut packet);
+                    return Ok((number, reply?));
                 }
                 continue;
             }
@@ -405,7 +461,7 @@ mod tests {
 
     fn sealed(reply: &Reply) -> Vec<u8> {
         let mut bytes = vec![0; PACKET];
-        let n = reply.encode(&mut bytes).unwrap();
+        let n = reply.encode(UNASKED, &mut bytes).unwrap();
         bytes.truncate(n);
         bytes
     }
@@ -443,7 +499,7 @@ mod tests {
         while let Err(LinkError::Reply(_)) = next {
             next = link.next(); // the rest of it
         }
-        assert_eq!(next.unwrap(), Reply::Restarted);
+        assert_eq!(next.unwrap(), (UNASKED, Reply::Restarted));
         assert!(link.received.is_empty());
     }
 }

@@ -51,7 +51,7 @@ impl Image {
         let build = ["build", "--locked", "--profile", "firmware", "--message-format", "json-render-diagnostics"];
         let what = ["--package", "firmware-sim", "--bin", "firmware", "--target", "thumbv7em-none-eabihf"];
         let mut command = Command::new(cargo);
-        command.args(build).args(what).current_dir(repository(".")).env_remove("PART");
+        command.args(build).args(what).current_dir(repository("."));
         let output = command.output().map_err(Error::starting("cargo"))?;
         Error::unless_successful("cargo", &output)?;
         Self::open(&executable(&output.stdout).ok_or_else(|| Error::Image("cargo built none".into()))?)
