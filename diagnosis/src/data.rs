@@ -375,9 +375,9 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// Chi-square of a monitor's readings by its expected noise, about its baseline and how that follows the supplies and, where the
-    /// hypothesis holds one, the drift. `residual` has a row for every frame.
-    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> f64 {
+    /// Chi-square of a monitor's readings by its expected noise and its degrees of freedom, about its baseline and how that follows the
+    /// supplies and, where the hypothesis holds one, the drift. `residual` has a row for every frame.
+    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> (f64, f64) {
         let frames = self.frames(b);
         let shared = self.shared(b, frames);
         let of_baseline: Vec<usize> = (1..shared.ncols()).filter(|k| *k != self.of_rf(b)).collect();

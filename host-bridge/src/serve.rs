@@ -1,6 +1,6 @@
 //! The loop: every estimate of a source into every sink.
 
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, Remarked};
 use crate::sink::{SinkError, Sinks};
 use crate::source::{Next, Source, SourceError};
 use crate::stop::Stop;
@@ -18,7 +18,7 @@ pub enum ServeError {
 }
 
 /// Hand every estimate of a source to the sinks, until the source ends or somebody asks to stop; `heard` is told of each.
-/// Returns the last one.
+/// Remarks are counted on the way. Returns the last one.
 ///
 /// # Errors
 /// [`ServeError`].
@@ -28,10 +28,12 @@ pub fn serve(
     stop: &Stop,
     mut heard: impl FnMut(),
 ) -> Result<Option<Box<EstimateRecord>>, ServeError> {
-    let mut last = None;
+    let (mut last, mut remarked) = (None, Remarked::default());
     while !stop.is_requested() {
         match source.next().map_err(ServeError::Source)? {
-            Next::Estimate(record) => {
+            Next::Estimate(mut record) => {
+                remarked.add(&record.remarks);
+                record.remarked = remarked;
                 sinks.take(&record).map_err(ServeError::Sink)?;
                 heard();
                 last = Some(record);

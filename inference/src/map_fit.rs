@@ -27,8 +27,8 @@ pub struct BatchFit {
     pub covariance: DMatrix<f64>,
     /// Marginal of each theta.
     pub marginals: Vec<Marginal>,
-    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, and of the squares of how their baselines follow the
-    /// supplies (in standard deviations), per degree of freedom (readings less baselines less params); not a number without any.
+    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines, less
+    /// what readings tell of how these follow the supplies, less params); not a number without any.
     pub chi2_per_dof: f64,
     /// True if that is more than noise explains, by the rule of the core.
     pub mismatch: bool,
@@ -203,11 +203,11 @@ impl Problem<'_> {
                 readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], weight);
             }
             normal.add(&slopes[b], &readings);
-            if campaign.is_ok(b) && !frames.is_empty() {
+            if campaign.is_ok(b) {
                 let following = campaign.following(b).select_rows(&frames);
-                let expected = campaign.recording.header.noise[b];
-                chi2 += chi_square(&residual.select_rows(&frames), &following, expected);
-                freedom += frames.len() as f64 - 1.0;
+                let of_monitor =
+                    chi_square(&residual.select_rows(&frames), &following, campaign.recording.header.noise[b]);
+                (chi2, freedom) = (chi2 + of_monitor.0, freedom + of_monitor.1);
             }
         }
         (normal, (chi2, freedom))

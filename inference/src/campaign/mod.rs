@@ -65,7 +65,8 @@ pub struct Campaign {
     pub baselines: Vec<Option<f64>>,
     /// Rms of these in x and y [m].
     pub orbit: [f64; 2],
-    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y.
+    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y, at `params`: towards an integer tune
+    /// it grows, to twice that of the Booster's design at 4.87.
     pub spurious: [f64; 2],
     /// Standard deviation of a baseline's change per `ln` of each supply, in x and y: of a misaligned ring with the orbit and the tunes
     /// of this one [F] [m].
@@ -88,7 +89,7 @@ impl Campaign {
         let supplies = drive::mean_supplies(&drives);
         let settings = Settings::of(&drives, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
-        let (prior, spurious) = (Prior::of(&ring), spurious_dispersion(&ring)?);
+        let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
             held: &held,
             ring: &ring,
@@ -100,12 +101,15 @@ impl Campaign {
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
-            spurious,
+            spurious: of_design,
         };
         let Seen { screened, params, baselines } = screener.run()?;
         let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
         let orbit = rms_by_plane(&ring, &baselines);
-        let ripple = ripple_of_misaligned(&ring.with_strengths(&ring.strengths(params.as_slice(), &supplies)))?;
+        let found = ring.with_strengths(&ring.strengths(params.as_slice(), &supplies));
+        let ripple = ripple_of_misaligned(&found)?;
+        // next to a resonance a misaligned ring may have no orbit
+        let spurious = spurious_dispersion(&found).unwrap_or(of_design);
         let mut campaign = Self {
             meters: [None, None],
             ripple: ripple.iter().map(|ratio| [0, 1].map(|plane| ratio[plane] * orbit[plane])).collect(),
