@@ -60,13 +60,30 @@ pub struct FitResult {
     pub notes: Vec<String>,
 }
 
-/// Time from wire bytes to estimate [us].
+/// Time from wire bytes to estimate (`update`), and of the whole frame, its preparation included [us].
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct Timing {
     pub update_us_p50: f64,
     pub update_us_p99: f64,
     pub update_us_max: f64,
+    pub frame_us_p50: f64,
+    pub frame_us_p99: f64,
+    pub frame_us_max: f64,
+}
+
+impl fmt::Display for Timing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max } = self;
+        writeln!(
+            f,
+            "frame to estimate: median {update_us_p50:.0} us, 99 % within {update_us_p99:.0} us, slowest {update_us_max:.0} us"
+        )?;
+        write!(
+            f,
+            "with preparation: median {frame_us_p50:.0} us, 99 % within {frame_us_p99:.0} us, slowest {frame_us_max:.0} us"
+        )
+    }
 }
 
 /// How well a posterior was sampled.
