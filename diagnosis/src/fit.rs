@@ -253,7 +253,7 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, about baselines that follow the supplies (and drift),
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift),
     /// per degree of freedom, as [`inference::BatchFit::chi2_per_dof`] counts it.
     ///
     /// # Errors

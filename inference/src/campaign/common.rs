@@ -1,7 +1,8 @@
 //! Sums over the readings of one monitor, from which the terms that they have in common are eliminated.
 //!
 //! A reading less its prediction obeys `r = x p + c t + noise`: `p` is wanted, `t` are the common terms (the baseline, whose
-//! coefficient is 1, then its change with each supply, see [`super::Campaign::following`]), each with a normal prior of mean 0. With
+//! coefficient is 1, then its change with each supply and with the RF offset, see [`super::Campaign::terms`]), each with a normal
+//! prior of mean 0. With
 //! `M` the sum of weight times `c c^T` plus the prior precision of the terms,
 //!
 //! `t = M^-1 (sum of weight c r - S^T p)`, `S = sum of weight x c^T`,
@@ -113,23 +114,23 @@ impl Common {
     }
 }
 
-/// Chi-square of some readings of a monitor by their noise [m], about a baseline and terms that they have in common, and its degrees of
-/// freedom: the number of readings less 1 for the baseline and, for each term, the share of it that the readings and not its prior
-/// determine. `terms`: in standard deviations, rows readings [m].
+/// Chi-square of some readings of a monitor by their noise [m] about what they have in common, and its degrees of freedom: the number of
+/// readings less 1 for the baseline and, for each other term, the share of it that the readings and not its prior determine.
+/// `terms`: a column for each reading, 1 for the baseline, then the others in standard deviations [m].
 ///
 /// Source: T. Hastie, R. Tibshirani and J. Friedman, The Elements of Statistical Learning (2009), eq. 3.50.
 pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, noise: f64) -> (f64, f64) {
-    let with_baseline = terms.transpose().insert_row(0, 1.0);
-    let mut common = Common::new(0, with_baseline.nrows(), 0.0);
-    for (residual, terms) in residual.iter().zip(with_baseline.column_iter()) {
+    let mut common = Common::new(0, terms.nrows(), 0.0);
+    for (residual, terms) in residual.iter().zip(terms.column_iter()) {
         common.add(&DVector::zeros(0).column(0), &Weighed::one(terms.as_slice(), *residual, noise.powi(-2)));
     }
     let Some((best, left)) = common.best(&DVector::zeros(0)).zip(common.factor().map(|factor| factor.inverse())) else {
         return (0.0, 0.0);
     };
-    let (costs, kept) =
-        (1..best.len()).fold((0.0, 0.0), |(costs, kept), k| (costs + best[k].powi(2), kept + left[(k, k)]));
-    (common.eliminated().square - costs, (residual.len() - best.len()) as f64 + kept)
+    let others = 1..best.len();
+    let cost: f64 = others.clone().map(|k| best[k].powi(2)).sum();
+    let learnt: f64 = others.map(|k| 1.0 - left[(k, k)]).sum();
+    (common.eliminated().square - cost, residual.len() as f64 - 1.0 - learnt)
 }
 
 #[cfg(test)]
@@ -170,7 +171,7 @@ mod tests {
         let noise = 0.4;
         let smoother = &all * (all.tr_mul(&all) + prior * f64::powi(noise, 2)).try_inverse().unwrap() * all.transpose();
         let left = (&residual - &smoother * &residual).norm_squared() / noise.powi(2);
-        let (chi2, freedom) = chi_square(&residual, &terms, noise);
+        let (chi2, freedom) = chi_square(&residual, &all.transpose(), noise);
         assert!((chi2 - left).abs() < 1e-9 && (freedom - (9.0 - smoother.trace())).abs() < 1e-9, "{chi2} {freedom}");
     }
 
@@ -179,7 +180,8 @@ mod tests {
         let residual = DVector::from_vec(vec![1.0, 2.0, 4.0, -3.0]);
         let about_mean = residual.add_scalar(-residual.mean()).norm_squared();
         for terms in [0, 2] {
-            let (chi2, freedom) = chi_square(&residual, &DMatrix::zeros(4, terms), 0.5);
+            let terms = DMatrix::zeros(terms, 4).insert_row(0, 1.0);
+            let (chi2, freedom) = chi_square(&residual, &terms, 0.5);
             assert!((chi2 - 4.0 * about_mean).abs() < 1e-12 && (freedom - 3.0).abs() < 1e-12);
         }
     }
@@ -189,6 +191,6 @@ mod tests {
         let Eliminated { columns, moment, square } = Common::new(2, 3, 0.0).eliminated();
         assert_eq!((columns.ncols(), moment, square), (0, DVector::zeros(2), 0.0));
         assert_eq!(Common::new(2, 3, 0.0).best(&DVector::zeros(2)), None);
-        assert_eq!(chi_square(&DVector::zeros(0), &DMatrix::zeros(0, 2), 0.1), (0.0, 0.0));
+        assert_eq!(chi_square(&DVector::zeros(0), &DMatrix::zeros(2, 0), 0.1), (0.0, 0.0));
     }
 }
