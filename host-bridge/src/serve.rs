@@ -44,3 +44,37 @@ pub fn serve(
     }
     Ok(last)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use inference::Recording;
+    use inference::stream::{self, Walk};
+    use twin::Ring;
+
+    use super::*;
+    use crate::record::Names;
+    use crate::result::FitResult;
+    use crate::source::replay::Replay;
+    use crate::source::{Clock, Rate};
+
+    /// Two frames without beam, whose monitors all read zero.
+    #[test]
+    fn frames_that_are_put_aside_are_said_and_not_counted_as_used() {
+        let ring = Ring::booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let mut recording = Recording::read(&folder, &ring).unwrap();
+        recording.rows.truncate(60);
+        recording.rows[40..42].iter_mut().for_each(|row| row.reading.fill(Some(0.0)));
+        let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+        let stop = Stop::default();
+        let mut source = Replay::new(&recording, &Names::of(&ring), core, Clock::new(Rate::Max, &stop));
+        let last = serve(&mut source, &mut Sinks::default(), &stop, || {}).unwrap().unwrap();
+        assert_eq!((last.frames, last.remarked), (60, Remarked { put_aside_frames: 2, ..Remarked::default() }));
+        let (quality, timing) = (source.quality(), source.times.quantiles());
+        let result = FitResult::of_core("green", &ring, &recording, &last, quality, timing);
+        assert_eq!(result.frames, 58);
+        assert!(result.to_string().contains(", 2 frames put aside"), "{result}");
+    }
+}
