@@ -44,10 +44,7 @@ impl Baseline {
         let rms = [rms(&baselines[..split]), rms(&baselines[split..])];
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
-        // towards the integer resonance the orbit's change with the momentum grows as its change with the gradients does
-        let of_design = self::sensitivity(&DMatrix::zeros(0, 2), &tunes);
-        let growth = [0, 1].map(|plane| (sensitivity[plane] / of_design[plane]).max(1.0));
-        let spurious = [0, 1].map(|plane| per_rms[plane] * rms[plane] * growth[plane]);
+        let spurious = [0, 1].map(|plane| per_rms[plane] * rms[plane]);
         let (orbit, sigma) = krige(ring, &baselines, rms)?;
         Ok((orbit, Self { rms, sensitivity, spurious, sigma }))
     }

@@ -253,17 +253,12 @@ impl Data {
         Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
     }
 
-    /// Which of the common terms of a monitor's readings is that of the RF frequency.
-    fn of_rf(&self, b: usize) -> usize {
-        self.shared[b].ncols()
-    }
-
     /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(b >= self.ring.horizontal_monitors());
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
-        let at = self.of_rf(b);
+        let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);
         shared.set_column(at, &(rf * self.baseline.spurious[plane]));
         if drift == 0.0 {
@@ -375,13 +370,12 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// Chi-square of a monitor's readings by its expected noise, about its baseline and how that follows the supplies and, where the
-    /// hypothesis holds one, the drift. `residual` has a row for every frame.
-    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> f64 {
+    /// Chi-square of a monitor's readings by its expected noise and its degrees of freedom, about all that they have in common. `residual`
+    /// has a row for every frame.
+    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> (f64, f64) {
         let frames = self.frames(b);
-        let shared = self.shared(b, frames);
-        let of_baseline: Vec<usize> = (1..shared.ncols()).filter(|k| *k != self.of_rf(b)).collect();
-        let terms = shared.select_columns(&of_baseline);
+        let mut terms = self.shared(b, frames).transpose();
+        terms.row_mut(0).fill(1.0);
         chi_square(&residual.select_rows(frames), &terms, self.expected_noise[b])
     }
 

@@ -501,13 +501,13 @@ impl<
 
     /// Variance of the mean of `n` repeats: the monitor's noise, and the stated error of the surrogate, which is the same
     /// in all of them [m^2].
-    fn variance(&self, model: &Model<'_, G, B, C, F>, b: usize, n: u32, rf_offset: f32) -> f32 {
-        self.noise_variance(b) / n.max(1) as f32 + self.shared_variance(model, b, rf_offset)
+    fn variance(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, n: u32, rf_offset: f32) -> f32 {
+        self.noise_variance(b) / n.max(1) as f32 + self.shared_variance(model, at, b, rf_offset)
     }
 
     /// Variance of a reading at a drive, seen from the supplies' mean [m^2].
-    fn variance_at(&self, model: &Model<'_, G, B, C, F>, b: usize, drive: &Drive<C, F>) -> f32 {
-        self.own_variance(model, b, &drive.strength) + self.shared_variance(model, b, drive.rf_offset)
+    fn variance_at(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, drive: &Drive<C, F>) -> f32 {
+        self.own_variance(model, b, &drive.strength) + self.shared_variance(model, at, b, drive.rf_offset)
     }
 
     /// Variance of a reading that no other shares: the monitor's noise, and what is not known of how its baseline follows the
@@ -518,10 +518,10 @@ impl<
     }
 
     /// Variance that repeats of a reading share: the stated error of the surrogate [m^2].
-    fn shared_variance(&self, model: &Model<'_, G, B, C, F>, b: usize, rf_offset: f32) -> f32 {
+    fn shared_variance(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, rf_offset: f32) -> f32 {
         let [orbit_x, orbit_y] = self.posterior.orbit;
         let orbit = if b < model.surrogate.layout().first_vertical() { orbit_x } else { orbit_y };
-        model.surrogate.error_variance(b, rf_offset, orbit)
+        model.surrogate.error_variance(at, b, rf_offset, orbit)
     }
 
     /// What a reading adds to its earlier repeats, as one of its own: innovation [m] and variance [m^2].
@@ -531,7 +531,7 @@ impl<
     /// `(v + (n - 1) e)(v + n e)/v`: both means then have variance `v/n + e`.
     fn news_of(&self, model: &Model<'_, G, B, C, F>, b: usize, innovation: f32, cell: Option<u16>) -> (f32, f32) {
         let own = self.own_variance(model, b, &self.predicted.strength);
-        let shared = self.shared_variance(model, b, self.predicted.rf_offset);
+        let shared = self.shared_variance(model, &self.tangent.linearised, b, self.predicted.rf_offset);
         let cell = cell.and_then(|index| self.past.campaign.cells().get(usize::from(index)));
         let (n, distance) = cell.map_or((1, 0.0), |cell| (cell.mean(b).1.max(1), cell.distance(b)));
         let ratio = shared / own;
@@ -617,7 +617,8 @@ impl<
             self.past.loose.recentre(self.posterior.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
             let drive = about(&oldest.drive, &self.tangent.supplies);
-            let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, b, &drive));
+            let variances: [f32; B] =
+                core::array::from_fn(|b| self.variance_at(model, &self.tangent.linearised, b, &drive));
             let readings = oldest.readings(&variances, &self.predicted.prediction);
             self.past.loose.condition(readings, |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
         }

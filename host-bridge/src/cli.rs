@@ -119,9 +119,12 @@ pub struct Replay {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub priors: Priors,
-    /// Random walk of each ln var, standard deviation per sqrt(frame)
+    /// Random walk of each ln var, standard deviation per sqrt(cycle), lost cycles counted; 0 for a campaign, whose vars are constant
     #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
     pub process_noise: f32,
+    /// Let vars and baselines drift as `orbitcal serve` does: 1e-4 and 0.02 mm per sqrt(hour)
+    #[arg(long, conflicts_with = "process_noise")]
+    pub follow: bool,
     /// One CSV row a frame
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,
@@ -154,9 +157,10 @@ pub struct Serve {
     /// Send it the tables of the machine first; otherwise the device keeps its tables
     #[arg(long, requires = "feed")]
     pub load: bool,
-    /// Random walk of each ln var, standard deviation per sqrt(frame)
-    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
-    pub process_noise: f32,
+    /// Random walk of each ln var, standard deviation per sqrt(cycle), of constant baselines; without it, vars walk by 1e-4 and
+    /// baselines by 0.02 mm per sqrt(hour)
+    #[arg(long, value_name = "S", requires = "feed", value_parser = walk)]
+    pub process_noise: Option<f32>,
     /// One CSV row a frame
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,

@@ -1,9 +1,11 @@
 //! An estimate on its way out: what every sink gets, for a ring of any size, with the names of what it holds.
 
+use core::fmt;
 use std::sync::Arc;
 
-use estimator::MonitorState;
+use estimator::{MonitorState, Remarks};
 use inference::stream::Estimate;
+use serde::Serialize;
 use twin::Ring;
 
 /// Whose numbers a record holds.
@@ -36,6 +38,39 @@ pub enum ReadingUse {
     Rejected = 2,
 }
 
+/// How many frames each remark was made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Remarked {
+    /// No beam, or one that the model does not know: nothing in the frame was used.
+    pub put_aside_frames: u32,
+    /// The baselines were found to have moved.
+    pub baselines_moved: u32,
+    /// The information was not positive.
+    pub unsolved_frames: u32,
+}
+
+impl Remarked {
+    /// Count a frame.
+    pub fn add(&mut self, remarks: &Remarks) {
+        self.put_aside_frames += u32::from(remarks.put_aside);
+        self.baselines_moved += u32::from(remarks.baselines_moved);
+        self.unsolved_frames += u32::from(remarks.unsolved);
+    }
+}
+
+/// What there is of it, each behind a comma.
+impl fmt::Display for Remarked {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { put_aside_frames, baselines_moved, unsolved_frames } = *self;
+        let said = [
+            (put_aside_frames, "frames put aside, without beam or with one that the model does not know"),
+            (baselines_moved, "times moved baselines"),
+            (unsolved_frames, "frames without a solution"),
+        ];
+        said.iter().filter(|(count, _)| *count > 0).try_for_each(|(count, what)| write!(f, ", {count} {what}"))
+    }
+}
+
 /// One estimate: vars with error bars and covariance, and the state of every monitor after one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EstimateRecord {
@@ -45,10 +80,14 @@ pub struct EstimateRecord {
     pub sequence: u32,
     /// Time of the frame [us].
     pub time_us: u64,
-    /// Frames used so far: one more with each estimate.
+    /// Frames taken so far, those put aside included: one more with each estimate.
     pub frames: u32,
     /// Frames refused so far.
     pub rejected_frames: u32,
+    /// What is to be said of this frame as a whole.
+    pub remarks: Remarks,
+    /// How often each of that was said, this frame included, since [`crate::serve::serve`] began to count.
+    pub remarked: Remarked,
     /// The model was relinearised since the last estimate.
     pub linearised: bool,
     /// The readings are further off than noise explains; none where that was not asked.
@@ -104,6 +143,8 @@ impl EstimateRecord {
             time_us: estimate.time_us,
             frames: estimate.frames,
             rejected_frames: estimate.rejected_frames,
+            remarks: estimate.remarks,
+            remarked: Remarked::default(),
             linearised: estimate.linearised,
             mismatch,
             nis: estimate.nis,
@@ -136,6 +177,13 @@ impl EstimateRecord {
     pub fn nis_per_reading(&self) -> Option<f32> {
         let readings = self.readings(ReadingUse::Used) + self.tune_innovation.iter().flatten().count();
         (readings > 0).then(|| self.nis / readings as f32)
+    }
+
+    /// The remarks of this frame in words.
+    pub fn words(&self) -> impl Iterator<Item = &'static str> {
+        let Remarks { put_aside, baselines_moved, unsolved } = self.remarks;
+        let all = [(put_aside, "put aside"), (baselines_moved, "baselines moved"), (unsolved, "unsolved")];
+        all.into_iter().filter_map(|(is_said, word)| is_said.then_some(word))
     }
 
     /// Number of readings of this frame that met this end.
@@ -178,6 +226,8 @@ pub(crate) mod tests {
             time_us: 0,
             frames: 1,
             rejected_frames: 0,
+            remarks: Remarks::default(),
+            remarked: Remarked::default(),
             linearised: false,
             mismatch: Some(false),
             nis: 0.0,

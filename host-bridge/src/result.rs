@@ -22,7 +22,7 @@ use var::covariance;
 pub use var::{Var, vars_of};
 
 use crate::output::{fill, table};
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, Remarked};
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
 #[derive(Debug, Clone, Serialize)]
@@ -33,6 +33,9 @@ pub struct FitResult {
     pub model: &'static str,
     pub frames: usize,
     pub rejected_frames: u32,
+    /// What the core said of frames as a whole; the batch fit has no such words.
+    #[serde(flatten)]
+    pub remarked: Option<Remarked>,
     pub vars: Vec<Var>,
     pub covariance: Vec<Vec<f64>>,
     /// None without degrees of freedom.
@@ -57,13 +60,30 @@ pub struct FitResult {
     pub notes: Vec<String>,
 }
 
-/// Time from wire bytes to estimate [us].
+/// Time from wire bytes to estimate (`update`), and of the whole frame, its preparation included [us].
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct Timing {
     pub update_us_p50: f64,
     pub update_us_p99: f64,
     pub update_us_max: f64,
+    pub frame_us_p50: f64,
+    pub frame_us_p99: f64,
+    pub frame_us_max: f64,
+}
+
+impl fmt::Display for Timing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max } = self;
+        writeln!(
+            f,
+            "frame to estimate: median {update_us_p50:.0} us, 99 % within {update_us_p99:.0} us, slowest {update_us_max:.0} us"
+        )?;
+        write!(
+            f,
+            "with preparation: median {frame_us_p50:.0} us, 99 % within {frame_us_p99:.0} us, slowest {frame_us_max:.0} us"
+        )
+    }
 }
 
 /// How well a posterior was sampled.
@@ -98,8 +118,9 @@ impl FitResult {
             recording: recording.name.clone(),
             method: "laplace",
             model,
-            frames: last.frames as usize,
+            frames: last.frames.saturating_sub(last.remarked.put_aside_frames) as usize,
             rejected_frames: last.rejected_frames,
+            remarked: Some(last.remarked),
             covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),
             tunes_measured: TunesMeasured::of_recording(recording, tunes.map(|tunes| [tunes.x, tunes.y])),
             lack: lack(recording).map(|lack| lack.to_string()),
@@ -155,6 +176,7 @@ impl FitResult {
             model: "",
             frames: campaign.frames(),
             rejected_frames: 0,
+            remarked: None,
             vars: Vec::new(),
             covariance: Vec::new(),
             chi2_per_dof: Some(fit.chi2_per_dof).filter(|chi2| chi2.is_finite()),
@@ -221,10 +243,8 @@ impl fmt::Display for FitResult {
         if self.rejected_frames > 0 {
             write!(f, ", {} frames refused", self.rejected_frames)?;
         }
-        if let Some(t) = &self.timing {
-            let [p50, p99, max] = [t.update_us_p50, t.update_us_p99, t.update_us_max];
-            write!(f, "\nframe to estimate: median {p50:.0} us, 99 % within {p99:.0} us, slowest {max:.0} us")?;
-        }
+        self.remarked.map_or(Ok(()), |remarked| write!(f, "{remarked}"))?;
+        self.timing.map_or(Ok(()), |timing| write!(f, "\n{timing}"))?;
         self.notes.iter().try_for_each(|note| write!(f, "\n{}", fill(note)))
     }
 }

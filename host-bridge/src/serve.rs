@@ -1,6 +1,6 @@
 //! The loop: every estimate of a source into every sink.
 
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, Remarked};
 use crate::sink::{SinkError, Sinks};
 use crate::source::{Next, Source, SourceError};
 use crate::stop::Stop;
@@ -18,7 +18,7 @@ pub enum ServeError {
 }
 
 /// Hand every estimate of a source to the sinks, until the source ends or somebody asks to stop; `heard` is told of each.
-/// Returns the last one.
+/// Remarks are counted on the way. Returns the last one.
 ///
 /// # Errors
 /// [`ServeError`].
@@ -28,10 +28,12 @@ pub fn serve(
     stop: &Stop,
     mut heard: impl FnMut(),
 ) -> Result<Option<Box<EstimateRecord>>, ServeError> {
-    let mut last = None;
+    let (mut last, mut remarked) = (None, Remarked::default());
     while !stop.is_requested() {
         match source.next().map_err(ServeError::Source)? {
-            Next::Estimate(record) => {
+            Next::Estimate(mut record) => {
+                remarked.add(&record.remarks);
+                record.remarked = remarked;
                 sinks.take(&record).map_err(ServeError::Sink)?;
                 heard();
                 last = Some(record);
@@ -41,4 +43,38 @@ pub fn serve(
         }
     }
     Ok(last)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use inference::Recording;
+    use inference::stream::{self, Walk};
+    use twin::Ring;
+
+    use super::*;
+    use crate::record::Names;
+    use crate::result::FitResult;
+    use crate::source::replay::Replay;
+    use crate::source::{Clock, Rate};
+
+    /// Two frames without beam, whose monitors all read zero.
+    #[test]
+    fn frames_that_are_put_aside_are_said_and_not_counted_as_used() {
+        let ring = Ring::booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let mut recording = Recording::read(&folder, &ring).unwrap();
+        recording.rows.truncate(60);
+        recording.rows[40..42].iter_mut().for_each(|row| row.reading.fill(Some(0.0)));
+        let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+        let stop = Stop::default();
+        let mut source = Replay::new(&recording, &Names::of(&ring), core, Clock::new(Rate::Max, &stop));
+        let last = serve(&mut source, &mut Sinks::default(), &stop, || {}).unwrap().unwrap();
+        assert_eq!((last.frames, last.remarked), (60, Remarked { put_aside_frames: 2, ..Remarked::default() }));
+        let (quality, timing) = (source.quality(), source.times.quantiles());
+        let result = FitResult::of_core("green", &ring, &recording, &last, quality, timing);
+        assert_eq!(result.frames, 58);
+        assert!(result.to_string().contains(", 2 frames put aside"), "{result}");
+    }
 }

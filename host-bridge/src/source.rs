@@ -81,34 +81,61 @@ impl Clock {
     }
 }
 
-/// How long each estimate took.
+/// How long each frame took: what had to be done, after the one before, until it could come, and the answer to it.
 #[derive(Debug, Default)]
-pub struct Times(Vec<Duration>);
+pub struct Times {
+    answers: Vec<Duration>,
+    preparations: Vec<Duration>,
+}
 
 impl Times {
-    /// Run something, and note how long it took.
-    pub fn of<T>(&mut self, run: impl FnOnce() -> T) -> T {
-        let start = Instant::now();
-        let value = run();
-        self.0.push(start.elapsed());
-        value
+    /// Run what answers a frame, and note how long it took.
+    pub fn of<T>(&mut self, answer: impl FnOnce() -> T) -> T {
+        timed(&mut self.answers, answer)
     }
 
-    /// Median, 99th percentile and largest.
-    pub fn quantiles(&self) -> Timing {
-        let mut sorted = self.0.clone();
-        sorted.sort_unstable();
-        let at = |p: f64| {
-            let index = (p * sorted.len() as f64) as usize;
-            sorted.get(index.min(sorted.len().saturating_sub(1))).map_or(0.0, |t| t.as_secs_f64() * 1e6)
-        };
-        Timing { update_us_p50: at(0.5), update_us_p99: at(0.99), update_us_max: at(1.0) }
+    /// Run what prepares for a frame, and note how long it took.
+    pub fn preparing<T>(&mut self, prepare: impl FnOnce() -> T) -> T {
+        timed(&mut self.preparations, prepare)
     }
+
+    /// Median, 99th percentile and largest of the answer and of the whole frame.
+    pub fn quantiles(&self) -> Timing {
+        let whole = self.answers.iter().zip(&self.preparations).map(|(answer, preparation)| *answer + *preparation);
+        let [update_us_p50, update_us_p99, update_us_max] = quantiles(self.answers.clone());
+        let [frame_us_p50, frame_us_p99, frame_us_max] = quantiles(whole.collect());
+        Timing { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max }
+    }
+}
+
+fn timed<T>(times: &mut Vec<Duration>, run: impl FnOnce() -> T) -> T {
+    let start = Instant::now();
+    let value = run();
+    times.push(start.elapsed());
+    value
+}
+
+/// Median, 99th percentile and largest [us]; 0 of nothing.
+fn quantiles(mut times: Vec<Duration>) -> [f64; 3] {
+    times.sort_unstable();
+    [0.5, 0.99, 1.0].map(|p| {
+        let index = (p * times.len() as f64) as usize;
+        times.get(index.min(times.len().saturating_sub(1))).map_or(0.0, |time| time.as_secs_f64() * 1e6)
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_whole_frame_is_its_answer_and_its_preparation() {
+        let ms = |times: &[u64]| times.iter().map(|time| Duration::from_millis(*time)).collect::<Vec<_>>();
+        let times = Times { answers: ms(&[1, 3, 2]), preparations: ms(&[30, 10, 20]) };
+        let Timing { update_us_p50, update_us_max, frame_us_p50, frame_us_max, .. } = times.quantiles();
+        assert_eq!([update_us_p50, update_us_max, frame_us_p50, frame_us_max], [2e3, 3e3, 22e3, 31e3]);
+        assert_eq!(Times::default().quantiles().frame_us_p99, 0.0);
+    }
 
     #[test]
     fn rates_are_numbers_or_max() {

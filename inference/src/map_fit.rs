@@ -5,9 +5,9 @@
 //!
 //! `chi2 = sum of (reading - baseline_b - predicted)^2/variance + sum of (tune - predicted)^2/variance + sum of (theta - prior)^2/sigma^2`,
 //!
-//! minimised by damped Gauss-Newton within the range of the params. A baseline follows the supplies ([`Campaign::following`]):
-//! `baseline_b + sum of u_bf following_bf`, with the squares of the unknown `u_bf` added to chi-square; they are eliminated as the
-//! baselines are.
+//! minimised by damped Gauss-Newton within the range of the params. A baseline follows the supplies and the RF frequency
+//! ([`Campaign::following`], spurious dispersion): `baseline_b + sum of u_bf following_bf`, with the squares of the unknown `u_bf` added
+//! to chi-square; they are eliminated as the baselines are.
 
 use core::fmt;
 
@@ -27,8 +27,8 @@ pub struct BatchFit {
     pub covariance: DMatrix<f64>,
     /// Marginal of each theta.
     pub marginals: Vec<Marginal>,
-    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, and of the squares of how their baselines follow the
-    /// supplies (in standard deviations), per degree of freedom (readings less baselines less params); not a number without any.
+    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines, less
+    /// what readings tell of how these follow supplies and RF, less params); not a number without any.
     pub chi2_per_dof: f64,
     /// True if that is more than noise explains, by the rule of the core.
     pub mismatch: bool,
@@ -190,7 +190,7 @@ impl Problem<'_> {
     fn orbits(&self, params: &DVector<f64>, linearised: &Linearised) -> (Normal, (f64, f64)) {
         let campaign = self.campaign;
         let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
-        let count = 1 + campaign.supplies.len();
+        let count = 2 + campaign.supplies.len();
         let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), count, 0.0);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for b in 0..campaign.monitors() {
@@ -199,15 +199,13 @@ impl Problem<'_> {
             let residual = &campaign.readings.column(b) - orbits.column(b);
             let mut readings = vec![(b, Weighed::none(count)); campaign.frames()];
             for &i in &frames {
-                let weight = campaign.variance(i, b).recip();
-                readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], weight);
+                readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], campaign.noise(b).powi(-2));
             }
             normal.add(&slopes[b], &readings);
-            if campaign.is_ok(b) && !frames.is_empty() {
-                let following = campaign.following(b).select_rows(&frames);
+            if campaign.is_ok(b) {
                 let expected = campaign.recording.header.noise[b];
-                chi2 += chi_square(&residual.select_rows(&frames), &following, expected);
-                freedom += frames.len() as f64 - 1.0;
+                let of_monitor = chi_square(&residual.select_rows(&frames), &terms.select_columns(&frames), expected);
+                (chi2, freedom) = (chi2 + of_monitor.0, freedom + of_monitor.1);
             }
         }
         (normal, (chi2, freedom))

@@ -5,7 +5,7 @@
 //!
 //! `chi2 = rho^T A rho - 2 m rho + const`, `A = sum of k k^T/variance`, `m = sum of k reading/variance`,
 //!
-//! less what the unknown baseline absorbs, and how it follows the supplies (the Schur complement of these terms). Two things are not linear in the response and are
+//! less what the unknown baseline absorbs, and how it follows supplies and RF (the Schur complement of these terms). Two things are not linear in the response and are
 //! subtracted from the readings beforehand, at the MAP: the frame's own supply currents, which scatter by 2e-4 (they move an
 //! orbit by up to 3 um, and by less than 0.1 um differently within the posterior), and the second order of the RF orbit.
 //!
@@ -106,13 +106,6 @@ impl Reduced {
         factors.iter().map(|factor| factor.ln()).collect()
     }
 
-    /// Error that readings of one setting share: the model's own, and the dispersion of unknown misalignments [m].
-    fn shared_error(&self, model: &ResponseModel, b: usize, rf_offset: f64) -> f64 {
-        model
-            .stated_error(b)
-            .hypot(self.campaign.spurious[self.campaign.plane(b)] * self.fit.orbit[self.campaign.plane(b)] * rf_offset)
-    }
-
     /// Number of frames that repeat each frame's setting, itself included.
     fn repeats(&self) -> Vec<usize> {
         let of_frame = &self.campaign.settings.of_frame;
@@ -147,8 +140,7 @@ impl Readings {
                 let Some(reading) = reduced.reading(frame, b) else { continue };
                 let k = reduced.drive(frame);
                 // repeats share the error: their mean has the variance of one over n, plus all of it
-                let shared = reduced.shared_error(model, b, k[k.len() - 1]).powi(2) * repeats as f64;
-                let w = 1.0 / (reduced.noise(b).powi(2) + shared);
+                let w = 1.0 / (reduced.noise(b).powi(2) + model.stated_error(b).powi(2) * repeats as f64);
                 gram.ger(w, &k, &k, 1.0);
                 common.add(&k.column(0), &Weighed::one(terms.column(frame).as_slice(), reading, w));
             }
@@ -162,7 +154,7 @@ impl Readings {
     /// Differences of frame pairs, each independent of the others; no tunes, as in the paper.
     pub fn of_pairs(reduced: &Reduced, model: &ResponseModel, pairs: &[Pair]) -> Self {
         let of_monitor = |b: usize| {
-            let following = reduced.campaign.following(b);
+            let terms = reduced.campaign.terms(b);
             let mut form = Form::new(reduced.campaign.ring.correctors.len() + 1);
             for pair in pairs {
                 let (Some(initial), Some(last)) = (reduced.reading(pair.initial, b), reduced.reading(pair.last, b))
@@ -170,9 +162,9 @@ impl Readings {
                     continue;
                 };
                 let k = reduced.drive(pair.last) - reduced.drive(pair.initial);
-                let shared = reduced.shared_error(model, b, k[k.len() - 1]).powi(2);
-                let moved = (following.row(pair.last) - following.row(pair.initial)).norm_squared();
-                form.add(&k, last - initial, 1.0 / (2.0 * reduced.noise(b).powi(2) + shared + moved));
+                let moved = (terms.column(pair.last) - terms.column(pair.initial)).norm_squared();
+                let variance = 2.0 * reduced.noise(b).powi(2) + model.stated_error(b).powi(2) + moved;
+                form.add(&k, last - initial, 1.0 / variance);
             }
             form
         };

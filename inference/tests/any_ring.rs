@@ -210,10 +210,10 @@ fn the_posterior_of_family_factors_is_that_of_the_batch_fit() {
     let reduced = Reduced::of(campaign, fit).unwrap();
     let posterior = Posterior::new(model.clone(), Readings::of_frames(&reduced, &model, TuneUse::LeftOut), prior);
     let laplace = posterior.laplace(&map).unwrap();
-    let settings = NutsSettings { chains: 2, warm_up: 200, draws: 300, seed: 1 };
+    let settings = NutsSettings { chains: 2, warm_up: 200, draws: 1500, seed: 1 };
     let run = nuts::sample(Arc::new(posterior), Arc::new(laplace), &ring.var_names(), settings, |_| ()).unwrap();
     for (i, summary) in run.draws.summary().iter().enumerate() {
-        // 600 draws, some 300 independent ones: 6 % of a mean's sigma, 4 % of a sigma
+        // 3000 draws, 300 independent ones at least: 6 % of a mean's sigma, 4 % of a sigma
         let shift = (summary.mean.ln() - map[i]) / sigma[i];
         assert!(shift.abs() < 0.25, "{}: {shift}", summary.name);
         assert!((summary.sd / summary.mean / sigma[i] - 1.0).abs() < 0.2, "{summary:?} {sigma:?}");
@@ -236,7 +236,8 @@ fn without_a_kick_or_a_reading_the_result_is_the_prior_and_says_so() {
         let away = |i: usize| (fit.map_params[i] - campaign.prior.mean[i]).abs() * campaign.prior.precision[i].sqrt();
         let furthest = (0..48).map(away).fold(0.0, f64::max);
         println!("{lack}: furthest param {furthest:.3} prior sigma from its mean");
-        assert!(furthest < 0.3, "{lack}: {furthest}");
+        // orbits that take less than a tenth of a width away move its mean by 0.44 of it: sqrt(1 - 0.9^2)
+        assert!(furthest < 0.44, "{lack}: {furthest}");
         let tuned = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
         assert_eq!(tuned.lack, Some(lack));
         assert!(tuned.tunes.iter().all(|tune| tune.pull().unwrap().abs() < 3.0), "{:?}", tuned.tunes);

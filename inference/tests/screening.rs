@@ -19,12 +19,13 @@ fn folders() -> Vec<PathBuf> {
     all
 }
 
-/// What the core makes of a recording in the end: readings confirmed late or outvoted are counted as in its last estimate.
-fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>) {
+/// What the core makes of a recording in the end: readings confirmed late or outvoted are counted as in its last estimate; and which
+/// frames it put aside.
+fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>, Vec<usize>) {
     let mut core = stream::estimator(ring, recording, Walk::NONE).unwrap();
     let (frames, monitors) = (recording.rows.len(), ring.read_monitors.len());
     let (mut accepted, mut health) = (DMatrix::from_element(frames, monitors, false), Vec::new());
-    let mut history: Vec<Vec<usize>> = Vec::new();
+    let (mut history, mut aside) = (Vec::<Vec<usize>>::new(), Vec::new());
     let mut at = 0;
     let set = |accepted: &mut DMatrix<bool>, row: usize, mask: &[bool], to: bool| {
         (0..monitors).filter(|b| mask[*b]).for_each(|b| accepted[(row, b)] = to);
@@ -38,16 +39,21 @@ fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>) {
             rows.last().into_iter().for_each(|&last| set(&mut accepted, last, &estimate.confirmed, true));
             rows.push(at);
         }
+        aside.extend(estimate.remarks.put_aside.then_some(at));
         health = estimate.health.to_vec();
         at += 1;
     })
     .unwrap();
-    (accepted, health)
+    (accepted, health, aside)
 }
 
 /// Readings that differ, of a recording's 11,000. They are of `x_C6` alone, four times noisier than its header says: while its noise is
 /// being learnt, a first reading of a setting is now and then just within the gate of one and just beyond that of the other.
 const DIFFERENT: usize = 2;
+
+/// Frames that the core puts aside in a recording: the six of a corrector whose polarity is reversed. It cannot tell them from a beam that
+/// it does not know; the host has the whole campaign, lets the repeats decide, and has to: they show what is missing.
+const ASIDE: usize = 6;
 
 /// Relative difference of a monitor's noise: one difference of two repeats that falls into the next bin of a histogram of some 250.
 const NOISE: f32 = 0.05;
@@ -62,13 +68,13 @@ fn readings_and_states_are_those_of_the_core() {
         let started = std::time::Instant::now();
         let campaign = Campaign::of(&ring, &recording).unwrap();
         let took = started.elapsed();
-        let (accepted, health) = by_core(&ring, &recording);
+        let (accepted, health, aside) = by_core(&ring, &recording);
         let here = &campaign.screened;
         let mut different: Vec<(usize, &str)> = Vec::new();
         for (b, name) in names.iter().enumerate() {
             different.extend(
                 (0..accepted.nrows())
-                    .filter(|&i| accepted[(i, b)] != here.accepted[(i, b)])
+                    .filter(|i| !aside.contains(i) && accepted[(*i, b)] != here.accepted[(*i, b)])
                     .map(|i| (i, name.as_str())),
             );
             let (core, host) = (&health[b], &here.health[b]);
@@ -82,6 +88,7 @@ fn readings_and_states_are_those_of_the_core() {
             different.len(),
             accepted.len()
         );
+        assert!(aside.len() <= ASIDE, "{}: {aside:?} put aside", recording.name);
         assert!(different.len() <= DIFFERENT, "{}: {different:?}", recording.name);
     }
 }

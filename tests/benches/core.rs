@@ -5,6 +5,8 @@ use estimator::booster::{
     self, CHANNELS, CORRECTORS, COUPLINGS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
 };
 use estimator::{Correlated, Gaussian, Layout, Prior, Reading, Solution, Surrogate, Walk};
+use host_bridge::result::Timing;
+use host_bridge::source::Times;
 use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
@@ -14,6 +16,22 @@ const LAYOUT: Layout = Layout { ring: booster::SIZES, room: booster::SIZES };
 
 fn main() {
     divan::main();
+    println!("\n{}", whole_frames());
+}
+
+/// Campaigns over which whole frames are timed.
+const CAMPAIGNS: usize = 5;
+
+/// Each frame in its turn, with what the core does between frames: medians and 99th percentiles, which divan has not.
+fn whole_frames() -> Timing {
+    let (campaign, mut times) = (Campaign::read(), Times::default());
+    for mut core in vec![campaign.core; CAMPAIGNS] {
+        for mut wire in campaign.wires.clone() {
+            times.preparing(|| core.prepare());
+            times.of(|| core.ingest(black_box(&mut wire))).unwrap();
+        }
+    }
+    times.quantiles()
 }
 
 type Linearised = <Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised;

@@ -31,14 +31,18 @@ class Header(ctypes.Structure):
         ("vars", ctypes.c_uint32),
         ("monitors", ctypes.c_uint32),
         ("text_bytes", ctypes.c_uint32),
+        ("remarks", ctypes.c_uint32),
+        ("put_aside_frames", ctypes.c_uint32),
+        ("baselines_moved", ctypes.c_uint32),
+        ("unsolved_frames", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name():
-        return "orbitcal.Estimate.v2"
+        return "orbitcal.Estimate.v3"
 
 
-assert ctypes.sizeof(Header) == 72
+assert ctypes.sizeof(Header) == 88
 
 
 class Estimate:

@@ -320,9 +320,11 @@ impl<
         self.group.get(param).map_or(0, |group| *group as usize)
     }
 
-    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
-        let plane = usize::from(monitor >= BX);
-        let spurious = self.dispersion.spurious[plane] * orbit * rf_offset;
+    fn error_variance(&self, at: &Self::Linearised, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
+        let (plane, tune) = if monitor < BX { (0, at.x.tune) } else { (1, at.y.tune) };
+        // towards the integer an orbit's change with the momentum grows as its change with the gradients does
+        let growth = (steepness(self.tune[plane]) / steepness(tune)).abs().max(1.0);
+        let spurious = self.dispersion.spurious[plane] * growth * orbit * rf_offset;
         self.stated_error[plane] * self.stated_error[plane] + spurious * spurious
     }
 }
@@ -534,6 +536,11 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
             to.quantise(&response);
         }
     }
+}
+
+/// `tan(pi Q)`, 0 at the integer.
+fn steepness(tune: f32) -> f32 {
+    libm::tanf(core::f32::consts::PI * tune)
 }
 
 /// The tune up to an integer of a ring whose closure `4 sin^2(pi Q)` is `determinant` times that of the design, on the

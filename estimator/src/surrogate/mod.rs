@@ -124,5 +124,5 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
     ///
     /// `orbit` is the rms of the baseline orbit in the monitor's plane [m]; with an RF offset, the part of the
     /// dispersion that the unknown misalignments make grows with it.
-    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32;
+    fn error_variance(&self, at: &Self::Linearised, monitor: usize, rf_offset: f32, orbit: f32) -> f32;
 }

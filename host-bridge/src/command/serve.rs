@@ -1,7 +1,6 @@
 //! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
 
 use estimator::Tables as _;
-use estimator::Walk;
 use inference::{Recording, stream};
 use training::{LINE, Tables};
 use twin::Ring;
@@ -66,7 +65,8 @@ fn feed(
 ) -> Result<(), CommandError> {
     warn_if_not_modelled(recording);
     let powered = recording.powered(ring);
-    let setup = stream::setup(&powered, recording, Walk { params: options.process_noise, ..Walk::NONE })?;
+    let given = options.process_noise.map(|sigma| stream::walk_per_cycle(recording, sigma));
+    let setup = stream::setup(&powered, recording, given.unwrap_or(stream::DRIFT))?;
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {

@@ -1,9 +1,11 @@
-//! Estimates as a CSV file, one row a frame: `seq`, mean and sigma of every var, `nis`, `rejected`.
+//! Estimates as a CSV file, one row a frame: `seq`, mean and sigma of every var, `nis`, `rejected` readings, and the remarks on the
+//! frame, 1 where they are made.
 
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use estimator::Remarks;
 use tempfile::NamedTempFile;
 
 use super::{Sink, SinkError};
@@ -29,6 +31,9 @@ pub enum TraceError {
     },
 }
 
+/// Columns after those of the vars.
+const LAST: [&str; 5] = ["nis", "rejected", "put_aside", "baselines_moved", "unsolved"];
+
 /// A trace in the making. The file appears whole with [`Sink::finish`], or not at all.
 pub struct Trace {
     path: PathBuf,
@@ -50,7 +55,7 @@ impl Trace {
     /// Write the line of columns.
     fn begin(&mut self, vars: &[String]) -> Result<(), TraceError> {
         let vars = vars.iter().flat_map(|name| [format!("{name}_mean"), format!("{name}_sigma")]);
-        self.row(core::iter::once("seq".to_owned()).chain(vars).chain(["nis".to_owned(), "rejected".to_owned()]))
+        self.row(core::iter::once("seq".to_owned()).chain(vars).chain(LAST.map(str::to_owned)))
     }
 
     /// Write the line of columns before the first row, and see that the others are of the same vars.
@@ -77,8 +82,10 @@ impl Trace {
         self.check(&record.names)?;
         let vars =
             record.mean.iter().zip(&record.sigma).flat_map(|(mean, sigma)| [mean.to_string(), sigma.to_string()]);
+        let Remarks { put_aside, baselines_moved, unsolved } = record.remarks;
+        let remarks = [put_aside, baselines_moved, unsolved].map(|said| u8::from(said).to_string());
         let last = [record.nis.to_string(), record.readings(ReadingUse::Rejected).to_string()];
-        self.row(core::iter::once(record.sequence.to_string()).chain(vars).chain(last))
+        self.row(core::iter::once(record.sequence.to_string()).chain(vars).chain(last).chain(remarks))
     }
 
     fn row(&mut self, fields: impl Iterator<Item = String>) -> Result<(), TraceError> {
@@ -126,6 +133,7 @@ mod tests {
         let path = folder.path().join("trace.csv");
         let mut record = EstimateRecord { sequence: 4, nis: 33.3, ..record(48, 3) };
         record.reading = vec![ReadingUse::Rejected, ReadingUse::Used, ReadingUse::Rejected];
+        record.remarks.put_aside = true;
         let mut bits = 0x3f80_0001_u32; // 1 + one step, then scattered over all exponents
         for value in record.mean.iter_mut().chain(&mut record.sigma) {
             *value = f32::from_bits(bits & 0x7f7f_ffff);
@@ -137,7 +145,8 @@ mod tests {
         let mut reader = csv::Reader::from_path(&path).unwrap();
         assert_eq!(reader.headers().unwrap().iter().take(3).collect::<Vec<_>>(), ["seq", "V0_mean", "V0_sigma"]);
         let row: Vec<f32> = reader.records().next().unwrap().unwrap().iter().map(|f| f.parse().unwrap()).collect();
-        assert_eq!((row.len(), row[0], row[97], row[98]), (99, 4.0, 33.3, 2.0));
+        assert_eq!((row.len(), row[0], row[97], row[98]), (102, 4.0, 33.3, 2.0));
+        assert_eq!(row[99..], [1.0, 0.0, 0.0]);
         for i in 0..48 {
             assert_eq!(
                 [row[1 + 2 * i], row[2 + 2 * i]].map(f32::to_bits),
@@ -160,7 +169,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trace.csv");
         Trace::create(&path).unwrap().save().unwrap();
-        assert_eq!(std::fs::read_to_string(path).unwrap(), "seq,nis,rejected\n");
+        assert_eq!(std::fs::read_to_string(path).unwrap(), "seq,nis,rejected,put_aside,baselines_moved,unsolved\n");
     }
 
     #[test]

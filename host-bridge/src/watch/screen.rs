@@ -115,11 +115,13 @@ impl Screen {
         let rejected = record.readings(ReadingUse::Rejected);
         let first = format!("seq {}  {rate}  age {age}  nis/reading {nis}  rejected {rejected}", record.sequence);
         let WatchSummary { seen, lost, restarts } = summary;
-        let (frames, refused) = (record.frames, record.rejected_frames);
-        let second =
-            format!("frames {frames}, refused {refused}  seen {seen}  lost {lost}  restarts {restarts}  q quits");
+        let (frames, refused, aside) = (record.frames, record.rejected_frames, record.remarked.put_aside_frames);
+        let second = format!(
+            "frames {frames}, {refused} refused, {aside} put aside  seen {seen}  lost {lost}  restarts {restarts}  q quits"
+        );
         let third = format!("from {}: {}", stamp.publisher, record.names.machine);
-        let alarm = if record.mismatch == Some(true) { "MISMATCH beyond noise  " } else { "" };
+        let mismatch = (record.mismatch == Some(true)).then_some("MISMATCH beyond noise");
+        let alarm: String = mismatch.into_iter().chain(record.words()).map(|word| format!("{word}  ")).collect();
         let bold = Style::new().add_modifier(Modifier::BOLD);
         vec![
             Line::styled(first, bold),

@@ -120,9 +120,10 @@ fn line(record: &EstimateRecord) -> String {
         let (name, mean, sigma) = (&record.names.vars[i], record.mean[i], record.sigma[i]);
         format!("{name} {mean:.4} ± {sigma:.4} ({:+.1} sigma)", record.deviation(i))
     });
-    let alarm = if record.mismatch == Some(true) { " mismatch" } else { "" };
+    let alarm = (record.mismatch == Some(true)).then_some("mismatch");
+    let alarms: String = record.words().chain(alarm).map(|word| format!(", {word}")).collect();
     let (sequence, frames, rejected) = (record.sequence, record.frames, record.readings(ReadingUse::Rejected));
-    format!("seq {sequence} frames {frames} nis {nis} rejected {rejected} {var}{alarm}")
+    format!("seq {sequence} frames {frames} nis {nis} rejected {rejected} {var}{alarms}")
 }
 
 #[cfg(test)]
@@ -143,6 +144,8 @@ mod tests {
         (record.mean[3], record.mean[5]) = (0.95, 1.02);
         let expected = "seq 123456 frames 123455 nis 1.10 rejected 1 V3 0.9500 ± 0.0100 (-5.0 sigma)";
         assert_eq!(line(&record), expected);
+        (record.remarks.put_aside, record.mismatch) = (true, Some(true));
+        assert_eq!(line(&record), format!("{expected}, put aside, mismatch"));
     }
 
     #[test]

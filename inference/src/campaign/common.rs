@@ -1,7 +1,8 @@
 //! Sums over the readings of one monitor, from which the terms that they have in common are eliminated.
 //!
 //! A reading less its prediction obeys `r = x p + c t + noise`: `p` is wanted, `t` are the common terms (the baseline, whose
-//! coefficient is 1, then its change with each supply, see [`super::Campaign::following`]), each with a normal prior of mean 0. With
+//! coefficient is 1, then its change with each supply and with the RF offset, see [`super::Campaign::terms`]), each with a normal
+//! prior of mean 0. With
 //! `M` the sum of weight times `c c^T` plus the prior precision of the terms,
 //!
 //! `t = M^-1 (sum of weight c r - S^T p)`, `S = sum of weight x c^T`,
@@ -113,23 +114,30 @@ impl Common {
     }
 }
 
-/// Chi-square of some readings of a monitor by their noise [m], about a baseline and terms that they have in common, what these cost
-/// included: on average one for each reading, less one for the baseline. `terms`: in standard deviations, rows readings [m].
-pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, noise: f64) -> f64 {
-    let with_baseline = terms.transpose().insert_row(0, 1.0);
-    let mut common = Common::new(0, with_baseline.nrows(), 0.0);
-    for (residual, terms) in residual.iter().zip(with_baseline.column_iter()) {
+/// Chi-square of some readings of a monitor by their noise [m] about what they have in common, and its degrees of freedom: the number of
+/// readings less 1 for the baseline and, for each other term, the share of it that the readings and not its prior determine.
+/// `terms`: a column for each reading, 1 for the baseline, then the others in standard deviations [m].
+///
+/// Source: T. Hastie, R. Tibshirani and J. Friedman, The Elements of Statistical Learning (2009), eq. 3.50.
+pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, noise: f64) -> (f64, f64) {
+    let mut common = Common::new(0, terms.nrows(), 0.0);
+    for (residual, terms) in residual.iter().zip(terms.column_iter()) {
         common.add(&DVector::zeros(0).column(0), &Weighed::one(terms.as_slice(), *residual, noise.powi(-2)));
     }
-    common.eliminated().square
+    let Some((best, left)) = common.best(&DVector::zeros(0)).zip(common.factor().map(|factor| factor.inverse())) else {
+        return (0.0, 0.0);
+    };
+    let others = 1..best.len();
+    let cost: f64 = others.clone().map(|k| best[k].powi(2)).sum();
+    let learnt: f64 = others.map(|k| 1.0 - left[(k, k)]).sum();
+    (common.eliminated().square - cost, residual.len() as f64 - 1.0 - learnt)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Against the covariance of the readings, `noise^2 + C C^T`, with a baseline that is known to 1e6 noises in place of one of which
-    /// nothing is known: 1e-12 of it is left, and the matrix of that condition loses four more digits.
+    /// Against the covariance of the readings, `noise^2 + C C^T`, each term times its standard deviation.
     #[test]
     fn what_is_left_is_the_chi_square_of_correlated_readings() {
         let (readings, size, noise) = (12, 4, 0.3);
@@ -137,22 +145,34 @@ mod tests {
         let x = DMatrix::from_fn(size, readings, |p, i| wave(i, 1.1 + p as f64));
         let terms = DMatrix::from_fn(3, readings, |k, i| if k == 0 { 1.0 } else { wave(i, 0.5 + 0.2 * k as f64) });
         let residual = DVector::from_fn(readings, |i, _| 5.0 + wave(i, 2.3));
-        let mut common = Common::new(size, 3, 0.0);
+        let mut common = Common::new(size, 3, 0.02);
         for i in 0..readings {
             let one = Weighed::one(terms.column(i).as_slice(), residual[i], f64::powi(noise, -2));
             common.add(&x.column(i).as_view(), &one);
         }
         let Eliminated { columns, moment, square } = common.eliminated();
         let mut wide = terms.clone();
-        wide.row_mut(0).scale_mut(1e6 * noise);
+        wide.row_mut(0).scale_mut(0.02_f64.sqrt().recip());
         let covariance = DMatrix::identity(readings, readings) * noise.powi(2) + wide.tr_mul(&wide);
         let precision = covariance.cholesky().unwrap().inverse();
         let plain = &x * x.transpose() * noise.powi(-2) - &columns * columns.transpose();
-        assert!((plain - &x * &precision * x.transpose()).amax() < 1e-6);
-        assert!((moment - &x * &precision * &residual).amax() < 1e-6);
-        assert!((square - residual.dot(&(&precision * &residual))).abs() < 1e-6);
-        let following = terms.remove_row(0).transpose();
-        assert!((square - chi_square(&residual, &following, noise)).abs() < 1e-9);
+        assert!((plain - &x * &precision * x.transpose()).amax() < 1e-9);
+        assert!((moment - &x * &precision * &residual).amax() < 1e-9);
+        assert!((square - residual.dot(&(&precision * &residual))).abs() < 1e-9);
+    }
+
+    /// Residuals and trace of the linear smoother that the best terms are.
+    #[test]
+    fn chi_square_is_that_of_the_residuals_and_what_they_are_free_to_be() {
+        let terms = DMatrix::from_fn(9, 2, |i, k| (0.7 * (i + 1) as f64 * (k + 1) as f64).sin());
+        let residual = DVector::from_fn(9, |i, _| 2.0 + (1.9 * i as f64).cos());
+        let all = terms.clone().insert_column(0, 1.0);
+        let prior = DMatrix::from_diagonal(&DVector::from_vec(vec![0.0, 1.0, 1.0]));
+        let noise = 0.4;
+        let smoother = &all * (all.tr_mul(&all) + prior * f64::powi(noise, 2)).try_inverse().unwrap() * all.transpose();
+        let left = (&residual - &smoother * &residual).norm_squared() / noise.powi(2);
+        let (chi2, freedom) = chi_square(&residual, &all.transpose(), noise);
+        assert!((chi2 - left).abs() < 1e-9 && (freedom - (9.0 - smoother.trace())).abs() < 1e-9, "{chi2} {freedom}");
     }
 
     #[test]
@@ -160,7 +180,9 @@ mod tests {
         let residual = DVector::from_vec(vec![1.0, 2.0, 4.0, -3.0]);
         let about_mean = residual.add_scalar(-residual.mean()).norm_squared();
         for terms in [0, 2] {
-            assert!((chi_square(&residual, &DMatrix::zeros(4, terms), 0.5) - 4.0 * about_mean).abs() < 1e-12);
+            let terms = DMatrix::zeros(terms, 4).insert_row(0, 1.0);
+            let (chi2, freedom) = chi_square(&residual, &terms, 0.5);
+            assert!((chi2 - 4.0 * about_mean).abs() < 1e-12 && (freedom - 3.0).abs() < 1e-12);
         }
     }
 
@@ -169,5 +191,6 @@ mod tests {
         let Eliminated { columns, moment, square } = Common::new(2, 3, 0.0).eliminated();
         assert_eq!((columns.ncols(), moment, square), (0, DVector::zeros(2), 0.0));
         assert_eq!(Common::new(2, 3, 0.0).best(&DVector::zeros(2)), None);
+        assert_eq!(chi_square(&DVector::zeros(0), &DMatrix::zeros(2, 0), 0.1), (0.0, 0.0));
     }
 }

@@ -10,6 +10,8 @@ mod normal;
 mod screen;
 mod setting;
 
+use core::f64::consts::FRAC_1_SQRT_2;
+
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Rf, Ring, ripple_of_misaligned, spurious_dispersion};
@@ -43,8 +45,6 @@ pub struct Campaign {
     pub drives: Vec<Drive>,
     /// Time of each frame, from -1 to 1.
     pub time: Vec<f64>,
-    /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
-    sharing: Vec<f64>,
     /// Mean `ln` of each supply's factor [F].
     pub supplies: Vec<f64>,
     /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
@@ -65,7 +65,8 @@ pub struct Campaign {
     pub baselines: Vec<Option<f64>>,
     /// Rms of these in x and y [m].
     pub orbit: [f64; 2],
-    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y.
+    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y, at `params`: towards an integer tune
+    /// it grows, to twice that of the Booster's design at 4.87.
     pub spurious: [f64; 2],
     /// Standard deviation of a baseline's change per `ln` of each supply, in x and y: of a misaligned ring with the orbit and the tunes
     /// of this one [F] [m].
@@ -88,7 +89,7 @@ impl Campaign {
         let supplies = drive::mean_supplies(&drives);
         let settings = Settings::of(&drives, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
-        let (prior, spurious) = (Prior::of(&ring), spurious_dispersion(&ring)?);
+        let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
             held: &held,
             ring: &ring,
@@ -100,18 +101,20 @@ impl Campaign {
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
-            spurious,
+            spurious: of_design,
         };
         let Seen { screened, params, baselines } = screener.run()?;
         let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
         let orbit = rms_by_plane(&ring, &baselines);
-        let ripple = ripple_of_misaligned(&ring.with_strengths(&ring.strengths(params.as_slice(), &supplies)))?;
+        let found = ring.with_strengths(&ring.strengths(params.as_slice(), &supplies));
+        let ripple = ripple_of_misaligned(&found)?;
+        // next to a resonance a misaligned ring may have no orbit
+        let spurious = spurious_dispersion(&found).unwrap_or(of_design);
         let mut campaign = Self {
             meters: [None, None],
             ripple: ripple.iter().map(|ratio| [0, 1].map(|plane| ratio[plane] * orbit[plane])).collect(),
             fluctuation: DMatrix::from_fn(drives.len(), supplies.len(), |i, f| drives[i].strength[f] - supplies[f]),
             orbit,
-            sharing: drive::sharing(&drives),
             time: recording.times(),
             recording: recording.clone(),
             ring,
@@ -161,17 +164,6 @@ impl Campaign {
         usize::from(b >= self.ring.horizontal_monitors())
     }
 
-    /// Error that all readings of a monitor at an RF offset share: the dispersion of unknown misalignments [m].
-    pub fn shared_error(&self, b: usize, rf_offset: f64) -> f64 {
-        self.spurious[self.plane(b)] * self.orbit[self.plane(b)] * rf_offset
-    }
-
-    /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
-    pub fn variance(&self, frame: usize, b: usize) -> f64 {
-        let shared = self.shared_error(b, self.drives[frame].rf_offset);
-        self.noise(b).powi(2) + self.sharing[frame] * shared * shared
-    }
-
     /// How the baseline of a monitor follows the supplies: its change in each frame by each of them, in standard deviations. Misaligned
     /// quadrupoles make the orbit without kicks, and their supplies' ripple moves it, which way only the unknown misalignments
     /// could tell, rows frames, columns supplies [m].
@@ -182,10 +174,18 @@ impl Campaign {
         following
     }
 
-    /// Coefficients of the common terms of a monitor's reading in each frame, as columns: 1 for the baseline, then how it follows each
-    /// supply.
+    /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline, how it follows each supply,
+    /// and the dispersion of the unknown misalignments at the frame's RF offset; but for the first in standard deviations [m].
     pub(crate) fn terms(&self, b: usize) -> DMatrix<f64> {
-        self.following(b).transpose().insert_row(0, 1.0)
+        let plane = self.plane(b);
+        // `spurious` is stated for offsets of which two opposite ones are taken for independent
+        let spurious = self.spurious[plane] * self.orbit[plane] * FRAC_1_SQRT_2;
+        let following = self.following(b).transpose();
+        let mut terms = DMatrix::from_element(following.nrows() + 2, self.frames(), 1.0);
+        terms.rows_mut(1, following.nrows()).copy_from(&following);
+        let offsets = self.drives.iter().map(|drive| spurious * drive.rf_offset);
+        terms.row_mut(1 + following.nrows()).iter_mut().zip(offsets).for_each(|(to, offset)| *to = offset);
+        terms
     }
 
     /// Rms of the baselines that are known, in x and y [m].

@@ -4,15 +4,15 @@
 
 use std::sync::Arc;
 
-use estimator::MonitorState;
+use estimator::{MonitorState, Remarks};
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::record::{EstimateRecord, Names, ReadingUse};
+use crate::record::{EstimateRecord, Names, ReadingUse, Remarked};
 
 /// What holds for a whole record; see the module's first table.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("orbitcal.Estimate.v2")]
+#[type_name("orbitcal.Estimate.v3")]
 #[allow(missing_docs)] // the table
 pub struct Header {
     pub time_us: u64,
@@ -30,6 +30,11 @@ pub struct Header {
     pub vars: u32,
     pub monitors: u32,
     pub text_bytes: u32,
+    /// Bits, see [`said`].
+    pub remarks: u32,
+    pub put_aside_frames: u32,
+    pub baselines_moved: u32,
+    pub unsolved_frames: u32,
 }
 
 /// Who published a record, and when.
@@ -114,6 +119,10 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         vars: record.mean.len() as u32,
         monitors: record.reading.len() as u32,
         text_bytes: text.len() as u32,
+        remarks: said(&record.remarks),
+        put_aside_frames: record.remarked.put_aside_frames,
+        baselines_moved: record.remarked.baselines_moved,
+        unsolved_frames: record.remarked.unsolved_frames,
     };
     let mut payload = Vec::with_capacity(words(record.mean.len(), record.reading.len(), text.len()));
     let params = [&record.map_params, &record.centre, &record.params_sigma];
@@ -128,6 +137,11 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
     payload.extend(&record.monitor_rejected);
     payload.extend(text.as_bytes().chunks(4).map(word));
     (header, payload)
+}
+
+/// Remarks as bits.
+fn said(remarks: &Remarks) -> u32 {
+    u32::from(remarks.put_aside) | u32::from(remarks.baselines_moved) << 1 | u32::from(remarks.unsolved) << 2
 }
 
 /// Up to four bytes as a word; those that are missing are zero.
@@ -163,6 +177,12 @@ pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp
         time_us: header.time_us,
         frames: header.frames,
         rejected_frames: header.rejected_frames,
+        remarks: remarks(header.remarks),
+        remarked: Remarked {
+            put_aside_frames: header.put_aside_frames,
+            baselines_moved: header.baselines_moved,
+            unsolved_frames: header.unsolved_frames,
+        },
         linearised: header.linearised != 0,
         mismatch: [Some(false), Some(true)].get(header.mismatch as usize).copied().flatten(),
         nis: header.nis,
@@ -196,6 +216,11 @@ impl<'w> Words<'w> {
     fn floats(&mut self, count: usize) -> Vec<f32> {
         self.take(count).iter().map(|word| f32::from_bits(*word)).collect()
     }
+}
+
+fn remarks(bits: u32) -> Remarks {
+    let [put_aside, baselines_moved, unsolved] = [0, 1, 2].map(|bit| bits >> bit & 1 == 1);
+    Remarks { put_aside, baselines_moved, unsolved }
 }
 
 fn reading(code: u32) -> Result<ReadingUse, LayoutError> {
@@ -238,7 +263,7 @@ mod tests {
 
     #[test]
     fn the_header_is_the_documented_one() {
-        assert_eq!((size_of::<Header>(), align_of::<Header>()), (72, 8));
+        assert_eq!((size_of::<Header>(), align_of::<Header>()), (88, 8));
         macro_rules! stands_at {
             ($($field:ident $offset:literal)*) => {
                 $(assert_eq!(offset_of!(Header, $field), $offset, stringify!($field));)*
@@ -247,6 +272,7 @@ mod tests {
         stands_at! {
             time_us 0 started_ns 8 published_ns 16 sequence 24 frames 28 rejected_frames 32 linearised 36
             mismatch 40 nis 44 log_evidence 48 tune_innovation 52 vars 60 monitors 64 text_bytes 68
+            remarks 72 put_aside_frames 76 baselines_moved 80 unsolved_frames 84
         }
     }
 
@@ -255,6 +281,7 @@ mod tests {
         let mut record = record(3, 2);
         record.covariance = (0..6).map(|i| i as f32).collect();
         (record.clipped[2], record.monitor_rejected[1]) = (true, 41);
+        (record.remarks.put_aside, record.remarks.unsolved, record.remarked.put_aside_frames) = (true, true, 12);
         (record.reading[0], record.monitor_state[1]) = (ReadingUse::Rejected, MonitorState::Jumps);
         let (header, payload) = encode(&record, &stamp());
         let at = |field: &str| match field {
@@ -267,6 +294,7 @@ mod tests {
             "text" => 6 * 3 + 6 + 4 * 2,
             _ => unreachable!("the fields above"),
         };
+        assert_eq!((header.remarks, header.put_aside_frames), (0b101, 12));
         assert_eq!(payload[at("mean")], 1.0_f32.to_bits());
         assert_eq!(payload[at("clipped")..][..3], [0, 0, 1]);
         assert_eq!(payload[at("covariance") + 2 * 3 / 2 + 1], 4.0_f32.to_bits(), "row 2, column 1");
@@ -286,6 +314,7 @@ mod tests {
             let mut record = record(vars, monitors);
             (record.mismatch, record.linearised, record.nis, record.time_us) = (None, true, 2.5, 1 << 40);
             record.tune_innovation = [None, Some(-1e-3)];
+            (record.remarks.baselines_moved, record.remarked.unsolved_frames) = (true, 7);
             let (header, payload) = encode(&record, &stamp());
             assert_eq!(payload.len(), words_of(&stamp().publisher, &record.names));
             assert_eq!(decode(&header, &payload).unwrap(), (record, stamp()));
