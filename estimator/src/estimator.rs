@@ -5,6 +5,7 @@
 
 mod laplace;
 mod screen;
+mod steering;
 mod whole;
 
 use core::fmt;

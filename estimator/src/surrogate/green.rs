@@ -272,6 +272,31 @@ impl<
         }
     }
 
+    fn pull(&self, at: &Self::Linearised, orbit: &[f32; B], into: &mut [f32; C]) {
+        let (x, y) = orbit.split_at(BX.min(B));
+        let (pull_x, pull_y) = into.split_at_mut(CX.min(C));
+        at.x.pull(x, pull_x);
+        at.y.pull(y, pull_y);
+        self.low_rank.pull([x, y], [pull_x, pull_y]);
+    }
+
+    fn response_covariance(
+        &self,
+        at: &Self::Linearised,
+        plane: usize,
+        weight: &[f32; B],
+        covariance: impl Fn(usize) -> [f32; N],
+        add: impl FnMut(&[f32], &[f32]),
+    ) {
+        let (x, y) = weight.split_at(BX.min(B));
+        let (slope, param) = (&at.slope, &self.param);
+        if plane == 0 {
+            at.x.response_covariance(x, slope, param, covariance, add);
+        } else {
+            at.y.response_covariance(y, slope, param, covariance, add);
+        }
+    }
+
     fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
         let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
         let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
@@ -500,11 +525,54 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
         combine(reading, acting(kick, self.response.as_slice().chunks_exact(B)));
     }
 
+    /// `R^T orbit` [m^2/rad].
+    fn pull(&self, orbit: &[f32], pull: &mut [f32]) {
+        let responses = self.response.as_slice().chunks_exact(B);
+        pull.iter_mut().zip(responses).for_each(|(pull, response)| *pull = dot(response, orbit));
+    }
+
+    /// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
+    /// with `A_qp = 4 slope_q slope_p sum over b of weight_b Z_qb Z_pb`. The two nodes of a quadrupole count as one between
+    /// them: within half a metre an orbit hardly bends.
+    fn response_covariance<const N: usize>(
+        &self,
+        weight: &[f32],
+        slope: &[f32; M],
+        param: &[i16; M],
+        covariance: impl Fn(usize) -> [f32; N],
+        mut add: impl FnMut(&[f32], &[f32]),
+    ) {
+        for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
+            let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
+            let mut row = [0.0; M];
+            for (seen, weight) in self.seen.as_slice().chunks_exact(Q).zip(weight) {
+                let factor = weight * between(seen, q);
+                row.iter_mut().zip(seen.as_chunks::<2>().0).for_each(|(to, [a, b])| *to += factor * (a + b));
+            }
+            let shared = covariance(own);
+            for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
+                let covariance = shared.get(*param as usize).copied().unwrap_or(0.0);
+                *to *= slope_q * slope * covariance;
+            }
+            let (mut here, mut there) = ([0.0; C], [0.0; C]);
+            for ((driven, here), there) in self.driven.as_slice().chunks_exact(Q).zip(&mut here).zip(&mut there) {
+                *here = between(driven, q);
+                *there = row.iter().zip(driven.as_chunks::<2>().0).map(|(row, [a, b])| row * (a + b)).sum();
+            }
+            add(&here, &there);
+        }
+    }
+
     /// Add readings for kicks of nodes.
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
         let seen = self.seen.as_slice().chunks_exact(Q);
         reading.iter_mut().zip(seen).for_each(|(reading, seen)| *reading += dot(seen, kick));
     }
+}
+
+/// The mean of the two nodes of quadrupole `q`.
+fn between(nodes: &[f32], q: usize) -> f32 {
+    nodes.as_chunks::<2>().0.get(q).map_or(0.0, |[a, b]| 0.5 * (a + b))
 }
 
 /// The kicks that are not zero, each with its column.

@@ -1,0 +1,279 @@
+//! The loop closed in software: a machine, its frames as bytes, the core, the setpoints, the machine again.
+
+mod plant;
+mod scenario;
+
+use core::error::Error;
+
+use estimator::booster::{
+    self, CORRECTORS, Estimate, Estimator, Feedback, Frame, Green, MONITORS, PARAMS, SUPPLIES, Setup, Steer,
+};
+use estimator::{
+    CurrentCode, Each, Hold, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Response, RfCode, Steered,
+    Surrogate,
+};
+use inference::stream;
+use inference::{Recording, simulate};
+use twin::Ring;
+
+use crate::machine::{ALL, LAYOUT, Random, amperes, nees, wire_of};
+use crate::repository;
+
+pub use plant::{Orbit, Plant};
+pub use scenario::{Event, Scenario};
+
+/// Where the setpoints come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Control {
+    /// The response at the estimated vars, and its covariance.
+    Estimated,
+    /// The response of the design, taken as exact.
+    Design,
+    /// Correctors stay at 0.
+    Off,
+}
+
+/// Time between cycles [us].
+const CYCLE_US: u64 = 200_000;
+/// Scatter of the correctors' currents [A].
+const RIPPLE: f64 = 0.02;
+/// Relative scatter of the main supplies.
+const SUPPLY_RIPPLE: f64 = 2e-4;
+/// Scatter of the momentum.
+const JITTER: f64 = 2e-5;
+
+/// What is kept of a frame.
+#[derive(Debug, Clone, Copy)]
+pub struct Sample {
+    /// Rms over all monitors of the true orbit on momentum, less the wanted one [m].
+    pub rms: f64,
+    /// What the feedback said.
+    pub steered: Option<Steered>,
+    /// NIS of the frame.
+    pub nis: f32,
+    /// Normalised estimation error squared over the number of params.
+    pub nees: f64,
+    /// Mean standard deviation of the vars.
+    pub sigma: f64,
+    /// Largest current of a corrector [A].
+    pub largest: f64,
+    /// The frame was put aside.
+    pub aside: bool,
+}
+
+/// The tables, the setup and the linearised design of a Booster.
+#[derive(Debug, Clone)]
+pub struct Known {
+    /// Tables.
+    pub surrogate: Box<Green>,
+    /// Priors, noise, calibration.
+    pub setup: Setup,
+    design: Box<<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised>,
+}
+
+impl Known {
+    /// From the header of a recording.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn read(process_noise: f32) -> Result<Self, Box<dyn Error>> {
+        let ring = Ring::booster();
+        let recording = Recording::read(&repository("recordings/paper-vars"), &ring)?;
+        let core = stream::estimator(&ring, &recording, process_noise)?;
+        let mut surrogate = Box::new(Green::BLANK);
+        core.tables.fill(&mut *surrogate).map_err(|_| "tables of the Booster")?;
+        let mut design = Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED);
+        Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise(
+            &*surrogate,
+            &[0.0; PARAMS],
+            &[0.0; SUPPLIES],
+            &mut design,
+        )
+        .map_err(|_| "the design has no stable ring")?;
+        Ok(Self { surrogate, setup: core.setup.in_room(&LAYOUT), design })
+    }
+}
+
+/// What is recommended for the Booster; the wanted orbit is zero.
+pub fn recommended() -> Feedback {
+    Feedback {
+        orbit: [0.0; MONITORS],
+        gain: 0.4,
+        step_kick: 2e-5,
+        total_kick: 2e-4,
+        limit: Each::same(20.0),
+        rate: 2.0,
+        probe: 1.0,
+        close: 0.3,
+        patience_us: 10 * CYCLE_US,
+    }
+}
+
+/// A closed loop.
+#[derive(Debug)]
+pub struct Loop<'k> {
+    known: &'k Known,
+    feedback: Feedback,
+    control: Control,
+    /// The machine.
+    pub plant: Plant,
+    core: Box<Estimator>,
+    steer: Box<Steer>,
+    scenario: Scenario,
+    /// Disturbances, and the noise of the readings: the same whoever controls.
+    random: [Random; 2],
+    frame: u32,
+    sequence: u32,
+    /// What the supplies give [A].
+    current: [f64; CORRECTORS],
+}
+
+impl<'k> Loop<'k> {
+    /// A loop about to begin.
+    ///
+    /// # Errors
+    /// If the machine has no orbit.
+    pub fn new(
+        known: &'k Known,
+        mut feedback: Feedback,
+        control: Control,
+        scenario: Scenario,
+    ) -> Result<Self, Box<dyn Error>> {
+        let vars = simulate::vars(&Ring::booster(), true, scenario.seed)?;
+        let mut random = [Random::new(scenario.seed), Random::new(scenario.seed + 1_000_003)];
+        let plant = Plant::new(&vars, &mut random[0])?;
+        feedback.orbit = core::array::from_fn(|b| plant.offset[b] as f32);
+        let mut core = Box::new(Estimator::BLANK);
+        core.restart(&Model { surrogate: &*known.surrogate, setup: &known.setup })
+            .map_err(|_| "the design has no stable ring")?;
+        let steer = Box::new(Steer::BLANK);
+        Ok(Self {
+            known,
+            feedback,
+            control,
+            plant,
+            core,
+            steer,
+            scenario,
+            random,
+            frame: 0,
+            sequence: 0,
+            current: [0.0; CORRECTORS],
+        })
+    }
+
+    /// One cycle.
+    ///
+    /// # Errors
+    /// If the machine loses its orbit, or the core refuses the frame.
+    pub fn cycle(&mut self) -> Result<Sample, Box<dyn Error>> {
+        self.scenario.disturb(self.frame, &mut self.plant, &mut self.random[0])?;
+        let lost = self.scenario.gap(self.frame);
+        self.sequence += 1 + lost;
+        self.supply();
+        let (frame, rms) = self.read()?;
+        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
+        let estimate = self.core.ingest(&model, &mut wire_of(&frame))?;
+        let steered = self.steer(&frame, &estimate);
+        self.core.prepare(&model);
+        self.prepare_steer();
+        self.frame += 1;
+        let error = core::array::from_fn(|i| f64::from(estimate.map_params[i]) - self.plant.params[i]);
+        Ok(Sample {
+            rms,
+            steered,
+            nis: estimate.nis,
+            nees: nees(&error, |i, j| self.core.covariance(i, j)) / PARAMS as f64,
+            sigma: estimate.sigma.iter().map(|s| f64::from(*s)).sum::<f64>() / PARAMS as f64,
+            largest: self.current.iter().fold(0.0, |m, c| c.abs().max(m)),
+            aside: estimate.remarks.put_aside,
+        })
+    }
+
+    /// All cycles of the scenario.
+    ///
+    /// # Errors
+    /// As for one.
+    pub fn run(&mut self) -> Result<Vec<Sample>, Box<dyn Error>> {
+        (0..self.scenario.frames).map(|_| self.cycle()).collect()
+    }
+
+    /// The supplies take their setpoints over, but for those that stick.
+    fn supply(&mut self) {
+        for (c, (current, setpoint)) in self.current.iter_mut().zip(self.steer.setpoints()).enumerate() {
+            let ripple = RIPPLE * self.random[1].normal();
+            if !self.scenario.sticks(self.frame, c) {
+                let wanted = if self.control == Control::Off { 0.0 } else { f64::from(setpoint.value()) };
+                *current = wanted + ripple;
+            }
+        }
+    }
+
+    fn read(&mut self) -> Result<(Frame, f64), Box<dyn Error>> {
+        let calibration = &self.known.setup.calibration;
+        let [disturbance, noise] = &mut self.random;
+        let mut scatter = |nominal: f32| amperes(f64::from(nominal) * (1.0 + SUPPLY_RIPPLE * disturbance.normal()));
+        let supply = core::array::from_fn(|f| scatter(calibration.supplies[f].nominal));
+        let dipole = scatter(calibration.dipole.unwrap_or(0.0));
+        let mut frame = Frame {
+            epoch: 0,
+            sequence: self.sequence,
+            time_us: CYCLE_US * u64::from(self.sequence),
+            cycle_time_us: 92_000,
+            corrector: self.current.map(amperes),
+            magnets: MagnetCurrents { dipole, supply },
+            rf_offset: RfCode::default(),
+            reading: [PositionCode::default(); MONITORS],
+            tune: [None; 2],
+            intensity: None,
+            valid: Mask::from_words(&ALL),
+        };
+        let drive = calibration.drive(&frame).map_err(|beyond| format!("{beyond:?}"))?;
+        let (kick, strength) = (drive.kick.map(f64::from), drive.strength.map(f64::from));
+        let delta = self.scenario.momentum(self.frame) + JITTER * disturbance.normal();
+        let on_momentum = self.plant.orbit(&kick, &strength, 0.0)?;
+        let orbit = self.plant.orbit(&kick, &strength, delta)?;
+        let is_lost = self.scenario.is_lost(self.frame);
+        for b in 0..MONITORS {
+            let noise = f64::from(self.known.setup.noise.of(b)) * noise.normal();
+            let position = if is_lost { 0.0 } else { orbit[b] + self.plant.offset[b] };
+            frame.reading[b] = PositionCode::nearest(position + noise).unwrap_or_default();
+            frame.valid.put(b, !self.scenario.is_silent(self.frame, b));
+        }
+        if self.scenario.counts {
+            let particles = if is_lost { 0.0 } else { 1e12 * (1.0 + 0.03 * disturbance.normal()) };
+            frame.intensity = IntensityCode::nearest(particles);
+        }
+        Ok((frame, (on_momentum.norm_squared() / MONITORS as f64).sqrt()))
+    }
+
+    fn steer(&mut self, frame: &Frame, estimate: &Estimate) -> Option<Steered> {
+        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
+        match self.control {
+            Control::Off => None,
+            Control::Estimated => Some(self.core.steer(&model, &self.feedback, &mut self.steer, frame, estimate)),
+            Control::Design => Some(self.steer.steer(&self.feedback, &self.known.of_design(), frame, estimate)),
+        }
+    }
+
+    fn prepare_steer(&mut self) {
+        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
+        match self.control {
+            Control::Off => false,
+            Control::Estimated => self.core.prepare_steer(&model, &self.feedback, &mut self.steer),
+            Control::Design => {
+                self.steer.prepare(&self.feedback, &self.known.of_design(), |_| [0.0; PARAMS])
+            }
+        };
+    }
+}
+
+impl Known {
+    fn of_design(&self) -> Response<'_, Green, MONITORS, CORRECTORS, SUPPLIES, PARAMS> {
+        Response {
+            surrogate: &self.surrogate,
+            at: &self.design,
+            kick_per_ampere: &self.setup.calibration.kick_per_ampere,
+        }
+    }
+}
