@@ -51,11 +51,6 @@ impl Baseline {
         let (orbit, sigma) = krige(ring, &baselines, rms)?;
         Ok((orbit, Self { rms, sensitivity, spurious, sigma }))
     }
-
-    /// Standard deviation of a baseline's change per `ln` of all gradients in a plane (0 x, 1 y) [m].
-    pub fn per_gradient(&self, plane: usize) -> f64 {
-        self.sensitivity[plane] * self.rms[plane]
-    }
 }
 
 /// Relative change of the orbit of random misalignments per `ln` of all gradients, which is that of `1/sin(pi Q)` with

@@ -18,6 +18,7 @@ use super::baseline::Baseline;
 use super::error::FitError;
 use super::evidence::Units;
 use super::settings::Settings;
+use inference::campaign::chi_square;
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
 
@@ -41,8 +42,8 @@ pub struct Data {
     pub readings: DMatrix<f64>,
     /// Readings as recorded [m]; NaN for one that is missing.
     recorded: DMatrix<f64>,
-    /// `ln` of each supply's factor off its mean, of each frame [F].
-    fluctuation: Vec<DVector<f64>>,
+    /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
+    fluctuation: DMatrix<f64>,
     /// Noise of a reading of each monitor by the recording's header [B] [m].
     pub expected_noise: Vec<f64>,
     channels: Vec<Channel>,
@@ -111,9 +112,6 @@ impl Data {
     /// [`DataError`].
     pub fn of(campaign: &Campaign) -> Result<Self, DataError> {
         let Campaign { ring, recording, drives: driven, supplies, screened, readings: recorded, .. } = campaign;
-        let fluctuation: Vec<DVector<f64>> = (supplies.iter().enumerate())
-            .map(|(f, mean)| DVector::from_iterator(driven.len(), driven.iter().map(|d| d.strength[f] - mean)))
-            .collect();
         let mut drives = drives_of(campaign);
         let believed = recording.header.believed(ring)?;
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
@@ -125,13 +123,7 @@ impl Data {
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
-        let shared = |b: usize| {
-            let per_gradient = baseline.per_gradient(campaign.plane(b));
-            let of_supplies = fluctuation.iter().map(|off| off * per_gradient);
-            let columns: Vec<_> =
-                core::iter::once(DVector::from_element(driven.len(), BASELINE)).chain(of_supplies).collect();
-            DMatrix::from_columns(&columns)
-        };
+        let shared = |b: usize| campaign.following(b).insert_column(0, BASELINE);
         let mut data = Self {
             ring: ring.clone(),
             units: Units::of(&campaign.prior),
@@ -141,7 +133,7 @@ impl Data {
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
             recorded: recorded.clone(),
-            fluctuation,
+            fluctuation: campaign.fluctuation.clone(),
             expected_noise: recording.header.noise.clone(),
             channels: Vec::new(),
             meter: [None, None],
@@ -170,7 +162,7 @@ impl Data {
         let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
             let Some(supply) = quadrupole.supply else { continue };
-            let off = &self.fluctuation[supply];
+            let off = self.fluctuation.column(supply);
             for (b, mut column) in readings.column_iter_mut().enumerate() {
                 column -= off.component_mul(&slope.readings.column(b));
             }
@@ -261,12 +253,17 @@ impl Data {
         Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
     }
 
+    /// Which of the common terms of a monitor's readings is that of the RF frequency.
+    fn of_rf(&self, b: usize) -> usize {
+        self.shared[b].ncols()
+    }
+
     /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
         let plane = usize::from(b >= self.ring.horizontal_monitors());
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
-        let at = shared.ncols();
+        let at = self.of_rf(b);
         let mut shared = shared.insert_column(at, 0.0);
         shared.set_column(at, &(rf * self.baseline.spurious[plane]));
         if drift == 0.0 {
@@ -378,21 +375,14 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// A monitor's residuals about its baseline, and about the drift of that baseline where the hypothesis holds one: the
-    /// factors of the drift are at their most likely values, `(1 + U^T U/sigma^2)^-1 U^T r/sigma^2`. `residual` has a row for every frame.
-    pub fn about_baseline(&self, b: usize, residual: &DVector<f64>) -> DVector<f64> {
+    /// Chi-square of a monitor's readings by its expected noise, about its baseline and how that follows the supplies and, where the
+    /// hypothesis holds one, the drift. `residual` has a row for every frame.
+    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> f64 {
         let frames = self.frames(b);
-        let mut own = residual.select_rows(frames);
         let shared = self.shared(b, frames);
-        let steady = self.shared[b].ncols() + 1;
-        let variance = self.noise(b).powi(2);
-        let information = shared.tr_mul(&shared) / variance + DMatrix::identity(shared.ncols(), shared.ncols());
-        if let Some(factor) = information.cholesky().filter(|_| shared.ncols() > steady) {
-            let factors = factor.solve(&(shared.tr_mul(&own) / variance));
-            own -= shared.columns_range(steady..) * factors.rows_range(steady..);
-        }
-        own.add_scalar_mut(-own.mean());
-        own
+        let of_baseline: Vec<usize> = (1..shared.ncols()).filter(|k| *k != self.of_rf(b)).collect();
+        let terms = shared.select_columns(&of_baseline);
+        chi_square(&residual.select_rows(frames), &terms, self.expected_noise[b])
     }
 
     /// Whiten columns over all frames as readings of one monitor.

@@ -253,8 +253,8 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, baselines (and their drift) subtracted, per degree
-    /// of freedom (readings less baselines less vars).
+    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, about baselines that follow the supplies (and drift),
+    /// per degree of freedom (readings less baselines less vars), as [`inference::BatchFit::chi2_per_dof`] counts it.
     ///
     /// # Errors
     /// [`EffectError`].
@@ -263,9 +263,8 @@ impl Fitted {
         let miss = data.miss(&self.predicted(data)?);
         let (mut sum, mut degrees) = (0.0, -(self.params.len() as f64));
         for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
-            let own = data.about_baseline(b, &miss.column(b).into_owned());
-            sum += own.norm_squared() / data.expected_noise[b].powi(2);
-            degrees += own.len() as f64 - 1.0;
+            sum += data.chi_square(b, &miss.column(b).into_owned());
+            degrees += data.frames(b).len() as f64 - 1.0;
         }
         Ok(sum / degrees)
     }

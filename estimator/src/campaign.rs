@@ -237,30 +237,30 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
         }
     }
 
-    /// Take a reading in as judged; returns the growth of the sum of squared deviations from the mean [squared steps].
-    pub fn take(&mut self, b: usize, code: i32, moved: i32, verdict: Verdict) -> u64 {
+    /// Take a reading in as judged; `scatter` hears of each that is counted how far it is from the mean of those before [m], and
+    /// how many there are now.
+    pub fn take(&mut self, b: usize, code: i32, moved: i32, verdict: Verdict, mut scatter: impl FnMut(f32, u32)) {
         let before = self.last_code(b).unwrap_or(0);
         self.last.get_mut(b).into_iter().for_each(|last| *last = Last::new(moved, verdict == Verdict::Held));
         match verdict {
-            Verdict::Held => 0,
-            Verdict::Accepted => self.add(b, code, moved),
+            Verdict::Held => {}
+            Verdict::Accepted => self.add(b, code, moved, &mut scatter),
             Verdict::Confirms { outvotes } => {
                 if let (true, Some(mean), Some(count)) = (outvotes, self.reading.get_mut(b), self.count.get_mut(b)) {
                     (*mean, *count) = (0, 0);
                 }
-                self.add(b, before, before) + self.add(b, code, moved)
+                self.add(b, before, before, &mut scatter);
+                self.add(b, code, moved, &mut scatter);
             }
         }
     }
 
-    /// Count a reading into the mean: the squared distance from it grows the sum of squared deviations by `(n - 1)/n`.
-    fn add(&mut self, b: usize, code: i32, moved: i32) -> u64 {
-        let (Some(mean), Some(count)) = (self.reading.get_mut(b), self.count.get_mut(b)) else { return 0 };
+    /// Count a reading into the mean.
+    fn add(&mut self, b: usize, code: i32, moved: i32, scatter: &mut impl FnMut(f32, u32)) {
+        let (Some(mean), Some(count)) = (self.reading.get_mut(b), self.count.get_mut(b)) else { return };
         *count = count.saturating_add(1);
-        let distance = u64::from(moved.saturating_sub(*mean >> FRACTION).unsigned_abs());
-        let square = distance.saturating_mul(distance);
+        scatter(moved.saturating_sub(*mean >> FRACTION) as f32 * PositionCode::METRES_PER_LSB, *count);
         move_mean(mean, code << FRACTION, *count);
-        square - square / u64::from(*count)
     }
 }
 
@@ -278,22 +278,19 @@ pub enum Verdict {
     Held,
 }
 
-/// All settings, at most `S`, and the scatter of repeats within them.
+/// All settings, at most `S`.
 #[derive(Debug, Clone)]
 pub struct Campaign<const B: usize, const C: usize, const F: usize, const S: usize> {
     cells: Vec<Cell<B, C, F>, S>,
-    /// Sum of squared deviations of repeats from their means, in squared steps, for each monitor.
-    scatter: [u64; B],
 }
 
 impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B, C, F, S> {
     /// Nothing so far.
-    pub const BLANK: Self = Self { cells: Vec::new(), scatter: [0; B] };
+    pub const BLANK: Self = Self { cells: Vec::new() };
 
     /// Forget all settings.
     pub fn clear(&mut self) {
         self.cells.clear();
-        self.scatter = [0; B];
     }
 
     /// The settings so far.
@@ -314,19 +311,6 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
             Some(self.cells.len() - 1)
         })?;
         u16::try_from(index).ok()
-    }
-
-    /// Count scatter of a monitor's repeats [squared steps].
-    pub fn add_scatter(&mut self, b: usize, squared_steps: u64) {
-        if let Some(sum) = self.scatter.get_mut(b) {
-            *sum = sum.saturating_add(squared_steps);
-        }
-    }
-
-    /// Sum of squared deviations of a monitor's repeats from their means [m^2].
-    pub fn scatter(&self, b: usize) -> f64 {
-        let step = f64::from(PositionCode::METRES_PER_LSB);
-        self.scatter.get(b).map_or(0.0, |&s| s as f64 * step * step)
     }
 
     /// The monitors have moved by so much [m]: their readings so far move with them.
@@ -391,12 +375,16 @@ mod tests {
     fn means_and_scatter_are_those_of_the_readings() {
         let mut cell = Cell::<1, 1, 1>::open(setting(None, 0.0, 0));
         let codes = [1000, -2000, 4000, 500, 900];
-        let scatter: u64 = codes.iter().map(|&code| cell.take(0, code, code, Verdict::Accepted)).sum();
+        let mut scatter = 0.0;
+        for code in codes {
+            // the squared distance from the mean grows the sum of squared deviations by (n - 1)/n
+            cell.take(0, code, code, Verdict::Accepted, |d, n| scatter += d * d * (n as f32 - 1.0) / n as f32);
+        }
         let mean = codes.iter().sum::<i32>() as f32 / 5.0;
         assert_eq!(cell.mean(0).1, 5);
         assert!((cell.mean(0).0 / 1e-7 - mean).abs() < 0.01);
         let direct: f32 = codes.iter().map(|&c| (c as f32 - mean) * (c as f32 - mean)).sum();
-        assert!((scatter as f32 / direct - 1.0).abs() < 1e-3, "{scatter} {direct}"); // whole steps
+        assert!((scatter / 1e-14 / direct - 1.0).abs() < 1e-3, "{scatter} {direct}"); // whole steps
     }
 
     /// Readings of 0.15 mm noise against the repeats of their setting: what each becomes, the model expecting it or not.
@@ -430,7 +418,7 @@ mod tests {
             for &(code, expected, verdict) in story {
                 let judged = cell.judge(0, code, 1.5e-4, Gate::default(), expected);
                 assert_eq!(judged, verdict, "{code} in {story:?}");
-                cell.take(0, code, code, judged);
+                cell.take(0, code, code, judged, |_, _| ());
             }
         }
     }

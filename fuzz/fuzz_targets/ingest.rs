@@ -5,6 +5,7 @@
 //! recorded frames, so that what lies behind the CRC is reached as well.
 #![no_main]
 
+use estimator::Walk;
 use std::path::Path;
 use std::sync::LazyLock;
 
@@ -31,7 +32,7 @@ static CAMPAIGN: LazyLock<Campaign> = LazyLock::new(|| {
     let recording = Recording::read(&path, &ring).expect("a recording that ships with the repository");
     let wires: Vec<_> = recording.rows.iter().map(|row| stream::wire(&recording, row).expect("a frame")).collect();
     let [fresh, mut seasoned] =
-        [1e-5, 0.0].map(|walk| stream::estimator(&ring, &recording, walk).expect("a stable ring"));
+        [1e-5, 0.0].map(|params| stream::estimator(&ring, &recording, Walk { params, ..Walk::NONE }).expect("a stable ring"));
     for wire in wires.iter().take(HEARD) {
         seasoned.ingest(&mut wire.clone()).expect("a good frame");
     }

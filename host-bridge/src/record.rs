@@ -164,6 +164,8 @@ fn triangle(n: usize, entry: impl Fn(usize, usize) -> f32) -> Vec<f32> {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use estimator::Walk;
+
     use super::*;
 
     /// A record of a ring with this many vars `V0 ..` and monitors `M0 ..`: all vars 1.000 ± 0.010, all readings used.
@@ -208,7 +210,7 @@ pub(crate) mod tests {
         let ring = Ring::booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
         let recording = inference::Recording::read(&folder, &ring).unwrap();
-        let mut core = inference::stream::estimator(&ring, &recording, 0.0).unwrap();
+        let mut core = inference::stream::estimator(&ring, &recording, Walk::NONE).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
         let record = EstimateRecord::of(&Names::of(&ring), &estimate, |i, j| core.covariance(i, j), None);

@@ -1,6 +1,7 @@
 //! `orbitcal serve` with a device at the other end of a socket: what it writes is what `orbitcal replay` writes.
 
 use core::time::Duration;
+use estimator::Walk;
 use std::io::{Read as _, Write as _};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
@@ -190,7 +191,7 @@ fn request(request: &Request) -> Vec<u8> {
 fn a_day_of_a_front_end(line: UnixStream) {
     let recording = Recording::read(Path::new(RECORDING), &twin::Ring::booster()).unwrap();
     let ring = twin::Ring::booster();
-    let setup = stream::setup(&recording.powered(&ring), &recording, 0.0).unwrap();
+    let setup = stream::setup(&recording.powered(&ring), &recording, Walk::NONE).unwrap();
     let restart = || restart(&setup);
     let frame = |at: usize| stream::wire(&recording, &recording.rows[at]).unwrap();
     let tables = tables();

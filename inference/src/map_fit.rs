@@ -5,7 +5,9 @@
 //!
 //! `chi2 = sum of (reading - baseline_b - predicted)^2/variance + sum of (tune - predicted)^2/variance + sum of (theta - prior)^2/sigma^2`,
 //!
-//! minimised by damped Gauss-Newton within the range of the params.
+//! minimised by damped Gauss-Newton within the range of the params. A baseline follows the supplies ([`Campaign::following`]):
+//! `baseline_b + sum of u_bf following_bf`, with the squares of the unknown `u_bf` added to chi-square; they are eliminated as the
+//! baselines are.
 
 use core::fmt;
 
@@ -13,7 +15,7 @@ use estimator::{FitQuality, Marginal};
 use nalgebra::{DMatrix, DVector, Vector2};
 use twin::{OrbitError, Tunes};
 
-use crate::campaign::{Campaign, Linearised, Normal, Weighed};
+use crate::campaign::{Campaign, Linearised, Normal, Weighed, chi_square};
 use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
 
 /// The batch result for one campaign.
@@ -25,8 +27,8 @@ pub struct BatchFit {
     pub covariance: DMatrix<f64>,
     /// Marginal of each theta.
     pub marginals: Vec<Marginal>,
-    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines less
-    /// params); not a number without any.
+    /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, and of the squares of how their baselines follow the
+    /// supplies (in standard deviations), per degree of freedom (readings less baselines less params); not a number without any.
     pub chi2_per_dof: f64,
     /// True if that is more than noise explains, by the rule of the core.
     pub mismatch: bool,
@@ -188,19 +190,24 @@ impl Problem<'_> {
     fn orbits(&self, params: &DVector<f64>, linearised: &Linearised) -> (Normal, (f64, f64)) {
         let campaign = self.campaign;
         let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
-        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), 0.0);
+        let count = 1 + campaign.supplies.len();
+        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), count, 0.0);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for b in 0..campaign.monitors() {
-            let (mut residuals, mut readings) = (Vec::new(), vec![(b, Weighed::default()); campaign.frames()]);
-            for i in (0..campaign.frames()).filter(|&i| campaign.counts(i, b)) {
-                let residual = campaign.readings[(i, b)] - orbits[(i, b)];
-                readings[i].1 = Weighed::one(residual, 1.0 / campaign.variance(i, b));
-                residuals.push(residual);
+            let terms = campaign.terms(b);
+            let frames: Vec<usize> = (0..campaign.frames()).filter(|&i| campaign.counts(i, b)).collect();
+            let residual = &campaign.readings.column(b) - orbits.column(b);
+            let mut readings = vec![(b, Weighed::none(count)); campaign.frames()];
+            for &i in &frames {
+                let weight = campaign.variance(i, b).recip();
+                readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], weight);
             }
             normal.add(&slopes[b], &readings);
-            if campaign.is_ok(b) && !residuals.is_empty() {
-                chi2 += about_mean(&residuals) / campaign.recording.header.noise[b].powi(2);
-                freedom += residuals.len() as f64 - 1.0;
+            if campaign.is_ok(b) && !frames.is_empty() {
+                let following = campaign.following(b).select_rows(&frames);
+                let expected = campaign.recording.header.noise[b];
+                chi2 += chi_square(&residual.select_rows(&frames), &following, expected);
+                freedom += frames.len() as f64 - 1.0;
             }
         }
         (normal, (chi2, freedom))
@@ -262,10 +269,4 @@ impl Problem<'_> {
 /// Chi-square and its degrees of freedom as the core has them.
 fn quality((chi_square, degrees_of_freedom): (f64, f64)) -> FitQuality {
     FitQuality { chi_square: chi_square as f32, degrees_of_freedom: degrees_of_freedom as f32 }
-}
-
-/// Sum of squares about the mean.
-fn about_mean(values: &[f64]) -> f64 {
-    let mean = values.iter().sum::<f64>() / values.len() as f64;
-    values.iter().map(|value| (value - mean).powi(2)).sum()
 }

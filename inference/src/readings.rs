@@ -5,7 +5,7 @@
 //!
 //! `chi2 = rho^T A rho - 2 m rho + const`, `A = sum of k k^T/variance`, `m = sum of k reading/variance`,
 //!
-//! less what the unknown baseline absorbs (the Schur complement of its row). Two things are not linear in the response and are
+//! less what the unknown baseline absorbs, and how it follows the supplies (the Schur complement of these terms). Two things are not linear in the response and are
 //! subtracted from the readings beforehand, at the MAP: the frame's own supply currents, which scatter by 2e-4 (they move an
 //! orbit by up to 3 um, and by less than 0.1 um differently within the posterior), and the second order of the RF orbit.
 //!
@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
 use twin::OrbitError;
 
-use crate::campaign::{Campaign, Linearised, Meter};
+use crate::campaign::{Campaign, Common, Eliminated, Linearised, Meter, Weighed};
 use crate::map_fit::{BatchFit, TuneUse};
 use crate::model::{Prediction, ResponseModel};
 
@@ -141,20 +141,20 @@ impl Readings {
     pub fn of_frames(reduced: &Reduced, model: &ResponseModel, tunes: TuneUse) -> Self {
         let (repeats, drives) = (reduced.repeats(), reduced.campaign.ring.correctors.len() + 1);
         let of_monitor = |b: usize| {
-            let mut form = Form::new(drives);
-            let (mut weight, mut pull, mut slope) = (0.0, 0.0, DVector::zeros(drives));
+            let terms = reduced.campaign.terms(b);
+            let (mut gram, mut common) = (DMatrix::zeros(drives, drives), Common::new(drives, terms.nrows(), 0.0));
             for (frame, &repeats) in repeats.iter().enumerate() {
                 let Some(reading) = reduced.reading(frame, b) else { continue };
                 let k = reduced.drive(frame);
                 // repeats share the error: their mean has the variance of one over n, plus all of it
                 let shared = reduced.shared_error(model, b, k[k.len() - 1]).powi(2) * repeats as f64;
                 let w = 1.0 / (reduced.noise(b).powi(2) + shared);
-                form.add(&k, reading, w);
-                (weight, pull) = (weight + w, pull + w * reading);
-                slope.axpy(w, &k, 1.0);
+                gram.ger(w, &k, &k, 1.0);
+                common.add(&k.column(0), &Weighed::one(terms.column(frame).as_slice(), reading, w));
             }
-            form.eliminate(&slope, pull, weight);
-            form
+            let Eliminated { columns, moment, square } = common.eliminated();
+            gram.gemm(-1.0, &columns, &columns.transpose(), 1.0);
+            Form { gram, moment, square }
         };
         reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes)
     }
@@ -162,6 +162,7 @@ impl Readings {
     /// Differences of frame pairs, each independent of the others; no tunes, as in the paper.
     pub fn of_pairs(reduced: &Reduced, model: &ResponseModel, pairs: &[Pair]) -> Self {
         let of_monitor = |b: usize| {
+            let following = reduced.campaign.following(b);
             let mut form = Form::new(reduced.campaign.ring.correctors.len() + 1);
             for pair in pairs {
                 let (Some(initial), Some(last)) = (reduced.reading(pair.initial, b), reduced.reading(pair.last, b))
@@ -169,8 +170,9 @@ impl Readings {
                     continue;
                 };
                 let k = reduced.drive(pair.last) - reduced.drive(pair.initial);
-                let shared = reduced.shared_error(model, b, k[k.len() - 1]);
-                form.add(&k, last - initial, 1.0 / (2.0 * reduced.noise(b).powi(2) + shared.powi(2)));
+                let shared = reduced.shared_error(model, b, k[k.len() - 1]).powi(2);
+                let moved = (following.row(pair.last) - following.row(pair.initial)).norm_squared();
+                form.add(&k, last - initial, 1.0 / (2.0 * reduced.noise(b).powi(2) + shared + moved));
             }
             form
         };
@@ -253,15 +255,6 @@ impl Form {
         self.gram.ger(weight, k, k, 1.0);
         self.moment.axpy(weight * reading, k, 1.0);
         self.square += weight * reading * reading;
-    }
-
-    /// Take the best baseline from all readings, given the sums of weight times drive, reading and one.
-    fn eliminate(&mut self, slope: &DVector<f64>, pull: f64, weight: f64) {
-        if weight > 0.0 {
-            self.gram.ger(-1.0 / weight, slope, slope, 1.0);
-            self.moment.axpy(-pull / weight, slope, 1.0);
-            self.square -= pull * pull / weight;
-        }
     }
 }
 

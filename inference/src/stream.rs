@@ -18,8 +18,9 @@ use twin::Ring;
 use crate::recording::{Recording, Row};
 
 pub use estimate::Estimate;
+pub use estimator::Walk;
 use held::{Held, Stream};
-pub use setup::{Setup, setup};
+pub use setup::{Setup, setup, walk_per_cycle};
 
 /// Why a recording cannot be put on the wire.
 #[derive(Debug, thiserror::Error)]
@@ -191,9 +192,9 @@ impl fmt::Debug for Core {
 ///
 /// # Errors
 /// [`StreamError`] if the ring or the recording do not fit any core.
-pub fn estimator(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Core, StreamError> {
+pub fn estimator(ring: &Ring, recording: &Recording, walk: Walk) -> Result<Core, StreamError> {
     let ring = recording.powered(ring);
-    Core::try_new(&ring, setup(&ring, recording, process_noise)?)
+    Core::try_new(&ring, setup(&ring, recording, walk)?)
 }
 
 /// A row as wire bytes.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use estimator::{Health, MonitorState};
+use estimator::{Health, MonitorState, Walk};
 use inference::stream::{self, Estimate};
 use inference::{Campaign, Recording};
 use nalgebra::DMatrix;
@@ -21,7 +21,7 @@ fn folders() -> Vec<PathBuf> {
 
 /// What the core makes of a recording in the end: readings confirmed late or outvoted are counted as in its last estimate.
 fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>) {
-    let mut core = stream::estimator(ring, recording, 0.0).unwrap();
+    let mut core = stream::estimator(ring, recording, Walk::NONE).unwrap();
     let (frames, monitors) = (recording.rows.len(), ring.read_monitors.len());
     let (mut accepted, mut health) = (DMatrix::from_element(frames, monitors, false), Vec::new());
     let mut history: Vec<Vec<usize>> = Vec::new();

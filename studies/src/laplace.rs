@@ -100,7 +100,7 @@ pub fn study(sampling: &Sampling, reference: &Sampled) -> Result<(Section, Vec<C
 /// The core's final result.
 fn of_core(sampling: &Sampling, reference: &Sampled) -> Result<Approximation, StudyError> {
     let campaign = sampling.campaign();
-    let mut core = stream::estimator(&campaign.ring, &campaign.recording, 0.0)?;
+    let mut core = stream::estimator(&campaign.ring, &campaign.recording, stream::Walk::NONE)?;
     let mut last = None;
     stream::replay(&mut core, &campaign.recording, |_, estimate| last = Some(estimate.clone()))?;
     let n = reference.summary.len();

@@ -4,7 +4,7 @@ use divan::{Bencher, black_box};
 use estimator::booster::{
     self, CHANNELS, CORRECTORS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
 };
-use estimator::{Gaussian, Layout, Prior, Reading, Solution, Surrogate};
+use estimator::{Gaussian, Layout, Prior, Reading, Solution, Surrogate, Walk};
 use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
@@ -29,7 +29,7 @@ impl Campaign {
         let ring = Ring::booster();
         let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
         let wires = recording.rows.iter().map(|row| stream::wire(&recording, row)).collect::<Result<_, StreamError>>();
-        Self { wires: wires.unwrap(), core: stream::estimator(&ring, &recording, 0.0).unwrap() }
+        Self { wires: wires.unwrap(), core: stream::estimator(&ring, &recording, Walk::NONE).unwrap() }
     }
 
     /// The core just before each frame, and the frame.

@@ -10,7 +10,7 @@ use estimator::booster::{
 };
 use estimator::{
     CurrentCode, Each, Hold, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Response, RfCode, Steered,
-    Surrogate,
+    Surrogate, Walk,
 };
 use inference::stream;
 use inference::{Recording, simulate};
@@ -76,10 +76,10 @@ impl Known {
     ///
     /// # Errors
     /// If it cannot be read.
-    pub fn read(process_noise: f32) -> Result<Self, Box<dyn Error>> {
+    pub fn read(walk: Walk) -> Result<Self, Box<dyn Error>> {
         let ring = Ring::booster();
         let recording = Recording::read(&repository("recordings/paper-vars"), &ring)?;
-        let core = stream::estimator(&ring, &recording, process_noise)?;
+        let core = stream::estimator(&ring, &recording, walk)?;
         let mut surrogate = Box::new(Green::BLANK);
         core.tables.fill(&mut *surrogate).map_err(|_| "tables of the Booster")?;
         let mut design = Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED);

@@ -2,7 +2,7 @@
 //! millions of frames.
 
 use estimator::booster::{self, CORRECTORS, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, Setup};
-use estimator::{CurrentCode, Layout, MagnetCurrents, Mask, PositionCode, RfCode, Surrogate};
+use estimator::{CurrentCode, Layout, MagnetCurrents, Mask, PositionCode, RfCode, Surrogate, Walk};
 use inference::stream::Core;
 use nalgebra::{DMatrix, DVector};
 
@@ -21,6 +21,14 @@ pub fn wire_of(frame: &Frame) -> Vec<u8> {
     let n = frame.encode(&LAYOUT, &mut wire).expect("the buffer holds any frame");
     wire.truncate(n);
     wire
+}
+
+/// Time from one of its cycles to the next [us].
+const PERIOD: u64 = 100_000;
+
+/// A walk of the params by so much in each of its cycles.
+pub fn walk_per_cycle(sigma: f32) -> Walk {
+    Walk { params: sigma / (1e-6 * PERIOD as f32).sqrt(), ..Walk::NONE }
 }
 
 /// Random numbers, seeded. Source: G. Marsaglia, Xorshift RNGs, J. Stat. Softw. 8 (2003) 14.
@@ -161,7 +169,7 @@ impl Machine {
         let mut frame = Frame {
             epoch: 0,
             sequence,
-            time_us: 100_000 * u64::from(sequence),
+            time_us: PERIOD * u64::from(sequence),
             cycle_time_us: 92_000,
             corrector,
             magnets: MagnetCurrents { dipole, supply },

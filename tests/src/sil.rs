@@ -1,6 +1,7 @@
 //! A recording through the emulated chip and through the core in process, side by side.
 
 use core::error::Error;
+use estimator::Walk;
 
 use estimator::wire::link::Status;
 use host_bridge::cli::CoreModel;
@@ -50,7 +51,7 @@ pub struct Comparison {
 pub fn compare(
     image: &Image,
     (ring, recording): (&Ring, &Recording),
-    process_noise: f32,
+    walk: Walk,
     count: bool,
     mut hear: impl FnMut(&EstimateRecord) -> Result<(), Box<dyn Error>>,
 ) -> Result<Comparison, Box<dyn Error>> {
@@ -60,7 +61,7 @@ pub fn compare(
         vec![]
     };
     let emulator = Emulator::start(image, &Options { regions, ..Options::default() })?;
-    let mut core = stream::estimator(ring, recording, process_noise)?;
+    let mut core = stream::estimator(ring, recording, walk)?;
     let mut link = Link::new(emulator.uart());
     link.restart(&core.setup)?;
     let (names, clock) = (Names::of(ring), Clock::new(Rate::Max, &Stop::default()));

@@ -3,7 +3,7 @@
 use core::error::Error;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Frame, MONITORS, PARAMS};
-use estimator::{CurrentCode, Model};
+use estimator::{CurrentCode, Model, Walk};
 use inference::Recording;
 use inference::stream;
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -154,10 +154,10 @@ impl Soak {
     ///
     /// # Errors
     /// If the recording whose setup is used cannot be read.
-    pub fn new(row: Row, seed: u64, process_noise: f32) -> Result<Self, Box<dyn Error>> {
+    pub fn new(row: Row, seed: u64, walk: Walk) -> Result<Self, Box<dyn Error>> {
         let ring = Ring::booster();
         let recording = Recording::read(&repository("recordings/paper-vars"), &ring)?;
-        let mut machine = Machine::drawn(&stream::estimator(&ring, &recording, process_noise)?, seed);
+        let mut machine = Machine::drawn(&stream::estimator(&ring, &recording, walk)?, seed);
         // the surrogate is the truth here
         machine.surrogate.stated_error = [0.0; 2];
         machine.setup.tune_calibration = None;

@@ -3,6 +3,7 @@
 
 use diagnosis::score::{Grade, Truth};
 use diagnosis::{Diagnosis, Verdict};
+use estimator::Walk;
 use inference::{BatchFit, Campaign, Recording, TuneUse, simulate, stream};
 use system_tests::repository;
 use twin::{Effect, Ring};
@@ -40,7 +41,7 @@ fn stream_and_batch_fit_find_the_true_vars() {
         let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
         let of_fit = |i: usize| (fit.map_params[i], fit.covariance[(i, i)].sqrt());
         assert_sound(folder, fit.chi2_per_dof, pull(&ring, &truth, of_fit));
-        let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+        let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
         let mut last = None;
         stream::replay(&mut core, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
         let (last, quality) = (last.unwrap(), core.fit_quality());

@@ -5,7 +5,7 @@ use embedded_io::{ErrorKind, ErrorType, Read, Write};
 use estimator::booster::{Answer, Estimator, Green, LINE, PACKET, Parcel, Reply, Request, TRIANGLE};
 use estimator::surrogate::Table;
 use estimator::wire::link::{Refusal, Status, Taken, Vitals};
-use estimator::{ParcelError, Tables as _};
+use estimator::{ParcelError, Tables as _, Walk};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
@@ -133,7 +133,7 @@ fn estimates(replies: &[Reply]) -> Vec<Estimate> {
 #[test]
 fn the_loop_replies_as_the_core_in_process() {
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut bytes = start(&core);
     for (at, wire) in wires(&recording).iter().enumerate() {
         if at % 100 == 0 {
@@ -168,7 +168,7 @@ fn the_loop_replies_as_the_core_in_process() {
 #[test]
 fn bad_bytes_are_counted_and_change_no_estimate() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let (mut clean, mut faulty) = (start(&core), start(&core));
     let mut faults = Vec::new();
@@ -242,7 +242,7 @@ fn other_tables(ring: &Ring) -> Tables {
 #[test]
 fn new_tables_change_the_estimate_as_they_do_in_process() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let other = other_tables(&ring);
     let mut bytes = start(&core);
@@ -272,7 +272,7 @@ fn new_tables_change_the_estimate_as_they_do_in_process() {
 #[test]
 fn damaged_tables_are_rejected_whole() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let parcels: Vec<Parcel> = other_tables(&ring).parcels().collect();
     let mut clean = start(&core);
@@ -318,7 +318,7 @@ fn last_status(replies: &[Reply]) -> Status {
 fn tables_that_cannot_be_left_stay_in_use() {
     // given tables in flash that are right at vars = 1 and have no stable ring anywhere else
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut steep = in_flash(&core.tables);
     steep.weight.iter_mut().for_each(|weight| *weight *= 1e4);
     // when frames by other tables have moved the vars, and the device is to go back
@@ -349,7 +349,7 @@ fn tables_that_cannot_be_left_stay_in_use() {
 fn a_restart_with_tables_without_a_design_goes_back_to_those_in_flash() {
     // given tables whose Green's function between nodes is beyond all numbers
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     // when they come before the first setup, and then it
@@ -375,7 +375,7 @@ fn a_restart_with_tables_without_a_design_goes_back_to_those_in_flash() {
 #[test]
 fn a_device_without_a_design_says_so() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut endless = in_flash(&core.tables);
     endless.x.mutual.scale = f32::MAX;
     let bytes = [start(&core), heard(&wires(&recording)[0])].concat();
@@ -387,7 +387,7 @@ fn a_device_without_a_design_says_so() {
 #[test]
 fn a_front_end_that_restarts_its_counter_is_accepted_after_a_request() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let good = wires(&recording);
     let mut bytes = start(&core);
     bytes.extend(heard(&good[10]));
@@ -402,7 +402,7 @@ fn a_front_end_that_restarts_its_counter_is_accepted_after_a_request() {
 #[test]
 fn a_device_says_what_it_lacks() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut bytes = heard(&wires(&recording)[0]);
     bytes.extend(restart(&stream::Setup { noise: vec![0.0; 33], ..core.setup.clone() }));
     let replies = replies(&in_flash(&core.tables), &bytes);
@@ -413,7 +413,7 @@ fn a_device_says_what_it_lacks() {
 #[test]
 fn tables_of_another_ring_are_refused() {
     let (ring, recording) = paper_vars();
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     // given a ring with one monitor less, for which there would be room
     let mut smaller = ring.clone();
     smaller.read_monitors.pop();

@@ -1,5 +1,6 @@
 //! A machine with physics that its design lacks, estimated by the core with the design's tables and with a model file that holds it.
 
+use estimator::Walk;
 use host_bridge::model_file;
 use inference::stream::{self, Core};
 use inference::{Drive, Recording, simulate, with_priors};
@@ -58,7 +59,7 @@ fn replay(mut core: Core, recording: &Recording, truth: &[f64]) -> CoreResult {
 
 /// By the design's tables, and by a model file of the effects, made at the vars of a first pass with them.
 fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -> [CoreResult; 2] {
-    let setup = stream::setup(ring, recording, 0.0).unwrap();
+    let setup = stream::setup(ring, recording, Walk::NONE).unwrap();
     let design = replay(Core::try_new(ring, setup.clone()).unwrap(), recording, truth);
     let path = tempfile::NamedTempFile::new().unwrap();
     let by_file = |vars: &[f64]| {

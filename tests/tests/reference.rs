@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use estimator::Marginal;
+use estimator::{Marginal, Walk};
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::simulate::{self, Instruments};
 use inference::stream::{self, Core};
@@ -96,7 +96,7 @@ fn the_core_is_the_posterior_that_nuts_finds() {
     for s in &reference.summary {
         assert!(s.r_hat <= 1.01 && s.ess_bulk >= 4000.0 && s.ess_tail >= 4000.0, "{s:?}");
     }
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut last = None;
     stream::replay(&mut core, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     let last = last.unwrap();
@@ -147,7 +147,7 @@ fn simulated(count: usize, tune_cut: bool, seed: u64) -> impl Iterator<Item = (R
 #[cfg_attr(debug_assertions, ignore = "minutes unoptimised; the release tests run it")]
 fn error_bars_of_the_core_cover_a_hundred_simulated_truths() {
     let (ring, recording) = read("paper-vars");
-    let fresh: Core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let fresh: Core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     for tune_cut in [false, true] {
         let mut inside = [Vec::new(), Vec::new()];
         for (_, made, vars) in simulated(100, tune_cut, 7) {

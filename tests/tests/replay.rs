@@ -1,6 +1,7 @@
 //! The main job on the recordings that ship with the repository: readings in, vars out, against the truth, against the
 //! exact batch fit, and in another order.
 
+use estimator::Walk;
 use inference::stream::{self, Core, Estimate, Setup};
 use inference::{BatchFit, Campaign, Recording, TuneUse};
 use nalgebra::{DMatrix, DVector};
@@ -21,7 +22,7 @@ fn read(name: &str) -> (Ring, Recording) {
 }
 
 fn replay((ring, recording): (Ring, Recording)) -> Replayed {
-    let core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     replay_through(core, (ring, recording))
 }
 
@@ -33,7 +34,7 @@ fn replay_through(mut core: Core, (ring, recording): (Ring, Recording)) -> Repla
 
 /// Without the tunes: orbits alone.
 fn without_tunes((ring, recording): (Ring, Recording)) -> Replayed {
-    let setup = Setup { tune_calibration: None, ..stream::setup(&ring, &recording, 0.0).unwrap() };
+    let setup = Setup { tune_calibration: None, ..stream::setup(&ring, &recording, Walk::NONE).unwrap() };
     replay_through(Core::try_new(&ring, setup).unwrap(), (ring, recording))
 }
 

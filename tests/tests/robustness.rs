@@ -4,13 +4,13 @@
 use estimator::booster::{self, Frame};
 use estimator::{
     CurrentCode, FrameError, IngestError, IntensityCode, MagnetCurrents, Mask, MonitorState, PositionCode, Prior,
-    RfCode, TuneCode,
+    RfCode, TuneCode, Walk,
 };
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use system_tests::machine::{ALL, LAYOUT, Machine, Random, nees, wire_of};
+use system_tests::machine::{ALL, LAYOUT, Machine, Random, nees, walk_per_cycle, wire_of};
 use system_tests::{repository, truth};
 use twin::Ring;
 
@@ -210,7 +210,7 @@ fn ten_thousand_faulty_frames_leave_the_posterior_as_it_was() {
     const FAULTY: usize = 10_000;
     let (ring, recording) = paper_vars();
     let good = wires(&recording);
-    let mut alone = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut alone = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut mixed = alone.clone();
     let (mut random, mut thrown) = (Random::new(1), 0);
     for (at, wire) in good.iter().enumerate() {
@@ -243,7 +243,7 @@ fn seeded(cases: u32) -> ProptestConfig {
 /// A core after 150 frames, and its last estimate.
 fn seasoned() -> (Core, Estimate) {
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let mut last = None;
     for mut wire in wires(&recording).into_iter().take(150) {
         core.prepare();
@@ -407,7 +407,7 @@ fn check(core: &Core, estimate: &Estimate, prior: &Prior, walks: bool) -> Result
 #[test]
 fn extreme_frames_leave_every_estimate_sound() {
     let (ring, recording) = paper_vars();
-    let starts = [0.0, 1e-3].map(|walk| stream::estimator(&ring, &recording, walk).unwrap());
+    let starts = [0.0, 1e-3].map(|walk| stream::estimator(&ring, &recording, walk_per_cycle(walk)).unwrap());
     let frames = prop::collection::vec(frame(), 1..20);
     proptest!(seeded(300), |(frames in frames, walks in 0..2_usize, ordered: bool, heard in 0..40_usize)| {
         let mut core = starts[walks].clone();
@@ -450,7 +450,7 @@ fn errors(estimate: &Estimate, params: &[f32]) -> [f64; 48] {
 /// Sum of NEES over machines, and mean NIS per reading, at the end of a stream of frames that belong to no setting.
 fn steered(process_noise: f32, machines: u64, frames: u32) -> (f64, f64) {
     let (ring, recording) = paper_vars();
-    let start = stream::estimator(&ring, &recording, process_noise).unwrap();
+    let start = stream::estimator(&ring, &recording, walk_per_cycle(process_noise)).unwrap();
     let (mut total, mut nis, mut readings) = (0.0, 0.0, 0.0);
     for seed in 1..=machines {
         let (mut core, mut machine) = (start.clone(), Machine::drawn(&start, seed));
@@ -491,7 +491,7 @@ fn a_frame_without_beam_moves_nothing() {
     // given a machine that steers, the beam lost in one frame: its monitors read whatever they read
     let (ring, recording) = paper_vars();
     for process_noise in [0.0, 1e-4] {
-        let mut core = stream::estimator(&ring, &recording, process_noise).unwrap();
+        let mut core = stream::estimator(&ring, &recording, walk_per_cycle(process_noise)).unwrap();
         let mut machine = Machine::drawn(&core, 1);
         let mut before = None;
         for sequence in 0..=100 {
@@ -522,7 +522,7 @@ fn a_frame_without_beam_moves_nothing() {
 fn a_silent_monitor_is_dead_until_it_reports() {
     // given a campaign in which one monitor does not report in 300 frames
     let (ring, recording) = paper_vars();
-    let mut core = stream::estimator(&ring, &recording, 0.0).unwrap();
+    let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let (monitor, silence) = (10, 20..320);
     let mut last = None;
     for (at, row) in recording.rows.iter().enumerate() {

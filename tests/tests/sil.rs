@@ -3,6 +3,7 @@
 
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
+use estimator::Walk;
 use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
@@ -72,7 +73,7 @@ fn check_instructions(counts: &[(&'static str, u64)]) {
 #[test]
 fn the_chip_answers_a_campaign_as_the_host_does() {
     let (ring, recording) = read("paper-vars");
-    let run = compare(&IMAGE, (&ring, &recording), 0.0, true, |_| Ok(())).unwrap();
+    let run = compare(&IMAGE, (&ring, &recording), Walk::NONE, true, |_| Ok(())).unwrap();
     assert_eq!((run.frames, run.different.as_slice()), (346, [].as_slice()));
     assert_eq!((run.status.refused, run.status.vitals.lost_bytes), (0, 0));
     check_stack(&run.status);
@@ -87,7 +88,9 @@ fn the_chip_answers_a_drifting_machine_as_the_host_does() {
     let (ring, mut recording) = read("drift-stream");
     recording.rows.truncate(500);
     for process_noise in [0.0, 2e-4] {
-        let run = compare(&IMAGE, (&ring, &recording), process_noise, false, |_| Ok(())).unwrap();
+        let run =
+            compare(&IMAGE, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise), false, |_| Ok(()))
+                .unwrap();
         assert_eq!((run.frames, run.different.as_slice()), (500, [].as_slice()), "walk {process_noise}");
         assert_eq!(run.status.vitals.lost_bytes, 0);
     }
@@ -101,7 +104,7 @@ struct Pair<'e> {
 
 impl<'e> Pair<'e> {
     fn start(emulator: &'e Emulator, ring: &Ring, recording: &Recording) -> Self {
-        let core = stream::estimator(ring, recording, 0.0).unwrap();
+        let core = stream::estimator(ring, recording, Walk::NONE).unwrap();
         let mut link = Link::new(emulator.uart());
         link.restart(&core.setup).unwrap();
         Self { link, core }

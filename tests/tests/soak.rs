@@ -2,12 +2,13 @@
 //! `cargo run --release -p system-tests --bin soak` streams for hours.
 
 use estimator::booster::{Estimate, Frame, PARAMS};
-use estimator::{IntensityCode, PositionCode};
+use estimator::{IntensityCode, PositionCode, Walk};
+use system_tests::machine::walk_per_cycle;
 use system_tests::soak::{Row, Soak};
 
 /// A stream of 100,000 frames, beside double precision and the truth.
 fn stays_right(row: Row) {
-    let mut soak = Soak::new(row, 1, 0.0).unwrap();
+    let mut soak = Soak::new(row, 1, Walk::NONE).unwrap();
     for _ in 0..5 {
         let c = soak.run(20_000);
         // 48 degrees: 0.5 to 1.6 holds with 99.5 %
@@ -73,7 +74,7 @@ fn without_beam(soak: &mut Soak, kind: usize) -> Frame {
 fn frames_without_beam_are_flagged_and_change_nothing() {
     for row in [Row::Several, Row::Single] {
         for (kind, process_noise) in [(0, 0.0), (1, 0.0), (2, 0.0), (1, 1e-4)] {
-            let mut soak = Soak::new(row, 2, process_noise).unwrap();
+            let mut soak = Soak::new(row, 2, walk_per_cycle(process_noise)).unwrap();
             let before = stream(&mut soak, 300);
             for burst in [1, 2, 10, 20] {
                 // given a lost beam of so many frames
@@ -102,7 +103,7 @@ fn frames_without_beam_are_flagged_and_change_nothing() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn a_frame_without_particles_is_flagged_whatever_it_reads() {
-    let mut soak = Soak::new(Row::Several, 6, 0.0).unwrap();
+    let mut soak = Soak::new(Row::Several, 6, Walk::NONE).unwrap();
     let particles = |at| match at {
         40 => 0.0,
         50 => 4e13, // a wrong reading, 90 times the others
@@ -120,7 +121,7 @@ fn a_frame_without_particles_is_flagged_whatever_it_reads() {
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn baselines_that_move_are_said_and_leave_the_vars_alone() {
     for row in [Row::Several, Row::Single] {
-        let mut soak = Soak::new(row, 3, 0.0).unwrap();
+        let mut soak = Soak::new(row, 3, Walk::NONE).unwrap();
         let before = stream(&mut soak, 500);
         soak.machine.move_baselines(5e-3);
         let after: Vec<Estimate> = (0..20).map(|_| next(&mut soak)).collect();
@@ -139,7 +140,7 @@ fn baselines_that_move_are_said_and_leave_the_vars_alone() {
 fn a_long_gap_is_a_long_walk() {
     let (walk, gap) = (5e-5, 30_000);
     for row in [Row::Several, Row::Single] {
-        let mut soak = Soak::new(row, 4, walk).unwrap();
+        let mut soak = Soak::new(row, 4, walk_per_cycle(walk)).unwrap();
         stream(&mut soak, 200);
         soak.skip(gap);
         soak.machine.walk(walk * (gap as f32).sqrt());
@@ -153,7 +154,7 @@ fn a_long_gap_is_a_long_walk() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn a_front_end_that_restarts_is_heard() {
-    let mut soak = Soak::new(Row::Several, 5, 0.0).unwrap();
+    let mut soak = Soak::new(Row::Several, 5, Walk::NONE).unwrap();
     let before = stream(&mut soak, 300);
     // its count begins at 0 again
     soak.restart_front_end();

@@ -19,6 +19,7 @@ mod map;
 mod modes;
 mod orbit;
 mod response;
+mod ripple;
 mod site;
 mod spurious;
 #[cfg(test)]
@@ -40,6 +41,7 @@ pub use lattice::{
 pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source};
+pub use ripple::ripple_of_misaligned;
 pub use site::Site;
 pub use spurious::spurious_dispersion;
 pub use tune::Tunes;

@@ -45,7 +45,7 @@ fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {
 }
 
 /// The ring with its quadrupoles shifted at random, uniformly, seeded.
-fn misaligned(ring: &Ring, machine: u32, rms: f64) -> Ring {
+pub(crate) fn misaligned(ring: &Ring, machine: u32, rms: f64) -> Ring {
     let mut shifted = ring.clone();
     for (q, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
         let shift = &mut shifted.elements[at].misalignment;

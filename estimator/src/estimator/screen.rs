@@ -74,8 +74,12 @@ impl<
                 }
             }
             if self.monitors.get_mut(b).is_some_and(Monitor::judge) {
-                self.stale = true;
+                self.past.stale = true;
             }
+        }
+        for b in 0..B {
+            let expected = self.follows(model, b);
+            self.following.get_mut(b).into_iter().for_each(|following| following.learn(&expected));
         }
         self.screen_tunes(model, frame, drive, &mut screened);
         screened
@@ -94,10 +98,10 @@ impl<
         }
         for (plane, code) in frame.tune.iter().enumerate() {
             let (Some(code), Some(meter)) = (code, self.tunes.get_mut(plane)) else { continue };
-            let predicted = |strength: &[f32; F]| model.surrogate.tune(&self.linearised, plane, strength).0;
+            let predicted = |strength: &[f32; F]| model.surrogate.tune(&self.tangent.linearised, plane, strength).0;
             let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
             let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
-            self.stale |= meter.judge();
+            self.past.stale |= meter.judge();
             let innovation = self.tune_innovation(model, plane, code.value(), &drive.strength);
             screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
         }
@@ -113,19 +117,23 @@ impl<
         screened: &mut Screened<W>,
     ) {
         let moved = self.moved_to_mean_drive(b, code);
-        let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.campaign.cell_mut(index)) else { return };
+        let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.past.campaign.cell_mut(index)) else {
+            return;
+        };
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
         }
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
-        let scatter = cell.take(b, code, moved, verdict);
+        let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
+        if let Some(following) = following {
+            cell.take(b, code, moved, verdict, |deviation, n| following.add_repeat(deviation, off_mean, n));
+        }
         match verdict {
             Verdict::Accepted => {}
             Verdict::Confirms { .. } => monitor.pardon(),
             Verdict::Held => monitor.reject(),
         }
         screened.note(b, verdict);
-        self.campaign.add_scatter(b, scatter);
     }
 
     /// A reading without a setting passes if the model expects it.
@@ -139,7 +147,7 @@ impl<
 
     /// A reading as the mean drive of its setting would have made it, in steps.
     fn moved_to_mean_drive(&self, b: usize, code: i32) -> i32 {
-        let shift = match (self.at_mean_drive.get(b), self.prediction.reading.get(b)) {
+        let shift = match (self.predicted.at_mean_drive.get(b), self.predicted.prediction.reading.get(b)) {
             (Some(mean), Some(this)) => mean - this,
             _ => 0.0,
         };

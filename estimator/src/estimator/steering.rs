@@ -37,13 +37,13 @@ impl<
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
     ) -> bool {
-        state.prepare(feedback, &self.response(model), |i| self.solution.covariance_row(i))
+        state.prepare(feedback, &self.response(model), |i| self.posterior.solution.covariance_row(i))
     }
 
     fn response<'a>(&'a self, model: &Model<'a, G, B, C, F>) -> Response<'a, G, B, C, F, N> {
         Response {
             surrogate: model.surrogate,
-            at: &self.linearised,
+            at: &self.tangent.linearised,
             kick_per_ampere: &model.setup.calibration.kick_per_ampere,
         }
     }

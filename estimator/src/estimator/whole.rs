@@ -5,6 +5,7 @@ use crate::estimate::MonitorState;
 use crate::linear::dot;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
+use crate::quarantine::Quarantine;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -28,6 +29,20 @@ pub(super) enum Whole {
     Persists,
     /// None of its readings counts.
     Aside,
+}
+
+/// What is kept of the frames so far to judge the next one by.
+#[derive(Debug, Clone)]
+pub(super) struct WholeFrames<const B: usize> {
+    /// Frames put aside since the last good one.
+    quarantine: Quarantine<B>,
+    /// Largest beam intensity lately, in steps.
+    most_intense: i32,
+}
+
+impl<const B: usize> WholeFrames<B> {
+    /// None so far.
+    pub const NONE: Self = Self { quarantine: Quarantine::EMPTY, most_intense: 0 };
 }
 
 /// What the model makes of each reading.
@@ -65,17 +80,17 @@ impl<
         }
         // in a setting the repeats decide, of an orbit that might be one
         if self.is_expected_but_for_a_few(frame, &expected) || (in_setting && self.resembles(frame, &expected)) {
-            self.quarantine.clear();
+            self.whole.quarantine.clear();
             return (Whole::Good, expected);
         }
         self.put_aside(frame, &expected);
         let variance = |b: usize| self.noise_variance(b);
-        if let Some(shift) = self.quarantine.shift(variance) {
-            self.quarantine.clear();
+        if let Some(shift) = self.whole.quarantine.shift(variance) {
+            self.whole.quarantine.clear();
             self.move_baselines(&shift);
             return (Whole::Moved, self.expected(model, frame));
         }
-        (if self.quarantine.persists() { Whole::Persists } else { Whole::Aside }, expected)
+        (if self.whole.quarantine.persists() { Whole::Persists } else { Whole::Aside }, expected)
     }
 
     /// What the model, with all its uncertainty, makes of each reading.
@@ -83,13 +98,17 @@ impl<
         let mut expected = Expected { surprise: [0.0; B], within: Mask::NONE };
         let each = expected.surprise.iter_mut().zip(&frame.reading).enumerate();
         for (b, (to, reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
-            let (d, baseline_variance) = self.gaussian.effective(b, self.slope(b));
-            let predicted = self.gaussian.baseline(b) + dot(&d, &self.solution.delta);
+            let (d, baseline_variance) = self.posterior.gaussian.effective(b, self.slope(b));
+            let predicted = self.posterior.gaussian.baseline(b) + dot(&d, &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
-            let certain = f64::from(self.variance(model, b, 1, self.rf_offset)) + baseline_variance;
+            let certain = f64::from(
+                self.own_variance(model, b, &self.predicted.strength)
+                    + self.shared_variance(model, b, self.predicted.rf_offset),
+            ) + baseline_variance;
             let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
             // the uncertainty of the params is only worked out for readings that need it
-            let within = expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.solution.variance_of(&d));
+            let within =
+                expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.posterior.solution.variance_of(&d));
             *to = surprise as f32;
             expected.within.put(b, within);
         }
@@ -99,8 +118,8 @@ impl<
     /// True if the front end counts particles, and hardly any are there.
     fn is_beam_lost(&mut self, frame: &Frame<B, C, F, W>) -> bool {
         let Some(intensity) = frame.intensity.map(|intensity| intensity.steps()) else { return false };
-        self.most_intense = intensity.max(self.most_intense - (self.most_intense >> FORGOTTEN));
-        LOST * i64::from(intensity) <= i64::from(self.most_intense)
+        self.whole.most_intense = intensity.max(self.whole.most_intense - (self.whole.most_intense >> FORGOTTEN));
+        LOST * i64::from(intensity) <= i64::from(self.whole.most_intense)
     }
 
     /// Readings that count in a judgement of the whole: of monitors that report and are not dead.
@@ -130,20 +149,20 @@ impl<
     }
 
     fn put_aside(&mut self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) {
-        self.quarantine.add();
+        self.whole.quarantine.add();
         for (b, (surprise, reading)) in expected.surprise.iter().zip(&frame.reading).enumerate() {
             if frame.valid.has(b) {
-                self.quarantine.note(b, *surprise, reading.value());
+                self.whole.quarantine.note(b, *surprise, reading.value());
             }
         }
     }
 
     /// Take the baselines as moved: all that was read before is moved with them.
     fn move_baselines(&mut self, shift: &[f32; B]) {
-        self.gaussian.move_baselines(shift);
-        self.loose.move_baselines(shift);
-        self.campaign.move_readings(shift);
-        for frame in &mut self.recent {
+        self.posterior.gaussian.move_baselines(shift);
+        self.past.loose.move_baselines(shift);
+        self.past.campaign.move_readings(shift);
+        for frame in &mut self.past.recent {
             frame.reading.iter_mut().zip(shift).for_each(|(reading, by)| *reading = reading.moved(*by));
         }
     }

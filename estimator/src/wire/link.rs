@@ -270,7 +270,7 @@ impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
     pub const MAX_BYTES: usize = 1 + 16 * GROUPS // priors
         + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
         + 5 + LENGTH + 28 * F // dipole, supplies
-        + 3 * 4 + 5; // powered, gate, process noise, tunes
+        + 4 * 4 + 5; // powered, gate, both walks, tunes
 }
 
 impl<S: Serialize, P: Serialize> Request<S, P> {

@@ -1,6 +1,7 @@
 //! `orbitcal check`: what a recording holds, and what each command can do with it.
 
 use core::fmt;
+use estimator::Walk;
 
 use comfy_table::CellAlignment;
 use inference::stream::{self, Core};
@@ -180,7 +181,7 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 /// Whether the core takes it: its tables, the setup, and the first frame.
 fn replay(campaign: &Campaign) -> Usable {
     let (ring, recording) = (&campaign.ring, &campaign.recording);
-    let ready = stream::setup(ring, recording, 0.0).and_then(|setup| {
+    let ready = stream::setup(ring, recording, Walk::NONE).and_then(|setup| {
         Core::try_new(ring, setup)?;
         recording.rows.iter().try_for_each(|row| stream::wire(recording, row).map(drop))
     });

@@ -1,6 +1,7 @@
 //! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
 
 use estimator::Tables as _;
+use estimator::Walk;
 use inference::{Recording, stream};
 use training::LINE;
 use twin::Ring;
@@ -65,7 +66,7 @@ fn feed(
 ) -> Result<(), CommandError> {
     warn_if_not_modelled(recording);
     let powered = recording.powered(ring);
-    let setup = stream::setup(&powered, recording, options.process_noise)?;
+    let setup = stream::setup(&powered, recording, Walk { params: options.process_noise, ..Walk::NONE })?;
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {

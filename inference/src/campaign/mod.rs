@@ -2,6 +2,7 @@
 //!
 //! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
 
+mod common;
 mod drive;
 mod linear;
 mod meter;
@@ -11,16 +12,18 @@ mod setting;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{Machine, OrbitError, Rf, Ring, spurious_dispersion};
+use twin::{Machine, OrbitError, Rf, Ring, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
 use crate::recording::Recording;
 
+pub use common::chi_square;
+pub(crate) use common::{Common, Eliminated, Weighed};
 pub use drive::{Drive, supplies_of};
 pub(crate) use linear::Linearised;
 pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::{Normal, Weighed};
+pub(crate) use normal::Normal;
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
@@ -44,6 +47,8 @@ pub struct Campaign {
     sharing: Vec<f64>,
     /// Mean `ln` of each supply's factor [F].
     pub supplies: Vec<f64>,
+    /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
+    pub fluctuation: DMatrix<f64>,
     /// Frames grouped by setting.
     pub settings: Settings,
     /// Readings as recorded, rows frames, columns monitors; not a number where a monitor did not report [m].
@@ -62,6 +67,9 @@ pub struct Campaign {
     pub orbit: [f64; 2],
     /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y.
     pub spurious: [f64; 2],
+    /// Standard deviation of a baseline's change per `ln` of each supply, in x and y: of a misaligned ring with the orbit and the tunes
+    /// of this one [F] [m].
+    pub ripple: Vec<[f64; 2]>,
 }
 
 impl Campaign {
@@ -96,9 +104,13 @@ impl Campaign {
         };
         let Seen { screened, params, baselines } = screener.run()?;
         let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
+        let orbit = rms_by_plane(&ring, &baselines);
+        let ripple = ripple_of_misaligned(&ring.with_strengths(&ring.strengths(params.as_slice(), &supplies)))?;
         let mut campaign = Self {
             meters: [None, None],
-            orbit: rms_by_plane(&ring, &baselines),
+            ripple: ripple.iter().map(|ratio| [0, 1].map(|plane| ratio[plane] * orbit[plane])).collect(),
+            fluctuation: DMatrix::from_fn(drives.len(), supplies.len(), |i, f| drives[i].strength[f] - supplies[f]),
+            orbit,
             sharing: drive::sharing(&drives),
             time: recording.times(),
             recording: recording.clone(),
@@ -158,6 +170,22 @@ impl Campaign {
     pub fn variance(&self, frame: usize, b: usize) -> f64 {
         let shared = self.shared_error(b, self.drives[frame].rf_offset);
         self.noise(b).powi(2) + self.sharing[frame] * shared * shared
+    }
+
+    /// How the baseline of a monitor follows the supplies: its change in each frame by each of them, in standard deviations. Misaligned
+    /// quadrupoles make the orbit without kicks, and their supplies' ripple moves it, which way only the unknown misalignments
+    /// could tell, rows frames, columns supplies [m].
+    pub fn following(&self, b: usize) -> DMatrix<f64> {
+        let mut following = self.fluctuation.clone();
+        let sigma = self.ripple.iter().map(|sigma| sigma[self.plane(b)]);
+        following.column_iter_mut().zip(sigma).for_each(|(mut column, sigma)| column *= sigma);
+        following
+    }
+
+    /// Coefficients of the common terms of a monitor's reading in each frame, as columns: 1 for the baseline, then how it follows each
+    /// supply.
+    pub(crate) fn terms(&self, b: usize) -> DMatrix<f64> {
+        self.following(b).transpose().insert_row(0, 1.0)
     }
 
     /// Rms of the baselines that are known, in x and y [m].

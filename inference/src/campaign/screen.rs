@@ -10,9 +10,10 @@ use estimator::{Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Machine, OrbitError, Ring};
 
+use super::common::Weighed;
 use super::drive::{self, Drive};
 use super::linear::Linearised;
-use super::normal::{Normal, Weighed};
+use super::normal::Normal;
 use super::rms_by_plane;
 use super::setting::Settings;
 use crate::prior::Prior;
@@ -64,6 +65,8 @@ pub(super) struct Seen {
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f64 = 0.02;
+/// The baseline is the only common term of a monitor's readings: how it follows the supplies is small beside the gate.
+const TERMS: [f64; 1] = [1.0];
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f64 = 1.0;
 /// Growth of chi-square that counts as uphill.
@@ -186,7 +189,7 @@ impl<'c> Screening<'c> {
     fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
         let (frames, monitors) = (of.drives.len(), of.noise.len());
         let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
-        let normal = Normal::new(of.prior, &model.params, monitors, BASELINE.powi(-2));
+        let normal = Normal::new(of.prior, &model.params, monitors, TERMS.len(), BASELINE.powi(-2));
         let expecting = |sigma: &f64| {
             let mut monitor = Monitor::BLANK;
             monitor.expect(*sigma as f32);
@@ -304,7 +307,8 @@ impl<'c> Screening<'c> {
     /// True if the model, with all its uncertainty, expects a reading.
     fn is_expected(&self, frame: usize, b: usize) -> bool {
         let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
-        let (expected, of_baseline, of_params) = self.normal.expect(b, slope, &self.best.step, &self.best.factor);
+        let expectation = self.normal.expect(b, slope, &TERMS, &self.best.step, &self.best.factor);
+        let (expected, of_baseline, of_params) = expectation.expect("a baseline's prior is known");
         let innovation = (self.residual(frame, b) - expected) as f32;
         let certain = self.variance(frame, b) + of_baseline;
         // the uncertainty of the params is only worked out for readings that need it
@@ -324,7 +328,7 @@ impl<'c> Screening<'c> {
     }
 
     fn weighed(&self, frame: usize, b: usize) -> Weighed {
-        Weighed::one(self.residual(frame, b), 1.0 / self.variance(frame, b))
+        Weighed::one(&TERMS, self.residual(frame, b), 1.0 / self.variance(frame, b))
     }
 
     /// Linearise at the best params if they have left those of the model, or if readings need re-weighting.
@@ -372,11 +376,11 @@ impl<'c> Screening<'c> {
     /// The normal equations of the accepted readings of the first frames.
     fn rebuild(&mut self, frames: usize) {
         let monitors = self.monitors.len();
-        self.normal = Normal::new(self.of.prior, &self.model.params, monitors, BASELINE.powi(-2));
+        self.normal = Normal::new(self.of.prior, &self.model.params, monitors, TERMS.len(), BASELINE.powi(-2));
         for b in 0..monitors {
-            let mut sums = vec![(b, Weighed::default()); self.of.groups.drives.len()];
+            let mut sums = vec![(b, Weighed::none(TERMS.len())); self.of.groups.drives.len()];
             for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
-                sums[self.of.groups.of_frame[frame]].1 += self.weighed(frame, b);
+                sums[self.of.groups.of_frame[frame]].1 += &self.weighed(frame, b);
             }
             self.normal.add(&self.model.slope[b], &sums);
         }

@@ -1,12 +1,12 @@
 //! Priors, noise and calibration of a core, for a ring of any size.
 
-use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, SupplyCalibration};
+use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, SupplyCalibration, Walk};
 use training::rooms::large;
 use twin::Ring;
 
 use super::StreamError;
 use crate::campaign::TUNE_CALIBRATION;
-use crate::recording::Recording;
+use crate::recording::{Recording, Row};
 
 /// Largest read-back above which a corrector counts as powered [A]: 50 times its scatter. A twentieth of the largest setting where
 /// that is less.
@@ -30,8 +30,8 @@ pub struct Setup {
     pub noise: Vec<f32>,
     /// When readings agree.
     pub gate: Gate,
-    /// Random walk of each theta, standard deviation per `sqrt(frame)`; 0 for constant vars.
-    pub process_noise: f32,
+    /// How params and baselines walk.
+    pub walk: Walk,
     /// Calibration error of the tune meter [1]; none, and tunes do not count.
     pub tune_calibration: Option<f32>,
 }
@@ -43,11 +43,21 @@ fn powered(recording: &Recording) -> f32 {
     if largest > 0.0 { POWERED.min((SHARE * largest) as f32) } else { POWERED }
 }
 
+/// A random walk of the params by so much per square root of a cycle of a recording, lost ones counted.
+pub fn walk_per_cycle(recording: &Recording, sigma: f32) -> Walk {
+    let cycles = |rows: &[Row]| f64::from(rows[1].sequence - rows[0].sequence);
+    let mut periods: Vec<f64> =
+        recording.rows.windows(2).map(|rows| (rows[1].time - rows[0].time) / cycles(rows)).collect();
+    periods.sort_by(f64::total_cmp);
+    let period = periods.get(periods.len() / 2).copied().unwrap_or(1.0);
+    Walk { params: sigma / period.sqrt() as f32, ..Walk::NONE }
+}
+
 /// What is known beforehand of a recording of a ring, from its header.
 ///
 /// # Errors
 /// [`StreamError::Transfer`], or [`StreamError::Training`] for more priors than a core tells apart.
-pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<Setup, StreamError> {
+pub fn setup(ring: &Ring, recording: &Recording, walk: Walk) -> Result<Setup, StreamError> {
     let header = &recording.header;
     let single = |values: &[f64]| values.iter().map(|v| *v as f32).collect();
     let supply = |(nominal, coefficients): (&f64, &Vec<f64>)| {
@@ -66,7 +76,7 @@ pub fn setup(ring: &Ring, recording: &Recording, process_noise: f32) -> Result<S
         powered: powered(recording),
         noise: single(&header.noise),
         gate: Gate::default(),
-        process_noise,
+        walk,
         tune_calibration: Some(TUNE_CALIBRATION as f32),
     })
 }
@@ -114,7 +124,7 @@ impl Setup {
             },
             noise: each(&self.noise, monitor),
             gate: self.gate,
-            process_noise: self.process_noise,
+            walk: self.walk,
             tune_calibration: self.tune_calibration,
         }
     }

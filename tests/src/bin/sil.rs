@@ -10,7 +10,7 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use host_bridge::record::Names;
 use host_bridge::sink::shared_memory::{PUBLISHER, Publisher, SERVICE};
-use inference::Recording;
+use inference::{Recording, stream};
 use serde_json::{Value, json};
 use system_tests::qemu::{Image, Sizes};
 use system_tests::repository;
@@ -55,10 +55,11 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
         let mut recording = Recording::read(&repository(name), &ring)?;
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
-        let comparison = compare(&image, (&ring, &recording), process_noise, true, |record| {
-            bar.inc(1);
-            Ok(publisher.publish(record)?)
-        })?;
+        let comparison =
+            compare(&image, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise), true, |record| {
+                bar.inc(1);
+                Ok(publisher.publish(record)?)
+            })?;
         bar.finish_and_clear();
         print(&comparison, &sizes);
         results.push(summary(&recording.name, &comparison, &sizes));

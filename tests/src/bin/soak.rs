@@ -1,6 +1,7 @@
 //! Long streams of simulated frames through the core, hours of them if asked: one line a checkpoint.
 
 use core::error::Error;
+use estimator::Walk;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -36,7 +37,7 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     for row in Row::ALL.into_iter().filter(|row| arguments.row.is_none_or(|only| only == *row)) {
         println!("{row:?}, seed {}", arguments.seed);
-        let mut soak = Soak::new(row, arguments.seed, 0.0)?;
+        let mut soak = Soak::new(row, arguments.seed, Walk::NONE)?;
         for _ in 0..arguments.frames / arguments.every.max(1) {
             let c = soak.run(arguments.every);
             println!(

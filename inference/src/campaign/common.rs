@@ -1,0 +1,173 @@
+//! Sums over the readings of one monitor, from which the terms that they have in common are eliminated.
+//!
+//! A reading less its prediction obeys `r = x p + c t + noise`: `p` is wanted, `t` are the common terms (the baseline, whose
+//! coefficient is 1, then its change with each supply, see [`super::Campaign::following`]), each with a normal prior of mean 0. With
+//! `M` the sum of weight times `c c^T` plus the prior precision of the terms,
+//!
+//! `t = M^-1 (sum of weight c r - S^T p)`, `S = sum of weight x c^T`,
+//!
+//! and the normal equations of `p` alone lose the Schur complement `S M^-1 S^T`.
+
+use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
+
+/// Sums over some readings of a monitor of weight times products of their terms' coefficients and residual.
+#[derive(Debug, Clone)]
+pub(crate) struct Weighed(DMatrix<f64>);
+
+/// Sums over all readings of a monitor.
+#[derive(Debug, Clone)]
+pub(crate) struct Common {
+    /// Sum of weight times `(c, r) (c, r)^T`, the prior precision of the terms included [K + 1][K + 1].
+    moments: DMatrix<f64>,
+    /// Sum of weight times `x (c, r)^T` [X][K + 1].
+    slope: DMatrix<f64>,
+}
+
+/// What readings say of `p` when the terms are at their best.
+pub(crate) struct Eliminated {
+    /// Columns `S L^-T`, `M = L L^T`: the sum of weight times `x x^T` loses their squares [X][K].
+    pub columns: DMatrix<f64>,
+    /// What is left of the sum of weight times `x r` [X].
+    pub moment: DVector<f64>,
+    /// What is left of the sum of weight times `r^2`.
+    pub square: f64,
+}
+
+impl Weighed {
+    /// No reading of a monitor with this many terms.
+    pub fn none(terms: usize) -> Self {
+        Self(DMatrix::zeros(terms + 1, terms + 1))
+    }
+
+    /// One reading: the coefficients of its terms, measured minus predicted, and one over its variance.
+    pub fn one(terms: &[f64], residual: f64, weight: f64) -> Self {
+        let all = DVector::from_iterator(terms.len() + 1, terms.iter().copied().chain([residual]));
+        Self(&all * all.transpose() * weight)
+    }
+
+    /// Sum of the weights.
+    pub fn weight(&self) -> f64 {
+        self.0[(0, 0)]
+    }
+}
+
+impl core::ops::AddAssign<&Self> for Weighed {
+    fn add_assign(&mut self, other: &Self) {
+        self.0 += &other.0;
+    }
+}
+
+impl Common {
+    /// No reading yet, of `size` wanted numbers; `baseline` is the precision to which the baseline is known to be 0, 0 for not at all. The
+    /// other terms are in units of their standard deviations.
+    pub fn new(size: usize, terms: usize, baseline: f64) -> Self {
+        let mut moments = DMatrix::zeros(terms + 1, terms + 1);
+        (1..terms).for_each(|k| moments[(k, k)] = 1.0);
+        moments[(0, 0)] = baseline;
+        Self { moments, slope: DMatrix::zeros(size, terms + 1) }
+    }
+
+    /// Add readings that share `x`.
+    pub fn add(&mut self, x: &DVectorView<f64>, readings: &Weighed) {
+        self.moments += &readings.0;
+        self.slope.ger(1.0, x, &readings.0.column(0), 1.0);
+    }
+
+    fn terms(&self) -> usize {
+        self.moments.ncols() - 1
+    }
+
+    /// Factor of `M`; none without readings of a baseline that nothing is known of.
+    fn factor(&self) -> Option<Cholesky<f64, Dyn>> {
+        let k = self.terms();
+        self.moments.view((0, 0), (k, k)).into_owned().cholesky()
+    }
+
+    /// Terms at their best for given `p`; none without readings.
+    pub fn best(&self, p: &DVector<f64>) -> Option<DVector<f64>> {
+        let k = self.terms();
+        let pull = self.moments.view((0, k), (k, 1)) - self.slope.columns(0, k).tr_mul(p);
+        self.factor().map(|factor| factor.solve(&pull).column(0).into_owned())
+    }
+
+    /// `M^-1 c` and `S M^-1 c`: what a reading with these terms has in common with those before; none without any.
+    pub fn seen_by(&self, terms: &[f64]) -> Option<(DVector<f64>, DVector<f64>)> {
+        let solved = self.factor()?.solve(&DVector::from_column_slice(terms));
+        let along = self.slope.columns(0, self.terms()) * &solved;
+        Some((solved, along))
+    }
+
+    /// Without the terms.
+    pub fn eliminated(&self) -> Eliminated {
+        let k = self.terms();
+        let (moment, square) = (self.slope.column(k).into_owned(), self.moments[(k, k)]);
+        let lower = self.factor().map(|factor| factor.unpack());
+        let solve = |lower: DMatrix<f64>| {
+            let pull = lower.solve_lower_triangular(&self.moments.view((0, k), (k, 1)))?;
+            Some((lower.solve_lower_triangular(&self.slope.columns(0, k).transpose())?.transpose(), pull))
+        };
+        let Some((columns, pull)) = lower.and_then(solve) else {
+            return Eliminated { columns: DMatrix::zeros(moment.len(), 0), moment, square };
+        };
+        Eliminated { moment: moment - &columns * &pull.column(0), square: square - pull.norm_squared(), columns }
+    }
+}
+
+/// Chi-square of some readings of a monitor by their noise [m], about a baseline and terms that they have in common, what these cost
+/// included: on average one for each reading, less one for the baseline. `terms`: in standard deviations, rows readings [m].
+pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, noise: f64) -> f64 {
+    let with_baseline = terms.transpose().insert_row(0, 1.0);
+    let mut common = Common::new(0, with_baseline.nrows(), 0.0);
+    for (residual, terms) in residual.iter().zip(with_baseline.column_iter()) {
+        common.add(&DVector::zeros(0).column(0), &Weighed::one(terms.as_slice(), *residual, noise.powi(-2)));
+    }
+    common.eliminated().square
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Against the covariance of the readings, `noise^2 + C C^T`, with a baseline that is known to 1e6 noises in place of one of which
+    /// nothing is known: 1e-12 of it is left, and the matrix of that condition loses four more digits.
+    #[test]
+    fn what_is_left_is_the_chi_square_of_correlated_readings() {
+        let (readings, size, noise) = (12, 4, 0.3);
+        let wave = |i: usize, k: f64| (k * i as f64 + 0.3 * k).sin();
+        let x = DMatrix::from_fn(size, readings, |p, i| wave(i, 1.1 + p as f64));
+        let terms = DMatrix::from_fn(3, readings, |k, i| if k == 0 { 1.0 } else { wave(i, 0.5 + 0.2 * k as f64) });
+        let residual = DVector::from_fn(readings, |i, _| 5.0 + wave(i, 2.3));
+        let mut common = Common::new(size, 3, 0.0);
+        for i in 0..readings {
+            let one = Weighed::one(terms.column(i).as_slice(), residual[i], f64::powi(noise, -2));
+            common.add(&x.column(i).as_view(), &one);
+        }
+        let Eliminated { columns, moment, square } = common.eliminated();
+        let mut wide = terms.clone();
+        wide.row_mut(0).scale_mut(1e6 * noise);
+        let covariance = DMatrix::identity(readings, readings) * noise.powi(2) + wide.tr_mul(&wide);
+        let precision = covariance.cholesky().unwrap().inverse();
+        let plain = &x * x.transpose() * noise.powi(-2) - &columns * columns.transpose();
+        assert!((plain - &x * &precision * x.transpose()).amax() < 1e-6);
+        assert!((moment - &x * &precision * &residual).amax() < 1e-6);
+        assert!((square - residual.dot(&(&precision * &residual))).abs() < 1e-6);
+        let following = terms.remove_row(0).transpose();
+        assert!((square - chi_square(&residual, &following, noise)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn terms_that_are_zero_change_nothing() {
+        let residual = DVector::from_vec(vec![1.0, 2.0, 4.0, -3.0]);
+        let about_mean = residual.add_scalar(-residual.mean()).norm_squared();
+        for terms in [0, 2] {
+            assert!((chi_square(&residual, &DMatrix::zeros(4, terms), 0.5) - 4.0 * about_mean).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn without_readings_nothing_is_left() {
+        let Eliminated { columns, moment, square } = Common::new(2, 3, 0.0).eliminated();
+        assert_eq!((columns.ncols(), moment, square), (0, DVector::zeros(2), 0.0));
+        assert_eq!(Common::new(2, 3, 0.0).best(&DVector::zeros(2)), None);
+    }
+}
