@@ -12,7 +12,8 @@
 //! of a matrix and a vector ([`Steer::steer`]).
 //!
 //! `r` is filtered: what the correctors have done since the last frame is added by the response, and `gain` of what is then left
-//! of the reading. A monitor that does not report keeps its last orbit, moved by the correctors.
+//! of the reading; a new orbit, at the beginning or once the baselines have moved, begins as the mean of its frames. A monitor
+//! that does not report keeps its last orbit, moved by the correctors.
 //!
 //! Source: S. Boyd and L. Vandenberghe, Convex Optimization (2004), sec. 6.4.1, stochastic robust approximation; K. J. Astrom and
 //! B. Wittenmark, Adaptive Control (1995), ch. 9, cautious control.
@@ -106,6 +107,8 @@ pub struct Steer<
 > {
     /// Time of the last frame [us].
     clock: Option<u64>,
+    /// Frames in the filtered orbit, counted up to a few.
+    heard: u16,
     /// Filtered orbit at the last read-backs, less the wanted one [m].
     residual: [f32; B],
     /// `1/noise^2` of each monitor [1/m^2]; 0 of one that is dead.
@@ -169,6 +172,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     /// Memory for one, all zero: it begins with the first frame.
     pub const BLANK: Self = Self {
         clock: None,
+        heard: 0,
         residual: [0.0; B],
         weight: [0.0; B],
         momentum: [0.0; B],
@@ -257,8 +261,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     ) {
         self.supplies.take_over(&frame.corrector);
         self.pattern = 0;
-        self.residual = [0.0; B];
-        self.believe(1.0, feedback, &frame.reading, |b| estimate.accepted.has(b));
+        (self.residual, self.heard) = ([0.0; B], 0);
+        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
     }
 
     /// Move the filtered orbit by what the correctors have done, then towards the readings.
@@ -276,17 +280,21 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
         let moved = response.orbit(response.kicks(done));
         self.residual.iter_mut().zip(moved).for_each(|(residual, moved)| *residual += moved);
-        self.believe(feedback.gain, feedback, &frame.reading, |b| estimate.accepted.has(b));
+        if estimate.remarks.baselines_moved {
+            self.heard = 0;
+        }
+        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
     }
 
-    /// Move the filtered orbit towards the readings that count.
+    /// Move the filtered orbit towards the readings that count: it is their mean as long as they are few.
     fn believe(
         &mut self,
-        gain: f32,
         feedback: &Feedback<B, C>,
         reading: &[PositionCode; B],
         counts: impl Fn(usize) -> bool,
     ) {
+        self.heard = self.heard.saturating_add(1);
+        let gain = feedback.gain.max(1.0 / f32::from(self.heard));
         let each = self.residual.iter_mut().zip(reading).zip(&feedback.orbit).enumerate();
         for (_, ((residual, reading), wanted)) in each.filter(|(b, _)| counts(*b)) {
             *residual += gain * (reading.value() - wanted - *residual);

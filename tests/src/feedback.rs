@@ -203,7 +203,12 @@ impl<'k> Loop<'k> {
         for (c, (current, setpoint)) in self.current.iter_mut().zip(self.steer.setpoints()).enumerate() {
             let ripple = RIPPLE * self.random[1].normal();
             if !self.scenario.sticks(self.frame, c) {
-                let wanted = if self.control == Control::Off { 0.0 } else { f64::from(setpoint.value()) };
+                let campaign = campaign_current(self.frame, c);
+                let wanted = match self.control {
+                    _ if self.frame < self.scenario.campaign => campaign,
+                    Control::Off => 0.0,
+                    _ => f64::from(setpoint.value()),
+                };
                 *current = wanted + ripple;
             }
         }
@@ -250,6 +255,7 @@ impl<'k> Loop<'k> {
     fn steer(&mut self, frame: &Frame, estimate: &Estimate) -> Option<Steered> {
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
         match self.control {
+            _ if self.frame < self.scenario.campaign => None,
             Control::Off => None,
             Control::Estimated => Some(self.core.steer(&model, &self.feedback, &mut self.steer, frame, estimate)),
             Control::Design => Some(self.steer.steer(&self.feedback, &self.known.of_design(), frame, estimate)),
@@ -259,6 +265,7 @@ impl<'k> Loop<'k> {
     fn prepare_steer(&mut self) {
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
         match self.control {
+            _ if self.frame < self.scenario.campaign => false,
             Control::Off => false,
             Control::Estimated => self.core.prepare_steer(&model, &self.feedback, &mut self.steer),
             Control::Design => {
@@ -275,5 +282,13 @@ impl Known {
             at: &self.design,
             kick_per_ampere: &self.setup.calibration.kick_per_ampere,
         }
+    }
+}
+
+/// Each corrector in turn at 22 A and -22 A, and none [A].
+fn campaign_current(frame: u32, corrector: usize) -> f64 {
+    match (frame as usize % (2 * CORRECTORS + 1)).checked_sub(1) {
+        Some(k) if k / 2 == corrector => 22.0 * if k % 2 == 0 { 1.0 } else { -1.0 },
+        _ => 0.0,
     }
 }

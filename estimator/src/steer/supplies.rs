@@ -86,9 +86,8 @@ impl<const C: usize> Supplies<C> {
         let mut limited = 0;
         for (c, (setpoint, by)) in self.setpoint.iter_mut().zip(by).enumerate() {
             let limit = limit.of(c);
-            let to = (setpoint.value() + by).min(limit).max(-limit);
-            *setpoint = CurrentCode::nearest(f64::from(to)).unwrap_or(*setpoint);
-            limited += u16::from(to.abs() >= limit);
+            *setpoint = moved(*setpoint, by.min(limit - setpoint.value()).max(-limit - setpoint.value()));
+            limited += u16::from(setpoint.steps().abs() >= moved(ZERO, limit).steps());
         }
         limited
     }

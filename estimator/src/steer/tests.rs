@@ -210,6 +210,8 @@ fn estimate(health: Health) -> Estimate<B, 1, 1> {
     }
 }
 
+/// Where kicks have several ways, a step that costs something: 1 % of what an orbit costs.
+const STEP: f32 = 1e-4;
 /// Steps of readings, 0.1 um, and of setpoints, 0.1 mA or 0.01 um here.
 const ROUNDING: f32 = 2e-7;
 
@@ -228,6 +230,7 @@ fn a_known_response_removes_the_orbit_in_one_step() {
 #[test]
 fn with_a_gain_the_orbit_decays_by_what_is_left_of_it() {
     let mut machine = Machine::new(diagonal(), Feedback { gain: 0.3, ..free() }, 0.0);
+    (0..4).for_each(|_| drop(machine.cycle()));
     machine.disturbance = [1e-3, -2e-3, 5e-4, 3e-3];
     for n in 1..10 {
         machine.cycle();
@@ -235,6 +238,16 @@ fn with_a_gain_the_orbit_decays_by_what_is_left_of_it() {
         let each = machine.orbit().into_iter().zip(machine.disturbance);
         assert!(each.into_iter().all(|(x, d)| (x - left * d).abs() < 4.0 * ROUNDING), "{n}: {:?}", machine.orbit());
     }
+}
+
+#[test]
+fn a_moved_orbit_is_the_mean_of_its_frames() {
+    let mut machine = Machine::new(diagonal(), Feedback { gain: 0.1, ..free() }, 0.0);
+    (0..20).for_each(|_| drop(machine.cycle()));
+    machine.disturbance = [1e-3; B];
+    machine.estimate.remarks.baselines_moved = true;
+    machine.cycle();
+    assert!(machine.orbit().iter().all(|x| x.abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
 /// `d = -R r/(R^2 + var R)` for one monitor and one corrector.
@@ -268,14 +281,13 @@ fn steps_and_kicks_have_their_cost() {
 #[test]
 fn the_orbit_of_another_momentum_is_not_corrected() {
     let table = Table { dispersion: [2.0, 3.0, 1.0, 0.0], ..diagonal() };
-    let mut machine = Machine::new(table, free(), 0.0);
+    let mut machine = Machine::new(table, Feedback { step_kick: STEP, ..free() }, 0.0);
     machine.disturbance = [2e-3, 3e-3, 1e-3, 0.0];
     machine.cycle();
     assert!(machine.amperes().iter().all(|a| a.abs() < 2e-3), "{:?}", machine.amperes());
     // across it, all is corrected
     machine.disturbance = [3e-3, -2e-3, 0.0, 1e-3];
-    machine.cycle();
-    machine.cycle();
+    (0..4).for_each(|_| drop(machine.cycle()));
     assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
@@ -285,19 +297,19 @@ fn limits_hold_and_the_others_make_up_for_them() {
     // the second monitor is seen by the first and the second corrector
     table.at[1] = [6.0, 10.0, 0.0, 0.0];
     table.at[0] = [0.0; C];
-    let mut machine = Machine::new(table, Feedback { limit: Each::same(7.0), ..free() }, 0.0);
+    let mut machine = Machine::new(table, Feedback { limit: Each::same(7.0), step_kick: STEP, ..free() }, 0.0);
     machine.disturbance = [0.0, 1e-3, 0.0, 0.0];
     let steered = machine.cycle();
-    // the least kicks would be -4.4 A and -7.4 A
+    // the least kicks would be -4.4 A and -7.4 A; of what is left, 0.3 mm, the other does 6^2/(6^2 + 1)
     assert_eq!((steered.limited, machine.amperes()[1]), (1, -7.0));
-    assert!((machine.amperes()[0] + 5.0).abs() < 1e-3, "{:?}", machine.amperes());
+    assert!((machine.amperes()[0] + 5.0 * 36.0 / 37.0).abs() < 2e-3, "{:?}", machine.amperes());
     machine.disturbance = [0.1; B];
     (0..20).for_each(|_| drop(machine.cycle()));
     assert!(machine.amperes().iter().all(|a| a.abs() <= 7.0), "{:?}", machine.amperes());
     // nothing has wound up: the first frame without the disturbance leaves the limits
     machine.disturbance = [0.0; B];
     machine.cycle();
-    assert!(machine.amperes()[2].abs() < 1e-2, "{:?}", machine.amperes());
+    assert!(machine.amperes()[2].abs() < 0.1, "{:?}", machine.amperes());
 }
 
 #[test]
@@ -341,7 +353,7 @@ fn a_lasting_mismatch_holds_until_it_is_over() {
     let mut machine = Machine::new(diagonal(), free(), 0.0);
     machine.estimate.nis = 14.0; // 3.5 times what four readings make
     let holds: std::vec::Vec<_> = (0..300).map(|_| machine.cycle().hold).collect();
-    assert_eq!((holds[0], holds[30], holds[60]), (None, None, Some(Hold::Mismatch)));
+    assert_eq!((holds[0], holds[60], holds[150]), (None, None, Some(Hold::Mismatch)));
     machine.estimate.nis = 4.0;
     assert!((0..100).map(|_| machine.cycle().hold).any(|hold| hold.is_none()));
 }
@@ -361,8 +373,8 @@ fn a_corrector_that_sticks_is_left_out_and_comes_back() {
     let mut table = diagonal();
     table.at[0] = [10.0, 10.0, 0.0, 0.0];
     table.at[1] = [0.0; C];
-    let mut machine = Machine::new(table, free(), 0.0);
-    let mut stick = |machine: &mut Machine, sticks: bool| {
+    let mut machine = Machine::new(table, Feedback { step_kick: STEP, ..free() }, 0.0);
+    let stick = |machine: &mut Machine, sticks: bool| {
         let before = machine.current[0];
         let steered = machine.cycle();
         if sticks {
@@ -374,16 +386,16 @@ fn a_corrector_that_sticks_is_left_out_and_comes_back() {
     let left_out: std::vec::Vec<_> = (0..8).map(|_| stick(&mut machine, true)).collect();
     assert_eq!((left_out[3], left_out[7]), (0, 1));
     assert!(!machine.state.follows(0) && machine.state.follows(1));
-    assert!(machine.orbit()[0].abs() < 1e-5, "{:?}", machine.orbit());
+    assert!(machine.orbit()[0].abs() < 2e-5, "{:?}", machine.orbit());
     let mended: std::vec::Vec<_> = (0..20).map(|_| stick(&mut machine, false)).collect();
     assert_eq!((mended[0], mended[19]), (1, 0));
-    machine.cycle();
     assert!(machine.orbit()[0].abs() < 4.0 * ROUNDING, "{:?}", machine.orbit());
 }
 
 #[test]
 fn a_monitor_that_does_not_report_keeps_its_orbit() {
     let mut machine = Machine::new(diagonal(), Feedback { gain: 0.5, ..free() }, 0.0);
+    machine.cycle();
     machine.disturbance = [1e-3; B];
     machine.cycle();
     machine.estimate.accepted = Mask::from_words(&[14]);

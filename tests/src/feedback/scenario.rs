@@ -34,6 +34,8 @@ pub struct Scenario {
     pub seed: u64,
     /// How long it is.
     pub frames: u32,
+    /// Frames of a campaign before the feedback is switched on: each corrector in turn, up and down.
+    pub campaign: u32,
     /// Random walk of each `ln var` a frame.
     pub walk: f64,
     /// Random walk of each quadrupole's position [m] a frame.
@@ -50,7 +52,7 @@ const MOVES: u32 = 4;
 impl Scenario {
     /// Nothing happens but drift.
     pub fn quiet(seed: u64, frames: u32) -> Self {
-        Self { seed, frames, walk: 1e-5, ground: 2e-7, counts: true, events: Vec::new() }
+        Self { seed, frames, campaign: 98, walk: 1e-5, ground: 2e-7, counts: true, events: Vec::new() }
     }
 
     fn during(&self, frame: u32) -> impl Iterator<Item = &Event> {
