@@ -6,7 +6,7 @@ RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench peers exports validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil loop train bench peers exports validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -41,6 +41,9 @@ firmware: toolchain ## the image for the chip; MACHINE=FILE makes it for another
 
 sil: setup ## recordings through the image in the emulator, beside the core in process; numbers in target/sil.json
 	cargo run --locked --release -p system-tests --bin sil
+
+loop: setup ## the loop closed in software: orbit with estimated vars, with the design's, without; the same frames through the emulator
+	cargo run --locked --release -p system-tests --bin loop
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check

@@ -97,14 +97,7 @@ pub struct Steered {
 /// The state of a feedback: `B` monitors, `C` correctors, `CX` and `CY` of them horizontal and vertical; `TX` and `TY` entries
 /// make triangles of these.
 #[derive(Debug, Clone)]
-pub struct Steer<
-    const B: usize,
-    const C: usize,
-    const CX: usize,
-    const CY: usize,
-    const TX: usize,
-    const TY: usize,
-> {
+pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX: usize, const TY: usize> {
     /// Time of the last frame [us].
     clock: Option<u64>,
     /// Frames in the filtered orbit, counted up to a few.
@@ -287,12 +280,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     }
 
     /// Move the filtered orbit towards the readings that count: it is their mean as long as they are few.
-    fn believe(
-        &mut self,
-        feedback: &Feedback<B, C>,
-        reading: &[PositionCode; B],
-        counts: impl Fn(usize) -> bool,
-    ) {
+    fn believe(&mut self, feedback: &Feedback<B, C>, reading: &[PositionCode; B], counts: impl Fn(usize) -> bool) {
         self.heard = self.heard.saturating_add(1);
         let gain = feedback.gain.max(1.0 / f32::from(self.heard));
         let each = self.residual.iter_mut().zip(reading).zip(&feedback.orbit).enumerate();
@@ -328,13 +316,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// `A` of the plane whose correctors begin at `first`; those that are left out have a diagonal only.
     #[inline(never)]
-    fn matrix<
-        G: Surrogate<B, C, F, N>,
-        const F: usize,
-        const N: usize,
-        const CP: usize,
-        const TP: usize,
-    >(
+    fn matrix<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const CP: usize, const TP: usize>(
         &self,
         response: &Response<'_, G, B, C, F, N>,
         first: usize,
@@ -375,7 +357,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         let mut orbit = response.orbit(response.kicks(self.supplies.under_way(feedback.close)));
         orbit.iter_mut().zip(&self.residual).for_each(|(orbit, residual)| *orbit += residual);
         let mut pull = response.pull(&self.weighted(&orbit));
-        let (stiffness, total) = (stiffness(feedback), response.kicks(self.supplies.setpoints().map(CurrentCode::value)));
+        let (stiffness, total) =
+            (stiffness(feedback), response.kicks(self.supplies.setpoints().map(CurrentCode::value)));
         for (c, (pull, total)) in pull.iter_mut().zip(total).enumerate() {
             *pull = if self.supplies.follows(c) { *pull + stiffness * total } else { 0.0 };
         }

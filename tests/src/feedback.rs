@@ -1,24 +1,21 @@
 //! The loop closed in software: a machine, its frames as bytes, the core, the setpoints, the machine again.
 
+mod chip;
+mod known;
 mod plant;
 mod scenario;
 
 use core::error::Error;
 
-use estimator::booster::{
-    self, CORRECTORS, Estimate, Estimator, Feedback, Frame, Green, MONITORS, PARAMS, SUPPLIES, Setup, Steer,
-};
-use estimator::{
-    CurrentCode, Each, Hold, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Response, RfCode, Steered,
-    Surrogate, Walk,
-};
-use inference::stream;
-use inference::{Recording, simulate};
+use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback, Frame, MONITORS, PARAMS, Steer};
+use estimator::{Each, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, RfCode, Steered};
+use inference::simulate;
 use twin::Ring;
 
-use crate::machine::{ALL, LAYOUT, Random, amperes, nees, wire_of};
-use crate::repository;
+use crate::machine::{ALL, Random, amperes, nees, wire_of};
 
+pub use chip::on_chip;
+pub use known::Known;
 pub use plant::{Orbit, Plant};
 pub use scenario::{Event, Scenario};
 
@@ -45,62 +42,28 @@ const JITTER: f64 = 2e-5;
 /// What is kept of a frame.
 #[derive(Debug, Clone, Copy)]
 pub struct Sample {
-    /// Rms over all monitors of the true orbit on momentum, less the wanted one [m].
+    /// Rms over all monitors of the true orbit less the wanted one and less any momentum's [m].
     pub rms: f64,
-    /// What the feedback said.
+    /// What the feedback said; nothing while there is none.
     pub steered: Option<Steered>,
-    /// NIS of the frame.
-    pub nis: f32,
     /// Normalised estimation error squared over the number of params.
     pub nees: f64,
     /// Mean standard deviation of the vars.
     pub sigma: f64,
     /// Largest current of a corrector [A].
     pub largest: f64,
-    /// The frame was put aside.
-    pub aside: bool,
 }
 
-/// The tables, the setup and the linearised design of a Booster.
-#[derive(Debug, Clone)]
-pub struct Known {
-    /// Tables.
-    pub surrogate: Box<Green>,
-    /// Priors, noise, calibration.
-    pub setup: Setup,
-    design: Box<<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised>,
-}
-
-impl Known {
-    /// From the header of a recording.
-    ///
-    /// # Errors
-    /// If it cannot be read.
-    pub fn read(walk: Walk) -> Result<Self, Box<dyn Error>> {
-        let ring = Ring::booster();
-        let recording = Recording::read(&repository("recordings/paper-vars"), &ring)?;
-        let core = stream::estimator(&ring, &recording, walk)?;
-        let mut surrogate = Box::new(Green::BLANK);
-        core.tables.fill(&mut *surrogate).map_err(|_| "tables of the Booster")?;
-        let mut design = Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED);
-        Surrogate::<MONITORS, CORRECTORS, SUPPLIES, PARAMS>::linearise(
-            &*surrogate,
-            &[0.0; PARAMS],
-            &[0.0; SUPPLIES],
-            &mut design,
-        )
-        .map_err(|_| "the design has no stable ring")?;
-        Ok(Self { surrogate, setup: core.setup.in_room(&LAYOUT), design })
-    }
-}
+/// The largest gain that is recommended; see `docs/feedback.md`.
+pub const GAIN: f32 = 0.1;
 
 /// What is recommended for the Booster; the wanted orbit is zero.
 pub fn recommended() -> Feedback {
     Feedback {
         orbit: [0.0; MONITORS],
-        gain: 0.4,
+        gain: GAIN,
         step_kick: 2e-5,
-        total_kick: 2e-4,
+        total_kick: 1e-3,
         limit: Each::same(20.0),
         rate: 2.0,
         probe: 1.0,
@@ -124,6 +87,8 @@ pub struct Loop<'k> {
     random: [Random; 2],
     frame: u32,
     sequence: u32,
+    /// The last frame as bytes.
+    pub wire: Vec<u8>,
     /// What the supplies give [A].
     current: [f64; CORRECTORS],
 }
@@ -158,6 +123,7 @@ impl<'k> Loop<'k> {
             random,
             frame: 0,
             sequence: 0,
+            wire: Vec::new(),
             current: [0.0; CORRECTORS],
         })
     }
@@ -173,7 +139,8 @@ impl<'k> Loop<'k> {
         self.supply();
         let (frame, rms) = self.read()?;
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
-        let estimate = self.core.ingest(&model, &mut wire_of(&frame))?;
+        self.wire = wire_of(&frame);
+        let estimate = self.core.ingest(&model, &mut self.wire.clone())?;
         let steered = self.steer(&frame, &estimate);
         self.core.prepare(&model);
         self.prepare_steer();
@@ -182,11 +149,9 @@ impl<'k> Loop<'k> {
         Ok(Sample {
             rms,
             steered,
-            nis: estimate.nis,
             nees: nees(&error, |i, j| self.core.covariance(i, j)) / PARAMS as f64,
             sigma: estimate.sigma.iter().map(|s| f64::from(*s)).sum::<f64>() / PARAMS as f64,
             largest: self.current.iter().fold(0.0, |m, c| c.abs().max(m)),
-            aside: estimate.remarks.put_aside,
         })
     }
 
@@ -249,7 +214,7 @@ impl<'k> Loop<'k> {
             let particles = if is_lost { 0.0 } else { 1e12 * (1.0 + 0.03 * disturbance.normal()) };
             frame.intensity = IntensityCode::nearest(particles);
         }
-        Ok((frame, (on_momentum.norm_squared() / MONITORS as f64).sqrt()))
+        Ok((frame, residual(&on_momentum, &(orbit - on_momentum))))
     }
 
     fn steer(&mut self, frame: &Frame, estimate: &Estimate) -> Option<Steered> {
@@ -268,21 +233,15 @@ impl<'k> Loop<'k> {
             _ if self.frame < self.scenario.campaign => false,
             Control::Off => false,
             Control::Estimated => self.core.prepare_steer(&model, &self.feedback, &mut self.steer),
-            Control::Design => {
-                self.steer.prepare(&self.feedback, &self.known.of_design(), |_| [0.0; PARAMS])
-            }
+            Control::Design => self.steer.prepare(&self.feedback, &self.known.of_design(), |_| [0.0; PARAMS]),
         };
     }
 }
 
-impl Known {
-    fn of_design(&self) -> Response<'_, Green, MONITORS, CORRECTORS, SUPPLIES, PARAMS> {
-        Response {
-            surrogate: &self.surrogate,
-            at: &self.design,
-            kick_per_ampere: &self.setup.calibration.kick_per_ampere,
-        }
-    }
+/// Rms of an orbit less its part of the shape of another, that of the momentum [m]: what correctors are to make up for.
+fn residual(orbit: &Orbit, momentum: &Orbit) -> f64 {
+    let share = orbit.dot(momentum) / momentum.norm_squared();
+    ((orbit - share * momentum).norm_squared() / MONITORS as f64).sqrt()
 }
 
 /// Each corrector in turn at 22 A and -22 A, and none [A].
@@ -291,4 +250,14 @@ fn campaign_current(frame: u32, corrector: usize) -> f64 {
         Some(k) if k / 2 == corrector => 22.0 * if k % 2 == 0 { 1.0 } else { -1.0 },
         _ => 0.0,
     }
+}
+
+/// Rms over a stretch of frames [m].
+pub fn rms(samples: &[Sample]) -> f64 {
+    (samples.iter().map(|sample| sample.rms * sample.rms).sum::<f64>() / samples.len() as f64).sqrt()
+}
+
+/// Frames of a stretch in which the setpoints stayed.
+pub fn held(samples: &[Sample]) -> usize {
+    samples.iter().filter(|sample| sample.steered.is_some_and(|steered| steered.hold.is_some())).count()
 }

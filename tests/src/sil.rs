@@ -89,7 +89,7 @@ pub fn compare(
 }
 
 /// True if the core in process gives the same for a frame, bit for bit: the whole estimate, and the covariance.
-fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
+pub(crate) fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
     core.prepare();
     let Ok(estimate) = core.ingest(&mut wire) else { return false };
     let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));

@@ -46,13 +46,7 @@ impl<const C: usize, const T: usize> Gain<C, T> {
     /// Where the best kicks are beyond a corrector's room, it is held at its edge and the others make up for it:
     /// `d -= A^-1 e_c (d_c - edge)/(A^-1)_cc` is the minimum on condition that `d_c = edge`.
     #[inline(never)]
-    pub fn step(
-        &self,
-        pull: &[f32],
-        room: impl Fn(usize) -> [f32; 2],
-        rate: impl Fn(usize) -> f32,
-        step: &mut [f32],
-    ) {
+    pub fn step(&self, pull: &[f32], room: impl Fn(usize) -> [f32; 2], rate: impl Fn(usize) -> f32, step: &mut [f32]) {
         let mut best = [0.0; C];
         best.iter_mut().zip(pull).for_each(|(to, pull)| *to = -pull);
         best = self.inverse.multiply(&best);

@@ -19,8 +19,7 @@ pub struct Supplies<const C: usize> {
 
 impl<const C: usize> Supplies<C> {
     /// Memory for one, all zero.
-    pub const BLANK: Self =
-        Self { setpoint: [ZERO; C], read_back: [ZERO; C], missed: [0; C] };
+    pub const BLANK: Self = Self { setpoint: [ZERO; C], read_back: [ZERO; C], missed: [0; C] };
 
     /// Setpoints are where the supplies are; all of them count.
     pub fn take_over(&mut self, read_back: &[CurrentCode; C]) {
