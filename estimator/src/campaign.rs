@@ -9,59 +9,56 @@ use heapless::Vec;
 
 use crate::drive::Drive;
 use crate::monitor::Gate;
-use crate::wire::{CurrentCode, Frame, PositionCode, RfCode};
+use crate::wire::{PositionCode, RfCode};
 
-/// The setting that a frame repeats: at most one corrector powered, or the RF moved.
+/// The setting that a frame repeats: at most one corrector moved from a reference drive, or the RF moved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
-    /// The powered corrector.
+    /// From which reference drive; 0 is none, all correctors at 0 A.
+    pub reference: u16,
+    /// The corrector that is moved from it.
     pub corrector: Option<u16>,
-    /// Its current.
-    pub current: CurrentCode,
+    /// By how much, in steps of a mean kick.
+    pub kick: i32,
+    /// By how much other kicks of it make the same orbit within the noise, in these steps.
+    pub tolerance: i32,
     /// RF offset, in steps.
     pub rf_offset: i32,
+    /// Time in the cycle [us].
+    pub cycle_time: u32,
 }
 
-/// Currents this close belong to the same setting, as a share of the current: 1/16.
-const SAME_CURRENT: i32 = 16;
+/// Kicks this close belong to the same setting, as a share of the kick: 1/16.
+const SAME_KICK: i32 = 16;
 /// RF offsets this close belong to the same setting: 1e-6.
 const SAME_OFFSET: i32 = 1_000;
+/// Times in the cycle this close belong to the same setting [us].
+const SAME_TIME: u32 = 1_000;
 
 impl Setting {
-    /// The setting of a frame; none if several correctors, or a corrector and the RF, are moved at once, as by a feedback.
-    pub fn of<const B: usize, const C: usize, const F: usize, const W: usize>(
-        frame: &Frame<B, C, F, W>,
-        powered: f32,
-    ) -> Option<Self> {
-        let mut setting = Self { corrector: None, current: CurrentCode::default(), rf_offset: frame.rf_offset.steps() };
-        for (c, &current) in (0..).zip(&frame.corrector) {
-            if current.value().abs() > powered {
-                if setting.corrector.is_some() || is_moved(frame.rf_offset) {
-                    return None;
-                }
-                setting = Self { corrector: Some(c), current, ..setting };
-            }
-        }
-        Some(setting)
+    /// A frame in which no corrector is moved.
+    pub fn at_rest(reference: u16, rf_offset: RfCode, cycle_time: u32) -> Self {
+        Self { reference, corrector: None, kick: 0, tolerance: 0, rf_offset: rf_offset.steps(), cycle_time }
     }
 
-    /// The part of a frame's kicks that is not the setting's.
-    pub fn idle<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
-        let mut kick = drive.kick;
-        self.corrector.and_then(|c| kick.get_mut(usize::from(c))).into_iter().for_each(|kick| *kick = 0.0);
-        Drive { kick, strength: [0.0; F], rf_offset: 0.0 }
+    /// The same with one corrector moved by a kick [rad], of which others by `tolerance` cannot be told.
+    pub fn with(self, corrector: u16, kick: f32, tolerance: f32) -> Self {
+        Self { corrector: Some(corrector), kick: kick_steps(kick), tolerance: kick_steps(tolerance), ..self }
     }
 
     /// True if two frames repeat one setting.
     pub fn repeats(&self, other: &Self) -> bool {
-        let (here, there) = (self.current.steps(), other.current.steps());
-        self.corrector == other.corrector
-            && (here - there).abs() <= here.abs().max(there.abs()) / SAME_CURRENT
-            && self.same_offset(other)
+        let apart = self.kick.saturating_sub(other.kick).saturating_abs();
+        let share = self.kick.saturating_abs().max(other.kick.saturating_abs()) / SAME_KICK;
+        self.reference == other.reference
+            && self.corrector == other.corrector
+            && apart <= share.max(other.tolerance)
+            && self.same_but_for_the_correctors(other)
     }
 
-    fn same_offset(&self, other: &Self) -> bool {
-        (self.rf_offset - other.rf_offset).abs() <= SAME_OFFSET
+    fn same_but_for_the_correctors(&self, other: &Self) -> bool {
+        self.rf_offset.saturating_sub(other.rf_offset).saturating_abs() <= SAME_OFFSET
+            && self.cycle_time.abs_diff(other.cycle_time) <= SAME_TIME
     }
 }
 
@@ -76,6 +73,11 @@ const FRACTION: u32 = 10;
 const READING: f32 = 1024.0 / PositionCode::METRES_PER_LSB;
 /// Steps of a mean kick in a radian; ±21 mrad fit.
 const KICK: f32 = 1e11;
+/// A kick [rad] in its steps.
+fn kick_steps(kick: f32) -> i32 {
+    (kick * KICK) as i32
+}
+
 /// Steps of a mean in a unit of strength or of RF offset; ±2 fit.
 const RATIO: f32 = 1e9;
 
@@ -163,21 +165,31 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
         }
     }
 
-    /// True if two settings differ by no more than the current of the powered corrector.
+    /// True if two settings are at shares of one drive: without a reference drive, and of the same corrector.
     pub fn is_kind_of(&self, other: &Self) -> bool {
-        self.setting.corrector == other.setting.corrector && self.setting.same_offset(&other.setting)
+        let (one, two) = (&self.setting, &other.setting);
+        one == two
+            || ([one.reference, two.reference] == [0; 2]
+                && one.corrector == two.corrector
+                && one.same_but_for_the_correctors(two))
     }
 
-    /// The drive without the idle correctors.
+    /// The drive without the idle correctors, those of a reference drive apart.
     pub fn alone(&self) -> Drive<C, F> {
         let mut drive = self.drive();
+        if self.setting.reference != 0 {
+            return drive;
+        }
         let powered = self.setting.corrector.map(usize::from);
         drive.kick.iter_mut().enumerate().filter(|(c, _)| Some(*c) != powered).for_each(|(_, kick)| *kick = 0.0);
         drive
     }
 
-    /// Kick of the powered corrector over that at another setting of the kind; 1 where none is powered.
+    /// Kick of the moved corrector over that at another setting of the kind; 1 where none is moved, or from a reference drive.
     pub fn share(&self, of: &Self) -> f32 {
+        if self.setting.reference != 0 {
+            return 1.0;
+        }
         let kick = |cell: &Self| cell.kick.get(usize::from(cell.setting.corrector?)).copied();
         match (kick(self), kick(of)) {
             (Some(kick), Some(of)) if of != 0 => kick as f32 / of as f32,
@@ -189,7 +201,7 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     pub fn add_drive(&mut self, drive: &Drive<C, F>) {
         self.frames = self.frames.saturating_add(1);
         let n = self.frames;
-        self.kick.iter_mut().zip(&drive.kick).for_each(|(mean, k)| move_mean(mean, (k * KICK) as i32, n));
+        self.kick.iter_mut().zip(&drive.kick).for_each(|(mean, k)| move_mean(mean, kick_steps(*k), n));
         self.strength.iter_mut().zip(&drive.strength).for_each(|(mean, s)| move_mean(mean, ratio_steps(*s), n));
         move_mean(&mut self.rf_offset, ratio_steps(drive.rf_offset), n);
     }
@@ -303,6 +315,17 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
         self.cells.get_mut(usize::from(index))
     }
 
+    /// Take out a setting of another reference drive than this, if there is no room for a new one.
+    pub fn retire(&mut self, reference: u16) -> Option<Cell<B, C, F>> {
+        let former = self.cells.iter().position(|cell| cell.setting.reference != reference);
+        let at = former.filter(|_| self.cells.is_full())?;
+        let last = self.cells.pop()?;
+        Some(match self.cells.get_mut(at) {
+            Some(cell) => core::mem::replace(cell, last),
+            None => last,
+        })
+    }
+
     /// Index of a setting, which is stored if it is new; none if there is no room.
     pub fn find(&mut self, setting: &Setting) -> Option<u16> {
         let known = self.cells.iter().position(|cell| cell.setting.repeats(setting));
@@ -343,37 +366,43 @@ impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B,
 mod tests {
     use super::*;
 
-    fn setting(corrector: Option<u16>, amperes: f64, rf_offset: i32) -> Setting {
-        Setting { corrector, current: CurrentCode::nearest(amperes).unwrap(), rf_offset }
+    const REST: Setting =
+        Setting { reference: 0, corrector: None, kick: 0, tolerance: 0, rf_offset: 0, cycle_time: 92_000 };
+
+    fn kicked(corrector: u16, kick: f32) -> Setting {
+        REST.with(corrector, kick, 2e-6)
     }
 
     #[test]
-    fn settings_are_told_apart_by_corrector_sign_amplitude_and_rf() {
-        let up = setting(Some(3), 22.0, 0);
-        assert!(up.repeats(&setting(Some(3), 21.93, 0)));
+    fn settings_are_told_apart_by_reference_corrector_kick_rf_and_time() {
+        let up = kicked(3, 2e-4);
+        assert!(up.repeats(&kicked(3, 1.9e-4)) && kicked(3, 3e-6).repeats(&kicked(3, 1.5e-6)));
         for other in [
-            setting(Some(4), 22.0, 0),
-            setting(Some(3), -22.0, 0),
-            setting(Some(3), 11.0, 0),
-            setting(None, 0.0, 0),
-            setting(Some(3), 22.0, 200_000),
+            kicked(4, 2e-4),
+            kicked(3, -2e-4),
+            kicked(3, 1e-4),
+            REST,
+            Setting { reference: 1, ..up },
+            Setting { rf_offset: 200_000, ..up },
+            Setting { cycle_time: 60_000, ..up },
         ] {
             assert!(!up.repeats(&other), "{other:?}");
         }
+        assert!(!kicked(3, 3e-6).repeats(&kicked(3, -1e-6)));
     }
 
     #[test]
     fn a_full_table_says_so() {
         let mut campaign = Campaign::<1, 1, 1, 2>::BLANK;
-        assert_eq!(campaign.find(&setting(None, 0.0, 0)), Some(0));
-        assert_eq!(campaign.find(&setting(Some(0), 5.0, 0)), Some(1));
-        assert_eq!(campaign.find(&setting(Some(0), -5.0, 0)), None);
-        assert_eq!(campaign.find(&setting(Some(0), 5.01, 0)), Some(1));
+        assert_eq!(campaign.find(&REST), Some(0));
+        assert_eq!(campaign.find(&kicked(0, 5e-5)), Some(1));
+        assert_eq!(campaign.find(&kicked(0, -5e-5)), None);
+        assert_eq!(campaign.find(&kicked(0, 5.01e-5)), Some(1));
     }
 
     #[test]
     fn means_and_scatter_are_those_of_the_readings() {
-        let mut cell = Cell::<1, 1, 1>::open(setting(None, 0.0, 0));
+        let mut cell = Cell::<1, 1, 1>::open(REST);
         let codes = [1000, -2000, 4000, 500, 900];
         let mut scatter = 0.0;
         for code in codes {
@@ -414,7 +443,7 @@ mod tests {
             ],
         ];
         for story in stories {
-            let mut cell = Cell::<1, 1, 1>::open(setting(None, 0.0, 0));
+            let mut cell = Cell::<1, 1, 1>::open(REST);
             for &(code, expected, verdict) in story {
                 let judged = cell.judge(0, code, 1.5e-4, Gate::default(), expected);
                 assert_eq!(judged, verdict, "{code} in {story:?}");

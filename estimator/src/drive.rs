@@ -50,8 +50,6 @@ pub struct Calibration<const C: usize, const F: usize> {
     pub dipole: Option<f32>,
     /// The supplies of quadrupoles.
     pub supplies: Vec<SupplyCalibration, F>,
-    /// Read-back above which a corrector counts as powered [A]; read-backs scatter by 20 mA.
-    pub powered: f32,
 }
 
 /// What acts on the beam in one frame, or on average over the frames of one setting.
@@ -107,7 +105,6 @@ impl<const C: usize, const F: usize> Calibration<C, F> {
     pub fn is_sound(&self) -> bool {
         let is_positive = |v: f32| v.is_finite() && v > 0.0;
         self.kick_per_ampere.is_positive()
-            && is_positive(self.powered)
             && self.dipole.is_none_or(is_positive)
             && self.supplies.is_full()
             && self.supplies.iter().all(SupplyCalibration::is_sound)

@@ -56,6 +56,9 @@ pub struct Remarks {
     pub baselines_moved: bool,
     /// The information was not positive, and was made so, or given up for the prior.
     pub unsolved: bool,
+    /// Slices of work done since the estimate before ([`crate::Estimator::prepare`]): with as many before each frame, another
+    /// core arrives at the same bits.
+    pub slices: u32,
 }
 
 /// The vars and the state of the monitors after a frame.

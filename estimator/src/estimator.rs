@@ -1,10 +1,14 @@
 //! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate. What decides on readings stands
-//! in `screen.rs`, what linearises anew in `laplace.rs`, both below this file.
+//! in `screen.rs`, what linearises anew between frames in `anew.rs` and
+//! `pooling.rs`, all below this file.
 //!
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
+mod anew;
 mod laplace;
+mod pooling;
 mod posterior;
+mod reference;
 mod screen;
 mod sequence;
 mod steering;
@@ -28,9 +32,12 @@ use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
 use crate::wire::{Frame, FrameError, PositionCode};
 
+pub use anew::Prepared;
+use anew::{Anew, Work};
 pub use laplace::FitQuality;
 use posterior::Posterior;
 pub use posterior::Walk;
+use reference::Reference;
 use screen::Screened;
 use sequence::Sequence;
 use whole::{Whole, WholeFrames};
@@ -84,8 +91,8 @@ pub struct Model<'a, G, const B: usize, const C: usize, const F: usize> {
 }
 
 /// The posterior that frames have made of a model: `B` monitors, `C` correctors, `F` supplies, `N` params, `S` settings; `K`
-/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `W` words have a bit for each
-/// monitor or param.
+/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `U` one of `K`, `W` words have a bit
+/// for each monitor or param.
 #[derive(Debug, Clone)]
 pub struct Estimator<
     G: Surrogate<B, C, F, N>,
@@ -96,20 +103,24 @@ pub struct Estimator<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
 > {
     started: bool,
     sequence: Sequence,
-    /// All is done that can be before the next frame: linearised if due, and the params walked until then.
-    prepared: bool,
+    /// No frame has come since the last look at whether to linearise anew.
+    looked: bool,
+    /// Slices of work between frames since the last estimate.
+    slices: u32,
     tangent: Tangent<G::Linearised, F>,
+    anew: Anew<G::Linearised, G::Progress, B, C, F, N, S, K, T, W>,
     predicted: Predicted<B, F, N>,
     monitors: [Monitor; B],
     /// How their baselines follow the supplies.
     following: [Following<F>; B],
     tunes: [TuneMeter<F>; 2],
     past: Past<B, C, F, N, S, K, T, W>,
-    posterior: Posterior<K, N, T, W>,
+    posterior: Posterior<K, N, T, U, W>,
     whole: WholeFrames<B>,
     /// Sum of NIS, and the number of readings in it.
     nis: (f64, u64),
@@ -125,6 +136,27 @@ struct Tangent<L, const F: usize> {
     ripple: [[f32; F]; 2],
     /// Linearised since the last estimate.
     is_new: bool,
+}
+
+impl<L, const F: usize> Tangent<L, F> {
+    /// Measured minus predicted tune at `ln` of the supplies' factors.
+    fn tune_innovation<G: Surrogate<B, C, F, N, Linearised = L>, const B: usize, const C: usize, const N: usize>(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        plane: usize,
+        tune: f32,
+        strength: &[f32; F],
+    ) -> f32 {
+        let (predicted, _) = model.surrogate.tune(&self.linearised, plane, &less(strength, &self.supplies));
+        wrapped(tune - predicted)
+    }
+}
+
+impl<L, const F: usize> Tangent<L, F> {
+    /// Memory for one.
+    const fn blank(unlinearised: L) -> Self {
+        Self { linearised: unlinearised, supplies: [0.0; F], ripple: [[0.0; F]; 2], is_new: false }
+    }
 }
 
 /// What the surrogate makes of the frame at hand.
@@ -153,6 +185,7 @@ struct Past<
     const W: usize,
 > {
     campaign: Campaign<B, C, F, S>,
+    reference: Reference<C>,
     /// The last frames that belong to no setting.
     recent: Deque<Loose<B, C, F, W>, RECENT>,
     /// The prior, and older ones: they cannot be linearised anew.
@@ -214,9 +247,6 @@ struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
     accepted: Mask<W>,
 }
 
-/// Mean square orbit of idle correctors over the noise's below which they count as idle: the scatter of read-backs makes 0.004.
-const IDLE: f32 = 0.1;
-
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f32 = 0.02;
 
@@ -256,8 +286,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     const FITS: () = assert!(K == B + 2, "a channel for each monitor and for each tune");
 
@@ -265,8 +296,10 @@ impl<
     pub const BLANK: Self = Self {
         started: false,
         sequence: Sequence::EMPTY,
-        prepared: false,
-        tangent: Tangent { linearised: G::UNLINEARISED, supplies: [0.0; F], ripple: [[0.0; F]; 2], is_new: false },
+        looked: false,
+        slices: 0,
+        tangent: Tangent::blank(G::UNLINEARISED),
+        anew: Anew::blank(G::UNLINEARISED),
         predicted: Predicted {
             prediction: Prediction::BLANK,
             at_mean_drive: [0.0; B],
@@ -277,7 +310,13 @@ impl<
         monitors: [const { Monitor::BLANK }; B],
         following: [Following::NONE; B],
         tunes: [const { TuneMeter::BLANK }; 2],
-        past: Past { campaign: Campaign::BLANK, recent: Deque::new(), loose: Gaussian::BLANK, stale: false },
+        past: Past {
+            campaign: Campaign::BLANK,
+            reference: Reference::ZERO,
+            recent: Deque::new(),
+            loose: Gaussian::BLANK,
+            stale: false,
+        },
         posterior: Posterior::BLANK,
         whole: WholeFrames::NONE,
         nis: (0.0, 0),
@@ -290,9 +329,9 @@ impl<
     pub fn restart(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         let () = Self::FITS;
         self.started = false;
-        model.surrogate.linearise(&[0.0; N], &[0.0; F], &mut self.tangent.linearised)?;
+        self.linearise_design(model)?;
         (self.tangent.supplies, self.tangent.is_new, self.predicted.rf_offset) = ([0.0; F], false, 0.0);
-        (self.sequence, self.whole, self.prepared) = (Sequence::EMPTY, WholeFrames::NONE, true);
+        (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
         self.posterior.clear();
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
@@ -301,6 +340,7 @@ impl<
         self.following = [Following::NONE; B];
         self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.past.campaign.clear();
+        self.past.reference = Reference::ZERO;
         self.past.recent.clear();
         let calibration = model.setup.tune_calibration.unwrap_or(1.0);
         self.past
@@ -335,6 +375,9 @@ impl<
         }
         let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
         let screened = self.screen(model, &frame, &drive, cell, whole, &expected.within);
+        if let Some(cell) = cell {
+            self.note_late(model, &frame, &drive, cell, &screened);
+        }
         let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
@@ -342,19 +385,29 @@ impl<
         Ok(self.estimate(model, &frame, cell, &screened, nis, whole))
     }
 
-    /// What can be done between frames, so that the next one is answered at once: linearise anew if that is due (true if
-    /// it was done), and let the params walk for one cycle. To be called after each frame; a second call does nothing.
+    /// One slice of what can be done between frames, so that the next one is answered at once: let the params walk for one
+    /// cycle, and linearise anew if that is due. To be called until there is [`Prepared::Nothing`] to do, or a frame has come:
+    /// that is answered with the old linearisation, and counts in the new one.
     #[inline(never)]
-    pub fn prepare(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
-        if !self.started || self.prepared {
-            return false;
+    pub fn prepare(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
+        if !self.started {
+            return Prepared::Nothing;
         }
-        self.prepared = true;
-        let linearised = self.is_due() && self.linearise_anew(model);
-        self.tangent.is_new |= linearised;
         let seconds = self.sequence.expect_next();
-        self.walk(model, seconds);
-        linearised
+        let walked = self.walk(model, seconds);
+        if !walked && !self.anew.under_way {
+            if core::mem::replace(&mut self.looked, true) {
+                return Prepared::Nothing;
+            }
+            self.seek_reference(model);
+            self.retire(model);
+            if !self.is_due() {
+                return Prepared::Nothing;
+            }
+            self.begin();
+        }
+        self.slices = self.slices.saturating_add(1);
+        if walked { Prepared::Slice } else { self.slice(model) }
     }
 
     /// Take the next frame as new, whatever its number: its sender counts anew without a new epoch.
@@ -362,16 +415,23 @@ impl<
         self.sequence.forget();
     }
 
-    /// Go over to another model of the same machine: all frames so far are weighed anew by it.
+    /// Go over to another model of the same machine, all slices at once: all frames so far are weighed anew by it.
     ///
     /// # Errors
     /// [`Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
     pub fn adopt(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         self.past.stale = true;
-        if self.started && !self.linearise_anew(model) {
-            return Err(Unstable);
+        if self.started { self.linearise_anew(model) } else { Ok(()) }
+    }
+
+    /// Linearise at vars = 1, all steps at once.
+    fn linearise_design(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
+        (self.anew.work, self.anew.under_way) = (Work::Surrogate(G::BEGIN), false);
+        while let Work::Surrogate(progress) = &mut self.anew.work {
+            if model.surrogate.advance(&[0.0; N], &[0.0; F], progress, &mut self.tangent.linearised)? {
+                break;
+            }
         }
-        self.tangent.is_new |= self.started;
         Ok(())
     }
 
@@ -395,29 +455,13 @@ impl<
     fn catch_up(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
         let seconds = self.sequence.advance(frame);
         self.walk(model, seconds);
-        self.prepared = false;
+        self.looked = false;
     }
 
-    fn walk(&mut self, model: &Model<'_, G, B, C, F>, seconds: f32) {
+    /// Let params and baselines walk for a time [s]; false if nothing has to.
+    fn walk(&mut self, model: &Model<'_, G, B, C, F>, seconds: f32) -> bool {
         let prior = |i| prior_of::<G, B, C, F, N>(model, i);
-        self.posterior.walk::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior);
-    }
-
-    /// The setting that a frame repeats. Several correctors at once belong to none; nor do idle ones that move the orbit
-    /// noticeably, since what they say of the params is lost in a setting's mean.
-    #[inline(never)]
-    fn setting(
-        &mut self,
-        model: &Model<'_, G, B, C, F>,
-        frame: &Frame<B, C, F, W>,
-        drive: &Drive<C, F>,
-    ) -> Option<Setting> {
-        let setting = Setting::of(frame, model.setup.calibration.powered)?;
-        // work space: what the mean drive would have made is not known yet
-        model.surrogate.orbit(&self.tangent.linearised, &setting.idle(drive), &mut self.predicted.at_mean_drive);
-        let over_noise = |(b, orbit): (usize, &f32)| orbit * orbit / self.noise_variance(b);
-        let moved: f32 = self.predicted.at_mean_drive.iter().enumerate().map(over_noise).sum();
-        (moved <= IDLE * model.surrogate.layout().monitors() as f32).then_some(setting)
+        self.posterior.walk::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior)
     }
 
     /// The cell of a setting, the frame's drive counted in, and what its mean drive would have made.
@@ -450,13 +494,6 @@ impl<
     /// Measured minus predicted at the origin, before the baseline [m].
     fn innovation(&self, b: usize, code: i32) -> f32 {
         metres(code) - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0)
-    }
-
-    /// Measured minus predicted tune at `ln` of the supplies' factors.
-    fn tune_innovation(&self, model: &Model<'_, G, B, C, F>, plane: usize, tune: f32, strength: &[f32; F]) -> f32 {
-        let (predicted, _) =
-            model.surrogate.tune(&self.tangent.linearised, plane, &less(strength, &self.tangent.supplies));
-        wrapped(tune - predicted)
     }
 
     fn slope(&self, b: usize) -> &[f32] {
@@ -577,6 +614,7 @@ impl<
         if self.past.recent.is_full()
             && let Some(oldest) = self.past.recent.pop_front()
         {
+            self.note_leaving(model, &oldest);
             self.past.loose.recentre(self.posterior.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
             let drive = about(&oldest.drive, &self.tangent.supplies);
@@ -584,6 +622,7 @@ impl<
             let readings = oldest.readings(&variances, &self.predicted.prediction);
             self.past.loose.condition(readings, |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
         }
+        self.past.reference.wait();
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
@@ -608,6 +647,7 @@ impl<
             put_aside: whole == Whole::Aside,
             baselines_moved: whole == Whole::Moved,
             unsolved: core::mem::take(&mut self.posterior.unsolved),
+            slices: core::mem::take(&mut self.slices),
         };
         let solution = &self.posterior.solution;
         let mut estimate = Estimate {

@@ -46,18 +46,23 @@ impl<const F: usize> Following<F> {
     /// Count the `n`-th repeat in a setting. `off_mean`: `ln` of the supplies' factors, off their mean with this one; `deviation`: the
     /// reading, moved to that mean by what is known so far, off the mean of those before [m].
     ///
+    /// Returns the growth of the sum of squared deviations, as known so far [m^2].
+    ///
     /// A mean of those before is `n/(n - 1)` times as far as that with this one, and a deviation from it counts `(n - 1)/n` times.
-    pub fn add_repeat(&mut self, deviation: f32, off_mean: &[f32; F], n: u32) {
+    pub fn add_repeat(&mut self, deviation: f32, off_mean: &[f32; F], n: u32) -> f64 {
         if n < 2 {
-            return;
+            return 0.0;
         }
-        let (deviation, n) = (f64::from(deviation + self.shift(off_mean)), f64::from(n));
+        let n = f64::from(n);
+        let growth = (n - 1.0) / n * f64::from(deviation) * f64::from(deviation);
+        let deviation = f64::from(deviation + self.shift(off_mean));
         self.scatter += (n - 1.0) / n * deviation * deviation;
         for ((row, along), s) in self.ripple.iter_mut().zip(&mut self.along).zip(off_mean) {
             *along += f64::from(*s) * deviation;
             let s = n / (n - 1.0) * f64::from(*s);
             row.iter_mut().zip(off_mean).for_each(|(sum, other)| *sum += s * f64::from(*other));
         }
+        growth
     }
 
     /// Learn: one sweep towards the best slopes.

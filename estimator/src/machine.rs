@@ -43,6 +43,8 @@ macro_rules! machine {
         pub const SETTINGS: usize = 2 * CORRECTORS + 3;
         /// The monitors and the two tunes.
         pub const CHANNELS: usize = MONITORS + 2;
+        /// Entries of the lower triangle of a covariance of the channels.
+        pub const COUPLINGS: usize = CHANNELS * (CHANNELS + 1) / 2;
         /// Words of 32 bits with a bit for each monitor or param.
         pub const WORDS: usize = $crate::words($crate::largest(&[MONITORS, PARAMS]));
         /// All these numbers.
@@ -72,8 +74,18 @@ macro_rules! machine {
             PAIRS,
         >;
         /// Its core.
-        pub type Estimator =
-            $crate::Estimator<Green, MONITORS, CORRECTORS, SUPPLIES, PARAMS, SETTINGS, CHANNELS, TRIANGLE, WORDS>;
+        pub type Estimator = $crate::Estimator<
+            Green,
+            MONITORS,
+            CORRECTORS,
+            SUPPLIES,
+            PARAMS,
+            SETTINGS,
+            CHANNELS,
+            TRIANGLE,
+            COUPLINGS,
+            WORDS,
+        >;
         /// The feedback on it.
         pub type Steer = $crate::Steer<
             MONITORS,

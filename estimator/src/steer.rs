@@ -85,6 +85,7 @@ pub struct Response<'a, G: Surrogate<B, C, F, N>, const B: usize, const C: usize
 
 /// What is to be said of a frame's correction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[must_use]
 pub struct Steered {
     /// Why the setpoints stay as they were; none if they were moved.
     pub hold: Option<Hold>,

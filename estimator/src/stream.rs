@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::estimate::Estimate;
-use crate::estimator::{Estimator, FitQuality, IngestError, Model, Setup};
+use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
 use crate::surrogate::{Surrogate, Tables, Unstable};
 use crate::wire::link::Answer;
 
@@ -31,7 +31,7 @@ pub trait Core: Sized {
         setup: &Self::Setup,
         bytes: &mut [u8],
     ) -> Result<Self::Estimate, IngestError>;
-    fn prepare(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> bool;
+    fn prepare(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Prepared;
     fn adopt(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Result<(), Unstable>;
     fn fit_quality(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> FitQuality;
     fn forget_sequence(&mut self);
@@ -52,8 +52,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Core for Estimator<G, B, C, F, N, S, K, T, W>
+> Core for Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     type Tables = G;
     type Setup = Setup<B, C, F>;
@@ -74,7 +75,7 @@ impl<
         self.ingest(&Model { surrogate, setup }, bytes)
     }
 
-    fn prepare(&mut self, surrogate: &G, setup: &Self::Setup) -> bool {
+    fn prepare(&mut self, surrogate: &G, setup: &Self::Setup) -> Prepared {
         self.prepare(&Model { surrogate, setup })
     }
 

@@ -35,7 +35,7 @@ mod chip {
         let model = Model { surrogate: &memory.green, setup: &memory.setup };
         let _ = black_box(memory.core.restart(&model));
         memory.answer = Some(memory.core.ingest(&model, &mut memory.bytes));
-        black_box(memory.core.prepare(&model));
+        let _ = black_box(memory.core.prepare(&model));
         let _ = black_box(memory.core.adopt(&model));
         black_box(memory.core.fit_quality(&model));
         black_box(memory.core.covariance(black_box(1), black_box(2)));

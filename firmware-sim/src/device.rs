@@ -5,7 +5,7 @@
 use estimator::surrogate::Unstable;
 use estimator::wire::link::{PIECE, REQUEST, Refusal, Status, Taken, Vitals};
 use estimator::wire::{ParcelError, link};
-use estimator::{Core, Parcel, Tables, packet};
+use estimator::{Core, Parcel, Prepared, Tables, packet};
 use heapless::Vec;
 
 /// What a device of this core says.
@@ -58,9 +58,9 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         self.ingest(bytes, reply)
     }
 
-    /// What can be done between packets. See [`estimator::Estimator::prepare`].
-    pub fn prepare(&mut self) -> bool {
-        let Some(setup) = &self.setup else { return false };
+    /// One slice of what can be done between packets. See [`estimator::Estimator::prepare`].
+    pub fn prepare(&mut self) -> Prepared {
+        let Some(setup) = &self.setup else { return Prepared::Nothing };
         self.core.prepare(tables(self.contents, self.built_in, self.slot), setup)
     }
 
@@ -85,7 +85,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         };
         match self.core.ingest(tables(self.contents, self.built_in, self.slot), setup, bytes) {
             Ok(estimate) => {
-                reply(&link::Reply::Estimate((&estimate).into()));
+                say(|| link::Reply::Estimate((&estimate).into()), reply);
                 if core::mem::take(&mut self.wants_covariance) {
                     self.send_covariance(E::sequence(&estimate), reply);
                 }
@@ -222,7 +222,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
 }
 
 /// Say something. Not inlined: room for a reply is more than a kilobyte, which is not to lie on the stack while the core
-/// goes over to other tables.
+/// takes a frame in or goes over to other tables.
 #[inline(never)]
 fn say<A>(what: impl FnOnce() -> link::Reply<A>, reply: &mut impl FnMut(&link::Reply<A>)) {
     reply(&what());

@@ -3,7 +3,7 @@
 use std::io::{self, Read as _, Write as _};
 
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
-use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Panel};
 
@@ -34,6 +34,13 @@ impl ErrorType for Stdout {
 impl Read for Stdin {
     fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
         self.0.read(to).map_err(|e| e.kind().into())
+    }
+}
+
+/// All slices are done before the next packet is read: standard input cannot say whether one waits.
+impl ReadReady for Stdin {
+    fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+        Ok(false)
     }
 }
 

@@ -1,9 +1,9 @@
 //! The loop of a device: bytes in, packets, replies out. The same on the host and on a chip.
 
 use embedded_hal::digital::OutputPin;
-use embedded_io::{Read, Write};
-use estimator::Core;
+use embedded_io::{Read, ReadReady, Write};
 use estimator::wire::link::Vitals;
+use estimator::{Core, Prepared};
 
 use crate::device::{Device, Reply};
 use crate::inbox::{Event, Inbox};
@@ -16,7 +16,7 @@ use crate::panel::Panel;
 ///
 /// # Errors
 /// What the source or the sink report.
-pub fn run<E: Core, R: Read, W: Write<Error = R::Error>, const L: usize, const P: usize>(
+pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: usize, const P: usize>(
     device: &mut Device<'_, E, L>,
     source: &mut R,
     sink: &mut W,
@@ -48,8 +48,8 @@ pub fn run<E: Core, R: Read, W: Write<Error = R::Error>, const L: usize, const P
         let _ = (device.refused() != refused).then(|| panel.alarm());
         sent?;
         let _ = panel.feed();
-        // the reply is sent; this may take until the next frame
-        device.prepare();
+        // the reply is sent: in slices, the device gets ready for the next frame until that comes
+        while !source.read_ready()? && device.prepare() != Prepared::Nothing {}
     }
 }
 

@@ -8,8 +8,8 @@ use core::fmt;
 
 use estimator::surrogate::Unstable;
 use estimator::{
-    CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode, Prior,
-    RfCode, Sizes, TuneCode,
+    CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
+    Prepared, Prior, RfCode, Sizes, TuneCode,
 };
 use training::rooms::large;
 use training::{Tables, in_room, in_spare_room};
@@ -138,8 +138,20 @@ impl Core {
         self.stream.ingest(bytes)
     }
 
-    /// What is done between frames. See [`estimator::Estimator::prepare`].
+    /// All that is done between frames; true if the model was linearised anew.
     pub fn prepare(&mut self) -> bool {
+        let mut linearised = false;
+        loop {
+            match self.slice() {
+                Prepared::Nothing => return linearised,
+                Prepared::Slice => {}
+                Prepared::Linearised => linearised = true,
+            }
+        }
+    }
+
+    /// One slice of it. See [`estimator::Estimator::prepare`].
+    pub fn slice(&mut self) -> Prepared {
         self.stream.prepare()
     }
 

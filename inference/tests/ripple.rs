@@ -33,6 +33,12 @@ fn explore() {
         let ripple = campaign.ripple.clone();
         campaign.ripple.iter_mut().for_each(|r| *r = [0.0; 2]);
         let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
-        println!("{seed} {tune:.4} orbit {:.2e} ripple {:?} chi2 {:.4} -> {new:.4} nees {:.2} -> {new_nees:.2}, {screened:?} {took:?}", campaign.orbit[0], ripple, fit.chi2_per_dof, nees(&fit));
+        println!(
+            "{seed} {tune:.4} orbit {:.2e} ripple {:?} chi2 {:.4} -> {new:.4} nees {:.2} -> {new_nees:.2}, {screened:?} {took:?}",
+            campaign.orbit[0],
+            ripple,
+            fit.chi2_per_dof,
+            nees(&fit)
+        );
     }
 }

@@ -2,9 +2,9 @@
 
 use divan::{Bencher, black_box};
 use estimator::booster::{
-    self, CHANNELS, CORRECTORS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
+    self, CHANNELS, CORRECTORS, COUPLINGS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
 };
-use estimator::{Gaussian, Layout, Prior, Reading, Solution, Surrogate, Walk};
+use estimator::{Correlated, Gaussian, Layout, Prior, Reading, Solution, Surrogate, Walk};
 use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
 use system_tests::repository;
@@ -136,7 +136,7 @@ fn predict(bencher: Bencher) {
 
 const PRIOR: Prior = Prior { mean: 0.0, sigma: 0.03, lower: -0.06, upper: 0.06 };
 
-type Posterior = Gaussian<CHANNELS, PARAMS, TRIANGLE>;
+type Posterior = Gaussian<CHANNELS, PARAMS, TRIANGLE, Correlated<CHANNELS, COUPLINGS>>;
 
 fn prior() -> Box<Posterior> {
     let mut gaussian = Box::new(Gaussian::BLANK);

@@ -8,7 +8,7 @@ mod scenario;
 use core::error::Error;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback, Frame, MONITORS, PARAMS, Steer};
-use estimator::{Each, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, RfCode, Steered};
+use estimator::{Each, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Prepared, RfCode, Steered};
 use inference::simulate;
 use twin::Ring;
 
@@ -142,7 +142,7 @@ impl<'k> Loop<'k> {
         self.wire = wire_of(&frame);
         let estimate = self.core.ingest(&model, &mut self.wire.clone())?;
         let steered = self.steer(&frame, &estimate);
-        self.core.prepare(&model);
+        while self.core.prepare(&model) != Prepared::Nothing {}
         self.prepare_steer();
         self.frame += 1;
         let error = core::array::from_fn(|i| f64::from(estimate.map_params[i]) - self.plant.params[i]);

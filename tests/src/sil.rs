@@ -1,7 +1,7 @@
 //! A recording through the emulated chip and through the core in process, side by side.
 
 use core::error::Error;
-use estimator::Walk;
+use estimator::{Prepared, Walk};
 
 use estimator::wire::link::Status;
 use host_bridge::cli::CoreModel;
@@ -18,15 +18,14 @@ use twin::Ring;
 use crate::qemu::{Counts, Emulator, Image, Options};
 
 /// Steps of a frame whose instructions are counted, by the words of the table and the function in the image.
-pub const REGIONS: [(&str, &str); 8] = [
+pub const REGIONS: [(&str, &str); 7] = [
     ("decode", "Estimator::decode"),
     ("predict", "Estimator::predict"),
     ("screen", "screen"),
     ("condition", "Estimator::condition"),
     ("ingest", "Estimator::ingest"),
     ("encode", "Reply::encode"),
-    ("linearise", "linearise_anew"),
-    ("attempt", "linearise_at"),
+    ("slice", "Estimator::prepare"),
 ];
 
 /// What a run on the chip showed beside the same frames in process.
@@ -36,6 +35,8 @@ pub struct Comparison {
     pub frames: usize,
     /// Sequence numbers of frames whose estimates differ in any bit.
     pub different: Vec<u32>,
+    /// Frames that the chip answered while it was getting ready for them.
+    pub interrupting: usize,
     /// How the device was at the end.
     pub status: Status,
     /// Instructions of each region.
@@ -66,9 +67,13 @@ pub fn compare(
     link.restart(&core.setup)?;
     let (names, clock) = (Names::of(ring), Clock::new(Rate::Max, &Stop::default()));
     let mut fed = Fed::new(recording, &names, &mut link, clock);
-    let (mut different, mut last) = (Vec::new(), None);
+    let (mut different, mut interrupting, mut last) = (Vec::new(), 0, None);
     for row in &recording.rows {
         let heard = fed.advance().map_err(|error| error.to_string())?.expect("one reply a row");
+        for _ in 0..heard.estimate.remarks.slices {
+            let _ = core.slice();
+        }
+        interrupting += usize::from(core.clone().slice() != Prepared::Nothing);
         if !is_same(&mut core, stream::wire(recording, row)?, &heard) {
             different.push(row.sequence);
         }
@@ -82,6 +87,7 @@ pub fn compare(
     Ok(Comparison {
         frames: recording.rows.len(),
         different,
+        interrupting,
         status,
         counts,
         result: FitResult::of_core(CoreModel::Green.word(), ring, recording, &last, quality, timing),
@@ -90,7 +96,6 @@ pub fn compare(
 
 /// True if the core in process gives the same for a frame, bit for bit: the whole estimate, and the covariance.
 pub(crate) fn is_same(core: &mut Core, mut wire: Vec<u8>, heard: &Heard) -> bool {
-    core.prepare();
     let Ok(estimate) = core.ingest(&mut wire) else { return false };
     let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));
     bits(&estimate) == bits(&heard.estimate)
@@ -105,7 +110,7 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
         [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
     });
     let remarks = [e.remarks.put_aside, e.remarks.baselines_moved, e.remarks.unsolved].map(u64::from);
-    let numbers = [e.sequence, e.frames, e.rejected_frames, u32::from(e.linearised)].map(u64::from);
+    let numbers = [e.sequence, e.frames, e.rejected_frames, u32::from(e.linearised), e.remarks.slices].map(u64::from);
     let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
     let masks = masks.map(|bit| u64::from(*bit));
     let tunes = e.tune_innovation.map(|tune| tune.map_or(u64::MAX, |tune| u64::from(tune.to_bits())));

@@ -3,7 +3,7 @@
 use core::error::Error;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Frame, MONITORS, PARAMS};
-use estimator::{CurrentCode, Model, Walk};
+use estimator::{CurrentCode, Model, Prepared, Walk};
 use inference::Recording;
 use inference::stream;
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -192,7 +192,7 @@ impl Soak {
     /// If it refuses it.
     pub fn ingest(&mut self, frame: &Frame) -> Estimate {
         let model = Model { surrogate: &*self.machine.surrogate, setup: &self.machine.setup };
-        self.core.prepare(&model);
+        while self.core.prepare(&model) != Prepared::Nothing {}
         let estimate = self.core.ingest(&model, &mut wire_of(frame)).expect("a good frame");
         self.frames += 1;
         estimate

@@ -1,7 +1,7 @@
 //! A device on the host: the loop that a chip runs, fed with recorded frames, bad bytes and new tables, beside the core in
 //! process.
 
-use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::booster::{Answer, Estimator, Green, LINE, PACKET, Parcel, Reply, Request, TRIANGLE};
 use estimator::surrogate::Table;
 use estimator::wire::link::{Refusal, Status, Taken, Vitals};
@@ -32,6 +32,13 @@ impl Read for Source {
         let Some(next) = self.0.pop() else { return Ok(0) };
         to[0] = next.ok_or(ErrorKind::TimedOut)?;
         Ok(1)
+    }
+}
+
+/// No packet waits until all slices are done.
+impl ReadReady for Source {
+    fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+        Ok(false)
     }
 }
 

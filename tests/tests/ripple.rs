@@ -1,7 +1,7 @@
 //! The orbit of misaligned quadrupoles follows the ripple of their supplies: exact closed orbits through the core, next to the integer.
+use inference::Recording;
 use inference::simulate::{self, Hardware, Truth};
 use inference::stream::{self, Walk};
-use inference::Recording;
 use system_tests::repository;
 use twin::{Hold, Optics, Ring};
 
@@ -26,6 +26,10 @@ fn explore() {
         let off = nalgebra::DVector::from_fn(48, |i, _| f64::from(e.map_params[i]) - vars[i].ln());
         let cov = nalgebra::DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
         let nees = off.dot(&cov.cholesky().unwrap().solve(&off)) / 48.0;
-        println!("{seed} {tune:.4} chi2/dof {:.4} nees {nees:.2} ev {}", q.chi_square / q.degrees_of_freedom, e.log_evidence);
+        println!(
+            "{seed} {tune:.4} chi2/dof {:.4} nees {nees:.2} ev {}",
+            q.chi_square / q.degrees_of_freedom,
+            e.log_evidence
+        );
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::gaussian::{Gaussian, Solution};
+use crate::gaussian::{Correlated, Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
 
@@ -28,11 +28,11 @@ impl Walk {
     }
 }
 
-/// The posterior of `N` params; `K` channels, `T` entries of a triangle of `N`, `W` words.
+/// The posterior of `N` params; `K` channels, `T` entries of a triangle of `N`, `U` of one of `K`, `W` words.
 #[derive(Debug, Clone)]
-pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, const W: usize> {
+pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> {
     /// Information on params and baselines.
-    pub gaussian: Gaussian<K, N, T>,
+    pub gaussian: Gaussian<K, N, T, Correlated<K, U>>,
     /// Its best point.
     pub solution: Solution<N, T, W>,
     /// Rms of the baseline orbit in x and y [m].
@@ -43,7 +43,7 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
     pub unsolved: bool,
 }
 
-impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K, N, T, W> {
+impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> Posterior<K, N, T, U, W> {
     /// Memory for one, all zero.
     pub const BLANK: Self =
         Self { gaussian: Gaussian::BLANK, solution: Solution::BLANK, orbit: [0.0; 2], walked: 0.0, unsolved: false };
@@ -61,7 +61,7 @@ impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K
         self.orbit = [self.gaussian.orbit(0, x), self.gaussian.orbit(first, first + y)];
     }
 
-    /// Let params and baselines walk for a time [s].
+    /// Let params and baselines walk for a time [s]; false if nothing has to.
     #[inline(never)]
     pub fn walk<const B: usize>(
         &mut self,
@@ -69,9 +69,9 @@ impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K
         seconds: f32,
         layout: &Layout,
         prior: impl Fn(usize) -> Prior + Copy,
-    ) {
+    ) -> bool {
         if seconds <= 0.0 || *walk == Walk::NONE {
-            return;
+            return false;
         }
         self.walked += f64::from(seconds);
         let variance = |noise: f32| noise * noise * seconds;
@@ -85,6 +85,7 @@ impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K
             self.gaussian.walk(libm::sqrtf(variance), &mut self.solution);
             self.solve(layout, prior);
         }
+        true
     }
 
     /// True while all frames so far have seen the same ring, and the same baselines.

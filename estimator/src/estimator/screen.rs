@@ -16,6 +16,8 @@ pub(super) struct Screened<const W: usize> {
     pub rejected: Mask<W>,
     pub confirmed: Mask<W>,
     pub restarted: Mask<W>,
+    /// Growth of the repeats' squared deviations from the means of their settings, over the noise.
+    pub scatter: f64,
     /// Innovation of each tune that is used [1].
     pub tune: [Option<f32>; 2],
 }
@@ -48,8 +50,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// Decide which readings to use, and learn each monitor's noise from its repeats.
     #[inline(never)]
@@ -102,7 +105,7 @@ impl<
             let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
             let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
             self.past.stale |= meter.judge();
-            let innovation = self.tune_innovation(model, plane, code.value(), &drive.strength);
+            let innovation = self.tangent.tune_innovation(model, plane, code.value(), &drive.strength);
             screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
         }
     }
@@ -126,7 +129,10 @@ impl<
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
         let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
         if let Some(following) = following {
-            cell.take(b, code, moved, verdict, |deviation, n| following.add_repeat(deviation, off_mean, n));
+            let variance = f64::from(monitor.variance());
+            cell.take(b, code, moved, verdict, |deviation, n| {
+                screened.scatter += following.add_repeat(deviation, off_mean, n) / variance;
+            });
         }
         match verdict {
             Verdict::Accepted => {}

@@ -15,8 +15,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// Setpoints after a frame and its estimate. See [`Steer::steer`].
     pub fn steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(

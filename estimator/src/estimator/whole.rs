@@ -63,8 +63,9 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Estimator<G, B, C, F, N, S, K, T, W>
+> Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// Judge a frame as a whole, and put it aside if need be.
     #[inline(never)]
@@ -162,6 +163,7 @@ impl<
         self.posterior.gaussian.move_baselines(shift);
         self.past.loose.move_baselines(shift);
         self.past.campaign.move_readings(shift);
+        self.reopen_pool();
         for frame in &mut self.past.recent {
             frame.reading.iter_mut().zip(shift).for_each(|(reading, by)| *reading = reading.moved(*by));
         }

@@ -2,7 +2,8 @@
 
 use nalgebra::SMatrix;
 
-use crate::linear::{add, column, dot, zeros};
+use crate::linear::{add, dot};
+use crate::triangle::Triangle;
 
 /// Covariance of the baselines, params given [m^2].
 pub trait Covariance<const B: usize>: Copy {
@@ -36,10 +37,10 @@ pub struct Gain<const B: usize> {
 /// That of baselines which nothing correlates, as long as the params are constant.
 pub type Independent<const B: usize> = [f64; B];
 
-/// That of baselines which a walk of the params has correlated.
+/// That of baselines which a walk of the params has correlated; `U` entries make a triangle of `B`.
 #[derive(Debug, Clone, Copy)]
-pub struct Correlated<const B: usize> {
-    matrix: SMatrix<f64, B, B>,
+pub struct Correlated<const B: usize, const U: usize> {
+    matrix: Triangle<B, U, f64>,
     walked: bool,
 }
 
@@ -72,14 +73,13 @@ impl<const B: usize> Covariance<B> for Independent<B> {
     }
 }
 
-impl<const B: usize> Covariance<B> for Correlated<B> {
-    const ZERO: Self = Self { matrix: zeros(), walked: false };
+impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
+    const ZERO: Self = Self { matrix: Triangle::ZERO, walked: false };
 
     fn set(&mut self, variances: &[f64; B]) {
-        self.matrix.fill(0.0);
-        for (b, (column, variance)) in self.matrix.as_mut_slice().chunks_exact_mut(B).zip(variances).enumerate() {
-            column.get_mut(b).into_iter().for_each(|diagonal| *diagonal = *variance);
-        }
+        self.matrix.fill_diagonal(0.0);
+        let diagonal = self.matrix.rows_mut().filter_map(<[f64]>::last_mut);
+        diagonal.zip(variances).for_each(|(own, variance)| *own = *variance);
         self.walked = false;
     }
 
@@ -88,34 +88,31 @@ impl<const B: usize> Covariance<B> for Correlated<B> {
     }
 
     fn variance(&self, b: usize) -> f64 {
-        column(self.matrix.as_slice(), B, b).get(b).copied().unwrap_or(0.0)
+        self.matrix.get(b, b)
     }
 
     fn spread(&mut self, b: usize, variance: f64) {
-        let own = self.matrix.as_mut_slice().chunks_exact_mut(B).nth(b);
-        own.and_then(|column| column.get_mut(b)).into_iter().for_each(|own| *own += variance);
+        self.matrix.row_mut(b).last_mut().into_iter().for_each(|own| *own += variance);
     }
 
     fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
         let mut gain = [0.0; B];
         let (from, to) = if self.walked { (0, B) } else { (b, b + 1) };
-        let own = column(self.matrix.as_slice(), B, b);
-        gain.iter_mut().zip(own).skip(from).take(to - from).for_each(|(to, v)| *to = v / s);
-        let columns = self.matrix.as_mut_slice().chunks_exact_mut(B).zip(&gain);
-        for (column, g) in columns.skip(from).take(to - from) {
-            let rows = column.get_mut(from..to).unwrap_or_default();
-            add(rows, -g * s, gain.get(from..to).unwrap_or_default());
+        self.matrix.copy_row(b, &mut gain);
+        gain.iter_mut().for_each(|gain| *gain /= s);
+        for (row, g) in self.matrix.rows_from_mut(from).zip(gain.get(from..to).unwrap_or_default()) {
+            add(row.get_mut(from..).unwrap_or_default(), -g * s, gain.get(from..).unwrap_or_default());
         }
         Gain { gain, from, to }
     }
 }
 
-impl<const B: usize> Correlated<B> {
+impl<const B: usize, const U: usize> Correlated<B, U> {
     /// Add `variance` times the products of columns `h`, one of each baseline: what they share of a walk.
     pub fn correlate<const N: usize>(&mut self, variance: f64, h: &SMatrix<f64, N, B>) {
         let h = h.as_slice().chunks_exact(N);
-        for (column, one) in self.matrix.as_mut_slice().chunks_exact_mut(B).zip(h.clone()) {
-            column.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += variance * dot(one, other));
+        for (row, one) in self.matrix.rows_mut().zip(h.clone()) {
+            row.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += variance * dot(one, other));
         }
         self.walked = true;
     }

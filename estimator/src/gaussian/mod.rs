@@ -31,7 +31,7 @@ use crate::prior::Prior;
 use crate::triangle::Triangle;
 
 pub use baselines::{Correlated, Covariance, Gain, Independent};
-pub use pool::{Line, Repeats};
+pub use pool::{Line, Pool, Repeats};
 pub use solution::Solution;
 use staged::Staged;
 
@@ -50,7 +50,7 @@ pub struct Reading<'h> {
 
 /// Information on `N` params and `B` baselines; `T` entries make a triangle of `N`.
 #[derive(Debug, Clone, Copy)]
-pub struct Gaussian<const B: usize, const N: usize, const T: usize, V = Correlated<B>> {
+pub struct Gaussian<const B: usize, const N: usize, const T: usize, V> {
     /// Params at which the readings were linearised.
     origin: [f32; N],
     /// Information matrix of the params, baselines eliminated.
@@ -123,11 +123,6 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         libm::sqrt(dot(baselines, baselines) / baselines.len().max(1) as f64) as f32
     }
 
-    /// Baselines at the origin [m].
-    pub fn baselines(&self) -> &[f64; B] {
-        &self.baseline
-    }
-
     /// Baseline of a monitor at the origin [m].
     pub fn baseline(&self, b: usize) -> f64 {
         self.baseline.get(b).copied().unwrap_or(0.0)
@@ -193,26 +188,36 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     /// Move the origin without changing the distribution.
     pub fn recentre(&mut self, origin: &[f32; N]) {
-        let mut step = [0.0; N];
-        let each = step.iter_mut().zip(origin.iter().zip(&self.origin));
-        each.for_each(|(s, (to, from))| *s = f64::from(*to) - f64::from(*from));
+        let step = self.step_to(origin);
         let moved = self.information.multiply(&step);
         self.cost += dot(&step, &moved) - 2.0 * dot(&step, &self.vector);
         add(&mut self.vector, -1.0, &moved);
-        for (mean, slope) in self.baseline.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
+        self.baseline = self.baselines_at(origin);
+        self.origin = *origin;
+    }
+
+    /// Baselines at some params [m].
+    pub fn baselines_at(&self, params: &[f32; N]) -> [f64; B] {
+        let (step, mut baselines) = (self.step_to(params), self.baseline);
+        for (mean, slope) in baselines.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
             *mean -= dot(slope, &step);
         }
-        self.origin = *origin;
+        baselines
+    }
+
+    /// Some params, relative to the origin.
+    fn step_to(&self, params: &[f32; N]) -> [f64; N] {
+        let mut step = params.map(f64::from);
+        step.iter_mut().zip(&self.origin).for_each(|(step, origin)| *step -= f64::from(*origin));
+        step
     }
 }
 
 impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<B, N, T, V> {
     /// Downhill pull on the params at a point: minus half the derivative of chi-square.
     fn pull(&self, at: &[f32; N]) -> [f64; N] {
-        let mut step = at.map(f64::from);
-        step.iter_mut().zip(&self.origin).for_each(|(step, origin)| *step -= f64::from(*origin));
         let mut pull = self.vector;
-        add(&mut pull, -1.0, &self.information.multiply(&step));
+        add(&mut pull, -1.0, &self.information.multiply(&self.step_to(at)));
         pull
     }
 
@@ -261,7 +266,7 @@ mod tests {
             .collect()
     }
 
-    pub(super) fn prior() -> Gaussian<2, 2, 3> {
+    pub(super) fn prior() -> Gaussian<2, 2, 3, Correlated<2, 3>> {
         let mut gaussian = Gaussian::BLANK;
         gaussian.reset(|_| WIDE, |_| BASELINE);
         gaussian
@@ -272,7 +277,7 @@ mod tests {
         Reading { channel, innovation, variance: VARIANCE, slope }
     }
 
-    fn conditioned() -> Gaussian<2, 2, 3> {
+    fn conditioned() -> Gaussian<2, 2, 3, Correlated<2, 3>> {
         let mut gaussian = prior();
         for (b, innovation, h) in readings() {
             gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
@@ -299,7 +304,7 @@ mod tests {
         (x, p)
     }
 
-    fn assert_equal(gaussian: &Gaussian<2, 2, 3>, walks: &[usize], walk: f64) {
+    fn assert_equal(gaussian: &Gaussian<2, 2, 3, Correlated<2, 3>>, walks: &[usize], walk: f64) {
         let mut solution = Solved::BLANK;
         assert!(solution.solve(gaussian, |_| WIDE));
         let (x, p) = batch(walks, walk);

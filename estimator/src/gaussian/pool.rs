@@ -1,7 +1,7 @@
 //! Many readings at once: settings of one kind share one derivative, and each monitor one baseline.
 
 use super::{Covariance, Gaussian, Staged, ln_density};
-use crate::linear::add;
+use crate::linear::{add, column};
 
 /// Readings of one monitor at settings of one kind: at the share `x` of a drive whose derivative is `h`,
 /// `residual = x h . delta + baseline + noise`. Its fields are sums of precision times `1, x, x^2, residual, x residual`.
@@ -28,13 +28,17 @@ pub struct Repeats {
 /// What many readings say of the baselines, before these are eliminated; [`Gaussian::slope`] meanwhile holds sums of
 /// precision times `h`.
 #[derive(Debug, Clone)]
-pub struct Pool<const B: usize, const N: usize> {
+pub struct Pool<const B: usize> {
     /// Baselines from which residuals are counted [m].
-    level: [f64; B],
+    pub level: [f64; B],
     precision: [f64; B],
     /// Sum of precision times residual.
     pull: [f64; B],
-    staged: Staged<N>,
+}
+
+impl<const B: usize> Pool<B> {
+    /// Memory for one, all zero.
+    pub const BLANK: Self = Self { level: [0.0; B], precision: [0.0; B], pull: [0.0; B] };
 }
 
 impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<B, N, T, V> {
@@ -43,8 +47,9 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     /// Where [`Gaussian::condition`] takes one product of rows a reading, this takes one a line and two a monitor:
     ///
     /// `information += sum of x^2/s h h^T - (sum of x/s h)(sum of x/s h)^T / (sum of 1/s)`.
-    pub fn open(&mut self, level: [f64; B]) -> Pool<B, N> {
-        let mut pool = Pool { level, precision: [0.0; B], pull: [0.0; B], staged: Staged::NONE };
+    pub fn open(&mut self, pool: &mut Pool<B>, level: [f64; B]) {
+        *pool = Pool { level, ..Pool::BLANK };
+        let mut staged = Staged::NONE;
         for b in 0..B {
             // what is known of a baseline is one more reading
             let mut h = [0.0; N];
@@ -55,9 +60,9 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
             let r = self.baseline(b) - pool.level.get(b).copied().unwrap_or(0.0);
             self.cost += precision * r * r;
             let line = Line { one: precision, x: precision, xx: precision, r: precision * r, xr: precision * r };
-            self.add_line_of(&mut pool, b, &line, &h);
+            self.add_line(pool, &mut staged, b, &line, &h);
         }
-        pool
+        staged.settle(&mut self.information);
     }
 
     /// Count the mean of repeats into a line: its residual [m] at the share `x`.
@@ -77,17 +82,23 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.volume += ln_density(n * f64::from(repeats.variance)) + (n - 1.0) * ln_density(repeats.noise.into());
     }
 
-    /// Add a line of monitor `b`.
-    pub fn add_line(&mut self, pool: &mut Pool<B, N>, b: usize, line: &Line, h: &[f32; N]) {
-        self.add_line_of(pool, b, line, &h.map(f64::from));
+    /// Add lines, one of each monitor from the first on, whose derivatives are the columns of `h`.
+    pub fn add_lines(&mut self, pool: &mut Pool<B>, lines: &[Line], h: &[f32]) {
+        let mut staged = Staged::NONE;
+        for (b, line) in lines.iter().enumerate().filter(|(_, line)| line.one > 0.0) {
+            let mut of_line = [0.0; N];
+            of_line.iter_mut().zip(column(h, N, b)).for_each(|(to, h)| *to = f64::from(*h));
+            self.add_line(pool, &mut staged, b, line, &of_line);
+        }
+        staged.settle(&mut self.information);
     }
 
-    fn add_line_of(&mut self, pool: &mut Pool<B, N>, b: usize, line: &Line, h: &[f64; N]) {
+    fn add_line(&mut self, pool: &mut Pool<B>, staged: &mut Staged<N>, b: usize, line: &Line, h: &[f64; N]) {
         let (Some(precision), Some(pull)) = (pool.precision.get_mut(b), pool.pull.get_mut(b)) else { return };
         *precision += line.one;
         *pull += line.r;
         if h.iter().any(|h| *h != 0.0) {
-            pool.staged.push(h, line.xx, &mut self.information);
+            staged.push(h, line.xx, &mut self.information);
             add(&mut self.vector, line.xr, h);
             let slopes = self.slope.as_mut_slice().as_chunks_mut::<N>().0;
             slopes.get_mut(b).into_iter().for_each(|slope| add(slope, line.x, h));
@@ -95,9 +106,9 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     }
 
     /// Eliminate the baselines from what a pool has taken in.
-    pub fn close(&mut self, pool: &mut Pool<B, N>) {
-        let Pool { level, precision, pull, staged } = pool;
-        let mut variances = [0.0; B];
+    pub fn close(&mut self, pool: &Pool<B>) {
+        let Pool { level, precision, pull } = pool;
+        let (mut variances, mut staged) = ([0.0; B], Staged::NONE);
         let slopes = self.slope.as_mut_slice().as_chunks_mut::<N>().0.iter_mut();
         let each = slopes.zip(self.baseline.iter_mut().zip(&mut variances));
         let sums = precision.iter().zip(pull.iter().zip(level.iter())).enumerate();
@@ -133,17 +144,19 @@ mod tests {
             one_by_one.condition([reading(b, innovation, &h)], |_| 0.0);
             pooled.condition([reading(b, innovation, &h)], |_| 0.0);
         }
-        let mut pool = pooled.open([2.9e-3, 0.0]);
-        for b in 0..2 {
-            let (mut line, level) = (Line::default(), pool.level[b]);
+        let mut pool = Pool::BLANK;
+        pooled.open(&mut pool, [2.9e-3, 0.0]);
+        let mut lines = [Line::default(); 2];
+        for (b, line) in lines.iter_mut().enumerate() {
+            let level = pool.level[b];
             for i in 0..20 {
-                pooled.count(&mut line, share(i), f64::from(residual(b, i)) - level, &SINGLE);
+                pooled.count(line, share(i), f64::from(residual(b, i)) - level, &SINGLE);
                 let h = derivative(b).map(|h| share(i) * h);
                 one_by_one.condition([reading(b, residual(b, i), &h)], |_| 0.0);
             }
-            pooled.add_line(&mut pool, b, &line, &derivative(b));
         }
-        pooled.close(&mut pool);
+        pooled.add_lines(&mut pool, &lines, &[derivative(0), derivative(1)].concat());
+        pooled.close(&pool);
         let (mut expected, mut solution) = (Solved::BLANK, Solved::BLANK);
         expected.solve(&one_by_one, |_| WIDE);
         solution.solve(&pooled, |_| WIDE);

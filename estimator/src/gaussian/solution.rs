@@ -1,6 +1,6 @@
 //! The best point of a Gaussian within the prior's range, its covariance, and the evidence.
 
-use super::{Gaussian, square};
+use super::{Covariance, Gaussian, square};
 use crate::linear::{add, dot};
 use crate::mask::Mask;
 use crate::prior::Prior;
@@ -42,7 +42,11 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
 
     /// Solve a Gaussian. True if its information was positive as it stands; else the diagonal is enlarged by as little as makes
     /// it so, and where nothing does, the solution is the prior: whatever happens, it is a whole one.
-    pub fn solve<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: impl Fn(usize) -> Prior) -> bool {
+    pub fn solve<const B: usize, V: Covariance<B>>(
+        &mut self,
+        gaussian: &Gaussian<B, N, T, V>,
+        prior: impl Fn(usize) -> Prior,
+    ) -> bool {
         const { assert!(W >= crate::mask::words(N), "W words have a bit for each param") };
         let mut tried = 0;
         let factorised = SUPPORT.into_iter().find_map(|more| {
@@ -71,7 +75,11 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
 
     /// The prior as a solution; returns the logarithm of the determinant of its information.
     #[cold]
-    fn forget<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: impl Fn(usize) -> Prior) -> f64 {
+    fn forget<const B: usize, V: Covariance<B>>(
+        &mut self,
+        gaussian: &Gaussian<B, N, T, V>,
+        prior: impl Fn(usize) -> Prior,
+    ) -> f64 {
         let mut log_determinant = 0.0;
         self.factor.fill_diagonal(0.0);
         let each = self.factor.rows_mut().zip(self.delta.iter_mut().zip(&gaussian.origin));
@@ -85,7 +93,11 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
     }
 
     /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
-    fn bound<const B: usize>(&mut self, gaussian: &Gaussian<B, N, T>, prior: impl Fn(usize) -> Prior) {
+    fn bound<const B: usize, V: Covariance<B>>(
+        &mut self,
+        gaussian: &Gaussian<B, N, T, V>,
+        prior: impl Fn(usize) -> Prior,
+    ) {
         // not `clamp`, which panics on bounds that are crossed
         let bounded = |i: usize, theta: f32| {
             let Prior { lower, upper, .. } = prior(i);
@@ -117,9 +129,9 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
 
     /// Move each param to its best value within the bounds, the others held; false if none moved by more than a thousandth
     /// of its error bar.
-    fn sweep<const B: usize>(
+    fn sweep<const B: usize, V: Covariance<B>>(
         &mut self,
-        gaussian: &Gaussian<B, N, T>,
+        gaussian: &Gaussian<B, N, T, V>,
         pull: &mut [f64; N],
         bounded: impl Fn(usize, f32) -> f32,
     ) -> bool {

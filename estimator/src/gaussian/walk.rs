@@ -1,10 +1,10 @@
 //! A random walk of the params: a prediction of the Kalman filter in information form.
 
-use super::{Gaussian, Solution, square};
+use super::{Correlated, Gaussian, Solution, square};
 use crate::linear::dot;
 use crate::triangle::Triangle;
 
-impl<const B: usize, const N: usize, const T: usize> Gaussian<B, N, T> {
+impl<const B: usize, const N: usize, const T: usize, const U: usize> Gaussian<B, N, T, Correlated<B, U>> {
     /// Let every param walk at random by `sigma`: `P += sigma^2`, baselines stay.
     ///
     /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.

@@ -41,8 +41,11 @@ impl Surrogate<B, C, 1, 1> for Table {
     type Linearised = ();
     const UNLINEARISED: () = ();
 
-    fn linearise(&self, _: &[f32; 1], _: &[f32; 1], (): &mut ()) -> Result<(), Unstable> {
-        Ok(())
+    type Progress = ();
+    const BEGIN: () = ();
+
+    fn advance(&self, _: &[f32; 1], _: &[f32; 1], (): &mut (), (): &mut ()) -> Result<bool, Unstable> {
+        Ok(true)
     }
 
     fn orbit(&self, (): &(), drive: &Drive<C, 1>, into: &mut [f32; B]) {
@@ -179,6 +182,12 @@ impl Machine {
         steered
     }
 
+    fn cycles(&mut self, count: usize) {
+        for _ in 0..count {
+            let _ = self.cycle();
+        }
+    }
+
     fn amperes(&self) -> [f32; C] {
         self.state.setpoints().map(CurrentCode::value)
     }
@@ -223,17 +232,17 @@ fn a_known_response_removes_the_orbit_in_one_step() {
     assert!(machine.orbit().iter().all(|x| x.abs() < ROUNDING), "{:?}", machine.orbit());
     // to the wanted orbit, if that is another
     machine.feedback.orbit = [1e-3; B];
-    machine.cycle();
+    machine.cycles(1);
     assert!(machine.orbit().iter().all(|x| (x - 1e-3).abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
 #[test]
 fn with_a_gain_the_orbit_decays_by_what_is_left_of_it() {
     let mut machine = Machine::new(diagonal(), Feedback { gain: 0.3, ..free() }, 0.0);
-    (0..4).for_each(|_| drop(machine.cycle()));
+    machine.cycles(4);
     machine.disturbance = [1e-3, -2e-3, 5e-4, 3e-3];
     for n in 1..10 {
-        machine.cycle();
+        machine.cycles(1);
         let left = libm::powf(0.7, n as f32);
         let each = machine.orbit().into_iter().zip(machine.disturbance);
         assert!(each.into_iter().all(|(x, d)| (x - left * d).abs() < 4.0 * ROUNDING), "{n}: {:?}", machine.orbit());
@@ -243,10 +252,10 @@ fn with_a_gain_the_orbit_decays_by_what_is_left_of_it() {
 #[test]
 fn a_moved_orbit_is_the_mean_of_its_frames() {
     let mut machine = Machine::new(diagonal(), Feedback { gain: 0.1, ..free() }, 0.0);
-    (0..20).for_each(|_| drop(machine.cycle()));
+    machine.cycles(20);
     machine.disturbance = [1e-3; B];
     machine.estimate.remarks.baselines_moved = true;
-    machine.cycle();
+    machine.cycles(1);
     assert!(machine.orbit().iter().all(|x| x.abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
@@ -258,7 +267,7 @@ fn kicks_of_uncertain_effect_are_left_alone() {
     table.uncertain[1][1] = 30.0;
     let mut machine = Machine::new(table, free(), 1.0);
     machine.disturbance = [1e-3; B];
-    machine.cycle();
+    machine.cycles(1);
     let amperes = machine.amperes();
     for (c, share) in [(0, 1.0), (1, 0.1), (2, 1.0), (3, 1.0)] {
         assert!((amperes[c] + 10.0 * share).abs() < 2e-3, "{amperes:?}");
@@ -270,7 +279,7 @@ fn kicks_of_uncertain_effect_are_left_alone() {
 fn steps_and_kicks_have_their_cost() {
     let mut machine = Machine::new(diagonal(), Feedback { step_kick: 1e-5, ..free() }, 0.0);
     machine.disturbance = [1e-3; B];
-    machine.cycle();
+    machine.cycles(1);
     assert!((machine.amperes()[0] + 5.0).abs() < 1e-3, "{:?}", machine.amperes()); // noise/step = R
     let mut machine = Machine::new(diagonal(), Feedback { step_kick: 1e-5, total_kick: 2e-5, ..free() }, 0.0);
     machine.disturbance = [1e-3; B];
@@ -283,11 +292,11 @@ fn the_orbit_of_another_momentum_is_not_corrected() {
     let table = Table { dispersion: [2.0, 3.0, 1.0, 0.0], ..diagonal() };
     let mut machine = Machine::new(table, Feedback { step_kick: STEP, ..free() }, 0.0);
     machine.disturbance = [2e-3, 3e-3, 1e-3, 0.0];
-    machine.cycle();
+    machine.cycles(1);
     assert!(machine.amperes().iter().all(|a| a.abs() < 2e-3), "{:?}", machine.amperes());
     // across it, all is corrected
     machine.disturbance = [3e-3, -2e-3, 0.0, 1e-3];
-    (0..4).for_each(|_| drop(machine.cycle()));
+    machine.cycles(4);
     assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
@@ -304,11 +313,11 @@ fn limits_hold_and_the_others_make_up_for_them() {
     assert_eq!((steered.limited, machine.amperes()[1]), (1, -7.0));
     assert!((machine.amperes()[0] + 5.0 * 36.0 / 37.0).abs() < 2e-3, "{:?}", machine.amperes());
     machine.disturbance = [0.1; B];
-    (0..20).for_each(|_| drop(machine.cycle()));
+    machine.cycles(20);
     assert!(machine.amperes().iter().all(|a| a.abs() <= 7.0), "{:?}", machine.amperes());
     // nothing has wound up: the first frame without the disturbance leaves the limits
     machine.disturbance = [0.0; B];
-    machine.cycle();
+    machine.cycles(1);
     assert!(machine.amperes()[2].abs() < 0.1, "{:?}", machine.amperes());
 }
 
@@ -316,7 +325,7 @@ fn limits_hold_and_the_others_make_up_for_them() {
 fn no_setpoint_moves_faster_than_its_rate_and_the_direction_stays() {
     let mut machine = Machine::new(diagonal(), Feedback { rate: 2.0, ..free() }, 0.0);
     machine.disturbance = [1e-3, -5e-4, 0.0, 0.0];
-    machine.cycle();
+    machine.cycles(1);
     let amperes = machine.amperes();
     assert!((amperes[0] + 2.0).abs() < 1e-3 && (amperes[1] - 1.0).abs() < 1e-3, "{amperes:?}");
 }
@@ -334,7 +343,7 @@ fn each_reason_holds() {
     ];
     for (change, hold) in reasons {
         let mut machine = Machine::new(diagonal(), free(), 0.0);
-        machine.cycle();
+        machine.cycles(1);
         machine.disturbance = [1e-3; B];
         let good = machine.estimate.clone();
         change(&mut machine);
@@ -343,7 +352,7 @@ fn each_reason_holds() {
         // and it goes on
         machine.estimate = good;
         assert_eq!(machine.cycle().hold, None, "{hold:?}");
-        machine.cycle();
+        machine.cycles(1);
         assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{hold:?}: {:?}", machine.orbit());
     }
 }
@@ -395,15 +404,15 @@ fn a_corrector_that_sticks_is_left_out_and_comes_back() {
 #[test]
 fn a_monitor_that_does_not_report_keeps_its_orbit() {
     let mut machine = Machine::new(diagonal(), Feedback { gain: 0.5, ..free() }, 0.0);
-    machine.cycle();
+    machine.cycles(1);
     machine.disturbance = [1e-3; B];
-    machine.cycle();
+    machine.cycles(1);
     machine.estimate.accepted = Mask::from_words(&[14]);
-    (0..5).for_each(|_| drop(machine.cycle()));
+    machine.cycles(5);
     // half of it was believed; the rest waits
     assert!((machine.orbit()[0] - 5e-4).abs() < 4.0 * ROUNDING, "{:?}", machine.orbit());
     machine.estimate.accepted = Mask::from_words(&[15]);
-    (0..12).for_each(|_| drop(machine.cycle()));
+    machine.cycles(12);
     assert!(machine.orbit()[0].abs() < 1e-6, "{:?}", machine.orbit());
 }
 
@@ -411,9 +420,9 @@ fn a_monitor_that_does_not_report_keeps_its_orbit() {
 fn setpoints_that_are_not_reached_yet_are_not_corrected_twice() {
     let mut machine = Machine::new(diagonal(), free(), 0.0);
     machine.disturbance = [1e-3; B];
-    machine.frame();
+    let _ = machine.frame();
     let first = machine.amperes();
-    machine.frame(); // the supplies are slow
+    let _ = machine.frame(); // the supplies are slow
     let second = machine.amperes();
     assert!(first.iter().zip(second).all(|(a, b)| (a - b).abs() < 2e-3), "{first:?} {second:?}");
 }

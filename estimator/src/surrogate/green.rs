@@ -18,11 +18,10 @@
 //! Source: the resolvent (Dyson) form of the perturbed Green's function, by successive rank-one updates (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
-use nalgebra::SMatrix;
-
+use super::quantised::Column;
 use super::{Block, LowRank, Prediction, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, add_four, add_four_twice, combine, dot, zeros};
+use crate::linear::{add, add_four, add_four_twice, dot};
 use crate::sizes::Sizes;
 use crate::triangle::Triangle;
 
@@ -98,15 +97,15 @@ pub struct Green<
     pub stated_error: [f32; 2],
 }
 
-/// One plane at given strengths.
+/// One plane at given strengths, quantised column by column: half the memory, and errors within those of the tables.
 #[derive(Debug, Clone)]
 struct PlaneLinearised<const B: usize, const C: usize, const M: usize, const Q: usize> {
     /// Nodes to monitors, `Z_qb`.
-    seen: SMatrix<f32, Q, B>,
+    seen: [Column<Q>; B],
     /// Nodes to correctors, `Z_qc`.
-    driven: SMatrix<f32, Q, C>,
+    driven: [Column<Q>; C],
     /// Monitors to correctors, `R`.
-    response: SMatrix<f32, B, C>,
+    response: [Column<B>; C],
     /// Tune up to an integer [1].
     tune: f32,
     /// Derivative of the tune with respect to `ln` of each quadrupole's strength.
@@ -136,8 +135,44 @@ pub struct GreenLinearised<
 }
 
 impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
-    const BLANK: Self = Self { seen: zeros(), driven: zeros(), response: zeros(), tune: 0.0, tune_slope: [0.0; M] };
+    const BLANK: Self = Self {
+        seen: [Column::ZERO; B],
+        driven: [Column::ZERO; C],
+        response: [Column::ZERO; C],
+        tune: 0.0,
+        tune_slope: [0.0; M],
+    };
 }
+
+/// How far linearising has come, and its work space.
+#[derive(Debug, Clone)]
+pub struct GreenProgress<const Q: usize, const T: usize> {
+    /// x comes last: its function between the nodes also gives the dispersion.
+    is_x: bool,
+    step: Step,
+    /// `det(1 + G_qq D)` of the nodes that are switched on.
+    determinant: f32,
+    /// `Z_qq` of these.
+    mutual: Triangle<Q, T>,
+}
+
+/// What is next in a plane. Each is at most 0.3 million instructions of a chip for a ring of 48 quadrupoles.
+#[derive(Debug, Clone, Copy)]
+enum Step {
+    /// Switch pairs of quadrupoles on, from this one.
+    Pairs(usize),
+    /// Columns of `Z_qb`, from this one.
+    Seen(usize),
+    /// Columns of `Z_qc`, from this one.
+    Driven(usize),
+    /// `R`.
+    Response,
+}
+
+/// Pairs of quadrupoles that are switched on in one step.
+const PAIRS: usize = 4;
+/// Columns that are filled in one step.
+const COLUMNS: usize = 8;
 
 impl<
     const BX: usize,
@@ -177,16 +212,6 @@ impl<
 impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize, const M: usize, const Q: usize>
     GreenLinearised<BX, BY, CX, CY, M, Q>
 {
-    /// Response of the horizontal monitors to the horizontal correctors [m/rad].
-    pub fn response_x(&self) -> &SMatrix<f32, BX, CX> {
-        &self.x.response
-    }
-
-    /// Response of the vertical monitors to the vertical correctors [m/rad].
-    pub fn response_y(&self) -> &SMatrix<f32, BY, CY> {
-        &self.y.response
-    }
-
     /// Relative momentum that an RF offset makes.
     fn delta<const C: usize, const F: usize>(&self, drive: &Drive<C, F>) -> f32 {
         -drive.rf_offset / self.slip
@@ -225,6 +250,10 @@ impl<
 > Surrogate<B, C, F, N> for Green<BX, BY, CX, CY, M, N, Q, T>
 {
     type Linearised = GreenLinearised<BX, BY, CX, CY, M, Q>;
+    type Progress = GreenProgress<Q, T>;
+
+    const BEGIN: Self::Progress =
+        GreenProgress { is_x: false, step: Step::Pairs(0), determinant: 0.0, mutual: Triangle::ZERO };
 
     const UNLINEARISED: Self::Linearised = GreenLinearised {
         x: PlaneLinearised::BLANK,
@@ -235,22 +264,30 @@ impl<
         slip: 0.0,
     };
 
-    #[inline(never)] // 19 kB of stack, for as long as it runs
-    fn linearise(&self, params: &[f32; N], supplies: &[f32; F], at: &mut Self::Linearised) -> Result<(), Unstable> {
+    #[inline(never)]
+    fn advance(
+        &self,
+        params: &[f32; N],
+        supplies: &[f32; F],
+        progress: &mut Self::Progress,
+        at: &mut Self::Linearised,
+    ) -> Result<bool, Unstable> {
         const { assert!(B == BX + BY && C == CX + CY && Q == 2 * M, "planes and nodes add up") };
         let mut strength = self.ln_strength(params, supplies);
         strength.iter_mut().for_each(|s| *s = libm::expf(*s));
-        let excess_y = self.excess(&strength, -1.0);
-        let mut mutual = Triangle::ZERO;
         at.slope = product(&strength, self.weight.iter().copied());
-        let slope_y = at.slope.map(|k| -k);
         let focusing = self.focusing();
-        self.y.linearise(&excess_y, (self.tune[1], &slope_y), focusing, &mut at.y, &mut mutual)?;
-        // x last: its function between the nodes also gives the dispersion
-        let excess_x = excess_y.map(|e| -e);
-        self.x.linearise(&excess_x, (self.tune[0], &at.slope), focusing, &mut at.x, &mut mutual)?;
-        self.linearise_dispersion(&excess_x, at, &mutual);
-        Ok(())
+        if !progress.is_x {
+            let (excess, slope) = (self.excess(&strength, -1.0), at.slope.map(|k| -k));
+            progress.is_x = self.y.advance(&excess, (self.tune[1], &slope), focusing, progress, &mut at.y)?;
+            return Ok(false);
+        }
+        let excess = self.excess(&strength, 1.0);
+        let is_done = self.x.advance(&excess, (self.tune[0], &at.slope), focusing, progress, &mut at.x)?;
+        if is_done {
+            self.linearise_dispersion(&excess, at, &progress.mutual);
+        }
+        Ok(is_done)
     }
 
     fn orbit(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut [f32; B]) {
@@ -371,11 +408,11 @@ impl<
         by_supply: &mut [[f32; F]],
     ) {
         let push = push.as_chunks::<2>().0;
-        let seen = plane.seen.as_slice().chunks_exact(Q);
-        for ((by_param, by_supply), seen) in jacobian.chunks_exact_mut(N).zip(by_supply).zip(seen) {
+        for ((by_param, by_supply), seen) in jacobian.chunks_exact_mut(N).zip(by_supply).zip(&plane.seen) {
             by_param.fill(0.0);
             by_supply.fill(0.0);
-            let slopes = seen.as_chunks::<2>().0.iter().zip(push).map(|(z, x)| z[0] * x[0] + z[1] * x[1]);
+            let codes = seen.codes.as_chunks::<2>().0.iter().zip(push);
+            let slopes = codes.map(|(z, x)| seen.scale * (f32::from(z[0]) * x[0] + f32::from(z[1]) * x[1]));
             self.spread(slopes, by_param, by_supply);
         }
     }
@@ -398,8 +435,8 @@ impl<
         }
     }
 
-    #[inline(never)]
     /// Dispersion `D' = D - Z_qq D_q D` at the nodes, alike at the monitors, and the slip factor.
+    #[inline(never)]
     fn linearise_dispersion(
         &self,
         excess: &[f32; Q],
@@ -410,9 +447,8 @@ impl<
         let kick = product(excess, d.node.iter().copied());
         at.node_dispersion = d.node;
         add(&mut at.node_dispersion, -1.0, &mutual.multiply(&kick));
-        let seen = at.x.seen.as_slice().chunks_exact(Q);
-        for ((to, design), seen) in at.monitor_dispersion.iter_mut().zip(&d.monitor).zip(seen) {
-            *to = design - dot(seen, &kick);
+        for ((to, design), seen) in at.monitor_dispersion.iter_mut().zip(&d.monitor).zip(&at.x.seen) {
+            *to = design - seen.dot(&kick);
         }
         let compaction = d.compaction - dot(&kick, &at.node_dispersion) / d.circumference;
         at.slip = compaction - d.inverse_gamma_squared;
@@ -461,41 +497,67 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
     const BLANK: Self =
         Self { direct: Block::BLANK, seen: Block::BLANK, driven: Block::BLANK, mutual: SymmetricBlock::BLANK };
 
-    /// The plane at the errors of its nodes; `tune` is that of the design, `slope` is `k L w strength` of each quadrupole.
+    /// One step towards the plane at the errors of its nodes; `tune` is that of the design, `slope` is `k L w strength` of each
+    /// quadrupole. True after the last step.
     #[inline(never)]
-    fn linearise<const M: usize>(
+    fn advance<const M: usize>(
         &self,
         excess: &[f32; Q],
         (tune, slope): (f32, &[f32; M]),
         focusing: usize,
+        progress: &mut GreenProgress<Q, T>,
         at: &mut PlaneLinearised<B, C, M, Q>,
-        mutual: &mut Triangle<Q, T>,
-    ) -> Result<(), Unstable> {
-        self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
-        let mut determinant = 1.0;
-        // one focusing and one defocusing quadrupole at a time: the intermediate tunes then stay between the design's and
-        // the ring's
-        for k in 0..focusing.max(M - focusing.min(M)) {
-            let (one, other) = (2 * k, 2 * (k + focusing));
-            let one = if k < focusing { [one, one + 1] } else { [Q; 2] };
-            determinant *= switch_on(mutual, excess, [one[0], one[1], other, other + 1])?;
-        }
-        at.tune = tune_at(tune, determinant)?;
-        let steep = libm::tanf(core::f32::consts::PI * at.tune) / core::f32::consts::TAU;
-        for (q, (to, slope)) in at.tune_slope.iter_mut().zip(slope).enumerate() {
-            *to = steep * slope * (mutual.get(2 * q, 2 * q) + mutual.get(2 * q + 1, 2 * q + 1));
-        }
-        fill(at.seen.as_mut_slice(), &self.seen, mutual, excess);
-        fill(at.driven.as_mut_slice(), &self.driven, mutual, excess);
-        let responses = at.response.as_mut_slice().chunks_exact_mut(B);
-        for (c, response) in responses.enumerate() {
-            let kick = product(excess, self.driven.column(c));
-            let seen = at.seen.as_slice().chunks_exact(Q);
-            for ((to, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(seen) {
-                *to = direct - dot(seen, &kick);
+    ) -> Result<bool, Unstable> {
+        let GreenProgress { step, determinant, mutual, .. } = progress;
+        *step = match *step {
+            Step::Pairs(from) => {
+                if from == 0 {
+                    *determinant = 1.0;
+                    self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
+                }
+                // one focusing and one defocusing quadrupole at a time: the intermediate tunes then stay between the design's
+                // and the ring's
+                let pairs = focusing.max(M - focusing.min(M));
+                let to = pairs.min(from + PAIRS);
+                for k in from..to {
+                    let (one, other) = (2 * k, 2 * (k + focusing));
+                    let one = if k < focusing { [one, one + 1] } else { [Q; 2] };
+                    *determinant *= switch_on(mutual, excess, [one[0], one[1], other, other + 1])?;
+                }
+                if to == pairs {
+                    at.set_tune(tune_at(tune, *determinant)?, slope, mutual);
+                }
+                if to < pairs { Step::Pairs(to) } else { Step::Seen(0) }
             }
+            Step::Seen(from) => {
+                let table = self.seen.codes.get(from..).unwrap_or_default();
+                fill(at.seen.get_mut(from..).unwrap_or_default(), (self.seen.scale, table), mutual, excess);
+                if from + COLUMNS < B { Step::Seen(from + COLUMNS) } else { Step::Driven(0) }
+            }
+            Step::Driven(from) => {
+                let table = self.driven.codes.get(from..).unwrap_or_default();
+                fill(at.driven.get_mut(from..).unwrap_or_default(), (self.driven.scale, table), mutual, excess);
+                if from + COLUMNS < C { Step::Driven(from + COLUMNS) } else { Step::Response }
+            }
+            Step::Response => {
+                self.respond(excess, at);
+                *step = Step::Pairs(0);
+                return Ok(true);
+            }
+        };
+        Ok(false)
+    }
+
+    /// `R = G_bc - Z_bq D G_qc`.
+    fn respond<const M: usize>(&self, excess: &[f32; Q], at: &mut PlaneLinearised<B, C, M, Q>) {
+        for (c, to) in at.response.iter_mut().enumerate() {
+            let kick = product(excess, self.driven.column(c));
+            let mut response = [0.0; B];
+            for ((response, direct), seen) in response.iter_mut().zip(self.direct.column(c)).zip(&at.seen) {
+                *response = direct - seen.dot(&kick);
+            }
+            to.quantise(&response);
         }
-        Ok(())
     }
 }
 
@@ -513,22 +575,32 @@ fn tune_at(design: f32, determinant: f32) -> Result<f32, Unstable> {
 }
 
 impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
+    /// The tune, and `dQ/d(ln strength) = tan(pi Q)/(2 pi) slope (sum of Z_nn)` of each quadrupole.
+    fn set_tune<const T: usize>(&mut self, tune: f32, slope: &[f32; M], mutual: &Triangle<Q, T>) {
+        self.tune = tune;
+        let steep = libm::tanf(core::f32::consts::PI * tune) / core::f32::consts::TAU;
+        for (q, (to, slope)) in self.tune_slope.iter_mut().zip(slope).enumerate() {
+            *to = steep * slope * (mutual.get(2 * q, 2 * q) + mutual.get(2 * q + 1, 2 * q + 1));
+        }
+    }
+
     /// The orbit that kicks make at the nodes, on top of the `orbit` that the momentum makes there [m].
     fn orbit_at_nodes(&self, kick: &[f32], mut orbit: [f32; Q]) -> [f32; Q] {
-        combine(&mut orbit, acting(kick, self.driven.as_slice().chunks_exact(Q)));
+        acting(kick, self.driven.iter()).for_each(|(kick, driven)| driven.add_to(kick, &mut orbit));
         orbit
     }
 
     /// Readings for kicks of correctors.
     fn read(&self, kick: &[f32], reading: &mut [f32]) {
         reading.fill(0.0);
-        combine(reading, acting(kick, self.response.as_slice().chunks_exact(B)));
+        acting(kick, self.response.iter()).for_each(|(kick, response)| response.add_to(kick, reading));
     }
 
     /// `R^T orbit` [m^2/rad].
     fn pull(&self, orbit: &[f32], pull: &mut [f32]) {
-        let responses = self.response.as_slice().chunks_exact(B);
-        pull.iter_mut().zip(responses).for_each(|(pull, response)| *pull = dot(response, orbit));
+        let mut all = [0.0; B];
+        all.iter_mut().zip(orbit).for_each(|(to, x)| *to = *x);
+        pull.iter_mut().zip(&self.response).for_each(|(pull, response)| *pull = response.dot(&all));
     }
 
     /// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
@@ -545,9 +617,10 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
         for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
             let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
             let mut row = [0.0; M];
-            for (seen, weight) in self.seen.as_slice().chunks_exact(Q).zip(weight) {
-                let factor = weight * between(seen, q);
-                row.iter_mut().zip(seen.as_chunks::<2>().0).for_each(|(to, [a, b])| *to += factor * (a + b));
+            for (seen, weight) in self.seen.iter().zip(weight) {
+                let factor = weight * seen.scale * between(seen, q);
+                let nodes = seen.codes.as_chunks::<2>().0;
+                row.iter_mut().zip(nodes).for_each(|(to, [a, b])| *to += factor * (f32::from(*a) + f32::from(*b)));
             }
             let shared = covariance(own);
             for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
@@ -555,9 +628,10 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
                 *to *= slope_q * slope * covariance;
             }
             let (mut here, mut there) = ([0.0; C], [0.0; C]);
-            for ((driven, here), there) in self.driven.as_slice().chunks_exact(Q).zip(&mut here).zip(&mut there) {
+            for ((driven, here), there) in self.driven.iter().zip(&mut here).zip(&mut there) {
                 *here = between(driven, q);
-                *there = row.iter().zip(driven.as_chunks::<2>().0).map(|(row, [a, b])| row * (a + b)).sum();
+                let each = row.iter().zip(driven.codes.as_chunks::<2>().0);
+                *there = driven.scale * each.map(|(row, [a, b])| row * (f32::from(*a) + f32::from(*b))).sum::<f32>();
             }
             add(&here, &there);
         }
@@ -565,46 +639,48 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
 
     /// Add readings for kicks of nodes.
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
-        let seen = self.seen.as_slice().chunks_exact(Q);
-        reading.iter_mut().zip(seen).for_each(|(reading, seen)| *reading += dot(seen, kick));
+        reading.iter_mut().zip(&self.seen).for_each(|(reading, seen)| *reading += seen.dot(kick));
     }
 }
 
 /// The mean of the two nodes of quadrupole `q`.
-fn between(nodes: &[f32], q: usize) -> f32 {
-    nodes.as_chunks::<2>().0.get(q).map_or(0.0, |[a, b]| 0.5 * (a + b))
+fn between<const Q: usize>(nodes: &Column<Q>, q: usize) -> f32 {
+    let mean = |[a, b]: &[i16; 2]| 0.5 * (f32::from(*a) + f32::from(*b));
+    nodes.codes.as_chunks::<2>().0.get(q).map_or(0.0, |codes| nodes.scale * mean(codes))
 }
 
 /// The kicks that are not zero, each with its column.
-fn acting<'a>(kick: &'a [f32], columns: impl Iterator<Item = &'a [f32]>) -> impl Iterator<Item = (f32, &'a [f32])> {
+fn acting<'a, V>(kick: &'a [f32], columns: impl Iterator<Item = V>) -> impl Iterator<Item = (f32, V)> {
     kick.iter().copied().zip(columns).filter(|(kick, _)| *kick != 0.0)
 }
 
-/// Columns of a table, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a time.
+/// The first [`COLUMNS`] columns, at most, of a part of a table, in the ring as it is: `Z = G - Z_qq D G`, four rows of `Z_qq` at a
+/// time.
 #[inline(never)]
-fn fill<const Q: usize, const M: usize, const T: usize>(
-    to: &mut [f32],
-    table: &Block<Q, M>,
+fn fill<const Q: usize, const T: usize>(
+    to: &mut [Column<Q>],
+    (scale, table): (f32, &[[i16; Q]]),
     mutual: &Triangle<Q, T>,
     excess: &[f32; Q],
 ) {
-    for (m, column) in to.chunks_exact_mut(Q).enumerate() {
-        column.iter_mut().zip(table.column(m)).for_each(|(to, g)| *to = g);
+    let mut columns = [[0.0; Q]; COLUMNS];
+    for (column, codes) in columns.iter_mut().zip(table) {
+        column.iter_mut().zip(codes).for_each(|(to, code)| *to = scale * f32::from(*code));
     }
     let mut rows = [[0.0; Q]; 4];
-    for from in (0..Q).step_by(4) {
+    for first in (0..Q).step_by(4) {
         let mut errors = [0.0; 4];
-        for ((n, row), error) in (from..Q).zip(&mut rows).zip(&mut errors) {
+        for ((n, row), error) in (first..Q).zip(&mut rows).zip(&mut errors) {
             mutual.copy_row(n, row);
-            *error = -table.scale * excess.get(n).copied().unwrap_or(0.0);
+            *error = -scale * excess.get(n).copied().unwrap_or(0.0);
         }
         let rows = rows.each_ref().map(<[f32; Q]>::as_slice);
         let kicks = |codes: &[i16; Q]| {
             let mut kicks = errors;
-            kicks.iter_mut().zip(codes.iter().skip(from)).for_each(|(k, code)| *k *= f32::from(*code));
+            kicks.iter_mut().zip(codes.iter().skip(first)).for_each(|(k, code)| *k *= f32::from(*code));
             kicks
         };
-        let mut each = to.chunks_exact_mut(Q).zip(&table.codes);
+        let mut each = columns.iter_mut().zip(table);
         while let Some((one, codes)) = each.next() {
             match each.next() {
                 Some((other, others)) => add_four_twice([one, other], [kicks(codes), kicks(others)], rows),
@@ -612,6 +688,7 @@ fn fill<const Q: usize, const M: usize, const T: usize>(
             }
         }
     }
+    to.iter_mut().zip(&columns).for_each(|(to, column)| to.quantise(column));
 }
 
 /// `a b`, one by one.

@@ -5,7 +5,7 @@ mod low_rank;
 mod parcels;
 mod quantised;
 
-pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, NONE};
+pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, GreenProgress, NONE};
 pub use low_rank::{LowRank, TERMS};
 pub use parcels::{List, RING, Table, VERSION, shape};
 pub use quantised::{Block, SymmetricBlock, code, step};
@@ -78,11 +78,34 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
     /// Memory for a linearisation, all zero.
     const UNLINEARISED: Self::Linearised;
 
-    /// Linearise at params [N] and at `ln` of the supplies' factors [F].
+    /// How far linearising has come, and its work space.
+    type Progress;
+
+    /// Before the first step.
+    const BEGIN: Self::Progress;
+
+    /// One step of linearising at params [N] and at `ln` of the supplies' factors [F], the same in each step; true after the
+    /// last. Frames are answered between two steps: one should take no longer than a frame does.
+    ///
+    /// # Errors
+    /// [`Unstable`]; `into` is then not to be used, and `progress` to be begun anew.
+    fn advance(
+        &self,
+        params: &[f32; N],
+        supplies: &[f32; F],
+        progress: &mut Self::Progress,
+        into: &mut Self::Linearised,
+    ) -> Result<bool, Unstable>;
+
+    /// Linearise, all steps at once.
     ///
     /// # Errors
     /// [`Unstable`]; `into` is then not to be used.
-    fn linearise(&self, params: &[f32; N], supplies: &[f32; F], into: &mut Self::Linearised) -> Result<(), Unstable>;
+    fn linearise(&self, params: &[f32; N], supplies: &[f32; F], into: &mut Self::Linearised) -> Result<(), Unstable> {
+        let mut progress = Self::BEGIN;
+        while !self.advance(params, supplies, &mut progress, into)? {}
+        Ok(())
+    }
 
     /// The orbit that a drive makes [m].
     fn orbit(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut [f32; B]);

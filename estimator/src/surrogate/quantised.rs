@@ -20,6 +20,38 @@ pub struct SymmetricBlock<const N: usize, const T: usize> {
     pub codes: [i16; T],
 }
 
+/// A column of a matrix in codes with a scale of its own: off by half a step, `max/65534` of this column, at most.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Column<const R: usize> {
+    /// Size of one step.
+    pub scale: f32,
+    /// The codes.
+    pub codes: [i16; R],
+}
+
+impl<const R: usize> Column<R> {
+    /// All zero.
+    pub const ZERO: Self = Self { scale: 0.0, codes: [0; R] };
+
+    /// Become these values, which must be finite.
+    #[inline(never)]
+    pub fn quantise(&mut self, values: &[f32; R]) {
+        self.scale = step(values.iter().copied().map(f64::from));
+        self.codes.iter_mut().zip(values).for_each(|(to, value)| *to = code((*value).into(), self.scale));
+    }
+
+    /// The scalar product with some values.
+    pub fn dot(&self, values: &[f32; R]) -> f32 {
+        self.scale * self.codes.iter().zip(values).map(|(code, value)| f32::from(*code) * value).sum::<f32>()
+    }
+
+    /// `to += factor` times the column.
+    pub fn add_to(&self, factor: f32, to: &mut [f32]) {
+        let step = factor * self.scale;
+        to.iter_mut().zip(&self.codes).for_each(|(to, code)| *to += step * f32::from(*code));
+    }
+}
+
 impl<const R: usize, const C: usize> Block<R, C> {
     /// Memory for one, all zero.
     pub const BLANK: Self = Self { scale: 0.0, codes: [[0; R]; C] };
@@ -107,6 +139,21 @@ mod tests {
         let places = (0..4).flat_map(|r| (0..=r).map(move |c| (r, c)));
         assert!(symmetric.values().zip(places).all(|(v, (r, c))| near(v, value(r, c), symmetric.scale)));
         assert_eq!(symmetric.values().count(), 10);
+    }
+
+    #[test]
+    fn a_column_has_the_scale_of_its_largest() {
+        let values: [f32; 20] = core::array::from_fn(|r| 1e-3 * libm::sinf(r as f32));
+        let mut column = Column::ZERO;
+        column.quantise(&values);
+        assert!(column.scale < 1.001e-3 / 32_767.0);
+        let mut sum = values.map(|v| -2.0 * v);
+        column.add_to(2.0, &mut sum);
+        assert!(sum.iter().all(|left| left.abs() <= 1.02 * column.scale)); // twice half a step, and rounding
+        let exact: f32 = values.iter().map(|v| v * v).sum();
+        assert!((column.dot(&values) - exact).abs() <= 10.0 * column.scale * 1e-3);
+        column.quantise(&[0.0; 20]);
+        assert_eq!(column.dot(&values), 0.0);
     }
 
     #[test]

@@ -227,7 +227,7 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
         + 5 * (LENGTH + VARINT_32 * W) // masks
         + LENGTH + B * (1 + 8 + VARINT_32) // health
         + 3 * VARINT_32 + VARINT_64 // the frame, and how many
-        + 2 * 4 + 2 * 5 + 4 + 4; // nis, log_evidence, tunes, setting, linearised and remarks
+        + 2 * 4 + 2 * 5 + 4 + 4 + VARINT_32; // nis, log_evidence, tunes, setting, linearised and remarks
 
     /// The estimate, if every list is whole.
     pub fn estimate(&self) -> Option<Estimate<B, N, W>> {
@@ -270,7 +270,7 @@ impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
     pub const MAX_BYTES: usize = 1 + 16 * GROUPS // priors
         + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
         + 5 + LENGTH + 28 * F // dipole, supplies
-        + 4 * 4 + 5; // powered, gate, both walks, tunes
+        + 3 * 4 + 5; // gate, both walks, tunes
 }
 
 impl<S: Serialize, P: Serialize> Request<S, P> {

@@ -3,7 +3,7 @@
 use core::fmt;
 
 use estimator::surrogate::{Surrogate, Unstable};
-use estimator::{Core, Estimator, FitQuality, IngestError};
+use estimator::{Core, Estimator, FitQuality, IngestError, Prepared};
 use training::{Tables, with_stack};
 
 use super::{Estimate, Setup};
@@ -11,7 +11,7 @@ use super::{Estimate, Setup};
 /// What [`super::Core`] needs of a core.
 pub trait Stream: fmt::Debug + Send + Sync {
     fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate, IngestError>;
-    fn prepare(&mut self) -> bool;
+    fn prepare(&mut self) -> Prepared;
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable>;
     fn fit_quality(&mut self) -> FitQuality;
     fn covariance(&self, i: usize, j: usize) -> f32;
@@ -41,10 +41,12 @@ impl<
     const S: usize,
     const K: usize,
     const T: usize,
+    const U: usize,
     const W: usize,
-> Room for Estimator<G, B, C, F, N, S, K, T, W>
+> Room for Estimator<G, B, C, F, N, S, K, T, U, W>
 where
     G::Linearised: Clone + Send + Sync,
+    G::Progress: Clone + Send + Sync,
 {
     fn setup(tables: &G, setup: &Setup) -> Self::Setup {
         setup.in_room(&tables.layout())
@@ -97,7 +99,7 @@ where
         Ok(E::estimate(&self.tables, &estimate))
     }
 
-    fn prepare(&mut self) -> bool {
+    fn prepare(&mut self) -> Prepared {
         on_its_stack::<E, _>(|| self.core.prepare(&self.tables, &self.setup))
     }
 

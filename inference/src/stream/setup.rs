@@ -8,11 +8,6 @@ use super::StreamError;
 use crate::campaign::TUNE_CALIBRATION;
 use crate::recording::{Recording, Row};
 
-/// Largest read-back above which a corrector counts as powered [A]: 50 times its scatter. A twentieth of the largest setting where
-/// that is less.
-const POWERED: f32 = 1.0;
-const SHARE: f64 = 0.05;
-
 /// Priors, noise and calibration: [`estimator::Setup`] for a ring of any size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setup {
@@ -24,8 +19,6 @@ pub struct Setup {
     pub dipole: Option<f32>,
     /// The supplies of quadrupoles [F].
     pub supplies: Vec<SupplyCalibration>,
-    /// Read-back above which a corrector counts as powered [A].
-    pub powered: f32,
     /// Expected noise of a reading of each monitor [m] [B].
     pub noise: Vec<f32>,
     /// When readings agree.
@@ -34,13 +27,6 @@ pub struct Setup {
     pub walk: Walk,
     /// Calibration error of the tune meter [1]; none, and tunes do not count.
     pub tune_calibration: Option<f32>,
-}
-
-/// Read-back above which a corrector counts as powered [A].
-fn powered(recording: &Recording) -> f32 {
-    let settings = recording.rows.iter().flat_map(|row| &row.correctors).map(|(_, setting)| setting.abs());
-    let largest = settings.fold(0.0, f64::max);
-    if largest > 0.0 { POWERED.min((SHARE * largest) as f32) } else { POWERED }
 }
 
 /// A random walk of the params by so much per square root of a cycle of a recording, lost ones counted.
@@ -73,7 +59,6 @@ pub fn setup(ring: &Ring, recording: &Recording, walk: Walk) -> Result<Setup, St
         kick_per_ampere: single(&header.kick_per_ampere),
         dipole: header.nominal_dipole.map(|a| a as f32),
         supplies: header.nominal.iter().zip(&header.transfer).map(supply).collect::<Result<_, _>>()?,
-        powered: powered(recording),
         noise: single(&header.noise),
         gate: Gate::default(),
         walk,
@@ -120,7 +105,6 @@ impl Setup {
                 kick_per_ampere: each(&self.kick_per_ampere, corrector),
                 dipole: self.dipole,
                 supplies: supplies.take(F).collect(),
-                powered: self.powered,
             },
             noise: each(&self.noise, monitor),
             gate: self.gate,

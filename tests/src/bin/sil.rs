@@ -111,7 +111,7 @@ fn summary(recording: &str, comparison: &Comparison, sizes: &Sizes) -> Value {
             "decode": of("decode"),
             "predict": of("predict"),
             "update": of("screen") + of("condition"),
-            "linearise": of("linearise"),
+            "slice": of("slice"),
             "frame": of("ingest") + of("encode"),
         },
         "flash_bytes": sizes.flash,

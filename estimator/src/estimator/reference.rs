@@ -1,0 +1,158 @@
+//! The drive from which settings are counted, and the setting of a frame.
+//!
+//! A campaign moves one corrector at a time from 0 A. A machine under feedback holds all of them somewhere, and moves them seldom,
+//! or one at a time about there. What is moved is told by the orbit that it makes, not by amperes.
+
+use super::{Estimator, Model, UNDERWEIGHT};
+use crate::campaign::{Setting, is_moved};
+use crate::drive::Drive;
+use crate::gaussian::Reading;
+use crate::linear::column;
+use crate::surrogate::Surrogate;
+use crate::wire::Frame;
+
+/// Mean square orbit over the noise's below which kicks count as none: the scatter of read-backs makes 0.004.
+const IDLE: f32 = 0.1;
+/// Of the recent frames, so many parts of four must belong to a setting about a new reference drive.
+const PARTS: usize = 3;
+
+/// Kicks from which settings are counted.
+#[derive(Debug, Clone)]
+pub(super) struct Reference<const C: usize> {
+    /// 0 at first, and one more for each that followed.
+    number: u16,
+    kick: [f32; C],
+    /// Frames of no setting since it was last looked for.
+    waited: u16,
+}
+
+impl<const C: usize> Reference<C> {
+    /// All correctors at 0 A.
+    pub const ZERO: Self = Self { number: 0, kick: [0.0; C], waited: 0 };
+
+    /// A frame's kicks, seen from it, and nothing else of its drive.
+    fn moved<const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
+        let mut kick = drive.kick;
+        kick.iter_mut().zip(&self.kick).for_each(|(kick, reference)| *kick -= reference);
+        Drive { kick, strength: [0.0; F], rf_offset: 0.0 }
+    }
+
+    /// A frame of no setting has come.
+    pub fn wait(&mut self) {
+        self.waited = self.waited.saturating_add(1);
+    }
+}
+
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const U: usize,
+    const W: usize,
+> Estimator<G, B, C, F, N, S, K, T, U, W>
+{
+    /// The setting that a frame repeats. Several correctors at once belong to none, unless the reference drive has them, or all but one
+    /// of them move the orbit by less than is noticed: what a setting's mean says of the params would lose it.
+    #[inline(never)]
+    pub(super) fn setting(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+    ) -> Option<Setting> {
+        let reference = &self.past.reference;
+        let at_rest = Setting::at_rest(reference.number, frame.rf_offset, frame.cycle_time_us);
+        let mut moved = reference.moved(drive);
+        if self.is_idle(model, &moved) {
+            return Some(at_rest);
+        }
+        let largest = moved.kick.iter_mut().enumerate().reduce(|a, b| if b.1.abs() > a.1.abs() { b } else { a });
+        let (corrector, kick) = largest.map(|(c, kick)| (c, core::mem::take(kick)))?;
+        if is_moved(frame.rf_offset) || !self.is_idle(model, &moved) {
+            return None;
+        }
+        let mut alone = Drive { kick: [0.0; C], ..moved };
+        alone.kick.get_mut(corrector).into_iter().for_each(|own| *own = kick);
+        let idle = kick.abs() / libm::sqrtf(self.noticed(model, &alone));
+        Some(at_rest.with(u16::try_from(corrector).ok()?, kick, idle))
+    }
+
+    /// True if kicks move the orbit by less than is noticed.
+    fn is_idle(&mut self, model: &Model<'_, G, B, C, F>, moved: &Drive<C, F>) -> bool {
+        self.noticed(model, moved) <= 1.0
+    }
+
+    /// Mean square orbit of kicks over that which is noticed.
+    fn noticed(&mut self, model: &Model<'_, G, B, C, F>, moved: &Drive<C, F>) -> f32 {
+        // work space: what the mean drive would have made is not known yet
+        model.surrogate.orbit(&self.tangent.linearised, moved, &mut self.predicted.at_mean_drive);
+        let over_noise = |(b, orbit): (usize, &f32)| orbit * orbit / self.noise_variance(b);
+        let sum: f32 = self.predicted.at_mean_drive.iter().enumerate().map(over_noise).sum();
+        sum / (IDLE * model.surrogate.layout().monitors() as f32)
+    }
+
+    /// Look for another reference drive, if for a while no frame has repeated a setting: the median of the recent drives, if most of
+    /// them are settings about it.
+    #[inline(never)]
+    pub(super) fn seek_reference(&mut self, model: &Model<'_, G, B, C, F>) {
+        let recent = self.past.recent.len();
+        if !self.past.recent.is_full() || usize::from(self.past.reference.waited) < recent {
+            return;
+        }
+        self.past.reference.waited = 0;
+        let former = self.past.reference.kick;
+        self.past.reference.kick = core::array::from_fn(|c| self.median_kick(c));
+        let repeats = (0..recent).filter(|&at| self.repeats_about_reference(model, at)).count();
+        if 4 * repeats >= PARTS * recent {
+            // not 0 again, which means that there is none
+            self.past.reference.number = self.past.reference.number.checked_add(1).unwrap_or(1);
+        } else {
+            self.past.reference.kick = former;
+        }
+    }
+
+    /// Make room for new settings, if there is none, by one setting of a former reference drive: it counts on as it is linearised now.
+    #[inline(never)]
+    pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) {
+        let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return };
+        let drive = cell.drive();
+        self.predict_drive(model, &drive);
+        self.past.loose.recentre(self.posterior.gaussian.origin());
+        for b in 0..B {
+            if let (mean, number @ 1..) = cell.mean(b) {
+                let variance = self.variance(model, b, number, drive.rf_offset);
+                let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
+                let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
+                let reading = Reading { channel: b, innovation, variance, slope };
+                self.past.loose.condition([reading], |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
+                self.past.loose.add_repeats(number, self.noise_variance(b));
+            }
+        }
+    }
+
+    /// Median of the recent kicks of a corrector: that which as many exceed as fall short of.
+    fn median_kick(&self, c: usize) -> f32 {
+        let kick =
+            |at: usize| self.past.recent.get(at).and_then(|frame| frame.drive.kick.get(c)).copied().unwrap_or(0.0);
+        let all = 0..self.past.recent.len();
+        let rank = |value: f32| all.clone().filter(|&at| kick(at) < value).count();
+        let half = all.len() / 2;
+        let above = all.clone().map(kick).filter(|&value| rank(value) >= half);
+        let below = all.clone().map(kick).filter(|&value| rank(value) <= half);
+        0.5 * (above.fold(f32::MAX, f32::min) + below.fold(f32::MIN, f32::max))
+    }
+
+    /// True if at most one corrector is moved from the reference in a recent frame.
+    fn repeats_about_reference(&mut self, model: &Model<'_, G, B, C, F>, at: usize) -> bool {
+        let Some(drive) = self.past.recent.get(at).map(|frame| frame.drive) else { return false };
+        let mut moved = self.past.reference.moved(&drive);
+        let largest = moved.kick.iter_mut().reduce(|a, b| if b.abs() > a.abs() { b } else { a });
+        largest.into_iter().for_each(|kick| *kick = 0.0);
+        self.is_idle(model, &moved)
+    }
+}

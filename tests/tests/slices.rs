@@ -1,0 +1,168 @@
+//! Linearising anew in slices: frames that come between any two of them are answered at once, and count once.
+
+use estimator::{CurrentCode, PositionCode, Prepared, Walk};
+use inference::Recording;
+use inference::stream::{self, Core, Estimate};
+use system_tests::machine::{Machine, Random, wire_of};
+use system_tests::repository;
+use system_tests::soak::Row;
+use twin::Ring;
+
+fn paper_vars() -> (Core, Vec<Vec<u8>>) {
+    let ring = Ring::booster();
+    let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
+    let wires = recording.rows.iter().map(|row| stream::wire(&recording, row).unwrap()).collect();
+    (stream::estimator(&ring, &recording, Walk::NONE).unwrap(), wires)
+}
+
+fn ingest(core: &mut Core, wire: &[u8]) -> Estimate {
+    core.ingest(&mut wire.to_vec()).unwrap()
+}
+
+/// So many slices, as far as there is something to do.
+fn slices(core: &mut Core, number: usize) -> usize {
+    (0..number).take_while(|_| core.slice() != Prepared::Nothing).count()
+}
+
+/// Largest distance of two MAPs, in error bars.
+fn distance(one: &Estimate, other: &Estimate) -> f32 {
+    let each = one.map_params.iter().zip(&other.map_params).zip(&one.params_sigma);
+    each.map(|((a, b), sigma)| (a - b).abs() / sigma).fold(0.0, f32::max)
+}
+
+/// All frames so far at the MAP of all frames: what is left of where they were linearised before is of third order. Then the
+/// estimate after one more frame.
+fn converged(core: &mut Core, next: &[u8]) -> Estimate {
+    for _ in 0..2 {
+        core.adopt(core.tables.clone()).unwrap();
+    }
+    ingest(core, next)
+}
+
+/// Cores of a campaign that are about to linearise anew, each with the frames that follow.
+fn about_to_linearise(from: &[usize]) -> Vec<(Core, Vec<Vec<u8>>)> {
+    let (mut core, wires) = paper_vars();
+    let mut found = Vec::new();
+    for (at, wire) in wires.iter().enumerate() {
+        core.prepare();
+        ingest(&mut core, wire);
+        if found.len() < from.len() && at >= from[found.len()] && core.clone().prepare() {
+            found.push((core.clone(), wires[at + 1..].to_vec()));
+        }
+    }
+    assert_eq!(found.len(), from.len());
+    found
+}
+
+/// A frame that is lost, or counted twice, changes the evidence by some 200 nat. What is left is that of linearising at the MAP
+/// before or after the frames that came meanwhile.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn frames_between_any_two_slices_count_once() {
+    for (start, next) in about_to_linearise(&[20, 60, 200]) {
+        let total = slices(&mut start.clone(), usize::MAX);
+        assert!(total > 30, "{total} slices");
+        // one frame; two, which may have to wait for each other; four, for which there is no room to wait
+        for burst in [1, 2, 4] {
+            let (meanwhile, then) = next.split_at(burst);
+            let mut whole = start.clone();
+            for wire in meanwhile {
+                whole.prepare();
+                ingest(&mut whole, wire);
+            }
+            whole.prepare();
+            let expected = ingest(&mut whole, &then[0]);
+            let settled = converged(&mut whole, &then[1]);
+            for before in 0..=total {
+                let mut core = start.clone();
+                assert_eq!(slices(&mut core, before), before);
+                for wire in meanwhile {
+                    let estimate = ingest(&mut core, wire);
+                    assert_eq!(estimate.linearised, before == total && wire == &meanwhile[0]);
+                }
+                core.prepare();
+                let got = ingest(&mut core, &then[0]);
+                let evidence = (got.log_evidence - expected.log_evidence).abs();
+                assert_eq!(got.frames, expected.frames);
+                assert!(evidence < EVIDENCE, "{before} of {total} slices, then {burst} frames: {evidence} nat");
+                let off = distance(&got, &expected);
+                assert!(off < LINEARISED, "{before} of {total} slices, then {burst} frames: {off} sigma");
+                let off = distance(&converged(&mut core, &then[1]), &settled);
+                assert!(off < 1e-3, "{before} of {total} slices, then {burst} frames: {off} sigma in the end");
+            }
+        }
+    }
+}
+
+/// Evidence that depends on where frames were linearised [nat]: f32 of some 1e5 is in steps of 0.008.
+const EVIDENCE: f32 = 0.1;
+/// Estimates before the next linearisation: that of half an error bar's distance.
+const LINEARISED: f32 = 0.05;
+
+/// A stream of frames with and without a setting, in turn.
+fn mixed(machine: &mut Machine, frames: u32) -> Vec<Vec<u8>> {
+    let mut random = Random::new(7);
+    let drive = |at: u32, random: &mut Random| -> [CurrentCode; 48] {
+        if at / 7 % 3 == 2 { Row::Several.drive(at, random) } else { Row::Single.drive(at, random) }
+    };
+    (0..frames).map(|at| wire_of(&machine.cycle_with(at, drive(at, &mut random)))).collect()
+}
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn a_stream_at_any_pace_ends_where_one_that_waits_does() {
+    let (start, _) = paper_vars();
+    let wires = mixed(&mut Machine::drawn(&start, 3), 400);
+    let mut whole = start.clone();
+    let mut expected = None;
+    for wire in &wires {
+        whole.prepare();
+        expected = Some(ingest(&mut whole, wire));
+    }
+    let expected = expected.unwrap();
+    for pace in [1, 2, 3, 5, 9, 20, 60] {
+        let (mut core, mut random, mut last) = (start.clone(), Random::new(pace as u64), None);
+        for wire in &wires {
+            slices(&mut core, random.below(2 * pace + 1));
+            last = Some(ingest(&mut core, wire));
+        }
+        core.prepare();
+        let last = last.unwrap();
+        let (off, evidence) = (distance(&last, &expected), (last.log_evidence - expected.log_evidence).abs());
+        println!("pace {pace}: {off} sigma, {evidence} nat");
+        assert_eq!(last.frames, expected.frames);
+        assert!(off < 0.1 && evidence < 1.0, "pace {pace}: {off} sigma, {evidence} nat");
+    }
+}
+
+/// Lost beams, moved baselines and noise that changes come between slices, too.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn a_disturbed_stream_at_any_pace_stays_sound() {
+    let (start, _) = paper_vars();
+    for seed in 0..6 {
+        let (mut core, mut machine) = (start.clone(), Machine::drawn(&start, seed));
+        let mut random = Random::new(seed);
+        for at in 0..300 {
+            let corrector = if random.below(3) == 0 { Row::Several } else { Row::Single }.drive(at % 60, &mut random);
+            if at == 120 {
+                machine.move_baselines(1e-3);
+            }
+            let mut frame = machine.cycle_with(at, corrector);
+            if random.below(40) == 0 {
+                frame.reading = [PositionCode::default(); 33];
+            }
+            let number = random.below(12);
+            slices(&mut core, number);
+            let estimate = ingest(&mut core, &wire_of(&frame));
+            let lists = [&estimate.mean, &estimate.sigma, &estimate.map_params, &estimate.params_sigma];
+            assert!(lists.into_iter().flatten().all(|v| v.is_finite()), "seed {seed}, frame {at}");
+            assert!(estimate.params_sigma.iter().all(|sigma| *sigma > 0.0), "seed {seed}, frame {at}");
+        }
+        core.prepare();
+        let last = ingest(&mut core, &wire_of(&machine.cycle(300)));
+        let errors = last.map_params.iter().zip(&machine.params).zip(&last.params_sigma);
+        let nees: f32 = errors.map(|((map, theta), sigma)| ((map - theta) / sigma).powi(2)).sum::<f32>() / 48.0;
+        assert!(nees < 2.5, "seed {seed}: {nees}");
+    }
+}
