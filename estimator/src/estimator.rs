@@ -11,6 +11,7 @@ mod posterior;
 mod reference;
 mod screen;
 mod sequence;
+mod steering;
 mod whole;
 
 use core::fmt;

@@ -87,6 +87,17 @@ macro_rules! machine {
             COUPLINGS,
             WORDS,
         >;
+        /// The feedback on it.
+        pub type Steer = $crate::Steer<
+            MONITORS,
+            CORRECTORS,
+            { $correctors_x },
+            { $correctors_y },
+            { $correctors_x * ($correctors_x + 1) / 2 },
+            { $correctors_y * ($correctors_y + 1) / 2 },
+        >;
+        /// What is wanted of its orbit.
+        pub type Feedback = $crate::Feedback<MONITORS, CORRECTORS>;
         /// One of its cycles.
         pub type Frame = $crate::Frame<MONITORS, CORRECTORS, SUPPLIES, WORDS>;
         /// What drives its beam.

@@ -2,6 +2,7 @@
 
 pub mod endurance;
 pub mod faults;
+pub mod feedback;
 pub mod machine;
 pub mod qemu;
 pub mod sil;

@@ -159,6 +159,15 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         self.factor.rows().skip(i.max(j)).filter_map(|row| Some(row.get(i)? * row.get(j)?)).sum()
     }
 
+    /// Covariance of a param with each.
+    pub fn covariance_row(&self, i: usize) -> [f32; N] {
+        let mut sum = [0.0; N];
+        for row in self.factor.rows_from(i) {
+            add(&mut sum, row.get(i).copied().unwrap_or(0.0), row);
+        }
+        sum.map(|v| v as f32)
+    }
+
     /// Variance of a prediction with derivative `h`: `h^T P h`.
     pub fn variance_of(&self, h: &[f64; N]) -> f64 {
         let image = |row: &[f64]| {

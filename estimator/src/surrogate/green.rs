@@ -309,6 +309,31 @@ impl<
         }
     }
 
+    fn pull(&self, at: &Self::Linearised, orbit: &[f32; B], into: &mut [f32; C]) {
+        let (x, y) = orbit.split_at(BX.min(B));
+        let (pull_x, pull_y) = into.split_at_mut(CX.min(C));
+        at.x.pull(x, pull_x);
+        at.y.pull(y, pull_y);
+        self.low_rank.pull([x, y], [pull_x, pull_y]);
+    }
+
+    fn response_covariance(
+        &self,
+        at: &Self::Linearised,
+        plane: usize,
+        weight: &[f32; B],
+        covariance: impl Fn(usize) -> [f32; N],
+        add: impl FnMut(&[f32], &[f32]),
+    ) {
+        let (x, y) = weight.split_at(BX.min(B));
+        let (slope, param) = (&at.slope, &self.param);
+        if plane == 0 {
+            at.x.response_covariance(x, slope, param, covariance, add);
+        } else {
+            at.y.response_covariance(y, slope, param, covariance, add);
+        }
+    }
+
     fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
         let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
         let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
@@ -578,10 +603,57 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
         acting(kick, self.response.iter()).for_each(|(kick, response)| response.add_to(kick, reading));
     }
 
+    /// `R^T orbit` [m^2/rad].
+    fn pull(&self, orbit: &[f32], pull: &mut [f32]) {
+        let mut all = [0.0; B];
+        all.iter_mut().zip(orbit).for_each(|(to, x)| *to = *x);
+        pull.iter_mut().zip(&self.response).for_each(|(pull, response)| *pull = response.dot(&all));
+    }
+
+    /// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
+    /// with `A_qp = 4 slope_q slope_p sum over b of weight_b Z_qb Z_pb`. The two nodes of a quadrupole count as one between
+    /// them: within half a metre an orbit hardly bends.
+    fn response_covariance<const N: usize>(
+        &self,
+        weight: &[f32],
+        slope: &[f32; M],
+        param: &[i16; M],
+        covariance: impl Fn(usize) -> [f32; N],
+        mut add: impl FnMut(&[f32], &[f32]),
+    ) {
+        for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
+            let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
+            let mut row = [0.0; M];
+            for (seen, weight) in self.seen.iter().zip(weight) {
+                let factor = weight * seen.scale * between(seen, q);
+                let nodes = seen.codes.as_chunks::<2>().0;
+                row.iter_mut().zip(nodes).for_each(|(to, [a, b])| *to += factor * (f32::from(*a) + f32::from(*b)));
+            }
+            let shared = covariance(own);
+            for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
+                let covariance = shared.get(*param as usize).copied().unwrap_or(0.0);
+                *to *= slope_q * slope * covariance;
+            }
+            let (mut here, mut there) = ([0.0; C], [0.0; C]);
+            for ((driven, here), there) in self.driven.iter().zip(&mut here).zip(&mut there) {
+                *here = between(driven, q);
+                let each = row.iter().zip(driven.codes.as_chunks::<2>().0);
+                *there = driven.scale * each.map(|(row, [a, b])| row * (f32::from(*a) + f32::from(*b))).sum::<f32>();
+            }
+            add(&here, &there);
+        }
+    }
+
     /// Add readings for kicks of nodes.
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
         reading.iter_mut().zip(&self.seen).for_each(|(reading, seen)| *reading += seen.dot(kick));
     }
+}
+
+/// The mean of the two nodes of quadrupole `q`.
+fn between<const Q: usize>(nodes: &Column<Q>, q: usize) -> f32 {
+    let mean = |[a, b]: &[i16; 2]| 0.5 * (f32::from(*a) + f32::from(*b));
+    nodes.codes.as_chunks::<2>().0.get(q).map_or(0.0, |codes| nodes.scale * mean(codes))
 }
 
 /// The kicks that are not zero, each with its column.

@@ -76,6 +76,19 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank
             add(y, amplitude, seen_y);
         }
     }
+
+    /// Add what an orbit asks of the correctors through the terms: the transpose of [`LowRank::read`] for kicks.
+    pub(super) fn pull(&self, [x, y]: [&[f32]; 2], [pull_x, pull_y]: [&mut [f32]; 2]) {
+        let seen = self.seen_x.iter().zip(&self.seen_y);
+        let driven = self.driven_x.iter().zip(&self.driven_y);
+        for (scale, ((seen_x, seen_y), (driven_x, driven_y))) in
+            self.scale.iter().zip(seen.zip(driven)).take_while(|(scale, _)| **scale != 0.0)
+        {
+            let amplitude = scale * (product(seen_x, x) + product(seen_y, y));
+            add(pull_x, amplitude, driven_x);
+            add(pull_y, amplitude, driven_y);
+        }
+    }
 }
 
 fn quantise<const L: usize>(to: Option<&mut [i16; L]>, values: &[f64], step: f32) {
@@ -106,6 +119,19 @@ mod tests {
         for (got, expected) in x.iter().chain(&y).zip([16.0, 18.0, 34.0]) {
             assert!((got - expected).abs() < 1e-3, "{got} {expected}");
         }
+    }
+
+    #[test]
+    fn pull_is_the_transpose() {
+        let mut terms = Small::BLANK;
+        assert!(terms.push([&[3.0, -1.0], &[2.0]], [&[0.5], &[1.0, -0.25]], 4.0));
+        let (mut x, mut y, mut pull_x, mut pull_y) = ([0.0; 2], [0.0], [0.0], [0.0; 2]);
+        let (kick, orbit) = ([2.0, 1.0, 8.0], [0.3, 0.7, -0.2]);
+        terms.read([&kick[..1], &kick[1..]], 0.0, [&mut x, &mut y]);
+        terms.pull([&orbit[..2], &orbit[2..]], [&mut pull_x, &mut pull_y]);
+        let seen: f32 = x.iter().chain(&y).zip(orbit).map(|(a, b)| a * b).sum();
+        let asked: f32 = pull_x.iter().chain(&pull_y).zip(kick).map(|(a, b)| a * b).sum();
+        assert!((seen - asked).abs() < 1e-6, "{seen} {asked}"); // rounding
     }
 
     #[test]

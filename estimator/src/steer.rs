@@ -1,0 +1,386 @@
+//! Orbit feedback: corrector setpoints from the orbit, the response as it is estimated, and what is not known of it.
+//!
+//! With `r` the orbit less the one that is wanted, `k` the kicks at the setpoints and `R(theta)` the estimated response, the
+//! setpoints move by the kicks `d` that minimise
+//!
+//! `E |r + R(theta) d|^2_W + |d|^2/step^2 + |k + d|^2/total^2`,
+//!
+//! the mean taken over the posterior of theta: `|r + R d|^2_W + d^T Q d` with `Q_cd = sum over b of W_b cov(R_bc, R_bd)`, so that
+//! kicks whose effect is not known are left alone. `W` has `1/noise^2` of each monitor, less the dispersion: an orbit error of
+//! its shape is one of momentum, and no corrector is to make up for it. The minimum is `d = -A^-1 (R^T W r + k/total^2)` with
+//! `A = R^T W R + Q + 1/step^2 + 1/total^2`; `A^-1` is made between frames ([`Steer::prepare`]), and a frame costs three products
+//! of a matrix and a vector ([`Steer::steer`]).
+//!
+//! `r` is filtered: what the correctors have done since the last frame is added by the response, and `gain` of what is then left
+//! of the reading; a new orbit, at the beginning or once the baselines have moved, begins as the mean of its frames. A monitor
+//! that does not report keeps its last orbit, moved by the correctors.
+//!
+//! Source: S. Boyd and L. Vandenberghe, Convex Optimization (2004), sec. 6.4.1, stochastic robust approximation; K. J. Astrom and
+//! B. Wittenmark, Adaptive Control (1995), ch. 9, cautious control.
+
+mod gain;
+mod hold;
+mod supplies;
+#[cfg(test)]
+mod tests;
+
+use crate::drive::{Drive, Each};
+use crate::estimate::{Estimate, MonitorState};
+use crate::linear::dot;
+use crate::surrogate::Surrogate;
+use crate::triangle::Triangle;
+use crate::wire::{CurrentCode, Frame, PositionCode};
+
+use gain::Gain;
+pub use hold::Hold;
+use hold::Watch;
+use supplies::Supplies;
+
+/// What is wanted of the orbit, and what the correctors may do; read only.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Feedback<const B: usize, const C: usize> {
+    /// Wanted reading of each monitor [m].
+    pub orbit: [f32; B],
+    /// Share of a new orbit that is believed in one frame, 0 to 1: the low-pass against the noise of the readings.
+    pub gain: f32,
+    /// Kick of one corrector in one frame that costs as much as an orbit of one standard deviation at one monitor [rad].
+    pub step_kick: f32,
+    /// The same of its whole kick: what no monitor sees decays, and correctors stay near 0 [rad].
+    pub total_kick: f32,
+    /// Largest current of each corrector [A].
+    pub limit: Each<C>,
+    /// Largest change of a setpoint in one frame [A].
+    pub rate: f32,
+    /// By how much each corrector is moved one way or the other, anew in each frame, while the model is in doubt [A]: see
+    /// [`Hold::is_doubt`].
+    pub probe: f32,
+    /// Read-backs this close to their setpoints follow them [A].
+    pub close: f32,
+    /// Frames further apart than this do not belong together [us].
+    pub patience_us: u64,
+}
+
+impl<const B: usize, const C: usize> Feedback<B, C> {
+    /// True if every number is one, and every size positive.
+    pub fn is_sound(&self) -> bool {
+        let sizes = [self.gain, self.step_kick, self.total_kick, self.rate, self.close];
+        self.orbit.iter().all(|x| x.is_finite())
+            && sizes.iter().all(|v| v.is_finite() && *v > 0.0)
+            && self.gain <= 1.0
+            && self.probe.is_finite()
+            && self.limit.is_positive()
+    }
+}
+
+/// The ring as steering sees it.
+#[derive(Debug)]
+pub struct Response<'a, G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize> {
+    /// Its tables.
+    pub surrogate: &'a G,
+    /// At which vars.
+    pub at: &'a G::Linearised,
+    /// Kick of each corrector [rad/A].
+    pub kick_per_ampere: &'a Each<C>,
+}
+
+/// What is to be said of a frame's correction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[must_use]
+pub struct Steered {
+    /// Why the setpoints stay as they were; none if they were moved.
+    pub hold: Option<Hold>,
+    /// Correctors that do not follow their setpoints, and are left out.
+    pub left_out: u16,
+    /// Correctors at their limit.
+    pub limited: u16,
+}
+
+/// The state of a feedback: `B` monitors, `C` correctors, `CX` and `CY` of them horizontal and vertical; `TX` and `TY` entries
+/// make triangles of these.
+#[derive(Debug, Clone)]
+pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX: usize, const TY: usize> {
+    /// Time of the last frame [us].
+    clock: Option<u64>,
+    /// Frames in the filtered orbit, counted up to a few.
+    heard: u16,
+    /// Filtered orbit at the last read-backs, less the wanted one [m].
+    residual: [f32; B],
+    /// `1/noise^2` of each monitor [1/m^2]; 0 of one that is dead.
+    weight: [f32; B],
+    /// `W D/sqrt(D^T W D)` of the dispersion `D` [1/m].
+    momentum: [f32; B],
+    supplies: Supplies<C>,
+    /// Pattern of the probe in the setpoints; 0 for none.
+    pattern: u32,
+    x: Gain<CX, TX>,
+    y: Gain<CY, TY>,
+    /// Frames since the gains of x were due.
+    turn: u8,
+    watch: Watch,
+}
+
+/// Frames after which gains are made anew, for the estimate moves on.
+const TURN: u8 = 16;
+
+/// RF offset whose orbit stands for the dispersion: small enough to be of first order.
+const RF_OFFSET: f32 = 1e-6;
+
+impl<'a, G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize>
+    Response<'a, G, B, C, F, N>
+{
+    /// The orbit that kicks make [m].
+    fn orbit(&self, kick: [f32; C]) -> [f32; B] {
+        self.orbit_of(&Drive { kick, strength: [0.0; F], rf_offset: 0.0 })
+    }
+
+    /// The shape of an orbit that is off momentum [m].
+    fn dispersion(&self) -> [f32; B] {
+        self.orbit_of(&Drive { kick: [0.0; C], strength: [0.0; F], rf_offset: RF_OFFSET })
+    }
+
+    fn orbit_of(&self, drive: &Drive<C, F>) -> [f32; B] {
+        let mut orbit = [0.0; B];
+        self.surrogate.orbit(self.at, drive, &mut orbit);
+        orbit
+    }
+
+    /// `R^T orbit` [m^2/rad].
+    fn pull(&self, orbit: &[f32; B]) -> [f32; C] {
+        let mut pull = [0.0; C];
+        self.surrogate.pull(self.at, orbit, &mut pull);
+        pull
+    }
+
+    /// Currents as kicks [rad].
+    fn kicks(&self, mut current: [f32; C]) -> [f32; C] {
+        current.iter_mut().enumerate().for_each(|(c, current)| *current *= self.kick_per_ampere.of(c));
+        current
+    }
+}
+
+impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX: usize, const TY: usize>
+    Steer<B, C, CX, CY, TX, TY>
+{
+    const FITS: () = assert!(C == CX + CY, "planes add up");
+
+    /// Memory for one, all zero: it begins with the first frame.
+    pub const BLANK: Self = Self {
+        clock: None,
+        heard: 0,
+        residual: [0.0; B],
+        weight: [0.0; B],
+        momentum: [0.0; B],
+        supplies: Supplies::BLANK,
+        pattern: 0,
+        x: Gain::BLANK,
+        y: Gain::BLANK,
+        turn: 0,
+        watch: Watch::BLANK,
+    };
+
+    /// The currents that the correctors are to have.
+    pub fn setpoints(&self) -> &[CurrentCode; C] {
+        self.supplies.setpoints()
+    }
+
+    /// False for a corrector that does not follow its setpoint, and is left out until it does.
+    pub fn follows(&self, corrector: usize) -> bool {
+        self.supplies.follows(corrector)
+    }
+
+    /// Take a frame in, and move the setpoints, or say why not.
+    #[inline(never)]
+    pub fn steer<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        response: &Response<'_, G, B, C, F, N>,
+        frame: &Frame<B, C, F, W>,
+        estimate: &Estimate<B, N, W>,
+    ) -> Steered {
+        let () = Self::FITS;
+        let is_stale = self.is_stale(feedback, frame.time_us);
+        if is_stale {
+            self.begin(feedback, frame, estimate);
+        } else {
+            self.observe(feedback, response, frame, estimate);
+        }
+        self.weigh_monitors(estimate);
+        let is_ready = self.x.is_ready() && self.y.is_ready();
+        let hold = self.watch.judge(is_stale, is_ready, estimate, response.surrogate.layout().monitors());
+        self.supplies.probe(-feedback.probe, core::mem::take(&mut self.pattern));
+        let limited = if hold.is_none() { self.correct(feedback, response) } else { 0 };
+        if hold.is_some_and(Hold::is_doubt) {
+            self.pattern = (frame.time_us as u32).max(1);
+            self.supplies.probe(feedback.probe, self.pattern);
+        }
+        Steered { hold, left_out: self.supplies.left_out(), limited }
+    }
+
+    /// Make the gains of one plane anew if that is due; true if it was done. To be called after each frame.
+    ///
+    /// `covariance` gives one row of that of the params.
+    #[inline(never)]
+    pub fn prepare<G: Surrogate<B, C, F, N>, const F: usize, const N: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        response: &Response<'_, G, B, C, F, N>,
+        covariance: impl Fn(usize) -> [f32; N],
+    ) -> bool {
+        if self.clock.is_none() {
+            return false;
+        }
+        let turn = self.turn;
+        self.turn = (turn + 1) % TURN;
+        self.weigh_momentum(&response.dispersion());
+        let diagonal = 1.0 / (feedback.step_kick * feedback.step_kick) + stiffness(feedback);
+        match turn {
+            0 => self.x.invert(self.matrix(response, 0, diagonal, covariance)),
+            1 => self.y.invert(self.matrix(response, CX, diagonal, covariance)),
+            _ => return false,
+        }
+        true
+    }
+
+    fn is_stale(&mut self, feedback: &Feedback<B, C>, time_us: u64) -> bool {
+        let last = self.clock.replace(time_us);
+        last.is_none_or(|last| time_us.checked_sub(last).is_none_or(|gap| gap > feedback.patience_us))
+    }
+
+    /// Take over from whoever steered so far: setpoints are the read-backs, the orbit is that of this frame.
+    fn begin<const F: usize, const N: usize, const W: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        frame: &Frame<B, C, F, W>,
+        estimate: &Estimate<B, N, W>,
+    ) {
+        self.supplies.take_over(&frame.corrector);
+        self.pattern = 0;
+        (self.residual, self.heard) = ([0.0; B], 0);
+        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
+    }
+
+    /// Move the filtered orbit by what the correctors have done, then towards the readings.
+    #[inline(never)]
+    fn observe<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        response: &Response<'_, G, B, C, F, N>,
+        frame: &Frame<B, C, F, W>,
+        estimate: &Estimate<B, N, W>,
+    ) {
+        let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close);
+        if (changed || estimate.linearised) && self.turn > 1 {
+            self.turn = 0;
+        }
+        let moved = response.orbit(response.kicks(done));
+        self.residual.iter_mut().zip(moved).for_each(|(residual, moved)| *residual += moved);
+        if estimate.remarks.baselines_moved {
+            self.heard = 0;
+        }
+        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
+    }
+
+    /// Move the filtered orbit towards the readings that count: it is their mean as long as they are few.
+    fn believe(&mut self, feedback: &Feedback<B, C>, reading: &[PositionCode; B], counts: impl Fn(usize) -> bool) {
+        self.heard = self.heard.saturating_add(1);
+        let gain = feedback.gain.max(1.0 / f32::from(self.heard));
+        let each = self.residual.iter_mut().zip(reading).zip(&feedback.orbit).enumerate();
+        for (_, ((residual, reading), wanted)) in each.filter(|(b, _)| counts(*b)) {
+            *residual += gain * (reading.value() - wanted - *residual);
+        }
+    }
+
+    fn weigh_monitors<const N: usize, const W: usize>(&mut self, estimate: &Estimate<B, N, W>) {
+        for (weight, health) in self.weight.iter_mut().zip(&estimate.health) {
+            let is_of_use = health.state != MonitorState::Dead && health.weighted_as > 0.0;
+            *weight = if is_of_use { 1.0 / (health.weighted_as * health.weighted_as) } else { 0.0 };
+        }
+    }
+
+    fn weigh_momentum(&mut self, dispersion: &[f32; B]) {
+        self.momentum = *dispersion;
+        self.momentum.iter_mut().zip(&self.weight).for_each(|(m, weight)| *m *= weight);
+        let square = dot(&self.momentum, dispersion);
+        let scale = if square > 0.0 { 1.0 / libm::sqrtf(square) } else { 0.0 };
+        self.momentum.iter_mut().for_each(|m| *m *= scale);
+    }
+
+    /// `W r`, less what is of momentum.
+    fn weighted(&self, orbit: &[f32; B]) -> [f32; B] {
+        let off_momentum = dot(&self.momentum, orbit);
+        let mut weighted = *orbit;
+        for ((to, weight), momentum) in weighted.iter_mut().zip(&self.weight).zip(&self.momentum) {
+            *to = *to * weight - off_momentum * momentum;
+        }
+        weighted
+    }
+
+    /// `A` of the plane whose correctors begin at `first`; those that are left out have a diagonal only.
+    #[inline(never)]
+    fn matrix<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const CP: usize, const TP: usize>(
+        &self,
+        response: &Response<'_, G, B, C, F, N>,
+        first: usize,
+        diagonal: f32,
+        covariance: impl Fn(usize) -> [f32; N],
+    ) -> Triangle<CP, TP, f64> {
+        let mut matrix = Triangle::ZERO;
+        matrix.fill_diagonal(f64::from(diagonal));
+        let follows = |i: usize| self.supplies.follows(first + i);
+        let mut add = |i: usize, terms: &mut dyn Iterator<Item = f32>| {
+            for (j, (to, term)) in matrix.row_mut(i).iter_mut().zip(terms).enumerate() {
+                *to += if follows(i) && follows(j) { f64::from(term) } else { 0.0 };
+            }
+        };
+        for i in 0..CP {
+            let mut kick = [0.0; C];
+            kick.get_mut(first + i).into_iter().for_each(|kick| *kick = 1.0);
+            let pull = response.pull(&self.weighted(&response.orbit(kick)));
+            add(i, &mut pull.iter().skip(first).copied());
+        }
+        let plane = usize::from(first > 0);
+        response.surrogate.response_covariance(response.at, plane, &self.weight, covariance, |here, there| {
+            for (i, h) in here.iter().enumerate() {
+                add(i, &mut there.iter().map(|t| h * t));
+            }
+        });
+        matrix
+    }
+
+    /// Move the setpoints; returns how many correctors are at their limit.
+    #[inline(never)]
+    fn correct<G: Surrogate<B, C, F, N>, const F: usize, const N: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        response: &Response<'_, G, B, C, F, N>,
+    ) -> u16 {
+        // setpoints that are still on their way will move the orbit
+        let mut orbit = response.orbit(response.kicks(self.supplies.under_way(feedback.close)));
+        orbit.iter_mut().zip(&self.residual).for_each(|(orbit, residual)| *orbit += residual);
+        let mut pull = response.pull(&self.weighted(&orbit));
+        let (stiffness, total) =
+            (stiffness(feedback), response.kicks(self.supplies.setpoints().map(CurrentCode::value)));
+        for (c, (pull, total)) in pull.iter_mut().zip(total).enumerate() {
+            *pull = if self.supplies.follows(c) { *pull + stiffness * total } else { 0.0 };
+        }
+        let setpoints = self.supplies.setpoints();
+        let room = |c: usize| {
+            let (limit, kick) = (feedback.limit.of(c), response.kick_per_ampere.of(c));
+            let current = setpoints.get(c).copied().unwrap_or_default().value();
+            [(-limit - current) * kick, (limit - current) * kick]
+        };
+        let rate = |c: usize| feedback.rate * response.kick_per_ampere.of(c);
+        let (pull_x, pull_y) = pull.split_at(CX.min(C));
+        let mut step = [0.0; C];
+        let (step_x, step_y) = step.split_at_mut(CX.min(C));
+        self.x.step(pull_x, room, rate, step_x);
+        self.y.step(pull_y, |c| room(CX + c), |c| rate(CX + c), step_y);
+        step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick_per_ampere.of(c));
+        self.supplies.change(&step, &feedback.limit)
+    }
+}
+
+/// `1/total^2` [1/rad^2].
+fn stiffness<const B: usize, const C: usize>(feedback: &Feedback<B, C>) -> f32 {
+    1.0 / (feedback.total_kick * feedback.total_kick)
+}

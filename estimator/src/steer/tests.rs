@@ -1,0 +1,428 @@
+//! Closed forms, on a ring of three horizontal and one vertical monitors whose response is a table.
+
+use super::*;
+use crate::estimate::{Health, Remarks};
+use crate::mask::Mask;
+use crate::sizes::{Layout, Sizes};
+use crate::surrogate::{Prediction, Tables, Unstable};
+use crate::wire::{MagnetCurrents, Parcel, ParcelError, RfCode};
+
+const B: usize = 4;
+const C: usize = 4;
+type State = Steer<B, C, 3, 1, 6, 1>;
+type Cycle = Frame<B, C, 1, 1>;
+
+/// `R(theta) = at + theta uncertain`, one param; the orbit off momentum is `dispersion`.
+#[derive(Debug, Clone)]
+struct Table {
+    at: [[f32; C]; B],
+    uncertain: [[f32; C]; B],
+    dispersion: [f32; B],
+}
+
+impl Tables for Table {
+    const BLANK: Self = Self { at: [[0.0; C]; B], uncertain: [[0.0; C]; B], dispersion: [0.0; B] };
+    const ROOM: Sizes = Sizes::new([3, 1], [3, 1], [1, 1, 1]);
+
+    fn layout(&self) -> Layout {
+        Layout { ring: Self::ROOM, room: Self::ROOM }
+    }
+
+    fn parts<const L: usize>(&self) -> impl Iterator<Item = Parcel<L>> + '_ {
+        core::iter::empty()
+    }
+
+    fn take<const L: usize>(&mut self, _: &Parcel<L>) -> Result<(), ParcelError> {
+        Ok(())
+    }
+}
+
+impl Surrogate<B, C, 1, 1> for Table {
+    type Linearised = ();
+    const UNLINEARISED: () = ();
+
+    type Progress = ();
+    const BEGIN: () = ();
+
+    fn advance(&self, _: &[f32; 1], _: &[f32; 1], (): &mut (), (): &mut ()) -> Result<bool, Unstable> {
+        Ok(true)
+    }
+
+    fn orbit(&self, (): &(), drive: &Drive<C, 1>, into: &mut [f32; B]) {
+        for ((to, row), dispersion) in into.iter_mut().zip(&self.at).zip(&self.dispersion) {
+            *to = dot(row, &drive.kick) + dispersion * drive.rf_offset;
+        }
+    }
+
+    fn predict(&self, (): &(), _: &Drive<C, 1>, _: &mut Prediction<B, 1, 1>) {}
+
+    fn pull(&self, (): &(), orbit: &[f32; B], into: &mut [f32; C]) {
+        *into = core::array::from_fn(|c| self.at.iter().zip(orbit).map(|(row, x)| row[c] * x).sum());
+    }
+
+    fn response_covariance(
+        &self,
+        (): &(),
+        plane: usize,
+        weight: &[f32; B],
+        covariance: impl Fn(usize) -> [f32; 1],
+        mut add: impl FnMut(&[f32], &[f32]),
+    ) {
+        let correctors = if plane == 0 { 0..3 } else { 3..4 };
+        for (row, weight) in self.uncertain.iter().zip(weight) {
+            let here = &row[correctors.clone()];
+            let [variance] = covariance(0);
+            let there: std::vec::Vec<f32> = here.iter().map(|h| variance * weight * h).collect();
+            add(here, &there);
+        }
+    }
+
+    fn tune(&self, (): &(), _: usize, _: &[f32; 1]) -> (f32, [f32; 1]) {
+        (0.0, [0.0])
+    }
+
+    fn prior_group(&self, _: usize) -> usize {
+        0
+    }
+
+    fn error_variance(&self, (): &(), _: usize, _: f32, _: f32) -> f32 {
+        0.0
+    }
+}
+
+extern crate std;
+
+/// Each corrector is seen by one monitor, 10 m/rad; no dispersion, nothing uncertain.
+fn diagonal() -> Table {
+    Table { at: core::array::from_fn(|b| core::array::from_fn(|c| if b == c { 10.0 } else { 0.0 })), ..Table::BLANK }
+}
+
+const KICK: Each<C> = Each::same(1e-5);
+
+/// Steps and kicks cost nothing, and nothing is in the way.
+fn free() -> Feedback<B, C> {
+    Feedback {
+        orbit: [0.0; B],
+        gain: 1.0,
+        step_kick: 1.0,
+        total_kick: 1.0,
+        limit: Each::same(1e3),
+        rate: 1e3,
+        probe: 0.0,
+        close: 0.1,
+        patience_us: 1_000_000,
+    }
+}
+
+/// A machine whose response is a table, its feedback, and what disturbs it.
+struct Machine {
+    table: Table,
+    feedback: Feedback<B, C>,
+    variance: f32,
+    state: State,
+    disturbance: [f32; B],
+    current: [CurrentCode; C],
+    time_us: u64,
+    estimate: Estimate<B, 1, 1>,
+}
+
+impl Machine {
+    /// Ready to steer; the orbit has been 0 so far.
+    fn new(table: Table, feedback: Feedback<B, C>, variance: f32) -> Self {
+        let health = Health { noise: 1e-4, weighted_as: 1e-4, ..Health::default() };
+        let mut machine = Self {
+            table,
+            feedback,
+            variance,
+            state: State::BLANK,
+            disturbance: [0.0; B],
+            current: [CurrentCode::default(); C],
+            time_us: 0,
+            estimate: estimate(health),
+        };
+        assert_eq!(machine.cycle().hold, Some(Hold::Stale));
+        machine
+    }
+
+    fn orbit(&self) -> [f32; B] {
+        let kick = self.current.map(|current| 1e-5 * current.value());
+        let mut orbit = [0.0; B];
+        self.table.orbit(&(), &Drive { kick, strength: [0.0], rf_offset: 0.0 }, &mut orbit);
+        core::array::from_fn(|b| orbit[b] + self.disturbance[b])
+    }
+
+    /// A frame of the orbit as it is; the setpoints it makes are not taken over yet.
+    fn frame(&mut self) -> Steered {
+        self.time_us += 100_000;
+        let frame = Cycle {
+            epoch: 0,
+            sequence: 0,
+            time_us: self.time_us,
+            cycle_time_us: 0,
+            corrector: self.current,
+            magnets: MagnetCurrents { dipole: CurrentCode::default(), supply: [CurrentCode::default()] },
+            rf_offset: RfCode::default(),
+            reading: self.orbit().map(|x| PositionCode::nearest(x.into()).unwrap()),
+            tune: [None; 2],
+            intensity: None,
+            valid: Mask::from_words(&[15]),
+        };
+        let response = Response { surrogate: &self.table, at: &(), kick_per_ampere: &KICK };
+        let steered = self.state.steer(&self.feedback, &response, &frame, &self.estimate);
+        for _ in 0..TURN {
+            self.state.prepare(&self.feedback, &response, |_| [self.variance]);
+        }
+        steered
+    }
+
+    /// A frame, and the supplies at their new setpoints.
+    fn cycle(&mut self) -> Steered {
+        let steered = self.frame();
+        self.current = *self.state.setpoints();
+        steered
+    }
+
+    fn cycles(&mut self, count: usize) {
+        for _ in 0..count {
+            let _ = self.cycle();
+        }
+    }
+
+    fn amperes(&self) -> [f32; C] {
+        self.state.setpoints().map(CurrentCode::value)
+    }
+}
+
+fn estimate(health: Health) -> Estimate<B, 1, 1> {
+    Estimate {
+        sequence: 0,
+        time_us: 0,
+        frames: 1,
+        rejected_frames: 0,
+        mean: [1.0],
+        sigma: [0.01],
+        map_params: [0.0],
+        centre: [0.0],
+        params_sigma: [0.01],
+        clipped: Mask::NONE,
+        nis: 4.0,
+        accepted: Mask::from_words(&[15]),
+        rejected: Mask::NONE,
+        confirmed: Mask::NONE,
+        restarted: Mask::NONE,
+        tune_innovation: [None; 2],
+        setting: None,
+        log_evidence: 0.0,
+        linearised: false,
+        remarks: Remarks::default(),
+        health: [health; B],
+    }
+}
+
+/// Where kicks have several ways, a step that costs something: 1 % of what an orbit costs.
+const STEP: f32 = 1e-4;
+/// Steps of readings, 0.1 um, and of setpoints, 0.1 mA or 0.01 um here.
+const ROUNDING: f32 = 2e-7;
+
+#[test]
+fn a_known_response_removes_the_orbit_in_one_step() {
+    let mut machine = Machine::new(diagonal(), free(), 0.0);
+    machine.disturbance = [1e-3, -2e-3, 5e-4, 3e-3];
+    assert_eq!(machine.cycle(), Steered { hold: None, left_out: 0, limited: 0 });
+    assert!(machine.orbit().iter().all(|x| x.abs() < ROUNDING), "{:?}", machine.orbit());
+    // to the wanted orbit, if that is another
+    machine.feedback.orbit = [1e-3; B];
+    machine.cycles(1);
+    assert!(machine.orbit().iter().all(|x| (x - 1e-3).abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
+}
+
+#[test]
+fn with_a_gain_the_orbit_decays_by_what_is_left_of_it() {
+    let mut machine = Machine::new(diagonal(), Feedback { gain: 0.3, ..free() }, 0.0);
+    machine.cycles(4);
+    machine.disturbance = [1e-3, -2e-3, 5e-4, 3e-3];
+    for n in 1..10 {
+        machine.cycles(1);
+        let left = libm::powf(0.7, n as f32);
+        let each = machine.orbit().into_iter().zip(machine.disturbance);
+        assert!(each.into_iter().all(|(x, d)| (x - left * d).abs() < 4.0 * ROUNDING), "{n}: {:?}", machine.orbit());
+    }
+}
+
+#[test]
+fn a_moved_orbit_is_the_mean_of_its_frames() {
+    let mut machine = Machine::new(diagonal(), Feedback { gain: 0.1, ..free() }, 0.0);
+    machine.cycles(20);
+    machine.disturbance = [1e-3; B];
+    machine.estimate.remarks.baselines_moved = true;
+    machine.cycles(1);
+    assert!(machine.orbit().iter().all(|x| x.abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
+}
+
+/// `d = -R r/(R^2 + var R)` for one monitor and one corrector.
+#[test]
+fn kicks_of_uncertain_effect_are_left_alone() {
+    let mut table = diagonal();
+    // the second corrector's response is 10 ± 30 m/rad, and the first one's is known
+    table.uncertain[1][1] = 30.0;
+    let mut machine = Machine::new(table, free(), 1.0);
+    machine.disturbance = [1e-3; B];
+    machine.cycles(1);
+    let amperes = machine.amperes();
+    for (c, share) in [(0, 1.0), (1, 0.1), (2, 1.0), (3, 1.0)] {
+        assert!((amperes[c] + 10.0 * share).abs() < 2e-3, "{amperes:?}");
+    }
+}
+
+/// `d = -R r/(R^2 + noise^2/step^2)`, and in the long run `k = -R d/(R^2 + noise^2/total^2)`.
+#[test]
+fn steps_and_kicks_have_their_cost() {
+    let mut machine = Machine::new(diagonal(), Feedback { step_kick: 1e-5, ..free() }, 0.0);
+    machine.disturbance = [1e-3; B];
+    machine.cycles(1);
+    assert!((machine.amperes()[0] + 5.0).abs() < 1e-3, "{:?}", machine.amperes()); // noise/step = R
+    let mut machine = Machine::new(diagonal(), Feedback { step_kick: 1e-5, total_kick: 2e-5, ..free() }, 0.0);
+    machine.disturbance = [1e-3; B];
+    (0..60).for_each(|_| assert!(machine.cycle().hold.is_none()));
+    assert!((machine.amperes()[0] + 8.0).abs() < 1e-2, "{:?}", machine.amperes()); // noise/total = R/2
+}
+
+#[test]
+fn the_orbit_of_another_momentum_is_not_corrected() {
+    let table = Table { dispersion: [2.0, 3.0, 1.0, 0.0], ..diagonal() };
+    let mut machine = Machine::new(table, Feedback { step_kick: STEP, ..free() }, 0.0);
+    machine.disturbance = [2e-3, 3e-3, 1e-3, 0.0];
+    machine.cycles(1);
+    assert!(machine.amperes().iter().all(|a| a.abs() < 2e-3), "{:?}", machine.amperes());
+    // across it, all is corrected
+    machine.disturbance = [3e-3, -2e-3, 0.0, 1e-3];
+    machine.cycles(4);
+    assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{:?}", machine.orbit());
+}
+
+#[test]
+fn limits_hold_and_the_others_make_up_for_them() {
+    let mut table = diagonal();
+    // the second monitor is seen by the first and the second corrector
+    table.at[1] = [6.0, 10.0, 0.0, 0.0];
+    table.at[0] = [0.0; C];
+    let mut machine = Machine::new(table, Feedback { limit: Each::same(7.0), step_kick: STEP, ..free() }, 0.0);
+    machine.disturbance = [0.0, 1e-3, 0.0, 0.0];
+    let steered = machine.cycle();
+    // the least kicks would be -4.4 A and -7.4 A; of what is left, 0.3 mm, the other does 6^2/(6^2 + 1)
+    assert_eq!((steered.limited, machine.amperes()[1]), (1, -7.0));
+    assert!((machine.amperes()[0] + 5.0 * 36.0 / 37.0).abs() < 2e-3, "{:?}", machine.amperes());
+    machine.disturbance = [0.1; B];
+    machine.cycles(20);
+    assert!(machine.amperes().iter().all(|a| a.abs() <= 7.0), "{:?}", machine.amperes());
+    // nothing has wound up: the first frame without the disturbance leaves the limits
+    machine.disturbance = [0.0; B];
+    machine.cycles(1);
+    assert!(machine.amperes()[2].abs() < 0.1, "{:?}", machine.amperes());
+}
+
+#[test]
+fn no_setpoint_moves_faster_than_its_rate_and_the_direction_stays() {
+    let mut machine = Machine::new(diagonal(), Feedback { rate: 2.0, ..free() }, 0.0);
+    machine.disturbance = [1e-3, -5e-4, 0.0, 0.0];
+    machine.cycles(1);
+    let amperes = machine.amperes();
+    assert!((amperes[0] + 2.0).abs() < 1e-3 && (amperes[1] - 1.0).abs() < 1e-3, "{amperes:?}");
+}
+
+#[test]
+fn each_reason_holds() {
+    type Change = fn(&mut Machine);
+    let reasons: [(Change, Hold); 6] = [
+        (|m| m.time_us += 2_000_000, Hold::Stale),
+        (|m| m.time_us -= 150_000, Hold::Stale),
+        (|m| m.estimate.remarks.put_aside = true, Hold::PutAside),
+        (|m| m.estimate.remarks.unsolved = true, Hold::Unsolved),
+        (|m| m.estimate.nis = 30.0, Hold::Surprising),
+        (|m| m.estimate.accepted = Mask::from_words(&[1]), Hold::Blind),
+    ];
+    for (change, hold) in reasons {
+        let mut machine = Machine::new(diagonal(), free(), 0.0);
+        machine.cycles(1);
+        machine.disturbance = [1e-3; B];
+        let good = machine.estimate.clone();
+        change(&mut machine);
+        assert_eq!(machine.cycle().hold, Some(hold));
+        assert_eq!(machine.amperes(), [0.0; C], "{hold:?}");
+        // and it goes on
+        machine.estimate = good;
+        assert_eq!(machine.cycle().hold, None, "{hold:?}");
+        machine.cycles(1);
+        assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{hold:?}: {:?}", machine.orbit());
+    }
+}
+
+#[test]
+fn a_lasting_mismatch_holds_until_it_is_over() {
+    let mut machine = Machine::new(diagonal(), free(), 0.0);
+    machine.estimate.nis = 14.0; // 3.5 times what four readings make
+    let holds: std::vec::Vec<_> = (0..300).map(|_| machine.cycle().hold).collect();
+    assert_eq!((holds[0], holds[60], holds[150]), (None, None, Some(Hold::Mismatch)));
+    machine.estimate.nis = 4.0;
+    assert!((0..100).map(|_| machine.cycle().hold).any(|hold| hold.is_none()));
+}
+
+#[test]
+fn without_gains_nothing_moves() {
+    let mut machine = Machine::new(diagonal(), free(), 0.0);
+    machine.disturbance = [1e-3; B];
+    machine.state.x = Gain::BLANK;
+    assert_eq!(machine.cycle().hold, Some(Hold::Unprepared));
+    assert_eq!(machine.amperes(), [0.0; C]);
+}
+
+#[test]
+fn a_corrector_that_sticks_is_left_out_and_comes_back() {
+    // two correctors act alike on the first monitor
+    let mut table = diagonal();
+    table.at[0] = [10.0, 10.0, 0.0, 0.0];
+    table.at[1] = [0.0; C];
+    let mut machine = Machine::new(table, Feedback { step_kick: STEP, ..free() }, 0.0);
+    let stick = |machine: &mut Machine, sticks: bool| {
+        let before = machine.current[0];
+        let steered = machine.cycle();
+        if sticks {
+            machine.current[0] = before;
+        }
+        steered.left_out
+    };
+    machine.disturbance = [4e-3, 0.0, 0.0, 0.0];
+    let left_out: std::vec::Vec<_> = (0..8).map(|_| stick(&mut machine, true)).collect();
+    assert_eq!((left_out[3], left_out[7]), (0, 1));
+    assert!(!machine.state.follows(0) && machine.state.follows(1));
+    assert!(machine.orbit()[0].abs() < 2e-5, "{:?}", machine.orbit());
+    let mended: std::vec::Vec<_> = (0..20).map(|_| stick(&mut machine, false)).collect();
+    assert_eq!((mended[0], mended[19]), (1, 0));
+    assert!(machine.orbit()[0].abs() < 4.0 * ROUNDING, "{:?}", machine.orbit());
+}
+
+#[test]
+fn a_monitor_that_does_not_report_keeps_its_orbit() {
+    let mut machine = Machine::new(diagonal(), Feedback { gain: 0.5, ..free() }, 0.0);
+    machine.cycles(1);
+    machine.disturbance = [1e-3; B];
+    machine.cycles(1);
+    machine.estimate.accepted = Mask::from_words(&[14]);
+    machine.cycles(5);
+    // half of it was believed; the rest waits
+    assert!((machine.orbit()[0] - 5e-4).abs() < 4.0 * ROUNDING, "{:?}", machine.orbit());
+    machine.estimate.accepted = Mask::from_words(&[15]);
+    machine.cycles(12);
+    assert!(machine.orbit()[0].abs() < 1e-6, "{:?}", machine.orbit());
+}
+
+#[test]
+fn setpoints_that_are_not_reached_yet_are_not_corrected_twice() {
+    let mut machine = Machine::new(diagonal(), free(), 0.0);
+    machine.disturbance = [1e-3; B];
+    let _ = machine.frame();
+    let first = machine.amperes();
+    let _ = machine.frame(); // the supplies are slow
+    let second = machine.amperes();
+    assert!(first.iter().zip(second).all(|(a, b)| (a - b).abs() < 2e-3), "{first:?} {second:?}");
+}
