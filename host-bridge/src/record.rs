@@ -181,7 +181,7 @@ impl EstimateRecord {
 
     /// The remarks of this frame in words.
     pub fn words(&self) -> impl Iterator<Item = &'static str> {
-        let Remarks { put_aside, baselines_moved, unsolved } = self.remarks;
+        let Remarks { put_aside, baselines_moved, unsolved, slices: _ } = self.remarks;
         let all = [(put_aside, "put aside"), (baselines_moved, "baselines moved"), (unsolved, "unsolved")];
         all.into_iter().filter_map(|(is_said, word)| is_said.then_some(word))
     }

@@ -82,7 +82,7 @@ impl Trace {
         self.check(&record.names)?;
         let vars =
             record.mean.iter().zip(&record.sigma).flat_map(|(mean, sigma)| [mean.to_string(), sigma.to_string()]);
-        let Remarks { put_aside, baselines_moved, unsolved } = record.remarks;
+        let Remarks { put_aside, baselines_moved, unsolved, slices: _ } = record.remarks;
         let remarks = [put_aside, baselines_moved, unsolved].map(|said| u8::from(said).to_string());
         let last = [record.nis.to_string(), record.readings(ReadingUse::Rejected).to_string()];
         self.row(core::iter::once(record.sequence.to_string()).chain(vars).chain(last).chain(remarks))

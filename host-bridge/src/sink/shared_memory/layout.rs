@@ -141,7 +141,9 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
 
 /// Remarks as bits.
 fn said(remarks: &Remarks) -> u32 {
-    u32::from(remarks.put_aside) | u32::from(remarks.baselines_moved) << 1 | u32::from(remarks.unsolved) << 2
+    let flags =
+        u32::from(remarks.put_aside) | u32::from(remarks.baselines_moved) << 1 | u32::from(remarks.unsolved) << 2;
+    flags | remarks.slices << 3
 }
 
 /// Up to four bytes as a word; those that are missing are zero.
@@ -220,7 +222,7 @@ impl<'w> Words<'w> {
 
 fn remarks(bits: u32) -> Remarks {
     let [put_aside, baselines_moved, unsolved] = [0, 1, 2].map(|bit| bits >> bit & 1 == 1);
-    Remarks { put_aside, baselines_moved, unsolved }
+    Remarks { put_aside, baselines_moved, unsolved, slices: bits >> 3 }
 }
 
 fn reading(code: u32) -> Result<ReadingUse, LayoutError> {
