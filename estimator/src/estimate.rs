@@ -56,6 +56,8 @@ pub struct Remarks {
     pub baselines_moved: bool,
     /// The information was not positive, and was made so, or given up for the prior.
     pub unsolved: bool,
+    /// The param whose var has stepped: it was let loose, and is as unknown as at the start until frames say where it is.
+    pub let_loose: Option<u16>,
 }
 
 /// The vars and the state of the monitors after a frame.

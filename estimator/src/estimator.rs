@@ -3,6 +3,7 @@
 //!
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
+mod drift;
 mod laplace;
 mod posterior;
 mod screen;
@@ -332,7 +333,7 @@ impl<
             return false;
         }
         self.prepared = true;
-        let linearised = self.is_due() && self.linearise_anew(model);
+        let linearised = self.is_due(model) && self.linearise_anew(model);
         self.tangent.is_new |= linearised;
         let seconds = self.sequence.expect_next();
         self.walk(model, seconds);
@@ -488,7 +489,14 @@ impl<
         screened: &Screened<W>,
     ) -> f32 {
         let before = self.posterior.solution.cost;
-        let linearised_once = cell.is_none() || !self.posterior.is_still::<B>(&model.setup.walk);
+        let still = self.posterior.is_still::<B>(&model.setup.walk);
+        let linearised_once = cell.is_none() || !still;
+        // a mean over frames that have not seen the same ring says nothing
+        let cell = cell.filter(|_| still);
+        let may_step = model.setup.walk.params > 0.0;
+        if may_step {
+            self.posterior.expect();
+        }
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
             *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
@@ -509,6 +517,10 @@ impl<
         self.solve(model);
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
+        if may_step {
+            let prior = |i| prior_of::<G, B, C, F, N>(model, i);
+            self.posterior.let_loose(&model.surrogate.layout(), prior);
+        }
         nis as f32
     }
 
@@ -570,6 +582,7 @@ impl<
             put_aside: whole == Whole::Aside,
             baselines_moved: whole == Whole::Moved,
             unsolved: core::mem::take(&mut self.posterior.unsolved),
+            let_loose: self.posterior.let_loose.take(),
         };
         let solution = &self.posterior.solution;
         let mut estimate = Estimate {

@@ -2,10 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drift::Drift;
 use crate::gaussian::{Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
 
+/// Least variance that is added to a param where others walk: one part in 1e9 of the prior's, since none would be a division by 0.
+const LEAST: f32 = 1e-12;
 /// While the params have walked less than this share of an error bar, all frames so far have seen the same ring.
 const WALKED: f32 = 0.1;
 
@@ -39,18 +42,34 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
     pub orbit: [f32; 2],
     /// Time that the params have walked for [s].
     walked: f64,
+    /// A param has stepped: what was read before is of another ring.
+    stepped: bool,
+    /// The param that was let loose since the last estimate.
+    pub let_loose: Option<u16>,
+    /// Evidence for steps.
+    drift: Drift<N>,
     /// The Gaussian was not positive since the last estimate.
     pub unsolved: bool,
 }
 
 impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K, N, T, W> {
     /// Memory for one, all zero.
-    pub const BLANK: Self =
-        Self { gaussian: Gaussian::BLANK, solution: Solution::BLANK, orbit: [0.0; 2], walked: 0.0, unsolved: false };
+    pub const BLANK: Self = Self {
+        gaussian: Gaussian::BLANK,
+        solution: Solution::BLANK,
+        orbit: [0.0; 2],
+        walked: 0.0,
+        stepped: false,
+        let_loose: None,
+        drift: Drift::NONE,
+        unsolved: false,
+    };
 
-    /// Nothing has walked, nothing has failed.
+    /// Nothing has walked or stepped, nothing has failed.
     pub fn clear(&mut self) {
-        (self.orbit, self.walked, self.unsolved) = ([0.0; 2], 0.0, false);
+        (self.orbit, self.walked, self.stepped, self.unsolved) = ([0.0; 2], 0.0, false, false);
+        self.let_loose = None;
+        self.drift.clear();
     }
 
     /// Solve the Gaussian.
@@ -76,19 +95,42 @@ impl<const K: usize, const N: usize, const T: usize, const W: usize> Posterior<K
         self.walked += f64::from(seconds);
         let variance = |noise: f32| noise * noise * seconds;
         self.gaussian.spread_baselines(variance(walk.baselines).into(), B);
-        // After a long silence the vars are unknown, but not more than the range of the prior allows.
-        let room = |(i, sigma): (usize, &f32)| 2.0 * prior(i).sigma * prior(i).sigma - sigma * sigma;
-        let params = self.solution.sigma.iter().take(layout.params());
-        let smallest = params.enumerate().map(room).fold(f32::MAX, f32::min);
-        let variance = variance(walk.params).min(smallest.max(0.0));
-        if variance > 0.0 {
-            self.gaussian.walk(libm::sqrtf(variance), &mut self.solution);
-            self.solve(layout, prior);
+        let step = variance(walk.params);
+        if step > 0.0 {
+            // After a long silence a var is unknown, but not more than the range of the prior allows.
+            let known = self.solution.sigma;
+            let room = |i: usize| 2.0 * prior(i).sigma * prior(i).sigma - known.get(i).map_or(0.0, |sigma| sigma * sigma);
+            self.spread(|i| step.min(room(i)), layout, prior);
         }
+    }
+
+    /// Take note of what is expected of the next frame.
+    pub fn expect(&mut self) {
+        self.drift.expect(&self.gaussian, &self.solution);
+    }
+
+    /// Let the params loose, each by the probability that it has stepped, if the frames up to this one say that one has.
+    #[inline(never)]
+    pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+        let Some(step) = self.drift.weigh(&self.gaussian, &self.solution) else { return };
+        let variance = |i: usize| step.probability.get(i).unwrap_or(&0.0) * prior(i).sigma * prior(i).sigma;
+        self.spread(variance, layout, prior);
+        self.drift.clear();
+        (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
+    }
+
+    /// Add so much variance to each param.
+    fn spread(&mut self, variance: impl Fn(usize) -> f32, layout: &Layout, prior: impl Fn(usize) -> Prior) {
+        let sigma = core::array::from_fn(|i| libm::sqrt(variance(i).max(LEAST).into()));
+        self.gaussian.walk(&sigma, &mut self.solution);
+        self.solve(layout, prior);
     }
 
     /// True while all frames so far have seen the same ring, and the same baselines.
     pub fn is_still<const B: usize>(&self, walk: &Walk) -> bool {
+        if self.stepped {
+            return false;
+        }
         let time = libm::sqrt(self.walked) as f32;
         let walked = walk.params * time;
         let moved = walk.baselines * time;

@@ -111,11 +111,19 @@ impl<const B: usize> Covariance<B> for Correlated<B> {
 }
 
 impl<const B: usize> Correlated<B> {
-    /// Add `variance` times the products of columns `h`, one of each baseline: what they share of a walk.
-    pub fn correlate<const N: usize>(&mut self, variance: f64, h: &SMatrix<f64, N, B>) {
+    /// Add the products of columns `h`, one of each baseline: what they share of a walk.
+    pub fn correlate<const N: usize>(&mut self, h: &SMatrix<f64, N, B>) {
         let h = h.as_slice().chunks_exact(N);
         for (column, one) in self.matrix.as_mut_slice().chunks_exact_mut(B).zip(h.clone()) {
-            column.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += variance * dot(one, other));
+            column.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += dot(one, other));
+        }
+        self.walked = true;
+    }
+
+    /// Add `variance` times the products of `h`, one of each baseline: what they share of the move of one param.
+    pub fn share(&mut self, variance: f64, h: &[f64; B]) {
+        for (column, one) in self.matrix.as_mut_slice().chunks_exact_mut(B).zip(h) {
+            add(column, variance * one, h);
         }
         self.walked = true;
     }
