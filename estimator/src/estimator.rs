@@ -21,7 +21,7 @@ use crate::estimate::{Estimate, Remarks};
 use crate::gaussian::{Gaussian, Independent, Reading};
 use crate::linear::column;
 use crate::mask::Mask;
-use crate::monitor::{Gate, Monitor};
+use crate::monitor::{Gate, Monitor, Peers};
 use crate::prior::Prior;
 use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
@@ -104,6 +104,7 @@ pub struct Estimator<
     tangent: Tangent<G::Linearised, F>,
     predicted: Predicted<B, F, N>,
     monitors: [Monitor; B],
+    peers: Peers,
     tunes: [TuneMeter<F>; 2],
     past: Past<B, C, F, N, S, K, T, W>,
     posterior: Posterior<K, N, T, W>,
@@ -260,6 +261,7 @@ impl<
         tangent: Tangent { linearised: G::UNLINEARISED, supplies: [0.0; F], is_new: false },
         predicted: Predicted { prediction: Prediction::BLANK, at_mean_drive: [0.0; B], rf_offset: 0.0 },
         monitors: [const { Monitor::BLANK }; B],
+        peers: Peers::EXPECTED,
         tunes: [const { TuneMeter::BLANK }; 2],
         past: Past { campaign: Campaign::BLANK, recent: Deque::new(), loose: Gaussian::BLANK, stale: false },
         posterior: Posterior::BLANK,
@@ -282,6 +284,7 @@ impl<
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
             monitor.expect(model.setup.noise.of(b));
         }
+        self.peers = Peers::EXPECTED;
         self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.past.campaign.clear();
         self.past.recent.clear();
@@ -317,7 +320,7 @@ impl<
             return Ok(self.estimate(model, &frame, None, &Screened::none_of(&frame.valid), 0.0, whole));
         }
         let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
-        let screened = self.screen(model, &frame, &drive, cell, whole, &expected.within);
+        let screened = self.screen(model, &frame, &drive, cell, whole, &expected);
         let nis = self.condition(model, &frame, cell, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
@@ -493,10 +496,7 @@ impl<
         let linearised_once = cell.is_none() || !still;
         // a mean over frames that have not seen the same ring says nothing
         let cell = cell.filter(|_| still);
-        let may_step = model.setup.walk.params > 0.0;
-        if may_step {
-            self.posterior.expect();
-        }
+        self.posterior.expect();
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
             *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
@@ -515,11 +515,11 @@ impl<
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
         self.solve(model);
+        self.posterior.narrow();
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
-        if may_step {
-            let prior = |i| prior_of::<G, B, C, F, N>(model, i);
-            self.posterior.let_loose(&model.surrogate.layout(), prior);
+        if model.setup.walk.params > 0.0 {
+            self.posterior.let_loose(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
         }
         nis as f32
     }
@@ -625,6 +625,11 @@ impl<
         let origin = self.posterior.gaussian.origin().get(i).copied().unwrap_or(0.0);
         let unbounded = (f64::from(origin) + self.posterior.solution.delta.get(i).copied().unwrap_or(0.0)) as f32;
         if clipped { unbounded } else { self.posterior.solution.map_params.get(i).copied().unwrap_or(unbounded) }
+    }
+
+    /// Evidence that a param has stepped lately [nat].
+    pub fn step_evidence(&self) -> f32 {
+        self.posterior.step_evidence()
     }
 
     /// Frames used so far.

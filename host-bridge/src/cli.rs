@@ -122,6 +122,9 @@ pub struct Replay {
     /// Random walk of each ln var, standard deviation per sqrt(frame)
     #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
     pub process_noise: f32,
+    /// Follow a machine whose vars and baselines may drift, and look for steps of single vars
+    #[arg(long, conflicts_with = "process_noise")]
+    pub follow: bool,
     /// One CSV row a frame
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,

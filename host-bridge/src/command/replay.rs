@@ -23,10 +23,8 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     warn_if_not_modelled(&recording);
     let powered = recording.powered(&ring);
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
-    let core = Core::with_tables(
-        tables,
-        stream::setup(&powered, &recording, stream::walk_per_cycle(&recording, options.process_noise))?,
-    )?;
+    let walk = if options.follow { stream::FOLLOW } else { stream::walk_per_cycle(&recording, options.process_noise) };
+    let core = Core::with_tables(tables, stream::setup(&powered, &recording, walk)?)?;
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
