@@ -59,6 +59,8 @@ pub struct Remarks {
     /// Slices of work done since the estimate before ([`crate::Estimator::prepare`]): with as many before each frame, another
     /// core arrives at the same bits.
     pub slices: u32,
+    /// The param whose var has stepped: it was let loose, and is as unknown as at the start until frames say where it is.
+    pub let_loose: Option<u16>,
 }
 
 /// The vars and the state of the monitors after a frame.

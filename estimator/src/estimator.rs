@@ -5,6 +5,7 @@
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
 mod anew;
+mod drift;
 mod laplace;
 mod pooling;
 mod posterior;
@@ -26,7 +27,7 @@ use crate::following::{self, Following};
 use crate::gaussian::{Gaussian, Independent, Reading};
 use crate::linear::column;
 use crate::mask::Mask;
-use crate::monitor::{Gate, Monitor};
+use crate::monitor::{Gate, Monitor, Peers};
 use crate::prior::Prior;
 use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
@@ -118,6 +119,7 @@ pub struct Estimator<
     monitors: [Monitor; B],
     /// How their baselines follow the supplies.
     following: [Following<F>; B],
+    peers: Peers,
     tunes: [TuneMeter<F>; 2],
     past: Past<B, C, F, N, S, K, T, W>,
     posterior: Posterior<K, N, T, U, W>,
@@ -309,6 +311,7 @@ impl<
         },
         monitors: [const { Monitor::BLANK }; B],
         following: [Following::NONE; B],
+        peers: Peers::EXPECTED,
         tunes: [const { TuneMeter::BLANK }; 2],
         past: Past {
             campaign: Campaign::BLANK,
@@ -338,6 +341,7 @@ impl<
             monitor.expect(model.setup.noise.of(b));
         }
         self.following = [Following::NONE; B];
+        self.peers = Peers::EXPECTED;
         self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.past.campaign.clear();
         self.past.reference = Reference::ZERO;
@@ -374,7 +378,7 @@ impl<
             return Ok(self.estimate(model, &frame, None, &Screened::none_of(&frame.valid), 0.0, whole));
         }
         let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
-        let screened = self.screen(model, &frame, &drive, cell, whole, &expected.within);
+        let screened = self.screen(model, &frame, &drive, cell, whole, &expected);
         if let Some(cell) = cell {
             self.note_late(model, &frame, &drive, cell, &screened);
         }
@@ -401,7 +405,7 @@ impl<
             }
             self.seek_reference(model);
             self.retire(model);
-            if !self.is_due() {
+            if !self.is_due(model) {
                 return Prepared::Nothing;
             }
             self.begin();
@@ -562,7 +566,11 @@ impl<
         screened: &Screened<W>,
     ) -> f32 {
         let before = self.posterior.solution.cost;
-        let linearised_once = cell.is_none() || !self.posterior.is_still::<B>(&model.setup.walk);
+        let still = self.posterior.is_still::<B>(&model.setup.walk);
+        let linearised_once = cell.is_none() || !still;
+        // a mean over frames that have not seen the same ring says nothing
+        let cell = cell.filter(|_| still);
+        self.posterior.expect();
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
             *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
@@ -581,8 +589,12 @@ impl<
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
         self.solve(model);
+        self.posterior.narrow();
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
+        if model.setup.walk.params > 0.0 {
+            self.posterior.let_loose(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
+        }
         nis as f32
     }
 
@@ -649,6 +661,7 @@ impl<
             baselines_moved: whole == Whole::Moved,
             unsolved: core::mem::take(&mut self.posterior.unsolved),
             slices: core::mem::take(&mut self.slices),
+            let_loose: self.posterior.let_loose.take(),
         };
         let solution = &self.posterior.solution;
         let mut estimate = Estimate {
@@ -691,6 +704,11 @@ impl<
         let origin = self.posterior.gaussian.origin().get(i).copied().unwrap_or(0.0);
         let unbounded = (f64::from(origin) + self.posterior.solution.delta.get(i).copied().unwrap_or(0.0)) as f32;
         if clipped { unbounded } else { self.posterior.solution.map_params.get(i).copied().unwrap_or(unbounded) }
+    }
+
+    /// Evidence that a param has stepped lately [nat].
+    pub fn step_evidence(&self) -> f32 {
+        self.posterior.step_evidence()
     }
 
     /// Frames used so far.

@@ -1,8 +1,11 @@
 //! Monitors: noise learnt from repeats, a gate against jumps, and the state of each.
 //!
-//! Noise is learnt from the difference of readings that repeat a setting, never from the model's residuals: those contain
+//! Noise is learnt from the difference of readings that repeat a setting, not from the model's residuals: those contain
 //! the mismatch that the tool looks for. The gate likewise passes a reading that its repeat confirms, whatever the model
-//! predicts. Batch fits use these same definitions.
+//! predicts. Batch fits use these same definitions. Where nothing is repeated, residuals are all there is; what all monitors
+//! share of them is the model's ([`Peers`]).
+//!
+//! What is old is forgotten, so that a monitor that turns noisy or recovers is found at any age of the stream.
 
 use micromath::F32Ext;
 use serde::{Deserialize, Serialize};
@@ -49,8 +52,13 @@ const QUANTILE_ERROR: f32 = 1.15;
 const CONTRADICTION: f32 = 4.0;
 /// Standard errors by which they must contradict a noise that was learnt already.
 const REVISION: f32 = 0.5;
+/// Standard errors within which they must be of the expected noise before that is taken up again.
+const PARDON: f32 = 2.0;
 /// Differences needed before the noise is revised at all.
 const ENOUGH: u32 = 8;
+/// Differences at which half of them are forgotten: more than a campaign has, and noise that turns fourfold passes the 68 % quantile
+/// at 1.5 times the old within 200 more.
+const FULL: u32 = 512;
 
 /// The noise of one monitor, learnt from differences of repeats.
 ///
@@ -92,7 +100,7 @@ impl Noise {
         if let Some(count) = self.histogram.get_mut(bin) {
             *count += 1;
             self.total += 1;
-            if *count == u16::MAX {
+            if self.total >= FULL {
                 self.forget_half();
             }
         }
@@ -121,15 +129,22 @@ impl Noise {
         None
     }
 
-    /// Take over what was learnt if it contradicts the noise in use; true if the noise changed.
+    /// Learn from the surprise of a reading that nothing repeats [m]: a difference has twice its variance.
+    pub fn learn_alone(&mut self, surprise: f32) {
+        self.learn(core::f32::consts::SQRT_2 * surprise);
+    }
+
+    /// Take over what was learnt if it contradicts the noise in use, or the expected noise if it no longer contradicts that;
+    /// true if the noise changed.
     pub fn revise(&mut self) -> bool {
         let Some(learnt) = self.learnt() else { return false };
+        let error = QUANTILE_ERROR / libm::sqrtf(self.total as f32);
+        let contradicts = |noise: f32, errors: f32| libm::logf(learnt / noise).abs() > errors * error;
         let errors = if self.sigma == self.expected { CONTRADICTION } else { REVISION };
-        let error = errors * QUANTILE_ERROR / libm::sqrtf(self.total as f32);
-        if libm::logf(learnt / self.sigma).abs() <= error {
+        if !contradicts(self.sigma, errors) {
             return false;
         }
-        self.sigma = learnt;
+        self.sigma = if contradicts(self.expected, PARDON) { learnt } else { self.expected };
         true
     }
 }
@@ -141,7 +156,9 @@ const STUCK: u16 = 4;
 /// Share of rejected readings above which a monitor counts as jumping; normal noise gives 6e-7.
 const JUMPY: f32 = 0.01;
 /// Fewest rejected readings for that.
-const FEWEST_JUMPS: u32 = 3;
+const FEWEST_JUMPS: u16 = 3;
+/// Reports after which half of them, and of the rejected ones, are forgotten: more than a campaign has.
+const MANY: u16 = 512;
 /// Factor on the variance of a monitor that jumps: its smaller jumps pass the gate.
 const JUMPING: f32 = 2.0;
 /// Ratio to the expected noise above which a monitor is noisy.
@@ -156,7 +173,10 @@ pub struct Monitor {
     jumps: bool,
     silent: u16,
     unchanged: u16,
-    reported: u32,
+    /// Lately.
+    reported: u16,
+    refused: u16,
+    /// In all.
     rejected: u32,
     last_code: i32,
 }
@@ -170,6 +190,7 @@ impl Monitor {
         silent: 0,
         unchanged: 0,
         reported: 0,
+        refused: 0,
         rejected: 0,
         last_code: 0,
     };
@@ -189,24 +210,29 @@ impl Monitor {
         self.last_code = code;
         let moving = self.unchanged < STUCK;
         self.silent = if moving { 0 } else { self.silent.saturating_add(1) };
-        self.reported = self.reported.saturating_add(u32::from(moving));
+        self.reported = self.reported.saturating_add(u16::from(moving));
+        if self.reported >= MANY {
+            (self.reported, self.refused) = (self.reported / 2, self.refused / 2);
+        }
         moving
     }
 
     /// Count a reading that is not used.
     pub fn reject(&mut self) {
         self.rejected = self.rejected.saturating_add(1);
+        self.refused = self.refused.saturating_add(1);
     }
 
     /// Accept a late reading: a repeat has confirmed it.
     pub fn pardon(&mut self) {
         self.rejected = self.rejected.saturating_sub(1);
+        self.refused = self.refused.saturating_sub(1);
     }
 
     /// Update the monitor's state; true if its readings so far need re-weighting.
     pub fn judge(&mut self) -> bool {
         let (jumped, noise_changed) = (self.jumps, self.noise.revise());
-        self.jumps = self.rejected >= FEWEST_JUMPS && self.rejected as f32 > JUMPY * self.reported as f32;
+        self.jumps = self.refused >= FEWEST_JUMPS && f32::from(self.refused) > JUMPY * f32::from(self.reported);
         self.state = if self.silent >= SILENCE {
             MonitorState::Dead
         } else if self.noise.sigma > NOISY * self.noise.expected {
@@ -238,6 +264,42 @@ impl Monitor {
             weighted_as: libm::sqrtf(self.variance()),
             rejected: self.rejected,
         }
+    }
+}
+
+/// Median size of a standard normal number.
+const MEDIAN: f32 = 0.674_489_8;
+/// Share of itself by which the scale of all surprises moves in a frame where all are above it: its own error is then 2 %.
+const FOLLOWS: f32 = 1.0 / 32.0;
+
+/// How far the readings of all monitors together are off, over what is expected: what they share is the model's mismatch, and only
+/// what a monitor is off beyond that is its noise. It is the median of all surprises, followed from frame to frame.
+///
+/// Source: H. Robbins and S. Monro, Ann. Math. Stat. 22 (1951) 400, ex. 2.
+#[derive(Debug, Clone)]
+pub struct Peers {
+    scale: f32,
+}
+
+impl Peers {
+    /// As expected.
+    pub const EXPECTED: Self = Self { scale: 1.0 };
+
+    /// Take note of the surprises in a frame, each over its standard deviation.
+    pub fn hear(&mut self, surprises: impl Iterator<Item = f32>) {
+        let (mut all, mut above) = (0.0, 0.0);
+        for surprise in surprises {
+            all += 1.0;
+            above += f32::from(u8::from(surprise.abs() > MEDIAN * self.scale));
+        }
+        if all > 0.0 {
+            self.scale = (self.scale * (1.0 + FOLLOWS * (2.0 * above / all - 1.0))).max(1.0);
+        }
+    }
+
+    /// By this factor, 1 at least.
+    pub fn scale(&self) -> f32 {
+        self.scale
     }
 }
 
@@ -329,5 +391,38 @@ mod tests {
         let mut noise = Noise::expecting(1.0);
         (0..1_000_000).for_each(|_| noise.learn(1.0));
         assert!(noise.learnt().is_some());
+    }
+
+    /// Readings that repeat nothing, of a monitor that turns four times noisier after so many of them, and recovers.
+    #[test]
+    fn noise_that_turns_is_learnt_at_any_age_and_pardoned() {
+        for age in [300, 3_000, 100_000] {
+            let mut learner = Noise::expecting(1.5e-4);
+            let mut readings = noise(age + 1000);
+            let mut learn = |n: usize, sigma: f32| {
+                readings.by_ref().take(n).for_each(|z| {
+                    learner.learn_alone(sigma * z);
+                    learner.revise();
+                });
+                learner.sigma() / 1.5e-4
+            };
+            assert_eq!(learn(age, 1.5e-4), 1.0, "after {age}");
+            let noisy = learn(300, 6e-4);
+            assert!(noisy > NOISY, "after {age}: {noisy}");
+            assert_eq!(learn(700, 1.5e-4), 1.0, "after {age}");
+        }
+    }
+
+    #[test]
+    fn what_all_monitors_share_is_not_noise() {
+        let mut peers = Peers::EXPECTED;
+        let mut readings = noise(33 * 2000);
+        let mut hear = |peers: &mut Peers, scale: f32| {
+            (0..1000).for_each(|_| peers.hear(readings.by_ref().take(33).map(|z| scale * z)));
+        };
+        hear(&mut peers, 1.0);
+        assert!((1.0..1.06).contains(&peers.scale()), "{}", peers.scale()); // 2 % of its own, three of them
+        hear(&mut peers, 2.0);
+        assert!((1.88..2.12).contains(&peers.scale()), "{}", peers.scale());
     }
 }

@@ -122,7 +122,7 @@ pub struct Replay {
     /// Random walk of each ln var, standard deviation per sqrt(cycle), lost cycles counted; 0 for a campaign, whose vars are constant
     #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
     pub process_noise: f32,
-    /// Let vars and baselines drift as `orbitcal serve` does: 1e-4 and 0.02 mm per sqrt(hour)
+    /// Follow a machine whose vars and baselines may drift, and look for steps of single vars
     #[arg(long, conflicts_with = "process_noise")]
     pub follow: bool,
     /// One CSV row a frame

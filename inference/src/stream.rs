@@ -20,7 +20,7 @@ use crate::recording::{Recording, Row};
 pub use estimate::Estimate;
 pub use estimator::Walk;
 use held::{Held, Stream};
-pub use setup::{DRIFT, Setup, setup, walk_per_cycle};
+pub use setup::{FOLLOW, Setup, setup, walk_per_cycle};
 
 /// Why a recording cannot be put on the wire.
 #[derive(Debug, thiserror::Error)]

@@ -104,6 +104,8 @@ pub struct Machine {
     pub params: [f32; PARAMS],
     /// The true derivative of the last frame's readings, and its orbit without baselines.
     pub prediction: Box<Prediction>,
+    /// True noise of each monitor [m].
+    pub noise: [f64; MONITORS],
     /// Random numbers of the machine and of whoever runs it.
     pub random: Random,
     at: Box<<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::Linearised>,
@@ -123,6 +125,7 @@ impl Machine {
         let prior = core.prior(0);
         let mut surrogate = Box::new(Green::BLANK);
         core.tables.fill(&mut *surrogate).expect("tables of the Booster");
+        let setup = core.setup.in_room(&LAYOUT);
         let mut theta = || loop {
             let theta = prior.mean + prior.sigma * random.normal() as f32;
             if (prior.lower..=prior.upper).contains(&theta) {
@@ -131,7 +134,8 @@ impl Machine {
         };
         Self {
             surrogate,
-            setup: core.setup.in_room(&LAYOUT),
+            noise: core::array::from_fn(|b| setup.noise.of(b).into()),
+            setup,
             at: Box::new(<Green as Surrogate<MONITORS, CORRECTORS, SUPPLIES, PARAMS>>::UNLINEARISED),
             is_linearised: false,
             prediction: Box::new(Prediction::BLANK),
@@ -188,7 +192,7 @@ impl Machine {
         let drive = calibration.drive(&frame).expect("a drive within the model");
         self.surrogate.predict(&self.at, &drive, &mut self.prediction);
         for b in 0..MONITORS {
-            let noise = f64::from(self.setup.noise.of(b)) * self.random.normal();
+            let noise = self.noise[b] * self.random.normal();
             let position = f64::from(self.prediction.reading[b]) + self.offset[b] + noise;
             frame.reading[b] = PositionCode::nearest(position).expect("an orbit within ±100 mm");
         }

@@ -114,7 +114,8 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
     let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
     let masks = masks.map(|bit| u64::from(*bit));
     let tunes = e.tune_innovation.map(|tune| tune.map_or(u64::MAX, |tune| u64::from(tune.to_bits())));
-    let rest = [e.time_us, e.setting.map_or(u64::MAX, u64::from), tunes[0], tunes[1]];
+    let [setting, loose] = [e.setting, e.remarks.let_loose].map(|index| index.map_or(u64::MAX, u64::from));
+    let rest = [e.time_us, setting, loose, tunes[0], tunes[1]];
     numbers.into_iter().chain(remarks).chain(masks).chain(rest).chain(floats).chain(health).collect()
 }
 

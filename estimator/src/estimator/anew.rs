@@ -107,8 +107,8 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    /// True if the MAP has left the origin, or the past has to be weighted anew.
-    pub(super) fn is_due(&self) -> bool {
+    /// True if the MAP has left the origin, or a past that still counts has to be weighted anew.
+    pub(super) fn is_due(&self, model: &Model<'_, G, B, C, F>) -> bool {
         let each = self
             .posterior
             .solution
@@ -116,7 +116,8 @@ impl<
             .iter()
             .zip(self.posterior.gaussian.origin())
             .zip(&self.posterior.solution.sigma);
-        self.past.stale || each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
+        let stale = self.past.stale && self.posterior.is_still::<B>(&model.setup.walk);
+        stale || each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
     }
 
     /// Begin to linearise at the MAP.

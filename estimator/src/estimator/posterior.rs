@@ -2,10 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drift::Drift;
 use crate::gaussian::{Correlated, Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
 
+/// Least variance that is added to a param where others walk: one part in 1e9 of the prior's, since none would be a division by 0.
+const LEAST: f32 = 1e-12;
 /// While the params have walked less than this share of an error bar, all frames so far have seen the same ring.
 const WALKED: f32 = 0.1;
 
@@ -39,18 +42,39 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
     pub orbit: [f32; 2],
     /// Time that the params have walked for [s].
     walked: f64,
+    /// A param has stepped: what was read before is of another ring.
+    stepped: bool,
+    /// The param that was let loose since the last estimate.
+    pub let_loose: Option<u16>,
+    /// Evidence for steps.
+    drift: Drift<N>,
+    /// `ln` of the determinant of the information before the frame at hand, and what the frame has added to it [nat].
+    log_determinant: f64,
+    pub narrowed: f64,
     /// The Gaussian was not positive since the last estimate.
     pub unsolved: bool,
 }
 
 impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> Posterior<K, N, T, U, W> {
     /// Memory for one, all zero.
-    pub const BLANK: Self =
-        Self { gaussian: Gaussian::BLANK, solution: Solution::BLANK, orbit: [0.0; 2], walked: 0.0, unsolved: false };
+    pub const BLANK: Self = Self {
+        gaussian: Gaussian::BLANK,
+        solution: Solution::BLANK,
+        orbit: [0.0; 2],
+        walked: 0.0,
+        stepped: false,
+        let_loose: None,
+        drift: Drift::NONE,
+        log_determinant: 0.0,
+        narrowed: 0.0,
+        unsolved: false,
+    };
 
-    /// Nothing has walked, nothing has failed.
+    /// Nothing has walked or stepped, nothing has failed.
     pub fn clear(&mut self) {
-        (self.orbit, self.walked, self.unsolved) = ([0.0; 2], 0.0, false);
+        (self.orbit, self.walked, self.stepped, self.unsolved) = ([0.0; 2], 0.0, false, false);
+        (self.let_loose, self.narrowed) = (None, f64::MAX);
+        self.drift.clear();
     }
 
     /// Solve the Gaussian.
@@ -76,20 +100,60 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         self.walked += f64::from(seconds);
         let variance = |noise: f32| noise * noise * seconds;
         self.gaussian.spread_baselines(variance(walk.baselines).into(), B);
-        // After a long silence the vars are unknown, but not more than the range of the prior allows.
-        let room = |(i, sigma): (usize, &f32)| 2.0 * prior(i).sigma * prior(i).sigma - sigma * sigma;
-        let params = self.solution.sigma.iter().take(layout.params());
-        let smallest = params.enumerate().map(room).fold(f32::MAX, f32::min);
-        let variance = variance(walk.params).min(smallest.max(0.0));
-        if variance > 0.0 {
-            self.gaussian.walk(libm::sqrtf(variance), &mut self.solution);
-            self.solve(layout, prior);
+        let step = variance(walk.params);
+        if step > 0.0 {
+            // After a long silence a var is unknown, but not more than the range of the prior allows.
+            let known = self.solution.sigma;
+            let room =
+                |i: usize| 2.0 * prior(i).sigma * prior(i).sigma - known.get(i).map_or(0.0, |sigma| sigma * sigma);
+            self.spread(|i| step.min(room(i)), layout, prior);
         }
         true
     }
 
+    /// Take note of what is expected of the next frame.
+    pub fn expect(&mut self) {
+        self.drift.expect(&self.gaussian, &self.solution);
+        self.log_determinant = self.solution.log_determinant;
+    }
+
+    /// Take note of how much the frame has added to what is known.
+    pub fn narrow(&mut self) {
+        self.narrowed = self.solution.log_determinant - self.log_determinant;
+    }
+
+    /// Evidence that a param has stepped lately [nat].
+    pub fn step_evidence(&self) -> f32 {
+        self.drift.likeliest().evidence
+    }
+
+    /// Weigh what a frame has said of steps; if there is one, let the params loose, each by its probability to have stepped.
+    ///
+    /// The variance of such a mixture is the probability times the prior's. A normal distribution of that variance would have the
+    /// right one of 24 candidates, all of them as probable, 3 sigma off after a step of 2 %. With the root of the probability it is
+    /// 1.5 sigma, and 2 for one of probability 0.01.
+    #[inline(never)]
+    pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+        self.drift.weigh(&self.gaussian, libm::exp(self.narrowed).max(1.0));
+        let Some(step) = self.drift.found() else { return };
+        let probability = |i: usize| step.probability.get(i).copied().unwrap_or(0.0);
+        self.spread(|i| libm::sqrtf(probability(i)) * prior(i).sigma * prior(i).sigma, layout, prior);
+        self.drift.clear();
+        (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
+    }
+
+    /// Add so much variance to each param.
+    fn spread(&mut self, variance: impl Fn(usize) -> f32, layout: &Layout, prior: impl Fn(usize) -> Prior) {
+        let sigma = core::array::from_fn(|i| libm::sqrt(variance(i).max(LEAST).into()));
+        self.gaussian.walk(&sigma, &mut self.solution);
+        self.solve(layout, prior);
+    }
+
     /// True while all frames so far have seen the same ring, and the same baselines.
     pub fn is_still<const B: usize>(&self, walk: &Walk) -> bool {
+        if self.stepped {
+            return false;
+        }
         let time = libm::sqrt(self.walked) as f32;
         let walked = walk.params * time;
         let moved = walk.baselines * time;

@@ -49,7 +49,9 @@ impl<const B: usize> WholeFrames<B> {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Expected<const B: usize, const W: usize> {
     /// Measured minus expected [m]; 0 where none is reported.
-    surprise: [f32; B],
+    pub surprise: [f32; B],
+    /// Share of the monitor's own noise in its standard deviation, as far as it does not come from the params.
+    pub own: [f32; B],
     /// Those within the gate.
     pub within: Mask<W>,
 }
@@ -96,9 +98,9 @@ impl<
 
     /// What the model, with all its uncertainty, makes of each reading.
     fn expected(&self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) -> Expected<B, W> {
-        let mut expected = Expected { surprise: [0.0; B], within: Mask::NONE };
-        let each = expected.surprise.iter_mut().zip(&frame.reading).enumerate();
-        for (b, (to, reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
+        let mut expected = Expected { surprise: [0.0; B], own: [0.0; B], within: Mask::NONE };
+        let each = expected.surprise.iter_mut().zip(&mut expected.own).zip(&frame.reading).enumerate();
+        for (b, ((to, own), reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
             let (d, baseline_variance) = self.posterior.gaussian.effective(b, self.slope(b));
             let predicted = self.posterior.gaussian.baseline(b) + dot(&d, &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
@@ -110,7 +112,7 @@ impl<
             // the uncertainty of the params is only worked out for readings that need it
             let within =
                 expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.posterior.solution.variance_of(&d));
-            *to = surprise as f32;
+            (*to, *own) = (surprise as f32, libm::sqrtf(self.noise_variance(b) / certain as f32));
             expected.within.put(b, within);
         }
         expected
@@ -124,7 +126,7 @@ impl<
     }
 
     /// Readings that count in a judgement of the whole: of monitors that report and are not dead.
-    fn alive(&self, frame: &Frame<B, C, F, W>) -> impl Iterator<Item = (usize, &Monitor)> {
+    pub(super) fn alive(&self, frame: &Frame<B, C, F, W>) -> impl Iterator<Item = (usize, &Monitor)> {
         let valid = frame.valid;
         self.monitors.iter().enumerate().filter(move |(b, m)| valid.has(*b) && m.state() != MonitorState::Dead)
     }

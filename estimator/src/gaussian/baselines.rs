@@ -108,11 +108,11 @@ impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
 }
 
 impl<const B: usize, const U: usize> Correlated<B, U> {
-    /// Add `variance` times the products of columns `h`, one of each baseline: what they share of a walk.
-    pub fn correlate<const N: usize>(&mut self, variance: f64, h: &SMatrix<f64, N, B>) {
+    /// Add the products of columns `h`, one of each baseline: what they share of a walk.
+    pub fn correlate<const N: usize>(&mut self, h: &SMatrix<f64, N, B>) {
         let h = h.as_slice().chunks_exact(N);
         for (row, one) in self.matrix.rows_mut().zip(h.clone()) {
-            row.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += variance * dot(one, other));
+            row.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += dot(one, other));
         }
         self.walked = true;
     }

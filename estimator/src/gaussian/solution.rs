@@ -24,6 +24,8 @@ pub struct Solution<const N: usize, const T: usize, const W: usize> {
     pub cost: f64,
     /// `ln` of the evidence: the density of all readings under the model.
     pub log_evidence: f64,
+    /// `ln` of the determinant of the information.
+    pub log_determinant: f64,
     /// Inverse of the information's lower Cholesky factor, `P = X^T X`.
     factor: Triangle<N, T, f64>,
 }
@@ -37,6 +39,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         clipped: Mask::NONE,
         cost: 0.0,
         log_evidence: 0.0,
+        log_determinant: 0.0,
         factor: Triangle::ZERO,
     };
 
@@ -55,7 +58,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
             self.factor.rows_mut().filter_map(<[f64]>::last_mut).for_each(|diagonal| *diagonal *= 1.0 + more);
             self.factor.factorise()
         });
-        let log_determinant = factorised.unwrap_or_else(|| self.forget(gaussian, &prior));
+        self.log_determinant = factorised.unwrap_or_else(|| self.forget(gaussian, &prior));
         if factorised.is_some() {
             self.delta = gaussian.vector;
             self.factor.solve_lower(&mut self.delta);
@@ -68,7 +71,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         }
         self.sigma = variance.map(|v| libm::sqrt(v) as f32);
         self.cost = gaussian.cost - dot(&gaussian.vector, &self.delta);
-        self.log_evidence = -0.5 * (self.cost + gaussian.volume + log_determinant);
+        self.log_evidence = -0.5 * (self.cost + gaussian.volume + self.log_determinant);
         self.bound(gaussian, prior);
         tried == 1
     }
@@ -114,7 +117,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         if !outside {
             return;
         }
-        let mut pull = gaussian.pull(&self.map_params);
+        let mut pull = gaussian.pull(&gaussian.step_to(&self.map_params));
         // Each sweep minimises over one param at a time; the error falls by the coupling, about a half, each sweep.
         for _ in 0..30 {
             if !self.sweep(gaussian, &mut pull, bounded) {

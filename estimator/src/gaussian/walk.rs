@@ -1,50 +1,68 @@
-//! A random walk of the params: a prediction of the Kalman filter in information form.
+//! What is known is forgotten: a random walk of the params, each by its own step. It is a prediction of the Kalman filter, in
+//! information form; the best point stays.
 
-use super::{Correlated, Gaussian, Solution, square};
+use super::{Correlated, Gaussian, Solution};
 use crate::linear::dot;
 use crate::triangle::Triangle;
 
 impl<const B: usize, const N: usize, const T: usize, const U: usize> Gaussian<B, N, T, Correlated<B, U>> {
-    /// Let every param walk at random by `sigma`: `P += sigma^2`, baselines stay.
+    /// Let each param walk at random by its `sigma`, none of them 0: `P += S^2`, `S = diag(sigma)`, baselines stay.
     ///
-    /// With `K = (1 + sigma^2 Y)^-1`: `Y <- K Y`, `slope <- K slope`, `covariance += sigma^2 slope^T K slope`.
+    /// With `K = (1 + S Y S)^-1`: `Y <- S^-1 K S Y`, `slope <- S^-1 K S slope`, `covariance += slope^T S K S slope`.
     /// `solution` is that of this Gaussian and serves as work space.
-    pub fn walk<const W: usize>(&mut self, sigma: f32, solution: &mut Solution<N, T, W>) {
-        let variance = square(sigma);
+    pub fn walk<const W: usize>(&mut self, sigma: &[f64; N], solution: &mut Solution<N, T, W>) {
         let mean = solution.delta;
         let k = solution.work_space();
         for (i, (to, from)) in k.rows_mut().zip(self.information.rows()).enumerate() {
-            to.iter_mut().zip(from).for_each(|(to, y)| *to = variance * y);
+            let own = sigma.get(i).copied().unwrap_or(0.0);
+            to.iter_mut().zip(from).zip(sigma).for_each(|((to, y), other)| *to = own * y * other);
             to.get_mut(i).into_iter().for_each(|diagonal| *diagonal += 1.0);
         }
-        if k.factorise().is_none() {
+        let Some(log_determinant) = k.factorise() else {
             return; // 1 + a positive matrix; only a NaN could fail, and none can enter
-        }
+        };
+        let best = self.cost - dot(&self.vector, &mean);
         let mut row = [0.0; N];
         // from the first row down: each finds the rest of its column, in the rows below, as it was
         for i in 0..N {
             self.information.copy_row(i, &mut row);
+            multiply(&mut row, sigma);
             k.solve_lower(&mut row);
             k.solve_upper(&mut row);
+            divide(&mut row, sigma);
             self.information.row_mut(i).iter_mut().zip(&row).for_each(|(to, y)| *to = *y);
         }
-        self.walk_baselines(variance, k, &mean);
-        // the best point and its chi-square stay
-        let best = self.cost - dot(&self.vector, &mean);
-        self.vector = self.information.multiply(&mean);
-        self.cost = best + dot(&self.vector, &mean);
+        self.walk_baselines(sigma, k, &mean);
+        self.keep(best, log_determinant, &mean);
     }
 
     /// Slopes, covariance and, so that the best point stays, baselines; `K = L^-T L^-1`.
-    fn walk_baselines(&mut self, variance: f64, k: &Triangle<N, T, f64>, mean: &[f64; N]) {
+    fn walk_baselines(&mut self, sigma: &[f64; N], k: &Triangle<N, T, f64>, mean: &[f64; N]) {
         for (baseline, slope) in self.baseline.iter_mut().zip(self.slope.as_mut_slice().as_chunks_mut::<N>().0) {
             *baseline -= dot(slope, mean);
+            multiply(slope, sigma);
             k.solve_lower(slope);
         }
-        self.covariance.correlate(variance, &self.slope);
+        self.covariance.correlate(&self.slope);
         for (baseline, slope) in self.baseline.iter_mut().zip(self.slope.as_mut_slice().as_chunks_mut::<N>().0) {
             k.solve_upper(slope);
+            divide(slope, sigma);
             *baseline += dot(slope, mean);
         }
     }
+
+    /// The best point stays, and so do its chi-square and the evidence: the determinant has fallen by this logarithm.
+    fn keep(&mut self, best: f64, log_determinant: f64, mean: &[f64; N]) {
+        self.vector = self.information.multiply(mean);
+        self.cost = best + dot(&self.vector, mean);
+        self.volume += log_determinant;
+    }
+}
+
+fn multiply<const N: usize>(row: &mut [f64; N], by: &[f64; N]) {
+    row.iter_mut().zip(by).for_each(|(value, by)| *value *= by);
+}
+
+fn divide<const N: usize>(row: &mut [f64; N], by: &[f64; N]) {
+    row.iter_mut().zip(by).for_each(|(value, by)| *value /= by);
 }

@@ -282,7 +282,7 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
         + 5 * (LENGTH + VARINT_32 * W) // masks
         + LENGTH + B * (1 + 8 + VARINT_32) // health
         + 3 * VARINT_32 + VARINT_64 // the frame, and how many
-        + 2 * 4 + 2 * 5 + 4 + 4 + VARINT_32; // nis, log_evidence, tunes, setting, linearised and remarks
+        + 2 * 4 + 2 * 5 + 2 * 4 + 4 + VARINT_32; // nis, log_evidence, tunes, setting and the param let loose, linearised and other remarks, slices
 
     /// The estimate, if every list is whole.
     pub fn estimate(&self) -> Option<Estimate<B, N, W>> {

@@ -23,8 +23,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     warn_if_not_modelled(&recording);
     let powered = recording.powered(&ring);
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
-    let given = stream::walk_per_cycle(&recording, options.process_noise);
-    let walk = if options.follow { stream::DRIFT } else { given };
+    let walk = if options.follow { stream::FOLLOW } else { stream::walk_per_cycle(&recording, options.process_noise) };
     let core = Core::with_tables(tables, stream::setup(&powered, &recording, walk)?)?;
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);

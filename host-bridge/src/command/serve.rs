@@ -66,7 +66,7 @@ fn feed(
     warn_if_not_modelled(recording);
     let powered = recording.powered(ring);
     let given = options.process_noise.map(|sigma| stream::walk_per_cycle(recording, sigma));
-    let setup = stream::setup(&powered, recording, given.unwrap_or(stream::DRIFT))?;
+    let setup = stream::setup(&powered, recording, given.unwrap_or(stream::FOLLOW))?;
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     link.restart(&setup).map_err(CommandError::other)?;
     if options.load {

@@ -8,6 +8,13 @@ use super::StreamError;
 use crate::campaign::TUNE_CALIBRATION;
 use crate::recording::{Recording, Row};
 
+/// The walk of a machine that is followed for hours, and of what the daemon expects.
+///
+/// A supply or a magnet that warms up drifts by 1 % in minutes: 1.5e-4 in the root of a second is 1.2 % in the root of an hour and a
+/// half, and forgets in some minutes what contradicts it. Faster, vars that stay would be known worse than 0.3 %; slower, one that
+/// drifts by 3 % in ten minutes leaves its band. Orbits drift by 0.1 mm an hour: 2e-6 m in the root of a second.
+pub const FOLLOW: Walk = Walk { params: 1.5e-4, baselines: 2e-6 };
+
 /// Priors, noise and calibration: [`estimator::Setup`] for a ring of any size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setup {
@@ -28,16 +35,6 @@ pub struct Setup {
     /// Calibration error of the tune meter [1]; none, and tunes do not count.
     pub tune_calibration: Option<f32>,
 }
-
-/// How a machine walks that runs for months: vars by 1e-4 and baselines by 20 um per square root of an hour.
-///
-/// Vars: supplies and their current transducers keep 1e-4 over an hour, and a quadrupole that warms up by some K changes by 1e-5 to 1e-4.
-/// After a day that is 5e-4, after a month 0.3 %, what a campaign of a minute knows of a var. Baselines: by `A T L` with A of 1e-5 to
-/// 1e-4 um^2/(m s) the ground moves quadrupoles 8 m apart by 0.5 to 1.7 um in an hour; misalignments make an orbit 15 times as
-/// large (2.7 mm of 0.18 mm), and the monitors' electronics drift by some 10 um.
-///
-/// Source: V. Shiltsev, Observations of random walk of the ground in space and time, Phys. Rev. Lett. 104 (2010) 238501.
-pub const DRIFT: Walk = Walk { params: 1e-4 / 60.0, baselines: 20e-6 / 60.0 };
 
 /// A random walk of the params by so much per square root of a cycle of a recording, lost ones counted.
 pub fn walk_per_cycle(recording: &Recording, sigma: f32) -> Walk {
