@@ -181,8 +181,13 @@ impl EstimateRecord {
 
     /// The remarks of this frame in words.
     pub fn words(&self) -> impl Iterator<Item = &'static str> {
-        let Remarks { put_aside, baselines_moved, unsolved, slices: _ } = self.remarks;
-        let all = [(put_aside, "put aside"), (baselines_moved, "baselines moved"), (unsolved, "unsolved")];
+        let Remarks { put_aside, baselines_moved, unsolved, let_loose, slices: _ } = self.remarks;
+        let all = [
+            (put_aside, "put aside"),
+            (baselines_moved, "baselines moved"),
+            (unsolved, "unsolved"),
+            (let_loose.is_some(), "a var has stepped"),
+        ];
         all.into_iter().filter_map(|(is_said, word)| is_said.then_some(word))
     }
 

@@ -103,8 +103,10 @@ impl<
         if self.posterior.narrowed > NARROWS {
             return false;
         }
-        let sigma = |b: usize| Some(libm::sqrtf(self.noise_variance(b)) / expected.own.get(b)?);
-        let over_sigma = |(b, _): (usize, &Monitor)| Some(expected.surprise.get(b)? / sigma(b)?);
+        let over_sigma = |(b, _): (usize, &Monitor)| {
+            let sigma = libm::sqrtf(*expected.certain.get(b)?);
+            Some(expected.surprise.get(b)? / sigma)
+        };
         let mut peers = self.peers.clone();
         peers.hear(self.alive(frame).filter_map(over_sigma));
         self.peers = peers;
@@ -113,10 +115,12 @@ impl<
 
     /// Learn a monitor's noise from its surprise, less what all monitors share.
     fn learn_alone(&mut self, b: usize, expected: &Expected<B, W>) {
-        if let (Some(monitor), Some(surprise), Some(own)) =
-            (self.monitors.get_mut(b), expected.surprise.get(b), expected.own.get(b))
+        let noise = self.noise_variance(b);
+        if let (Some(monitor), Some(surprise), Some(certain)) =
+            (self.monitors.get_mut(b), expected.surprise.get(b), expected.certain.get(b))
         {
-            monitor.noise.learn_alone(surprise * own / self.peers.scale());
+            // the share of it that is the monitor's own
+            monitor.noise.learn_alone(surprise * libm::sqrtf(noise / certain) / self.peers.scale());
         }
     }
 

@@ -18,6 +18,10 @@ const FORGOTTEN: u32 = 6;
 /// An orbit resembles the one expected if the squares of the surprises are at most one part in so many of its own.
 const RESEMBLES: f32 = 4.0;
 
+/// Mean square of the surprises within the gate, over their variance, above which they surprise together; by chance the mean of 33
+/// is 1.00 ± 0.25.
+const TOGETHER: f64 = 3.0;
+
 /// What a frame is as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Whole {
@@ -50,8 +54,8 @@ impl<const B: usize> WholeFrames<B> {
 pub(super) struct Expected<const B: usize, const W: usize> {
     /// Measured minus expected [m]; 0 where none is reported.
     pub surprise: [f32; B],
-    /// Share of the monitor's own noise in its standard deviation, as far as it does not come from the params.
-    pub own: [f32; B],
+    /// Its variance but for the uncertainty of the params [m^2].
+    pub certain: [f32; B],
     /// Those within the gate.
     pub within: Mask<W>,
 }
@@ -82,7 +86,9 @@ impl<
             return (Whole::Aside, expected);
         }
         // in a setting the repeats decide, of an orbit that might be one
-        if self.is_expected_but_for_a_few(frame, &expected) || (in_setting && self.resembles(frame, &expected)) {
+        let is_expected = self.is_expected_but_for_a_few(frame, &expected)
+            && (in_setting || self.is_expected_together(frame, &expected));
+        if is_expected || (in_setting && self.resembles(frame, &expected)) {
             self.whole.quarantine.clear();
             return (Whole::Good, expected);
         }
@@ -98,9 +104,9 @@ impl<
 
     /// What the model, with all its uncertainty, makes of each reading.
     fn expected(&self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) -> Expected<B, W> {
-        let mut expected = Expected { surprise: [0.0; B], own: [0.0; B], within: Mask::NONE };
-        let each = expected.surprise.iter_mut().zip(&mut expected.own).zip(&frame.reading).enumerate();
-        for (b, ((to, own), reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
+        let mut expected = Expected { surprise: [0.0; B], certain: [0.0; B], within: Mask::NONE };
+        let each = expected.surprise.iter_mut().zip(&mut expected.certain).zip(&frame.reading).enumerate();
+        for (b, ((to, to_certain), reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
             let (d, baseline_variance) = self.posterior.gaussian.effective(b, self.slope(b));
             let predicted = self.posterior.gaussian.baseline(b) + dot(&d, &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
@@ -112,7 +118,7 @@ impl<
             // the uncertainty of the params is only worked out for readings that need it
             let within =
                 expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.posterior.solution.variance_of(&d));
-            (*to, *own) = (surprise as f32, libm::sqrtf(self.noise_variance(b) / certain as f32));
+            (*to, *to_certain) = (surprise as f32, certain as f32);
             expected.within.put(b, within);
         }
         expected
@@ -138,6 +144,30 @@ impl<
             surprising += u32::from(!expected.within.has(b));
         }
         FEW * surprising <= all
+    }
+
+    /// True if the readings within the gate are not all near its edge: an orbit that has moved by three standard deviations
+    /// everywhere surprises no single monitor, and would be taken for a change of the vars.
+    fn is_expected_together(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
+        let sum = |uncertain: f64| {
+            let (mut all, mut squares) = (0.0, 0.0);
+            for (b, _) in self.alive(frame).filter(|(b, _)| expected.within.has(*b)) {
+                let (Some(surprise), Some(certain)) = (expected.surprise.get(b), expected.certain.get(b)) else {
+                    continue;
+                };
+                let own = if uncertain > 0.0 { uncertain * self.variance_of_params(b) } else { 0.0 };
+                all += 1.0;
+                squares += f64::from(surprise * surprise) / (f64::from(*certain) + own);
+            }
+            squares <= TOGETHER * all
+        };
+        // the uncertainty of the params is only worked out for frames that need it
+        sum(0.0) || sum(1.0 + UNDERWEIGHT)
+    }
+
+    /// Variance that the params' uncertainty gives a prediction [m^2].
+    fn variance_of_params(&self, b: usize) -> f64 {
+        self.posterior.solution.variance_of(&self.posterior.gaussian.effective(b, self.slope(b)).0)
     }
 
     fn resembles(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {

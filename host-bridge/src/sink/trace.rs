@@ -32,7 +32,7 @@ pub enum TraceError {
 }
 
 /// Columns after those of the vars.
-const LAST: [&str; 5] = ["nis", "rejected", "put_aside", "baselines_moved", "unsolved"];
+const LAST: [&str; 6] = ["nis", "rejected", "put_aside", "baselines_moved", "unsolved", "stepped"];
 
 /// A trace in the making. The file appears whole with [`Sink::finish`], or not at all.
 pub struct Trace {
@@ -82,10 +82,12 @@ impl Trace {
         self.check(&record.names)?;
         let vars =
             record.mean.iter().zip(&record.sigma).flat_map(|(mean, sigma)| [mean.to_string(), sigma.to_string()]);
-        let Remarks { put_aside, baselines_moved, unsolved, slices: _ } = record.remarks;
+        let Remarks { put_aside, baselines_moved, unsolved, let_loose, slices: _ } = record.remarks;
         let remarks = [put_aside, baselines_moved, unsolved].map(|said| u8::from(said).to_string());
+        let stepped =
+            let_loose.and_then(|param| record.names.vars.get(usize::from(param))).cloned().unwrap_or_default();
         let last = [record.nis.to_string(), record.readings(ReadingUse::Rejected).to_string()];
-        self.row(core::iter::once(record.sequence.to_string()).chain(vars).chain(last).chain(remarks))
+        self.row(core::iter::once(record.sequence.to_string()).chain(vars).chain(last).chain(remarks).chain([stepped]))
     }
 
     fn row(&mut self, fields: impl Iterator<Item = String>) -> Result<(), TraceError> {
@@ -169,7 +171,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trace.csv");
         Trace::create(&path).unwrap().save().unwrap();
-        assert_eq!(std::fs::read_to_string(path).unwrap(), "seq,nis,rejected,put_aside,baselines_moved,unsolved\n");
+        assert_eq!(
+            std::fs::read_to_string(path).unwrap(),
+            "seq,nis,rejected,put_aside,baselines_moved,unsolved,stepped\n"
+        );
     }
 
     #[test]

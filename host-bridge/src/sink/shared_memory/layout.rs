@@ -139,11 +139,15 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
     (header, payload)
 }
 
-/// Remarks as bits.
+/// Slices beyond these are not told in the word of remarks.
+const MOST_SLICES: u32 = 0x1fff;
+
+/// Remarks as bits: three flags, in the upper half 1 more than the param that was let loose, and in between the slices.
 fn said(remarks: &Remarks) -> u32 {
     let flags =
         u32::from(remarks.put_aside) | u32::from(remarks.baselines_moved) << 1 | u32::from(remarks.unsolved) << 2;
-    flags | remarks.slices << 3
+    let let_loose = remarks.let_loose.map_or(0, |param| u32::from(param) + 1);
+    flags | remarks.slices.min(MOST_SLICES) << 3 | let_loose << 16
 }
 
 /// Up to four bytes as a word; those that are missing are zero.
@@ -222,7 +226,8 @@ impl<'w> Words<'w> {
 
 fn remarks(bits: u32) -> Remarks {
     let [put_aside, baselines_moved, unsolved] = [0, 1, 2].map(|bit| bits >> bit & 1 == 1);
-    Remarks { put_aside, baselines_moved, unsolved, slices: bits >> 3 }
+    let let_loose = (bits >> 16).checked_sub(1).and_then(|param| u16::try_from(param).ok());
+    Remarks { put_aside, baselines_moved, unsolved, let_loose, slices: bits >> 3 & MOST_SLICES }
 }
 
 fn reading(code: u32) -> Result<ReadingUse, LayoutError> {
