@@ -2,7 +2,7 @@
 
 use core::error::Error;
 
-use estimator::Model;
+use estimator::{Model, Prepared};
 use estimator::booster::{Estimator, Green, PARAMS, Setup};
 use inference::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
@@ -174,7 +174,7 @@ pub fn follow(ring: &Ring, stream: &Stream) -> Result<Vec<Followed>, Box<dyn Err
     core.restart(&model).map_err(|_| "the design has no stable ring")?;
     let each = recording.rows.iter().enumerate();
     each.map(|(k, row)| {
-        core.prepare(&model);
+        while core.prepare(&model) != Prepared::Nothing {}
         let estimate = core.ingest(&model, &mut stream::wire(recording, row)?).expect("a good frame");
         let vars = stream.vars(k);
         let error = core::array::from_fn::<_, PARAMS, _>(|i| f64::from(estimate.map_params[i]) - vars[i].ln());

@@ -78,7 +78,11 @@ impl embedded_hal::digital::OutputPin for Dark {
 }
 
 /// Run a device with these tables in flash until its source ends.
-fn run<R: Read<Error = ErrorKind>, W: Write<Error = ErrorKind>>(built_in: &Green, source: &mut R, sink: &mut W) {
+fn run<R: Read<Error = ErrorKind> + ReadReady, W: Write<Error = ErrorKind>>(
+    built_in: &Green,
+    source: &mut R,
+    sink: &mut W,
+) {
     let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
     let mut device = Device::<_, LINE>::new(&mut *core, built_in, &mut *slot);
     let mut panel = Panel::new(Dark, Dark, Dark);
@@ -634,7 +638,7 @@ impl FrontEnd {
             2 => setup.walk.params = wrong,
             3 => setup.tune_calibration = Some(wrong),
             4 => setup.noise.all = wrong,
-            5 => setup.calibration.powered = wrong,
+            5 => setup.walk.baselines = wrong,
             6 => setup.calibration.dipole = Some(wrong),
             _ => setup.calibration.supplies[0].nominal = wrong,
         }
@@ -647,6 +651,12 @@ struct Sent(FrontEnd, usize);
 
 impl ErrorType for Sent {
     type Error = ErrorKind;
+}
+
+impl ReadReady for Sent {
+    fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+        Ok(false)
+    }
 }
 
 impl Read for Sent {

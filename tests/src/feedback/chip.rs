@@ -2,9 +2,11 @@
 
 use core::error::Error;
 
+use estimator::booster::Frame;
 use host_bridge::source::link::Link;
 
 use super::Known;
+use crate::machine::LAYOUT;
 use crate::qemu::{Emulator, Image, Options};
 use crate::sil::is_same;
 
@@ -20,7 +22,8 @@ pub fn on_chip(image: &Image, wires: &[Vec<u8>]) -> Result<usize, Box<dyn Error>
     link.restart(&core.setup)?;
     let mut different = 0;
     for wire in wires {
-        let heard = link.ingest(wire)?;
+        let sequence = Frame::decode(&LAYOUT, &mut wire.clone())?.sequence;
+        let heard = link.ingest(sequence, wire)?;
         for _ in 0..heard.estimate.remarks.slices {
             let _ = core.slice();
         }
