@@ -2,8 +2,8 @@
 
 use core::error::Error;
 
-use estimator::booster::{Estimator, Green, PARAMS, Setup};
 use estimator::Model;
+use estimator::booster::{Estimator, Green, PARAMS, Setup};
 use inference::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
 use inference::stream::{self, FOLLOW};
