@@ -593,7 +593,7 @@ impl<
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
         if model.setup.walk.params > 0.0 {
-            self.posterior.let_loose(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
+            self.posterior.let_loose::<B>(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
         }
         nis as f32
     }

@@ -107,7 +107,9 @@ impl<const N: usize> Drift<N> {
             let own = scores.iter().map(Score::evidence).enumerate();
             let (param, evidence) = own.fold((0, 0.0), |most, this| if this.1 > most.1 { this } else { most });
             if evidence > step.evidence {
-                let weight = |score: &Score| libm::expf(score.evidence() - evidence);
+                // of more evidence than it takes, what tells candidates apart is the error of linearising
+                let counts = (ENOUGH / evidence).min(1.0);
+                let weight = |score: &Score| libm::expf(counts * (score.evidence() - evidence));
                 let all: f32 = scores.iter().map(weight).sum();
                 (step.param, step.evidence) = (param, evidence);
                 step.probability.iter_mut().zip(scores).for_each(|(to, score)| *to = weight(score) / all);

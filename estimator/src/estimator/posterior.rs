@@ -7,6 +7,9 @@ use crate::gaussian::{Correlated, Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
 
+/// How far a baseline may be moved by the step of a var [m]: the orbit passes quadrupoles some millimetres off their centres, and 2 %
+/// of such a deflection moves it by 0.1 mm.
+const STEERED: f32 = 1e-4;
 /// Least variance that is added to a param where others walk: one part in 1e9 of the prior's, since none would be a division by 0.
 const LEAST: f32 = 1e-12;
 /// While the params have walked less than this share of an error bar, all frames so far have seen the same ring.
@@ -133,10 +136,11 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     /// right one of 24 candidates, all of them as probable, 3 sigma off after a step of 2 %. With the root of the probability it is
     /// 1.5 sigma, and 2 for one of probability 0.01.
     #[inline(never)]
-    pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+    pub fn let_loose<const B: usize>(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
         self.drift.weigh(&self.gaussian, libm::exp(self.narrowed).max(1.0));
         let Some(step) = self.drift.found() else { return };
         let probability = |i: usize| step.probability.get(i).copied().unwrap_or(0.0);
+        self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), B);
         self.spread(|i| libm::sqrtf(probability(i)) * prior(i).sigma * prior(i).sigma, layout, prior);
         self.drift.clear();
         (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
