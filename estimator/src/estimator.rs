@@ -334,6 +334,7 @@ impl<
         self.started = false;
         self.linearise_design(model)?;
         (self.tangent.supplies, self.tangent.is_new, self.predicted.rf_offset) = ([0.0; F], false, 0.0);
+        self.tangent.ripple = [[0.0; F]; 2]; // not that of a ring before: a core that starts anew is a new one
         (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
         self.posterior.clear();

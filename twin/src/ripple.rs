@@ -5,7 +5,8 @@
 //! `x_b = sum over q of R_bq k1_q L_q d_q,   dx_b/d(ln s_f) = sum over q of (dR_bq/d(ln s_f) + R_bq [q has supply f]) k1_q L_q d_q`.
 //!
 //! Shifts are unknown; for independent ones of one size both sums have a known rms. Towards an integer tune the ratio grows as
-//! `|cot(pi Q)|`: 20 to 40 for the Booster, where a ripple of 2e-4 moves an orbit of 2.7 mm by 10 to 20 um.
+//! `|cot(pi Q)|`: for the Booster's QH in x it is 54 to 113 at tunes of 4.86 to 4.88, where a ripple of 2e-4 moves an orbit of
+//! 2.7 mm by some 30 um.
 //!
 //! Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors.
 
