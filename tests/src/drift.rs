@@ -2,8 +2,8 @@
 
 use core::error::Error;
 
-use estimator::{Model, Prepared};
 use estimator::booster::{Estimator, Green, PARAMS, Setup};
+use estimator::{Model, Prepared};
 use inference::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
 use inference::stream::{self, FOLLOW};
