@@ -262,7 +262,7 @@ fn a_silent_device_does_not_hold_up_a_signal() {
     let (uart, trace) = (folder.path().join("uart"), folder.path().join("trace.csv"));
     let (heard, hears) = std::sync::mpsc::channel();
     beside(&uart, move |mut line| {
-        line.read_exact(&mut [0; 10]).unwrap(); // the request for a covariance
+        assert!(line.read(&mut [0; 64]).unwrap() > 0); // the request for a covariance
         heard.send(()).unwrap();
         let _ = line.read(&mut [0]); // until it is closed
     });

@@ -1,8 +1,9 @@
 //! A device on the host: the loop that a chip runs, fed with recorded frames, bad bytes and new tables, beside the core in
 //! process.
 
+use core::hash::{Hash as _, Hasher as _};
 use std::collections::{BTreeMap, VecDeque};
-use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::hash::DefaultHasher;
 
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::booster::{
