@@ -70,6 +70,11 @@ impl<const B: usize, const C: usize> Feedback<B, C> {
             && self.probe.is_finite()
             && self.limit.is_positive()
     }
+
+    /// Largest current that a correction asks of a corrector: a probe has room beyond it [A].
+    fn edge(&self, corrector: usize) -> f32 {
+        (self.limit.of(corrector) - self.probe).max(0.0)
+    }
 }
 
 /// The ring as steering sees it.
@@ -207,11 +212,11 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.weigh_monitors(estimate);
         let is_ready = self.x.is_ready() && self.y.is_ready();
         let hold = self.watch.judge(is_stale, is_ready, estimate, response.surrogate.layout().monitors());
-        self.supplies.probe(-feedback.probe, core::mem::take(&mut self.pattern));
+        self.supplies.probe(-feedback.probe, core::mem::take(&mut self.pattern), &feedback.limit);
         let limited = if hold.is_none() { self.correct(feedback, response) } else { 0 };
         if hold.is_some_and(Hold::is_doubt) {
             self.pattern = (frame.time_us as u32).max(1);
-            self.supplies.probe(feedback.probe, self.pattern);
+            self.supplies.probe(feedback.probe, self.pattern, &feedback.limit);
         }
         Steered { hold, left_out: self.supplies.left_out(), limited }
     }
@@ -282,6 +287,9 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// Move the filtered orbit towards the readings that count: it is their mean as long as they are few.
     fn believe(&mut self, feedback: &Feedback<B, C>, reading: &[PositionCode; B], counts: impl Fn(usize) -> bool) {
+        if !(0..B).any(&counts) {
+            return;
+        }
         self.heard = self.heard.saturating_add(1);
         let gain = feedback.gain.max(1.0 / f32::from(self.heard));
         let each = self.residual.iter_mut().zip(reading).zip(&feedback.orbit).enumerate();
@@ -365,7 +373,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
         let setpoints = self.supplies.setpoints();
         let room = |c: usize| {
-            let (limit, kick) = (feedback.limit.of(c), response.kick_per_ampere.of(c));
+            let (limit, kick) = (feedback.edge(c), response.kick_per_ampere.of(c));
             let current = setpoints.get(c).copied().unwrap_or_default().value();
             [(-limit - current) * kick, (limit - current) * kick]
         };
@@ -376,7 +384,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.x.step(pull_x, room, rate, step_x);
         self.y.step(pull_y, |c| room(CX + c), |c| rate(CX + c), step_y);
         step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick_per_ampere.of(c));
-        self.supplies.change(&step, &feedback.limit)
+        self.supplies.change(&step, |c| feedback.edge(c))
     }
 }
 

@@ -257,6 +257,11 @@ pub fn rms(samples: &[Sample]) -> f64 {
     (samples.iter().map(|sample| sample.rms * sample.rms).sum::<f64>() / samples.len() as f64).sqrt()
 }
 
+/// The second half of a stretch: what was to be corrected is corrected.
+pub fn settled(samples: &[Sample]) -> &[Sample] {
+    &samples[samples.len() / 2..]
+}
+
 /// Frames of a stretch in which the setpoints stayed.
 pub fn held(samples: &[Sample]) -> usize {
     samples.iter().filter(|sample| sample.steered.is_some_and(|steered| steered.hold.is_some())).count()

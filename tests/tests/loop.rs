@@ -3,22 +3,28 @@
 
 use estimator::Hold;
 use estimator::booster::Feedback;
-use system_tests::feedback::{Control, Event, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms};
+use system_tests::feedback::{Control, Event, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
 
 fn run(known: &Known, feedback: &Feedback, control: Control, scenario: &Scenario) -> Vec<Sample> {
     Loop::new(known, feedback.clone(), control, scenario.clone()).unwrap().run().unwrap()
 }
 
-/// After every disturbance at most a fifth of what it is without correction, and below what it is with the design's response.
+/// After every disturbance at most a fifth of what it is without correction; once it is corrected, on average below what it is
+/// with the design's response, and nowhere 5 % above it: a ring may be as its design where it matters.
 fn holds_the_orbit(seed: u64) {
     let (known, scenario) = (Known::read().unwrap(), Scenario::of_everything(seed));
     let [off, design, estimated] = [Control::Off, Control::Design, Control::Estimated]
         .map(|control| run(&known, &recommended(), control, &scenario));
+    let mut ratios = Vec::new();
     for (name, frames) in scenario.stretches() {
-        let [off, design, estimated] = [&off, &design, &estimated].map(|samples| rms(&samples[frames.clone()]));
-        assert!(estimated <= 0.2 * off, "seed {seed}, {name}: {estimated} of {off} m");
-        assert!(estimated < design, "seed {seed}, {name}: {estimated}, design {design} m");
+        let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
+        assert!(rms(estimated) <= 0.2 * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
+        let ratio = rms(settled(estimated)) / rms(settled(design));
+        assert!(ratio < 1.05, "seed {seed}, {name}: {ratio} of the design's");
+        ratios.push(ratio);
     }
+    let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
+    assert!(mean < 1.0, "seed {seed}: {mean} of the design's on average");
     // what holds, holds for as long as it lasts and some frames more
     let of = |hold| estimated.iter().filter(|s| s.steered.is_some_and(|s| s.hold == Some(hold))).count();
     assert_eq!((of(Hold::Mismatch), of(Hold::Unsolved), of(Hold::Blind)), (0, 0, 0), "seed {seed}");

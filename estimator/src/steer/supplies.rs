@@ -73,18 +73,20 @@ impl<const C: usize> Supplies<C> {
 
     /// Move each setpoint by so much one way or the other [A], as the `n`-th of a sequence of patterns; 0 is none. The same
     /// pattern takes it back.
-    pub fn probe(&mut self, size: f32, n: u32) {
-        for (setpoint, c) in self.setpoint.iter_mut().zip(0..) {
-            let by = if n == 0 { 0.0 } else { size * sign(n, c) };
-            *setpoint = moved(*setpoint, by);
+    pub fn probe(&mut self, size: f32, n: u32, limit: &Each<C>) {
+        for (c, setpoint) in self.setpoint.iter_mut().enumerate().filter(|_| n != 0) {
+            let room = (limit.of(c) - setpoint.value().abs()).max(0.0);
+            let by = size * sign(n, c as u32);
+            let outward = by * setpoint.value() > 0.0;
+            *setpoint = moved(*setpoint, if outward { by.min(room).max(-room) } else { by });
         }
     }
 
     /// Move the setpoints [A], within their limits; returns how many are there.
-    pub fn change(&mut self, by: &[f32; C], limit: &Each<C>) -> u16 {
+    pub fn change(&mut self, by: &[f32; C], limit: impl Fn(usize) -> f32) -> u16 {
         let mut limited = 0;
         for (c, (setpoint, by)) in self.setpoint.iter_mut().zip(by).enumerate() {
-            let limit = limit.of(c);
+            let limit = limit(c);
             *setpoint = moved(*setpoint, by.min(limit - setpoint.value()).max(-limit - setpoint.value()));
             limited += u16::from(setpoint.steps().abs() >= moved(ZERO, limit).steps());
         }

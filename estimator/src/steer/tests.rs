@@ -368,6 +368,30 @@ fn a_lasting_mismatch_holds_until_it_is_over() {
 }
 
 #[test]
+fn doubt_is_probed_within_the_limits_and_leaves_nothing_behind() {
+    let mut machine = Machine::new(diagonal(), Feedback { probe: 1.0, limit: Each::same(7.0), ..free() }, 0.0);
+    machine.disturbance = [1e-2, 1e-4, -1e-2, 0.0];
+    machine.cycles(3);
+    let before = machine.amperes();
+    assert!(before[0] == -6.0 && before[2] == 6.0, "{before:?}");
+    machine.estimate.remarks.put_aside = true;
+    let mut patterns = [[0.0; C]; 20];
+    for pattern in &mut patterns {
+        machine.cycles(1);
+        *pattern = machine.amperes();
+        let each = pattern.iter().zip(before);
+        assert!(each.clone().all(|(a, b)| ((a - b).abs() - 1.0).abs() < 1e-3 && a.abs() <= 7.0), "{pattern:?}");
+    }
+    // each corrector is moved both ways, and no two alike
+    let moved = |c: usize| patterns.iter().filter(|pattern| pattern[c] > before[c]).count();
+    assert!((0..C).all(|c| (4..=16).contains(&moved(c))), "{patterns:?}");
+    machine.estimate.remarks.put_aside = false;
+    (machine.estimate.accepted, machine.estimate.nis) = (Mask::NONE, 0.0);
+    machine.cycles(1);
+    assert_eq!(machine.amperes(), before);
+}
+
+#[test]
 fn without_gains_nothing_moves() {
     let mut machine = Machine::new(diagonal(), free(), 0.0);
     machine.disturbance = [1e-3; B];

@@ -10,7 +10,7 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
-use system_tests::feedback::{Control, GAIN, Known, Loop, Sample, Scenario, held, on_chip, recommended, rms};
+use system_tests::feedback::{Control, GAIN, Known, Loop, Sample, Scenario, held, on_chip, recommended, rms, settled};
 use system_tests::qemu::Image;
 
 /// Close the loop in software.
@@ -74,20 +74,22 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
 }
 
 fn stretches(scenario: &Scenario, all: [&[Sample]; 3]) -> comfy_table::Table {
-    let mut table = table(["frame", "what happens", "without [mm]", "design [mm]", "estimated [mm]", "ratio", "held"]);
+    let mut table = table([
+        "frame",
+        "what happens",
+        "without [mm]",
+        "design [mm]",
+        "estimated [mm]",
+        "settled, design",
+        "settled",
+        "held",
+    ]);
     for (name, frames) in scenario.stretches() {
         let [off, design, estimated] = all.map(|samples| rms(&samples[frames.clone()]));
-        let numbers = [off, design, estimated].map(|rms| format!("{:.3}", 1e3 * rms));
-        let [off_mm, design_mm, estimated_mm] = numbers;
-        table.add_row([
-            frames.start.to_string(),
-            name,
-            off_mm,
-            design_mm,
-            estimated_mm,
-            format!("{:.3}", estimated / off),
-            held(&all[2][frames]).to_string(),
-        ]);
+        let [_, settled_design, settled] = all.map(|samples| rms(settled(&samples[frames.clone()])));
+        let numbers = [off, design, estimated, settled_design, settled].map(|rms| format!("{:.3}", 1e3 * rms));
+        let row = [vec![frames.start.to_string(), name], numbers.into(), vec![held(&all[2][frames]).to_string()]];
+        table.add_row(row.concat());
     }
     table.column_iter_mut().skip(2).for_each(|column| column.set_cell_alignment(CellAlignment::Right));
     table
@@ -107,8 +109,10 @@ fn figure(scenario: &Scenario, all: [&[Sample]; 3]) -> Figure {
 fn summary(scenario: &Scenario, all: [&[Sample]; 3], (chip, different): (usize, usize)) -> serde_json::Value {
     let rows = scenario.stretches().into_iter().map(|(name, frames)| {
         let [off, design, estimated] = all.map(|samples| 1e3 * rms(&samples[frames.clone()]));
+        let [_, settled_design, settled] = all.map(|samples| 1e3 * rms(settled(&samples[frames.clone()])));
         json!({"what": name, "from": frames.start, "to": frames.end, "held": held(&all[2][frames]),
-            "rms_mm": {"off": off, "design": design, "estimated": estimated}})
+            "rms_mm": {"off": off, "design": design, "estimated": estimated},
+            "settled_rms_mm": {"design": settled_design, "estimated": settled}})
     });
     let last = all[2].last();
     json!({
