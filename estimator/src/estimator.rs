@@ -346,7 +346,10 @@ impl<
         if let Some(cell) = cell {
             self.note_late(model, &frame, &drive, cell, &screened);
         }
-        let nis = self.condition(model, &frame, cell, &screened);
+        let before = self.posterior.solution.cost;
+        self.condition(model, &frame, cell, &screened);
+        self.solve(model);
+        let nis = self.count_nis(before, &screened);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
         }
@@ -513,7 +516,7 @@ impl<
         self.monitors.get(b).map_or(f32::MAX, Monitor::variance)
     }
 
-    /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
+    /// Add the readings that passed.
     #[inline(never)]
     fn condition(
         &mut self,
@@ -521,8 +524,7 @@ impl<
         frame: &Frame<B, C, F, W>,
         cell: Option<u16>,
         screened: &Screened<W>,
-    ) -> f32 {
-        let before = self.posterior.solution.cost;
+    ) {
         let linearised_once = cell.is_none() || !self.posterior.is_still::<B>(&model.setup.walk);
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
@@ -541,7 +543,10 @@ impl<
         self.condition_tunes(model, screened);
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
-        self.solve(model);
+    }
+
+    /// Joint NIS of a frame: the growth of the smallest chi-square from what it was before.
+    fn count_nis(&mut self, before: f64, screened: &Screened<W>) -> f32 {
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
         nis as f32
