@@ -43,14 +43,15 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         Self { core, built_in, slot, contents: Contents::Nothing, setup: None, wants_covariance: false, refused: 0 }
     }
 
-    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first. Returns that answer.
+    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first. After a frame, true if an operator should
+    /// look: see [`Core::needs_attention`].
     /// `vitals` is asked if the packet asks for the status.
     pub fn hear(
         &mut self,
         bytes: &mut [u8],
         vitals: impl FnOnce() -> Vitals,
         reply: &mut impl FnMut(&Reply<E>),
-    ) -> Option<E::Estimate> {
+    ) -> Option<bool> {
         if packet::kind(bytes) == Some(REQUEST) {
             self.obey(bytes, vitals, reply);
             return None;
@@ -78,7 +79,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
 
     /// A frame: the answer, and what was asked for with it.
     #[inline(never)]
-    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply<E>)) -> Option<E::Estimate> {
+    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(&Reply<E>)) -> Option<bool> {
         let Some(setup) = &self.setup else {
             self.refuse(estimator::IngestError::NotStarted, reply);
             return None;
@@ -89,7 +90,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
                 if core::mem::take(&mut self.wants_covariance) {
                     self.send_covariance(E::sequence(&estimate), reply);
                 }
-                Some(estimate)
+                Some(E::needs_attention(&estimate))
             }
             Err(error) => {
                 self.refuse(error, reply);
