@@ -588,7 +588,7 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
 }
 
 /// The kicks that are not zero, each with its column.
-fn acting<'a, V>(kick: &'a [f32], columns: impl Iterator<Item = V>) -> impl Iterator<Item = (f32, V)> {
+fn acting<V>(kick: &[f32], columns: impl Iterator<Item = V>) -> impl Iterator<Item = (f32, V)> {
     kick.iter().copied().zip(columns).filter(|(kick, _)| *kick != 0.0)
 }
 
