@@ -383,7 +383,12 @@ impl<
         if let Some(cell) = cell {
             self.note_late(model, &frame, &drive, cell, &screened);
         }
-        let nis = self.condition(model, &frame, cell, &screened);
+        let before = self.posterior.solution.cost;
+        self.posterior.expect();
+        self.condition(model, &frame, cell, &screened);
+        self.solve(model);
+        let nis = self.count_nis(before, &screened);
+        self.look_for_steps(model);
         if cell.is_none() {
             self.keep_loose(model, &frame, &drive, &screened);
         }
@@ -557,7 +562,7 @@ impl<
         self.monitors.get(b).map_or(f32::MAX, Monitor::variance)
     }
 
-    /// Add the readings that passed; returns their joint NIS, the growth of the smallest chi-square.
+    /// Add the readings that passed.
     #[inline(never)]
     fn condition(
         &mut self,
@@ -565,13 +570,11 @@ impl<
         frame: &Frame<B, C, F, W>,
         cell: Option<u16>,
         screened: &Screened<W>,
-    ) -> f32 {
-        let before = self.posterior.solution.cost;
+    ) {
         let still = self.posterior.is_still::<B>(&model.setup.walk);
         let linearised_once = cell.is_none() || !still;
         // a mean over frames that have not seen the same ring says nothing
         let cell = cell.filter(|_| still);
-        self.posterior.expect();
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
             *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
@@ -589,14 +592,21 @@ impl<
         self.condition_tunes(model, screened);
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
-        self.solve(model);
-        self.posterior.narrow();
+    }
+
+    /// Joint NIS of a frame: the growth of the smallest chi-square from what it was before.
+    fn count_nis(&mut self, before: f64, screened: &Screened<W>) -> f32 {
         let nis = self.posterior.solution.cost - before;
         self.nis = (self.nis.0 + nis, self.nis.1.saturating_add(screened.count().into()));
+        nis as f32
+    }
+
+    /// Look for steps of single vars in what the frame has said, if vars may step.
+    fn look_for_steps(&mut self, model: &Model<'_, G, B, C, F>) {
+        self.posterior.narrow();
         if model.setup.walk.params > 0.0 {
             self.posterior.let_loose::<B>(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
         }
-        nis as f32
     }
 
     /// Add the tunes that passed.

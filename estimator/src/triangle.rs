@@ -98,6 +98,7 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
     /// positive. nalgebra's own takes a full matrix by value, 9 kB of stack.
     ///
     /// Four columns of the factor at a time, then their products are subtracted from the remaining rows.
+    #[inline(never)] // four columns on the stack
     pub fn factorise(&mut self) -> Option<f64> {
         let mut log_determinant = 0.0;
         for from in (0..N).step_by(4) {
@@ -141,6 +142,7 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
     /// Invert a lower triangle, in place: `x_i = (e_i - sum over k < i of L_ik x_k)/L_ii` by rows.
     ///
     /// Four rows of the inverse at a time; in the rows below, entries left of the remaining factor hold the sum so far.
+    #[inline(never)] // four rows on the stack
     pub fn invert(&mut self) {
         for from in (0..N).step_by(4) {
             let to = (from + 4).min(N);

@@ -56,14 +56,14 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         }
     }
 
-    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first, and of which request it is. Returns that
-    /// answer. `vitals` is asked if the packet asks for the status.
+    /// Take a packet in; `reply` hears what there is to say, the answer to a frame first, and of which request it is. After a frame,
+    /// true if an operator should look: see [`Core::needs_attention`]. `vitals` is asked if the packet asks for the status.
     pub fn hear(
         &mut self,
         bytes: &mut [u8],
         vitals: impl FnOnce() -> Vitals,
         reply: &mut impl FnMut(u32, &Reply<E>),
-    ) -> Option<E::Estimate> {
+    ) -> Option<bool> {
         if packet::kind(bytes) == Some(REQUEST) {
             self.obey(bytes, vitals, reply);
             return None;
@@ -101,7 +101,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
 
     /// A frame: the answer, and what was asked for with it.
     #[inline(never)]
-    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Option<E::Estimate> {
+    fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Option<bool> {
         let Some(setup) = &self.setup else {
             self.refuse(Refusal::NotStarted, reply);
             return None;
@@ -115,7 +115,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
                 if let Some(number) = self.wants_covariance.take() {
                     self.send_covariance(number, E::sequence(&estimate), reply);
                 }
-                Some(estimate)
+                Some(E::needs_attention(&estimate))
             }
             Err(error) => {
                 self.refuse(error.into(), reply);

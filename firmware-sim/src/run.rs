@@ -34,7 +34,7 @@ pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: us
             }
         };
         let refused = device.refused();
-        let estimate = match event {
+        let needs_attention = match event {
             Event::Packet(bytes) => device.hear(bytes, || Vitals { silent_cycles, ..vitals() }, &mut reply),
             Event::Broken(why) => {
                 device.refuse(why, &mut reply);
@@ -44,7 +44,7 @@ pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: us
             Event::End => return sink.flush(),
         };
         // a pin that fails is no reason to stop
-        let _ = estimate.map(|estimate| panel.show(E::needs_attention(&estimate)));
+        let _ = needs_attention.map(|needs_attention| panel.show(needs_attention));
         let _ = (device.refused() != refused).then(|| panel.alarm());
         sent?;
         let _ = panel.feed();

@@ -18,11 +18,12 @@ use twin::Ring;
 use crate::qemu::{Counts, Emulator, Image, Options};
 
 /// Steps of a frame whose instructions are counted, by the words of the table and the function in the image.
-pub const REGIONS: [(&str, &str); 7] = [
+pub const REGIONS: [(&str, &str); 8] = [
     ("decode", "Estimator::decode"),
     ("predict", "Estimator::predict"),
     ("screen", "screen"),
     ("condition", "Estimator::condition"),
+    ("solve", "Posterior::solve"),
     ("ingest", "Estimator::ingest"),
     ("encode", "Reply::encode"),
     ("slice", "Estimator::prepare"),

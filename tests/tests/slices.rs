@@ -30,28 +30,27 @@ fn distance(one: &Estimate, other: &Estimate) -> f32 {
     each.map(|((a, b), sigma)| (a - b).abs() / sigma).fold(0.0, f32::max)
 }
 
-/// All frames so far at the MAP of all frames: what is left of where they were linearised before is of third order. Then the
-/// estimate after one more frame.
+/// All frames so far at the MAP of all frames, and then the estimate after one more frame.
 fn converged(core: &mut Core, next: &[u8]) -> Estimate {
-    for _ in 0..2 {
+    for _ in 0..3 {
         core.adopt(core.tables.clone()).unwrap();
     }
     ingest(core, next)
 }
 
-/// Cores of a campaign that are about to linearise anew, each with the frames that follow.
-fn about_to_linearise(from: &[usize]) -> Vec<(Core, Vec<Vec<u8>>)> {
+/// Cores of a campaign that are about to linearise anew, the fifth time, the last time, and halfway; each with the frames that
+/// follow.
+fn about_to_linearise() -> [(Core, Vec<Vec<u8>>); 3] {
     let (mut core, wires) = paper_vars();
     let mut found = Vec::new();
-    for (at, wire) in wires.iter().enumerate() {
+    for (at, wire) in wires.iter().enumerate().take(wires.len() - 8) {
         core.prepare();
         ingest(&mut core, wire);
-        if found.len() < from.len() && at >= from[found.len()] && core.clone().prepare() {
+        if core.clone().prepare() {
             found.push((core.clone(), wires[at + 1..].to_vec()));
         }
     }
-    assert_eq!(found.len(), from.len());
-    found
+    [4, found.len() / 2 + 2, found.len() - 1].map(|at| found[at].clone())
 }
 
 /// A frame that is lost, or counted twice, changes the evidence by some 200 nat. What is left is that of linearising at the MAP
@@ -59,9 +58,9 @@ fn about_to_linearise(from: &[usize]) -> Vec<(Core, Vec<Vec<u8>>)> {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn frames_between_any_two_slices_count_once() {
-    for (start, next) in about_to_linearise(&[20, 60, 200]) {
+    for (start, next) in about_to_linearise() {
         let total = slices(&mut start.clone(), usize::MAX);
-        assert!(total > 30, "{total} slices");
+        assert!(total > 20, "{total} slices");
         // one frame; two, which may have to wait for each other; four, for which there is no room to wait
         for burst in [1, 2, 4] {
             let (meanwhile, then) = next.split_at(burst);
@@ -73,6 +72,7 @@ fn frames_between_any_two_slices_count_once() {
             whole.prepare();
             let expected = ingest(&mut whole, &then[0]);
             let settled = converged(&mut whole, &then[1]);
+            let mut largest = [0.0_f32; 3];
             for before in 0..=total {
                 let mut core = start.clone();
                 assert_eq!(slices(&mut core, before), before);
@@ -86,18 +86,25 @@ fn frames_between_any_two_slices_count_once() {
                 assert_eq!(got.frames, expected.frames);
                 assert!(evidence < EVIDENCE, "{before} of {total} slices, then {burst} frames: {evidence} nat");
                 let off = distance(&got, &expected);
+                largest = [largest[0].max(evidence), largest[1].max(off), largest[2]];
                 assert!(off < LINEARISED, "{before} of {total} slices, then {burst} frames: {off} sigma");
                 let off = distance(&converged(&mut core, &then[1]), &settled);
-                assert!(off < 1e-3, "{before} of {total} slices, then {burst} frames: {off} sigma in the end");
+                largest[2] = largest[2].max(off);
+                assert!(off < ROUNDED, "{before} of {total} slices, then {burst} frames: {off} sigma in the end");
             }
+            let [evidence, off, end] = largest;
+            println!("{burst} frames between {total} slices: {evidence} nat, {off} sigma, in the end {end}");
         }
     }
 }
 
-/// Evidence that depends on where frames were linearised [nat]: f32 of some 1e5 is in steps of 0.008.
-const EVIDENCE: f32 = 0.1;
-/// Estimates before the next linearisation: that of half an error bar's distance.
-const LINEARISED: f32 = 0.05;
+/// Evidence that depends on where the frames that came meanwhile were linearised [nat].
+const EVIDENCE: f32 = 1.0;
+/// What depends on it of the params before the next linearisation, which is due when they have moved by half an error bar.
+const LINEARISED: f32 = 0.1;
+
+/// The linearisation is rounded to 16 bits, column by column: 1e-5 of an orbit of 10 mm beside a noise of 0.15 mm.
+const ROUNDED: f32 = 2e-3;
 
 /// A stream of frames with and without a setting, in turn.
 fn mixed(machine: &mut Machine, frames: u32) -> Vec<Vec<u8>> {
@@ -108,21 +115,28 @@ fn mixed(machine: &mut Machine, frames: u32) -> Vec<Vec<u8>> {
     (0..frames).map(|at| wire_of(&machine.cycle_with(at, drive(at, &mut random)))).collect()
 }
 
+/// A frame without a setting is linearised for the last time when it is no longer recent, at a slow pace elsewhere: so the
+/// streams part only once the vars are roughly known.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn a_stream_at_any_pace_ends_where_one_that_waits_does() {
     let (start, _) = paper_vars();
-    let wires = mixed(&mut Machine::drawn(&start, 3), 400);
+    let wires = mixed(&mut Machine::drawn(&start, 3), 500);
+    let (first, rest) = wires.split_at(150);
+    let (mut start, mut expected) = (start, None);
+    for wire in first {
+        start.prepare();
+        ingest(&mut start, wire);
+    }
     let mut whole = start.clone();
-    let mut expected = None;
-    for wire in &wires {
+    for wire in rest {
         whole.prepare();
         expected = Some(ingest(&mut whole, wire));
     }
     let expected = expected.unwrap();
     for pace in [1, 2, 3, 5, 9, 20, 60] {
         let (mut core, mut random, mut last) = (start.clone(), Random::new(pace as u64), None);
-        for wire in &wires {
+        for wire in rest {
             slices(&mut core, random.below(2 * pace + 1));
             last = Some(ingest(&mut core, wire));
         }

@@ -130,6 +130,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     /// Add the readings of a frame, of one channel each; `own` is what the uncertain linearisation adds to a variance, for a
     /// difference of reading and baseline of this derivative.
+    #[inline(never)] // rows of the information on the stack
     pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, own: impl Fn(&[f64; N]) -> f64) {
         let mut staged = Staged::NONE;
         for Reading { channel, innovation, variance, slope } in readings {

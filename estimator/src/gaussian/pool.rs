@@ -83,6 +83,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     }
 
     /// Add lines, one of each monitor from the first on, whose derivatives are the columns of `h`.
+    #[inline(never)]
     pub fn add_lines(&mut self, pool: &mut Pool<B>, lines: &[Line], h: &[f32]) {
         let mut staged = Staged::NONE;
         for (b, line) in lines.iter().enumerate().filter(|(_, line)| line.one > 0.0) {

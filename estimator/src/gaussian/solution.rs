@@ -96,6 +96,7 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
     }
 
     /// The best point within the bounds, by projected Gauss-Seidel sweeps from the unbounded one.
+    #[inline(never)] // so that the stack holds its rows, and those of each step of `solve`, one after the other
     fn bound<const B: usize, V: Covariance<B>>(
         &mut self,
         gaussian: &Gaussian<B, N, T, V>,

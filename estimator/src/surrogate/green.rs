@@ -154,6 +154,10 @@ pub struct GreenProgress<const Q: usize, const T: usize> {
     determinant: f32,
     /// `Z_qq` of these.
     mutual: Triangle<Q, T>,
+    /// Columns before they are quantised.
+    columns: [[f32; Q]; COLUMNS],
+    /// Rows of `Z_qq` that enter them.
+    rows: [[f32; Q]; 4],
 }
 
 /// What is next in a plane. Each is at most 0.3 million instructions of a chip for a ring of 48 quadrupoles.
@@ -252,8 +256,14 @@ impl<
     type Linearised = GreenLinearised<BX, BY, CX, CY, M, Q>;
     type Progress = GreenProgress<Q, T>;
 
-    const BEGIN: Self::Progress =
-        GreenProgress { is_x: false, step: Step::Pairs(0), determinant: 0.0, mutual: Triangle::ZERO };
+    const BEGIN: Self::Progress = GreenProgress {
+        is_x: false,
+        step: Step::Pairs(0),
+        determinant: 0.0,
+        mutual: Triangle::ZERO,
+        columns: [[0.0; Q]; COLUMNS],
+        rows: [[0.0; Q]; 4],
+    };
 
     const UNLINEARISED: Self::Linearised = GreenLinearised {
         x: PlaneLinearised::BLANK,
@@ -510,9 +520,9 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
         progress: &mut GreenProgress<Q, T>,
         at: &mut PlaneLinearised<B, C, M, Q>,
     ) -> Result<bool, Unstable> {
-        let GreenProgress { step, determinant, mutual, .. } = progress;
-        *step = match *step {
+        progress.step = match progress.step {
             Step::Pairs(from) => {
+                let GreenProgress { determinant, mutual, .. } = &mut *progress;
                 if from == 0 {
                     *determinant = 1.0;
                     self.mutual.values().zip(mutual.entries_mut()).for_each(|(v, to)| *to = v);
@@ -533,17 +543,17 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
             }
             Step::Seen(from) => {
                 let table = self.seen.codes.get(from..).unwrap_or_default();
-                fill(at.seen.get_mut(from..).unwrap_or_default(), (self.seen.scale, table), mutual, excess);
+                fill(at.seen.get_mut(from..).unwrap_or_default(), (self.seen.scale, table), excess, progress);
                 if from + COLUMNS < B { Step::Seen(from + COLUMNS) } else { Step::Driven(0) }
             }
             Step::Driven(from) => {
                 let table = self.driven.codes.get(from..).unwrap_or_default();
-                fill(at.driven.get_mut(from..).unwrap_or_default(), (self.driven.scale, table), mutual, excess);
+                fill(at.driven.get_mut(from..).unwrap_or_default(), (self.driven.scale, table), excess, progress);
                 if from + COLUMNS < C { Step::Driven(from + COLUMNS) } else { Step::Response }
             }
             Step::Response => {
                 self.respond(excess, at);
-                *step = Step::Pairs(0);
+                progress.step = Step::Pairs(0);
                 return Ok(true);
             }
         };
@@ -657,7 +667,7 @@ fn between<const Q: usize>(nodes: &Column<Q>, q: usize) -> f32 {
 }
 
 /// The kicks that are not zero, each with its column.
-fn acting<'a, V>(kick: &'a [f32], columns: impl Iterator<Item = V>) -> impl Iterator<Item = (f32, V)> {
+fn acting<V>(kick: &[f32], columns: impl Iterator<Item = V>) -> impl Iterator<Item = (f32, V)> {
     kick.iter().copied().zip(columns).filter(|(kick, _)| *kick != 0.0)
 }
 
@@ -667,17 +677,15 @@ fn acting<'a, V>(kick: &'a [f32], columns: impl Iterator<Item = V>) -> impl Iter
 fn fill<const Q: usize, const T: usize>(
     to: &mut [Column<Q>],
     (scale, table): (f32, &[[i16; Q]]),
-    mutual: &Triangle<Q, T>,
     excess: &[f32; Q],
+    GreenProgress { mutual, columns, rows, .. }: &mut GreenProgress<Q, T>,
 ) {
-    let mut columns = [[0.0; Q]; COLUMNS];
     for (column, codes) in columns.iter_mut().zip(table) {
         column.iter_mut().zip(codes).for_each(|(to, code)| *to = scale * f32::from(*code));
     }
-    let mut rows = [[0.0; Q]; 4];
     for first in (0..Q).step_by(4) {
         let mut errors = [0.0; 4];
-        for ((n, row), error) in (first..Q).zip(&mut rows).zip(&mut errors) {
+        for ((n, row), error) in (first..Q).zip(&mut *rows).zip(&mut errors) {
             mutual.copy_row(n, row);
             *error = -scale * excess.get(n).copied().unwrap_or(0.0);
         }
@@ -695,7 +703,7 @@ fn fill<const Q: usize, const T: usize>(
             }
         }
     }
-    to.iter_mut().zip(&columns).for_each(|(to, column)| to.quantise(column));
+    to.iter_mut().zip(&*columns).for_each(|(to, column)| to.quantise(column));
 }
 
 /// `a b`, one by one.

@@ -110,7 +110,7 @@ fn summary(recording: &str, comparison: &Comparison, sizes: &Sizes) -> Value {
         "instructions": {
             "decode": of("decode"),
             "predict": of("predict"),
-            "update": of("screen") + of("condition"),
+            "update": of("screen") + of("condition") + of("solve"),
             "slice": of("slice"),
             "frame": of("ingest") + of("encode"),
         },
