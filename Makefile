@@ -6,7 +6,7 @@ RECORDING ?= recordings/paper-vars
 ORBITCAL := target/release/orbitcal
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware sil train bench peers exports validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware sil drift train bench peers exports validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -41,6 +41,9 @@ firmware: toolchain ## the image for the chip; MACHINE=FILE makes it for another
 
 sil: setup ## recordings through the image in the emulator, beside the core in process; numbers in target/sil.json
 	cargo run --locked --release -p system-tests --bin sil
+
+drift: ## a stream that drifts, and how soon steps of vars are found: docs/drift.md with its figure; minutes
+	cargo run --locked --release -p system-tests --bin drift
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check
