@@ -347,15 +347,15 @@ mod tests {
     #[test]
     fn the_scale_is_right_for_normal_noise() {
         let scale = learnt(1.5e-4, usize::MAX, 20_000).learnt().unwrap() / 1.5e-4;
-        // sampling 1.15/sqrt(20000) = 0.8 %, binning and exp the rest
-        assert!((scale - 1.0).abs() < 0.03, "{scale}");
+        // sampling of the last 256 at least: 1.15/sqrt(256) = 7 %, two of them
+        assert!((scale - 1.0).abs() < 0.15, "{scale}");
     }
 
     #[test]
     fn jumps_of_every_twentieth_reading_hardly_move_the_scale() {
         let scale = learnt(1.5e-4, 20, 20_000).learnt().unwrap() / 1.5e-4;
-        // a tenth of the differences hold a jump: the quantile moves from 68 % to 76 %, from 1.0 to 1.17 sigma
-        assert!((1.0..1.2).contains(&scale), "{scale}");
+        // a tenth of the differences hold a jump: the quantile moves from 68 % to 76 %, from 1.0 to 1.17 sigma, ± 7 % of the last 256
+        assert!((1.0..1.3).contains(&scale), "{scale}");
     }
 
     #[test]
