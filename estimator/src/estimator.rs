@@ -114,6 +114,8 @@ pub struct Estimator<
     /// Slices of work between frames since the last estimate.
     slices: u32,
     tangent: Tangent<G::Linearised, F>,
+    /// [`Tangent::chromatic`] of the design.
+    design_chromatic: [f32; 2],
     anew: Anew<G::Linearised, G::Progress, B, C, F, N, S, K, T, W>,
     predicted: Predicted<B, F, N>,
     monitors: [Monitor; B],
@@ -134,8 +136,11 @@ struct Tangent<L, const F: usize> {
     linearised: L,
     /// `ln` of the supplies' mean factors at which it was linearised.
     supplies: [f32; F],
-    /// Rms change of a misaligned ring's orbit per `ln` of each supply's factor and per rms orbit, in x and y [1].
+    /// Rms change of a misaligned ring's orbit per `ln` of each supply's factor and per rms orbit, in x and y [1]: that of kicks by
+    /// all correctors, which is as well what the integer resonance next to the tune makes of it (`tests/ripple.rs`).
     ripple: [[f32; F]; 2],
+    /// The same of all gradients.
+    chromatic: [f32; 2],
     /// Linearised since the last estimate.
     is_new: bool,
 }
@@ -157,7 +162,18 @@ impl<L, const F: usize> Tangent<L, F> {
 impl<L, const F: usize> Tangent<L, F> {
     /// Memory for one.
     const fn blank(unlinearised: L) -> Self {
-        Self { linearised: unlinearised, supplies: [0.0; F], ripple: [[0.0; F]; 2], is_new: false }
+        Self { linearised: unlinearised, supplies: [0.0; F], ripple: [[0.0; F]; 2], chromatic: [0.0; 2], is_new: false }
+    }
+}
+
+impl<L, const F: usize> Tangent<L, F> {
+    /// Work out how orbits follow the gradients there.
+    fn follow<const B: usize, const C: usize, const N: usize>(
+        &mut self,
+        surrogate: &impl Surrogate<B, C, F, N, Linearised = L>,
+    ) {
+        let [(x, all_x), (y, all_y)] = [0, 1].map(|plane| surrogate.follow(&self.linearised, plane));
+        (self.ripple, self.chromatic) = ([x, y], [all_x, all_y]);
     }
 }
 
@@ -301,6 +317,7 @@ impl<
         looked: false,
         slices: 0,
         tangent: Tangent::blank(G::UNLINEARISED),
+        design_chromatic: [0.0; 2],
         anew: Anew::blank(G::UNLINEARISED),
         predicted: Predicted {
             prediction: Prediction::BLANK,
@@ -334,7 +351,8 @@ impl<
         self.started = false;
         self.linearise_design(model)?;
         (self.tangent.supplies, self.tangent.is_new, self.predicted.rf_offset) = ([0.0; F], false, 0.0);
-        self.tangent.ripple = [[0.0; F]; 2]; // not that of a ring before: a core that starts anew is a new one
+        self.tangent.follow(model.surrogate);
+        self.design_chromatic = self.tangent.chromatic;
         (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
         self.posterior.clear();
@@ -512,12 +530,25 @@ impl<
 
     /// Variance of the mean of `n` repeats: the monitor's noise, and the stated error of the surrogate, which is the same
     /// in all of them [m^2].
-    fn variance(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, n: u32, rf_offset: f32) -> f32 {
+    fn variance(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        at: &Tangent<G::Linearised, F>,
+        b: usize,
+        n: u32,
+        rf_offset: f32,
+    ) -> f32 {
         self.noise_variance(b) / n.max(1) as f32 + self.shared_variance(model, at, b, rf_offset)
     }
 
     /// Variance of a reading at a drive, seen from the supplies' mean [m^2].
-    fn variance_at(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, drive: &Drive<C, F>) -> f32 {
+    fn variance_at(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        at: &Tangent<G::Linearised, F>,
+        b: usize,
+        drive: &Drive<C, F>,
+    ) -> f32 {
         self.own_variance(model, b, &drive.strength) + self.shared_variance(model, at, b, drive.rf_offset)
     }
 
@@ -529,10 +560,18 @@ impl<
     }
 
     /// Variance that repeats of a reading share: the stated error of the surrogate [m^2].
-    fn shared_variance(&self, model: &Model<'_, G, B, C, F>, at: &G::Linearised, b: usize, rf_offset: f32) -> f32 {
-        let [orbit_x, orbit_y] = self.posterior.orbit;
-        let orbit = if b < model.surrogate.layout().first_vertical() { orbit_x } else { orbit_y };
-        model.surrogate.error_variance(at, b, rf_offset, orbit)
+    fn shared_variance(
+        &self,
+        model: &Model<'_, G, B, C, F>,
+        at: &Tangent<G::Linearised, F>,
+        b: usize,
+        rf_offset: f32,
+    ) -> f32 {
+        let plane = usize::from(b >= model.surrogate.layout().first_vertical());
+        let of_plane = |pair: &[f32; 2]| pair.get(plane).copied().unwrap_or(0.0);
+        let (now, design) = (of_plane(&at.chromatic), of_plane(&self.design_chromatic));
+        let growth = if design > 0.0 { now / design } else { 1.0 };
+        model.surrogate.error_variance(b, rf_offset, growth * of_plane(&self.posterior.orbit))
     }
 
     /// What a reading adds to its earlier repeats, as one of its own: innovation [m] and variance [m^2].
@@ -542,7 +581,7 @@ impl<
     /// `(v + (n - 1) e)(v + n e)/v`: both means then have variance `v/n + e`.
     fn news_of(&self, model: &Model<'_, G, B, C, F>, b: usize, innovation: f32, cell: Option<u16>) -> (f32, f32) {
         let own = self.own_variance(model, b, &self.predicted.strength);
-        let shared = self.shared_variance(model, &self.tangent.linearised, b, self.predicted.rf_offset);
+        let shared = self.shared_variance(model, &self.tangent, b, self.predicted.rf_offset);
         let cell = cell.and_then(|index| self.past.campaign.cells().get(usize::from(index)));
         let (n, distance) = cell.map_or((1, 0.0), |cell| (cell.mean(b).1.max(1), cell.distance(b)));
         let ratio = shared / own;
@@ -641,8 +680,7 @@ impl<
             self.past.loose.recentre(self.posterior.gaussian.origin());
             self.predict_drive(model, &oldest.drive);
             let drive = about(&oldest.drive, &self.tangent.supplies);
-            let variances: [f32; B] =
-                core::array::from_fn(|b| self.variance_at(model, &self.tangent.linearised, b, &drive));
+            let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
             let readings = oldest.readings(&variances, &self.predicted.prediction);
             self.past.loose.condition(readings, |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
         }
@@ -756,29 +794,6 @@ fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
 fn follow<const B: usize, const F: usize>(following: &[Following<F>; B], strength: &[f32; F], readings: &mut [f32; B]) {
     readings.iter_mut().zip(following).for_each(|(reading, following)| *reading += following.shift(strength));
 }
-
-/// How much the orbit of random misalignments follows each supply, in a plane: it grows as `1/sin(pi Q)` towards the integer, and
-/// as the kicks themselves.
-///
-/// Source: S. Y. Lee, Accelerator Physics, ch. 2, closed orbits of dipole errors. Beside exact orbits of misaligned rings it is right
-/// within a factor of 1.5 (`tests/ripple.rs`), enough for a prior of what is learnt.
-fn ripple_of<G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize>(
-    surrogate: &G,
-    at: &G::Linearised,
-    plane: usize,
-) -> [f32; F] {
-    let tune = |strength: &[f32; F]| surrogate.tune(at, plane, strength).0;
-    let rest = tune(&[0.0; F]);
-    let steep = core::f32::consts::PI / libm::tanf(core::f32::consts::PI * rest);
-    core::array::from_fn(|f| {
-        let mut unit = [0.0; F];
-        unit.get_mut(f).into_iter().for_each(|s| *s = 1.0);
-        1.0 + (steep * (tune(&unit) - rest)).abs().min(STEEPEST)
-    })
-}
-
-/// A ring nearer to the integer than this ratio says keeps no beam.
-const STEEPEST: f32 = 1000.0;
 
 fn metres(code: i32) -> f32 {
     code as f32 * PositionCode::METRES_PER_LSB

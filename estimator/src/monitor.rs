@@ -278,28 +278,29 @@ const FOLLOWS: f32 = 1.0 / 32.0;
 /// Source: H. Robbins and S. Monro, Ann. Math. Stat. 22 (1951) 400, ex. 2.
 #[derive(Debug, Clone)]
 pub struct Peers {
-    scale: f32,
+    /// By how much more than expected, as a share of that.
+    excess: f32,
 }
 
 impl Peers {
-    /// As expected.
-    pub const EXPECTED: Self = Self { scale: 1.0 };
+    /// As expected; all zero.
+    pub const EXPECTED: Self = Self { excess: 0.0 };
 
     /// Take note of the surprises in a frame, each over its standard deviation.
     pub fn hear(&mut self, surprises: impl Iterator<Item = f32>) {
         let (mut all, mut above) = (0.0, 0.0);
         for surprise in surprises {
             all += 1.0;
-            above += f32::from(u8::from(surprise.abs() > MEDIAN * self.scale));
+            above += f32::from(u8::from(surprise.abs() > MEDIAN * self.scale()));
         }
         if all > 0.0 {
-            self.scale = (self.scale * (1.0 + FOLLOWS * (2.0 * above / all - 1.0))).max(1.0);
+            self.excess = (self.scale() * (1.0 + FOLLOWS * (2.0 * above / all - 1.0)) - 1.0).max(0.0);
         }
     }
 
     /// By this factor, 1 at least.
     pub fn scale(&self) -> f32 {
-        self.scale
+        1.0 + self.excess
     }
 }
 

@@ -9,7 +9,7 @@ mod chip {
     use core::hint::black_box;
 
     use embedded_hal::digital;
-    use embedded_io::{ErrorKind, ErrorType, Read, Write};
+    use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
     use estimator::booster::{Estimator, Green, LINE, PACKET};
     use estimator::wire::link::Vitals;
     use firmware_sim::{Device, Panel};
@@ -34,6 +34,12 @@ mod chip {
         fn read(&mut self, to: &mut [u8]) -> Result<usize, ErrorKind> {
             black_box(to);
             black_box(Ok(1))
+        }
+    }
+
+    impl ReadReady for Anything {
+        fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+            Ok(black_box(false))
         }
     }
 

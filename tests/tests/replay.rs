@@ -109,7 +109,8 @@ fn the_core_agrees_with_the_exact_batch_fit() {
             let sigma = fit.covariance[(i, i)].sqrt();
             let shift = (f64::from(run.last.map_params[i]) - fit.map_params[i]) / sigma;
             let ratio = f64::from(run.last.params_sigma[i]) / sigma;
-            // measured 0.03 and 0.002: the surrogate, means per setting, and a linearisation up to half a sigma away
+            // measured 0.09 and 0.02: the RF dispersion of unknown misalignments, the surrogate, means per setting, and a linearisation up to half
+            // a sigma away
             assert!(shift.abs() < 0.1, "{name} {}: {shift:.3} sigma", run.ring.var_names()[i]);
             assert!((ratio - 1.0).abs() < 0.03, "{name} {}: sigma ratio {ratio:.4}", run.ring.var_names()[i]);
         }

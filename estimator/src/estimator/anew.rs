@@ -6,7 +6,7 @@
 use heapless::Deque;
 
 use super::pooling::{Late, Pooling};
-use super::{Estimator, Model, Tangent, ripple_of};
+use super::{Estimator, Model, Tangent};
 use crate::surrogate::{Surrogate, Unstable};
 
 /// What a call of [`Estimator::prepare`] did.
@@ -153,11 +153,11 @@ impl<
     #[inline(never)]
     pub(super) fn slice(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
         let Work::Surrogate(progress) = &mut self.anew.work else { return self.count_past(model) };
-        let Tangent { linearised, supplies, ripple, .. } = &mut self.anew.tangent;
+        let Tangent { linearised, supplies, .. } = &mut self.anew.tangent;
         match model.surrogate.advance(&self.anew.to, supplies, progress, linearised) {
             Ok(false) => {}
             Ok(true) => {
-                *ripple = [0, 1].map(|plane| ripple_of(model.surrogate, linearised, plane));
+                self.anew.tangent.follow(model.surrogate);
                 self.anew.work = Work::Past(Pooling::BLANK);
             }
             Err(Unstable) => self.retry(),

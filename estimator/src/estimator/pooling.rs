@@ -131,7 +131,7 @@ impl<
             model.surrogate.orbit(linearised, &direct, &mut self.predicted.prediction.reading);
             let repeats: [Repeats; B] = core::array::from_fn(|b| {
                 let number = cell.mean(b).1;
-                let variance = self.variance(model, linearised, b, number, drive.rf_offset);
+                let variance = self.variance(model, &self.anew.tangent, b, number, drive.rf_offset);
                 Repeats { number, noise: self.noise_variance(b), variance }
             });
             let Work::Past(Pooling { gaussian, pool, .. }) = &mut self.anew.work else { return };
@@ -243,9 +243,8 @@ impl<
 
     fn by_itself(&self, model: &Model<'_, G, B, C, F>, frame: &Loose<B, C, F, W>) -> Late<B, C, F, W> {
         let reading = |b| frame.reading.get(b).map_or(0.0, |reading: &PositionCode| reading.value());
-        let Tangent { linearised, supplies, .. } = &self.anew.tangent;
-        let drive = about(&frame.drive, supplies);
-        let news = |b| (reading(b), self.variance_at(model, linearised, b, &drive));
+        let drive = about(&frame.drive, &self.anew.tangent.supplies);
+        let news = |b| (reading(b), self.variance_at(model, &self.anew.tangent, b, &drive));
         Late { drive: frame.drive, news: core::array::from_fn(news), accepted: frame.accepted }
     }
 }

@@ -125,7 +125,7 @@ impl<
         self.past.loose.recentre(self.posterior.gaussian.origin());
         for b in 0..B {
             if let (mean, number @ 1..) = cell.mean(b) {
-                let variance = self.variance(model, &self.tangent.linearised, b, number, drive.rf_offset);
+                let variance = self.variance(model, &self.tangent, b, number, drive.rf_offset);
                 let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
                 let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
                 let reading = Reading { channel: b, innovation, variance, slope };

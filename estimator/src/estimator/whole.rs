@@ -112,7 +112,7 @@ impl<
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
             let certain = f64::from(
                 self.own_variance(model, b, &self.predicted.strength)
-                    + self.shared_variance(model, &self.tangent.linearised, b, self.predicted.rf_offset),
+                    + self.shared_variance(model, &self.tangent, b, self.predicted.rf_offset),
             ) + baseline_variance;
             let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
             // the uncertainty of the params is only worked out for readings that need it

@@ -355,12 +355,14 @@ impl<
         self.group.get(param).map_or(0, |group| *group as usize)
     }
 
-    fn error_variance(&self, at: &Self::Linearised, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
-        let (plane, tune) = if monitor < BX { (0, at.x.tune) } else { (1, at.y.tune) };
-        // towards the integer an orbit's change with the momentum grows as its change with the gradients does
-        let growth = (steepness(self.tune[plane]) / steepness(tune)).abs().max(1.0);
-        let spurious = self.dispersion.spurious[plane] * growth * orbit * rf_offset;
+    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
+        let plane = usize::from(monitor >= BX);
+        let spurious = self.dispersion.spurious[plane] * orbit * rf_offset;
         self.stated_error[plane] * self.stated_error[plane] + spurious * spurious
+    }
+
+    fn follow(&self, at: &Self::Linearised, plane: usize) -> ([f32; F], f32) {
+        if plane == 0 { at.x.follow(&at.slope, &self.supply) } else { at.y.follow(&at.slope, &self.supply) }
     }
 }
 
@@ -573,11 +575,6 @@ impl<const B: usize, const C: usize, const Q: usize, const T: usize> GreenPlane<
     }
 }
 
-/// `tan(pi Q)`, 0 at the integer.
-fn steepness(tune: f32) -> f32 {
-    libm::tanf(core::f32::consts::PI * tune)
-}
-
 /// The tune up to an integer of a ring whose closure `4 sin^2(pi Q)` is `determinant` times that of the design, on the
 /// design's side of the half-integer.
 fn tune_at(design: f32, determinant: f32) -> Result<f32, Unstable> {
@@ -592,6 +589,33 @@ fn tune_at(design: f32, determinant: f32) -> Result<f32, Unstable> {
 }
 
 impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
+    /// Rms of `dR_bc/d(ln strength) = - sum over nodes of k L w strength Z_qb Z_qc` over all `b` and `c`, for the quadrupoles of
+    /// each supply and for all of them, over the rms of `R_bc`.
+    #[inline(never)]
+    fn follow<const F: usize>(&self, slope: &[f32; M], supply: &[i16; M]) -> ([f32; F], f32) {
+        let (mut by_supply, mut of_all, mut size) = ([0.0; F], 0.0, 0.0);
+        for (driven, response) in self.driven.iter().zip(&self.response) {
+            size += response.squares();
+            for seen in &self.seen {
+                let (mut change, mut all) = ([0.0; F], 0.0);
+                let nodes = seen.codes.as_chunks::<2>().0.iter().zip(driven.codes.as_chunks::<2>().0);
+                for (([a, b], [c, d]), (slope, supply)) in nodes.zip(slope.iter().zip(supply)) {
+                    let one = slope * (f32::from(*a) * f32::from(*c) + f32::from(*b) * f32::from(*d));
+                    all += one;
+                    change.get_mut(*supply as usize).into_iter().for_each(|to| *to += one);
+                }
+                let scale = seen.scale * driven.scale;
+                of_all += scale * all * (scale * all);
+                by_supply.iter_mut().zip(change).for_each(|(sum, change)| *sum += scale * change * (scale * change));
+            }
+        }
+        if size > 0.0 {
+            (by_supply.map(|sum| libm::sqrtf(sum / size)), libm::sqrtf(of_all / size))
+        } else {
+            ([0.0; F], 0.0)
+        }
+    }
+
     /// The tune, and `dQ/d(ln strength) = tan(pi Q)/(2 pi) slope (sum of Z_nn)` of each quadrupole.
     fn set_tune<const T: usize>(&mut self, tune: f32, slope: &[f32; M], mutual: &Triangle<Q, T>) {
         self.tune = tune;

@@ -137,7 +137,12 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
 
     /// Stated mean square error of a prediction at one monitor [m^2]: the same at every repeat of a setting, unlike noise.
     ///
-    /// `orbit` is the rms of the baseline orbit in the monitor's plane [m]; with an RF offset, the part of the
-    /// dispersion that the unknown misalignments make grows with it.
-    fn error_variance(&self, at: &Self::Linearised, monitor: usize, rf_offset: f32, orbit: f32) -> f32;
+    /// `orbit` is the rms of the baseline orbit in the monitor's plane, times the growth of what [`Surrogate::follow`] says of all
+    /// gradients since the design [m]; with an RF offset, the part of the dispersion that the unknown misalignments make grows with
+    /// it.
+    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32;
+
+    /// How the orbits of kicks in a plane (0 for x) follow the gradients: rms change per `ln` of each supply's factor, and of all
+    /// gradients, over the rms orbit, of kicks by all correctors [1].
+    fn follow(&self, at: &Self::Linearised, plane: usize) -> ([f32; F], f32);
 }

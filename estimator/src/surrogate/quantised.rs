@@ -33,6 +33,12 @@ impl<const R: usize> Column<R> {
     /// All zero.
     pub const ZERO: Self = Self { scale: 0.0, codes: [0; R] };
 
+    /// Sum of the squared values.
+    pub fn squares(&self) -> f32 {
+        let sum: f32 = self.codes.iter().map(|code| f32::from(*code) * f32::from(*code)).sum();
+        self.scale * self.scale * sum
+    }
+
     /// Become these values, which must be finite.
     #[inline(never)]
     pub fn quantise(&mut self, values: &[f32; R]) {
