@@ -58,14 +58,22 @@ pub fn endure(image: &Image, frames: u32, mut tick: impl FnMut()) -> Result<Endu
         let is_equal = if sequence % FULL == 0 || sequence == frames {
             agree_in_full(&mut link, &mut core, sequence, &wire)?
         } else {
-            core.prepare();
-            says(&core.ingest(&mut wire.clone())?, &link.feedback(sequence, &wire)?)
+            let short = link.feedback(sequence, &wire)?;
+            do_slices(&mut core, short.remarks.slices);
+            says(&core.ingest(&mut wire.clone())?, &short)
         };
         different.extend((!is_equal).then_some(sequence));
         last = wire;
         tick();
     }
     Ok(Endured { different, refused, status: link.status()? })
+}
+
+/// Do as many slices as the device has done.
+fn do_slices(core: &mut Core, number: u32) {
+    for _ in 0..number {
+        let _ = core.slice();
+    }
 }
 
 /// True if a short reply says what an estimate says.
@@ -83,6 +91,7 @@ fn agree_in_full<L: Read + Write>(
     let mut heard = link.ingest(sequence, wire)?;
     heard.estimate.rejected_frames = 0; // the core in process hears good frames only
     link.form(Form::Short)?;
+    do_slices(core, heard.estimate.remarks.slices);
     Ok(is_same(core, wire.to_vec(), &heard))
 }
 
