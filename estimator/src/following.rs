@@ -149,10 +149,9 @@ mod tests {
     #[test]
     fn repeats_tell_how_it_follows() {
         let following = following(4000);
-        for f in 0..2 {
+        for (slope, expected) in following.slope.iter().zip(TRUE) {
             // noise over ripple, of 4000 repeats: 0.0045 m; three of them
-            let error = following.slope[f] - TRUE[f];
-            assert!(error.abs() < 0.015, "{f}: {error}");
+            assert!((slope - expected).abs() < 0.015, "{slope} {expected}");
         }
         // one a repeat: sqrt(2/4000) for normal noise, less for this
         let chi_square = following.chi_square(&EXPECTED) / 3999.0;

@@ -193,15 +193,15 @@ impl Problem<'_> {
         let count = 2 + campaign.supplies.len();
         let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), count, 0.0);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
-        for b in 0..campaign.monitors() {
+        for (b, slopes) in slopes.iter().enumerate() {
             let terms = campaign.terms(b);
             let frames: Vec<usize> = (0..campaign.frames()).filter(|&i| campaign.counts(i, b)).collect();
-            let residual = &campaign.readings.column(b) - orbits.column(b);
+            let residual = campaign.readings.column(b) - orbits.column(b);
             let mut readings = vec![(b, Weighed::none(count)); campaign.frames()];
             for &i in &frames {
                 readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], campaign.noise(b).powi(-2));
             }
-            normal.add(&slopes[b], &readings);
+            normal.add(slopes, &readings);
             if campaign.is_ok(b) {
                 let expected = campaign.recording.header.noise[b];
                 let of_monitor = chi_square(&residual.select_rows(&frames), &terms.select_columns(&frames), expected);

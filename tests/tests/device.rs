@@ -562,9 +562,9 @@ impl FrontEnd {
     fn send(&mut self) {
         let count = 1 + self.machine.random.below(6);
         let corrector = self.machine.random.powered(count, 1.0, 10.0);
-        self.sequence += 1 + u32::from(self.frames % 50 == 0); // cycles may be lost
+        self.sequence += 1 + u32::from(self.frames.is_multiple_of(50)); // cycles may be lost
         let mut frame = self.machine.cycle_with(self.sequence, corrector);
-        let silent = (self.frames % 7 == 0).then(|| self.machine.random.below(33));
+        let silent = (self.frames.is_multiple_of(7)).then(|| self.machine.random.below(33));
         silent.into_iter().for_each(|monitor| frame.valid.put(monitor, false));
         let mut wire = wire_of(&frame);
         if let Some(mut random) = self.faults.take() {

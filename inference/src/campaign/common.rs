@@ -110,7 +110,7 @@ impl Common {
         let Some((columns, pull)) = lower.and_then(solve) else {
             return Eliminated { columns: DMatrix::zeros(moment.len(), 0), moment, square };
         };
-        Eliminated { moment: moment - &columns * &pull.column(0), square: square - pull.norm_squared(), columns }
+        Eliminated { moment: moment - &columns * pull.column(0), square: square - pull.norm_squared(), columns }
     }
 }
 
