@@ -46,5 +46,6 @@ pub fn ring() -> &'static mut [u8] {
     #[unsafe(link_section = ".dma")]
     static mut BYTES: MaybeUninit<[u8; RING]> = MaybeUninit::uninit();
     // not loaded and not zeroed at the start, as the section is not the program's
-    unsafe { (*(&raw mut BYTES)).write([0; RING]) }
+    let bytes = &raw mut BYTES;
+    unsafe { (*bytes).write([0; RING]) }
 }

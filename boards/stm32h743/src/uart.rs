@@ -7,7 +7,7 @@ use embassy_stm32::peripherals::{DMA1_CH0, DMA1_CH1, PD8, PD9, USART3};
 use embassy_stm32::usart::{Config, InterruptHandler, RingBufferedUartRx, Uart, UartTx};
 use embassy_stm32::{Peri, bind_interrupts, dma};
 use embassy_time::{Duration, Instant, with_deadline};
-use embedded_io::{ErrorKind, ErrorType, Read, Write};
+use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 
 use crate::memory;
 
@@ -63,6 +63,12 @@ impl Read for Receiver {
             Ok(taken) => taken.map_err(|_| ErrorKind::Other),
             Err(_) => Err(ErrorKind::TimedOut),
         }
+    }
+}
+
+impl ReadReady for Receiver {
+    fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+        self.0.read_ready().map_err(|_| ErrorKind::Other)
     }
 }
 

@@ -146,7 +146,9 @@ mod tests {
         trace.save().unwrap();
         let mut reader = csv::Reader::from_path(&path).unwrap();
         assert_eq!(reader.headers().unwrap().iter().take(3).collect::<Vec<_>>(), ["seq", "V0_mean", "V0_sigma"]);
-        let row: Vec<f32> = reader.records().next().unwrap().unwrap().iter().map(|f| f.parse().unwrap()).collect();
+        let row = reader.records().next().unwrap().unwrap();
+        assert_eq!(row.iter().next_back(), Some(""), "no var has stepped");
+        let row: Vec<f32> = row.iter().take(row.len() - 1).map(|f| f.parse().unwrap()).collect();
         assert_eq!((row.len(), row[0], row[97], row[98]), (102, 4.0, 33.3, 2.0));
         assert_eq!(row[99..], [1.0, 0.0, 0.0]);
         for i in 0..48 {

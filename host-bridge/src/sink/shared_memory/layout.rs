@@ -30,7 +30,8 @@ pub struct Header {
     pub vars: u32,
     pub monitors: u32,
     pub text_bytes: u32,
-    /// Bits, see [`said`].
+    /// Three flags (put aside, baselines moved, unsolved), the slices of work from bit 3 on, and in the upper half 1 more than the
+    /// param that was let loose.
     pub remarks: u32,
     pub put_aside_frames: u32,
     pub baselines_moved: u32,
