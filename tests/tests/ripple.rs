@@ -1,35 +1,27 @@
 //! The orbit of misaligned quadrupoles follows the ripple of their supplies: exact closed orbits through the core, next to the integer.
+
 use inference::Recording;
 use inference::simulate::{self, Hardware, Truth};
 use inference::stream::{self, Walk};
 use system_tests::repository;
-use twin::{Hold, Optics, Ring};
+use twin::Ring;
 
+/// Machines with horizontal tunes of 4.8685, 4.8738, 4.8635 and 4.8708, whose chi2/dof is 1.07 to 1.28 if baselines stay. 10,600
+/// degrees of freedom scatter it by 1.4 %.
 #[test]
-fn explore() {
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn baselines_follow_the_supplies() {
     let ring = Ring::booster();
     let template = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
     let hardware = Hardware::shipped(&ring, &template);
-    for seed in 0..300 {
+    for seed in [119, 95, 240, 261] {
         let vars = simulate::vars(&ring, true, seed).unwrap();
-        let tune = Optics::of(&ring.with_vars(&vars), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap().x;
-        if !(4.862..4.88).contains(&tune) && seed > 5 {
-            continue;
-        }
         let truth = Truth { vars: &vars, ..Truth::default() };
-        let Ok(recording) = simulate::campaign(&template, &ring, &truth, &hardware, seed) else { continue };
+        let recording = simulate::campaign(&template, &ring, &truth, &hardware, seed).unwrap();
         let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
-        let mut last = None;
-        stream::replay(&mut core, &recording, |_, e| last = Some(e.clone())).unwrap();
-        let q = core.fit_quality();
-        let e = last.unwrap();
-        let off = nalgebra::DVector::from_fn(48, |i, _| f64::from(e.map_params[i]) - vars[i].ln());
-        let cov = nalgebra::DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
-        let nees = off.dot(&cov.cholesky().unwrap().solve(&off)) / 48.0;
-        println!(
-            "{seed} {tune:.4} chi2/dof {:.4} nees {nees:.2} ev {}",
-            q.chi_square / q.degrees_of_freedom,
-            e.log_evidence
-        );
+        stream::replay(&mut core, &recording, |_, _| ()).unwrap();
+        let quality = core.fit_quality();
+        let chi2 = quality.chi_square / quality.degrees_of_freedom;
+        assert!((0.96..1.04).contains(&chi2), "{seed}: chi2/dof {chi2}");
     }
 }
