@@ -40,7 +40,7 @@ pub use prior::{Marginal, Prior};
 pub use sizes::{Layout, Sizes, largest};
 pub use steer::{Feedback, Hold, Response, Steer, Steered};
 pub use stream::Core;
-pub use surrogate::{Prediction, Surrogate, Tables};
+pub use surrogate::{Prediction, Steerable, Surrogate, Tables};
 pub use triangle::Triangle;
 pub use wire::packet;
 pub use wire::{

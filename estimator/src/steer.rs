@@ -27,7 +27,7 @@ mod tests;
 use crate::drive::{Drive, Each};
 use crate::estimate::{Estimate, MonitorState};
 use crate::linear::dot;
-use crate::surrogate::Surrogate;
+use crate::surrogate::Steerable;
 use crate::triangle::Triangle;
 use crate::wire::{CurrentCode, Frame, PositionCode};
 
@@ -79,7 +79,7 @@ impl<const B: usize, const C: usize> Feedback<B, C> {
 
 /// The ring as steering sees it.
 #[derive(Debug)]
-pub struct Response<'a, G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize> {
+pub struct Response<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize> {
     /// Its tables.
     pub surrogate: &'a G,
     /// At which vars.
@@ -130,7 +130,7 @@ const TURN: u8 = 16;
 /// RF offset whose orbit stands for the dispersion: small enough to be of first order.
 const RF_OFFSET: f32 = 1e-6;
 
-impl<'a, G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize>
+impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usize, const N: usize>
     Response<'a, G, B, C, F, N>
 {
     /// The orbit that kicks make [m].
@@ -195,7 +195,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// Take a frame in, and move the setpoints, or say why not.
     #[inline(never)]
-    pub fn steer<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
+    pub fn steer<G: Steerable<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,
@@ -225,7 +225,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     ///
     /// `covariance` gives one row of that of the params.
     #[inline(never)]
-    pub fn prepare<G: Surrogate<B, C, F, N>, const F: usize, const N: usize>(
+    pub fn prepare<G: Steerable<B, C, F, N>, const F: usize, const N: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,
@@ -266,7 +266,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// Move the filtered orbit by what the correctors have done, then towards the readings.
     #[inline(never)]
-    fn observe<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
+    fn observe<G: Steerable<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,
@@ -325,7 +325,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// `A` of the plane whose correctors begin at `first`; those that are left out have a diagonal only.
     #[inline(never)]
-    fn matrix<G: Surrogate<B, C, F, N>, const F: usize, const N: usize, const CP: usize, const TP: usize>(
+    fn matrix<G: Steerable<B, C, F, N>, const F: usize, const N: usize, const CP: usize, const TP: usize>(
         &self,
         response: &Response<'_, G, B, C, F, N>,
         first: usize,
@@ -357,7 +357,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
 
     /// Move the setpoints; returns how many correctors are at their limit.
     #[inline(never)]
-    fn correct<G: Surrogate<B, C, F, N>, const F: usize, const N: usize>(
+    fn correct<G: Steerable<B, C, F, N>, const F: usize, const N: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,

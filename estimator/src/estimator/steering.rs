@@ -3,11 +3,11 @@
 use super::{Estimator, Model};
 use crate::estimate::Estimate;
 use crate::steer::{Feedback, Response, Steer, Steered};
-use crate::surrogate::Surrogate;
+use crate::surrogate::Steerable;
 use crate::wire::Frame;
 
 impl<
-    G: Surrogate<B, C, F, N>,
+    G: Steerable<B, C, F, N>,
     const B: usize,
     const C: usize,
     const F: usize,

@@ -4,7 +4,7 @@ use super::*;
 use crate::estimate::{Health, Remarks};
 use crate::mask::Mask;
 use crate::sizes::{Layout, Sizes};
-use crate::surrogate::{Prediction, Tables, Unstable};
+use crate::surrogate::{Prediction, Surrogate, Tables, Unstable};
 use crate::wire::{MagnetCurrents, Parcel, ParcelError, RfCode};
 
 const B: usize = 4;
@@ -56,6 +56,24 @@ impl Surrogate<B, C, 1, 1> for Table {
 
     fn predict(&self, (): &(), _: &Drive<C, 1>, _: &mut Prediction<B, 1, 1>) {}
 
+    fn tune(&self, (): &(), _: usize, _: &[f32; 1]) -> (f32, [f32; 1]) {
+        (0.0, [0.0])
+    }
+
+    fn prior_group(&self, _: usize) -> usize {
+        0
+    }
+
+    fn error_variance(&self, _: usize, _: f32, _: f32) -> f32 {
+        0.0
+    }
+
+    fn follow(&self, (): &(), _: usize) -> ([f32; 1], f32) {
+        ([0.0], 0.0)
+    }
+}
+
+impl Steerable<B, C, 1, 1> for Table {
     fn pull(&self, (): &(), orbit: &[f32; B], into: &mut [f32; C]) {
         *into = core::array::from_fn(|c| self.at.iter().zip(orbit).map(|(row, x)| row[c] * x).sum());
     }
@@ -75,22 +93,6 @@ impl Surrogate<B, C, 1, 1> for Table {
             let there: std::vec::Vec<f32> = here.iter().map(|h| variance * weight * h).collect();
             add(here, &there);
         }
-    }
-
-    fn tune(&self, (): &(), _: usize, _: &[f32; 1]) -> (f32, [f32; 1]) {
-        (0.0, [0.0])
-    }
-
-    fn prior_group(&self, _: usize) -> usize {
-        0
-    }
-
-    fn error_variance(&self, _: usize, _: f32, _: f32) -> f32 {
-        0.0
-    }
-
-    fn follow(&self, (): &(), _: usize) -> ([f32; 1], f32) {
-        ([0.0], 0.0)
     }
 }
 

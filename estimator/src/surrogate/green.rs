@@ -19,7 +19,7 @@
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
 use super::quantised::Column;
-use super::{Block, LowRank, Prediction, Surrogate, SymmetricBlock, Unstable};
+use super::{Block, LowRank, Prediction, Steerable, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
 use crate::linear::{add, add_four, add_four_twice, dot};
 use crate::sizes::Sizes;
@@ -319,6 +319,42 @@ impl<
         }
     }
 
+    fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
+        let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
+        let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
+        self.spread(slopes.iter().copied(), &mut by_param, &mut by_supply);
+        (tune + dot(&by_supply, strength), by_param)
+    }
+
+    fn prior_group(&self, param: usize) -> usize {
+        self.group.get(param).map_or(0, |group| *group as usize)
+    }
+
+    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
+        let plane = usize::from(monitor >= BX);
+        let spurious = self.dispersion.spurious[plane] * orbit * rf_offset;
+        self.stated_error[plane] * self.stated_error[plane] + spurious * spurious
+    }
+
+    fn follow(&self, at: &Self::Linearised, plane: usize) -> ([f32; F], f32) {
+        if plane == 0 { at.x.follow(&at.slope, &self.supply) } else { at.y.follow(&at.slope, &self.supply) }
+    }
+}
+
+impl<
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const BX: usize,
+    const BY: usize,
+    const CX: usize,
+    const CY: usize,
+    const M: usize,
+    const N: usize,
+    const Q: usize,
+    const T: usize,
+> Steerable<B, C, F, N> for Green<BX, BY, CX, CY, M, N, Q, T>
+{
     fn pull(&self, at: &Self::Linearised, orbit: &[f32; B], into: &mut [f32; C]) {
         let (x, y) = orbit.split_at(BX.min(B));
         let (pull_x, pull_y) = into.split_at_mut(CX.min(C));
@@ -342,27 +378,6 @@ impl<
         } else {
             at.y.response_covariance(y, slope, param, covariance, add);
         }
-    }
-
-    fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
-        let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
-        let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
-        self.spread(slopes.iter().copied(), &mut by_param, &mut by_supply);
-        (tune + dot(&by_supply, strength), by_param)
-    }
-
-    fn prior_group(&self, param: usize) -> usize {
-        self.group.get(param).map_or(0, |group| *group as usize)
-    }
-
-    fn error_variance(&self, monitor: usize, rf_offset: f32, orbit: f32) -> f32 {
-        let plane = usize::from(monitor >= BX);
-        let spurious = self.dispersion.spurious[plane] * orbit * rf_offset;
-        self.stated_error[plane] * self.stated_error[plane] + spurious * spurious
-    }
-
-    fn follow(&self, at: &Self::Linearised, plane: usize) -> ([f32; F], f32) {
-        if plane == 0 { at.x.follow(&at.slope, &self.supply) } else { at.y.follow(&at.slope, &self.supply) }
     }
 }
 

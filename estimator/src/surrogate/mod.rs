@@ -113,21 +113,6 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
     /// The orbit that a drive makes, and its derivative.
     fn predict(&self, at: &Self::Linearised, drive: &Drive<C, F>, into: &mut Prediction<B, F, N>);
 
-    /// What an orbit asks of each corrector, `R^T orbit` [m^2/rad]: the transpose of [`Surrogate::orbit`] for kicks.
-    fn pull(&self, at: &Self::Linearised, orbit: &[f32; B], into: &mut [f32; C]);
-
-    /// How uncertain the responses to the correctors of a plane (0 for x) are, [m^2/rad^2] times the unit of `weight`:
-    /// `sum over monitors b of weight_b cov(R_bc, R_bd)`, for the covariance of the params, of which `covariance` gives one row.
-    /// It comes as a sum of products: `add` gets the two factors of each, one entry a corrector of the plane.
-    fn response_covariance(
-        &self,
-        at: &Self::Linearised,
-        plane: usize,
-        weight: &[f32; B],
-        covariance: impl Fn(usize) -> [f32; N],
-        add: impl FnMut(&[f32], &[f32]),
-    );
-
     /// The tune in a plane (0 for x) up to an integer, and its derivative with respect to every param; `strength` is `ln` of
     /// the supplies' factors about where it was linearised.
     fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]);
@@ -145,4 +130,22 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
     /// How the orbits of kicks in a plane (0 for x) follow the gradients: rms change per `ln` of each supply's factor, and of all
     /// gradients, over the rms orbit, of kicks by all correctors [1].
     fn follow(&self, at: &Self::Linearised, plane: usize) -> ([f32; F], f32);
+}
+
+/// What orbit feedback asks of a surrogate beyond an estimate.
+pub trait Steerable<const B: usize, const C: usize, const F: usize, const N: usize>: Surrogate<B, C, F, N> {
+    /// What an orbit asks of each corrector, `R^T orbit` [m^2/rad]: the transpose of [`Surrogate::orbit`] for kicks.
+    fn pull(&self, at: &Self::Linearised, orbit: &[f32; B], into: &mut [f32; C]);
+
+    /// How uncertain the responses to the correctors of a plane (0 for x) are, [m^2/rad^2] times the unit of `weight`:
+    /// `sum over monitors b of weight_b cov(R_bc, R_bd)`, for the covariance of the params, of which `covariance` gives one row.
+    /// It comes as a sum of products: `add` gets the two factors of each, one entry a corrector of the plane.
+    fn response_covariance(
+        &self,
+        at: &Self::Linearised,
+        plane: usize,
+        weight: &[f32; B],
+        covariance: impl Fn(usize) -> [f32; N],
+        add: impl FnMut(&[f32], &[f32]),
+    );
 }
