@@ -672,17 +672,26 @@ impl<
             && let Some(oldest) = self.past.recent.pop_front()
         {
             self.note_leaving(model, &oldest);
-            self.past.loose.recentre(self.posterior.gaussian.origin());
-            self.predict_drive(model, &oldest.drive);
-            let drive = about(&oldest.drive, &self.tangent.supplies);
-            let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
-            let readings = oldest.readings(&variances, &self.predicted.prediction);
-            self.past.loose.condition(readings, &self.posterior.loose());
+            // a past that has seen another ring is not counted anew
+            if self.posterior.is_still::<B>(&model.setup.walk) {
+                self.let_go(model, &oldest);
+            }
         }
         self.past.reference.wait();
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
+    }
+
+    /// Linearise a frame for the last time.
+    #[inline(never)]
+    fn let_go(&mut self, model: &Model<'_, G, B, C, F>, frame: &Loose<B, C, F, W>) {
+        self.past.loose.recentre(self.posterior.gaussian.origin());
+        self.predict_drive(model, &frame.drive);
+        let drive = about(&frame.drive, &self.tangent.supplies);
+        let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
+        let readings = frame.readings(&variances, &self.predicted.prediction);
+        self.past.loose.condition(readings, &self.posterior.loose());
     }
 
     fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
