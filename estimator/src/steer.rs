@@ -137,6 +137,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     Response<'a, G, B, C, F, N>
 {
     /// The orbit that kicks make [m].
+    #[inline(never)]
     fn orbit(&self, kick: [f32; C]) -> [f32; B] {
         self.orbit_of(&Drive { kick, strength: [0.0; F], rf_offset: 0.0 })
     }
@@ -153,6 +154,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     }
 
     /// `R^T orbit` [m^2/rad].
+    #[inline(never)]
     fn pull(&self, orbit: &[f32; B]) -> [f32; C] {
         let mut pull = [0.0; C];
         self.surrogate.pull(self.at, orbit, &mut pull);
@@ -160,6 +162,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     }
 
     /// Currents as kicks [rad].
+    #[inline(never)]
     fn kicks(&self, mut current: [f32; C]) -> [f32; C] {
         current.iter_mut().enumerate().for_each(|(c, current)| *current *= self.kick_per_ampere.of(c));
         current
@@ -317,6 +320,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     }
 
     /// `W r`, less what is of momentum.
+    #[inline(never)]
     fn weighted(&self, orbit: &[f32; B]) -> [f32; B] {
         let off_momentum = dot(&self.momentum, orbit);
         let mut weighted = *orbit;
@@ -384,8 +388,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         let (pull_x, pull_y) = pull.split_at(CX.min(C));
         let mut step = [0.0; C];
         let (step_x, step_y) = step.split_at_mut(CX.min(C));
-        self.x.step(pull_x, room, rate, step_x);
-        self.y.step(pull_y, |c| room(CX + c), |c| rate(CX + c), step_y);
+        self.x.step(pull_x, &room, &rate, 0, step_x);
+        self.y.step(pull_y, &room, &rate, CX, step_y);
         step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick_per_ampere.of(c));
         self.supplies.change(&step, |c| feedback.edge(c))
     }

@@ -59,7 +59,13 @@ impl<const B: usize> Moves<B> {
     }
 
     /// By how much the readings at the first `count` places move the slope of a baseline; `rows` are theirs.
-    pub fn wait_for<const N: usize>(&self, b: usize, rows: &[[f64; N]; 4], count: usize, mut each: impl FnMut(f64, &[f64; N])) {
+    pub fn wait_for<const N: usize>(
+        &self,
+        b: usize,
+        rows: &[[f64; N]; 4],
+        count: usize,
+        mut each: impl FnMut(f64, &[f64; N]),
+    ) {
         if self.any {
             let gains = self.gain.iter().map(|gain| gain.get(b).copied().unwrap_or(0.0));
             gains.zip(rows).take(count).for_each(|(gain, row)| each(gain, row));
