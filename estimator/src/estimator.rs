@@ -389,31 +389,40 @@ impl<
         model: &Model<'_, G, B, C, F>,
         bytes: &mut [u8],
     ) -> Result<Estimate<B, N, W>, IngestError> {
-        let (frame, drive) = self
-            .decode(model, bytes)
-            .inspect_err(|_| self.sequence.rejected = self.sequence.rejected.saturating_add(1))?;
-        self.pass_time(model, &frame);
-        self.predict(model, &drive);
-        let setting = self.setting(model, &frame, &drive);
-        let (whole, expected) = self.judge_whole(model, &frame, setting.is_some());
+        let (frame, drive) = self.decode(model, bytes)?;
+        Ok(self.update(model, &frame, &drive))
+    }
+
+    /// Take a decoded frame in, and what drove the beam in it.
+    #[inline(never)]
+    fn update(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: &Frame<B, C, F, W>,
+        drive: &Drive<C, F>,
+    ) -> Estimate<B, N, W> {
+        self.pass_time(model, frame);
+        self.predict(model, drive);
+        let setting = self.setting(model, frame, drive);
+        let (whole, expected) = self.judge_whole(model, frame, setting.is_some());
         if whole == Whole::Aside {
-            return Ok(self.estimate(model, &frame, None, &Screened::none_of(&frame.valid), 0.0, whole));
+            return self.estimate(model, frame, None, &Screened::none_of(&frame.valid), 0.0, whole);
         }
-        let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
-        let screened = self.screen(model, &frame, &drive, cell, whole, &expected);
+        let cell = setting.and_then(|setting| self.find_cell(model, &setting, drive));
+        let screened = self.screen(model, frame, drive, cell, whole, &expected);
         if let Some(cell) = cell {
-            self.note_late(model, &frame, &drive, cell, &screened);
+            self.note_late(model, frame, drive, cell, &screened);
         }
         let before = self.posterior.solution.cost;
         self.posterior.expect();
-        self.condition(model, &frame, cell, &screened);
+        self.condition(model, frame, cell, &screened);
         self.solve(model);
         let nis = self.count_nis(before, &screened);
         self.look_for_steps(model);
         if cell.is_none() {
-            self.keep_loose(model, &frame, &drive, &screened);
+            self.keep_loose(model, frame, drive, &screened);
         }
-        Ok(self.estimate(model, &frame, cell, &screened, nis, whole))
+        self.estimate(model, frame, cell, &screened, nis, whole)
     }
 
     /// One slice of what can be done between frames, so that the next one is answered at once: let the params walk, and linearise
@@ -430,8 +439,12 @@ impl<
             if core::mem::replace(&mut self.looked, true) {
                 return Prepared::Nothing;
             }
-            self.seek_reference(model);
-            self.retire(model);
+            // what changes the past counts as a slice, or the number of slices would not tell whether it was done
+            if self.seek_reference(model) || self.retire(model) {
+                self.looked = false;
+                self.slices = self.slices.saturating_add(1);
+                return Prepared::Slice;
+            }
             if !self.is_due(model) {
                 return Prepared::Nothing;
             }
@@ -466,9 +479,18 @@ impl<
         Ok(())
     }
 
-    /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it.
+    /// A frame that is sound, new, and of a machine state that the model describes; and what drove the beam in it. One that is not
+    /// is counted.
     #[inline(never)]
     fn decode(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        bytes: &mut [u8],
+    ) -> Result<(Frame<B, C, F, W>, Drive<C, F>), IngestError> {
+        self.admit(model, bytes).inspect_err(|_| self.sequence.rejected = self.sequence.rejected.saturating_add(1))
+    }
+
+    fn admit(
         &self,
         model: &Model<'_, G, B, C, F>,
         bytes: &mut [u8],

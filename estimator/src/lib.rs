@@ -39,7 +39,7 @@ pub use monitor::{Gate, Monitor, Noise};
 pub use prior::{Marginal, Prior};
 pub use sizes::{Layout, Sizes, largest};
 pub use steer::{Feedback, Hold, Response, Steer, Steered};
-pub use stream::Core;
+pub use stream::{Core, Steering};
 pub use surrogate::{Prediction, Steerable, Surrogate, Tables};
 pub use triangle::Triangle;
 pub use wire::packet;

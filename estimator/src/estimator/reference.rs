@@ -97,12 +97,12 @@ impl<
     }
 
     /// Look for another reference drive, if for a while no frame has repeated a setting: the median of the recent drives, if most of
-    /// them are settings about it.
+    /// them are settings about it. True if it was looked for.
     #[inline(never)]
-    pub(super) fn seek_reference(&mut self, model: &Model<'_, G, B, C, F>) {
+    pub(super) fn seek_reference(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
         let recent = self.past.recent.len();
         if !self.past.recent.is_full() || usize::from(self.past.reference.waited) < recent {
-            return;
+            return false;
         }
         self.past.reference.waited = 0;
         let former = self.past.reference.kick;
@@ -114,12 +114,14 @@ impl<
         } else {
             self.past.reference.kick = former;
         }
+        true
     }
 
     /// Make room for new settings, if there is none, by one setting of a former reference drive: it counts on as it is linearised now.
+    /// True if one was.
     #[inline(never)]
-    pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) {
-        let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return };
+    pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
+        let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return false };
         let drive = cell.drive();
         self.predict_drive(model, &drive);
         self.past.loose.recentre(self.posterior.gaussian.origin());
@@ -133,6 +135,7 @@ impl<
                 self.past.loose.add_repeats(number, self.noise_variance(b));
             }
         }
+        true
     }
 
     /// Median of the recent kicks of a corrector: that which as many exceed as fall short of.
