@@ -192,7 +192,7 @@ impl<
                 let innovation = self.anew.tangent.tune_innovation(model, plane, mean, &strength);
                 let (_, slope) = model.surrogate.tune(&self.anew.tangent.linearised, plane, &[0.0; F]);
                 let mean = Reading { channel: B + plane, innovation, variance: variance / count as f32, slope: &slope };
-                gaussian.condition([mean], &[0.0; N]);
+                gaussian.condition([mean], &|_| 0.0);
                 gaussian.add_repeats(count, variance);
                 gaussian.add_scatter(squares / f64::from(variance), 0.0);
             }
