@@ -125,6 +125,7 @@ pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usiz
     /// Frames since the gains of x were due.
     turn: u8,
     watch: Watch,
+    steered: Steered,
 }
 
 /// Frames after which gains are made anew, for the estimate moves on.
@@ -187,11 +188,17 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         y: Gain::BLANK,
         turn: 0,
         watch: Watch::BLANK,
+        steered: Steered { hold: None, left_out: 0, limited: 0 },
     };
 
     /// The currents that the correctors are to have.
     pub fn setpoints(&self) -> &[CurrentCode; C] {
         self.supplies.setpoints()
+    }
+
+    /// What is to be said of the last frame's correction.
+    pub fn steered(&self) -> Steered {
+        self.steered
     }
 
     /// False for a corrector that does not follow its setpoint, and is left out until it does.
@@ -224,7 +231,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
             self.pattern = (frame.time_us as u32).max(1);
             self.supplies.probe(feedback.probe, self.pattern, &feedback.limit);
         }
-        Steered { hold, left_out: self.supplies.left_out(), limited }
+        self.steered = Steered { hold, left_out: self.supplies.left_out(), limited };
+        self.steered
     }
 
     /// Make the gains of one plane anew if that is due; true if it was done. To be called after each frame.

@@ -11,7 +11,9 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
-use system_tests::feedback::{Chip, Control, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
+use system_tests::feedback::{
+    Chip, Control, GAIN, Known, Loop, REGIONS, Sample, Scenario, held, recommended, rms, settled,
+};
 use system_tests::qemu::{Counts, Emulator, Image, Options};
 
 /// Close the loop in software.
@@ -69,14 +71,6 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     println!("{} {}", arguments.figure.display(), arguments.json.display());
     Ok(chip.different == 0)
 }
-
-/// Steps whose instructions are counted, by the words of the table and the function in the image.
-const REGIONS: [(&str, &str); 4] = [
-    ("frame to setpoints", "Estimator::ingest_and_steer"),
-    ("steer", "Steer::steer"),
-    ("gains of a plane", "Steer::prepare"),
-    ("reply", "Reply::encode"),
-];
 
 /// What the emulated chip showed.
 #[derive(Debug, Default)]
