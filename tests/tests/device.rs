@@ -16,7 +16,7 @@ use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use system_tests::faults::{Body, FAULTS, faulty, sealed};
-use system_tests::feedback::{Control, Event, Known, Loop, Scenario, recommended};
+use system_tests::feedback::{Control, Known, Loop, Scenario, recommended};
 use system_tests::machine::{LAYOUT, Machine, Random, wire_of};
 use system_tests::repository;
 use training::{Tables, rooms};
@@ -530,8 +530,7 @@ fn a_short_reply_says_what_the_estimate_says() {
 fn a_device_steers_from_one_request_to_the_next() {
     // given a loop with a lost beam and a corrector that sticks
     let known = Known::read().unwrap();
-    let events = vec![(60, Event::Lost(6)), (80, Event::Sticks(30, 30))];
-    let scenario = Scenario { campaign: 20, events, ..Scenario::quiet(5, 130) };
+    let scenario = Scenario::of_faults(5);
     let mut closed = Loop::new(&known, recommended(), Control::Estimated, scenario).unwrap();
     let cycles: Vec<_> = (0..130)
         .map(|_| {

@@ -15,7 +15,7 @@ use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use system_tests::endurance::endure;
-use system_tests::feedback::{Chip, Control, Event, Known, Loop, REGIONS, Scenario, recommended};
+use system_tests::feedback::{Chip, Control, Known, Loop, REGIONS, Scenario, recommended};
 use system_tests::machine::LAYOUT;
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
@@ -209,8 +209,7 @@ fn a_long_feedback_on_a_bad_line_is_the_same_on_the_chip() {
 #[test]
 fn the_chip_steers_as_the_host_does() {
     let known = Known::read().unwrap();
-    let events = vec![(60, Event::Lost(6)), (80, Event::Sticks(30, 30))];
-    let scenario = Scenario { campaign: 20, events, ..Scenario::quiet(5, 130) };
+    let scenario = Scenario::of_faults(5);
     let regions = REGIONS.iter().map(|(_, name)| IMAGE.function(name).unwrap()).collect();
     let emulator = Emulator::start(&IMAGE, &Options { regions, ..Options::default() }).unwrap();
     let mut closed = Loop::new(&known, recommended(), Control::Estimated, scenario).unwrap();
