@@ -404,6 +404,9 @@ impl<
         self.pass_time(model, frame);
         self.predict(model, drive);
         let setting = self.setting(model, frame, drive);
+        if setting.is_none() {
+            self.past.reference.wait();
+        }
         let (whole, expected) = self.judge_whole(model, frame, setting.is_some());
         if whole == Whole::Aside {
             return self.estimate(model, frame, None, &Screened::none_of(&frame.valid), 0.0, whole);
@@ -694,17 +697,25 @@ impl<
             && let Some(oldest) = self.past.recent.pop_front()
         {
             self.note_leaving(model, &oldest);
-            self.past.loose.recentre(self.posterior.gaussian.origin());
-            self.predict_drive(model, &oldest.drive);
-            let drive = about(&oldest.drive, &self.tangent.supplies);
-            let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
-            let readings = oldest.readings(&variances, &self.predicted.prediction);
-            self.past.loose.condition(readings, &self.posterior.loose());
+            // a past that has seen another ring is not counted anew
+            if self.posterior.is_still::<B>(&model.setup.walk) {
+                self.let_go(model, &oldest);
+            }
         }
-        self.past.reference.wait();
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
+    }
+
+    /// Linearise a frame for the last time.
+    #[inline(never)]
+    fn let_go(&mut self, model: &Model<'_, G, B, C, F>, frame: &Loose<B, C, F, W>) {
+        self.past.loose.recentre(self.posterior.gaussian.origin());
+        self.predict_drive(model, &frame.drive);
+        let drive = about(&frame.drive, &self.tangent.supplies);
+        let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
+        let readings = frame.readings(&variances, &self.predicted.prediction);
+        self.past.loose.condition(readings, &self.posterior.loose());
     }
 
     fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
@@ -777,7 +788,7 @@ impl<
         self.posterior.step_evidence()
     }
 
-    /// Frames used so far.
+    /// Frames taken in so far, those that were put aside included.
     pub fn frames(&self) -> u32 {
         self.sequence.frames
     }

@@ -64,6 +64,7 @@ impl<
         for ((b, _), following) in self.monitors.iter().enumerate().zip(&self.following).filter(|(m, _)| is_ok(m)) {
             sum +=
                 following.chi_square(&following::Expected { variance: expected(b) as f32, ..self.follows(model, b) });
+            readings += f64::from(following.repeats);
             baselines += 1.0;
         }
         for cell in self.past.campaign.cells() {
@@ -71,14 +72,14 @@ impl<
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
             follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-                let (mean, count) = cell.mean(b);
+                let (mean, count @ 1..) = cell.mean(b) else { continue };
                 let (d, _) =
                     self.posterior.gaussian.effective(b, column(self.predicted.prediction.jacobian.as_slice(), N, b));
                 let measured = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
                 let residual =
                     f64::from(measured) - self.posterior.gaussian.baseline(b) - dot(&d, &self.posterior.solution.delta);
                 sum += f64::from(count) * residual * residual / expected(b);
-                readings += f64::from(count);
+                readings += 1.0;
             }
         }
         let degrees_of_freedom = (readings - baselines - layout.params() as f64) as f32;

@@ -190,3 +190,48 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
             && (moved == 0.0 || (0..B).all(|b| moved <= least(libm::sqrt(self.gaussian.baseline_variance(b)) as f32)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sizes::Sizes;
+
+    const PRIOR: Prior = Prior { mean: 0.0, sigma: 0.03, lower: -0.06, upper: 0.06 };
+    const RING: Sizes = Sizes::new([1, 0], [0; 2], [2, 2, 0]);
+    const LAYOUT: Layout = Layout { ring: RING, room: RING };
+    const WALK: Walk = Walk { params: 1e-3, baselines: 0.0 };
+
+    fn posterior() -> Posterior<3, 2, 3, 6, 1> {
+        let mut posterior = Posterior::BLANK;
+        posterior.clear();
+        posterior.gaussian.reset(|_| Prior { sigma: 0.003, ..PRIOR }, |_| 0.02);
+        posterior.solve(&LAYOUT, |_| PRIOR);
+        posterior
+    }
+
+    /// Ten minutes at 5 Hz: what waits is never more than a share of the variance, and none of it is lost.
+    #[test]
+    fn a_walk_that_waits_is_walked_in_the_end() {
+        let (mut posterior, mut walks) = (posterior(), 0);
+        for frame in 1..=1000_u16 {
+            posterior.pass::<1>(&WALK, 0.2, &LAYOUT, |_| PRIOR);
+            walks += u32::from(posterior.walk(&WALK, &LAYOUT, |_| PRIOR));
+            let expected = 9e-6 + 1e-6 * 0.2 * f32::from(frame);
+            let share = posterior.solution.sigma[0] * posterior.solution.sigma[0] / expected;
+            assert!((1.0 - AFTER..1.0 + 1e-5).contains(&share), "frame {frame}: {share}");
+        }
+        assert!((100..400).contains(&walks), "{walks}");
+    }
+
+    #[test]
+    fn a_frame_after_a_long_silence_waits_for_the_walk() {
+        let mut posterior = posterior();
+        posterior.pass::<1>(&WALK, 100.0, &LAYOUT, |_| PRIOR);
+        let variance = posterior.solution.sigma.map(|sigma| sigma * sigma);
+        assert!(variance.iter().all(|v| (v / 109e-6 - 1.0).abs() < 1e-5), "{variance:?}");
+        // and no longer than until nothing more is known than the prior says, twice over
+        posterior.pass::<1>(&WALK, 1e6, &LAYOUT, |_| PRIOR);
+        let variance = posterior.solution.sigma[0] * posterior.solution.sigma[0];
+        assert!((variance / (2.0 * 9e-4) - 1.0).abs() < 1e-5, "{variance}");
+    }
+}

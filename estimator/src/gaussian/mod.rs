@@ -131,6 +131,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     /// Add the readings of a frame, of one channel each. What the uncertain linearisation adds to the variance of one is
     /// `sum over i of loose_i d_i^2`, for the derivative `d` of the difference of reading and baseline.
+    #[inline(never)] // four rows and gains on the stack
     pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, loose: &[f64; N]) {
         let (mut staged, mut moves) = (Staged::NONE, Moves::NONE);
         for reading in readings {
