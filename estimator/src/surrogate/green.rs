@@ -689,7 +689,7 @@ fn response_covariance<const C: usize, const M: usize, const N: usize, const Q: 
     covariance: impl Fn(usize) -> [f32; N],
     mut add: impl FnMut(&[f32], &[f32]),
 ) {
-    let pairs = driven.each_ref().map(|driven| both_nodes::<M, Q>(driven));
+    let pairs = driven.each_ref().map(both_nodes::<M, Q>);
     for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
         let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
         let mut row = [0.0; M];

@@ -47,7 +47,7 @@ pub enum Said {
     /// The estimate.
     Full(Box<Heard>),
     /// With setpoints.
-    Short(Short<Setpoints>),
+    Short(Box<Short<Setpoints>>),
 }
 
 impl Said {
@@ -92,7 +92,7 @@ impl<'e> Chip<'e> {
             self.link.form(Form::Short)?;
             self.link.steer(Some(on_wire(feedback)))?;
         }
-        self.link.feedback(sequence, wire).map(Said::Short)
+        self.link.feedback(sequence, wire).map(|short| Said::Short(Box::new(short)))
     }
 
     /// How the device is.
