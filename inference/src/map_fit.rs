@@ -175,7 +175,8 @@ impl Objective for Problem<'_> {
         }
         let (cost, quadratic) = normal.eliminated();
         let here = DVector::zeros(prior.len());
-        let baselines: Vec<Option<f64>> = (0..self.campaign.monitors()).map(|b| normal.baseline(b, &here)).collect();
+        let baselines: Vec<Option<f64>> =
+            (0..self.campaign.channels()).map(|channel| normal.baseline(channel, &here)).collect();
         let orbit = self.campaign.rms_by_plane(&baselines);
         Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.tunes }))
     }
@@ -191,21 +192,27 @@ impl Problem<'_> {
         let campaign = self.campaign;
         let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
         let count = 2 + campaign.supplies.len();
-        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), count, 0.0);
+        let mut normal = Normal::new(&campaign.prior, params, campaign.channels(), count, 0.0);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for (b, slopes) in slopes.iter().enumerate() {
             let terms = campaign.terms(b);
             let frames: Vec<usize> = (0..campaign.frames()).filter(|&i| campaign.counts(i, b)).collect();
             let residual = campaign.readings.column(b) - orbits.column(b);
-            let mut readings = vec![(b, Weighed::none(count)); campaign.frames()];
+            let none = |i: usize| (campaign.channel(i, b), Weighed::none(count));
+            let mut readings: Vec<(usize, Weighed)> = (0..campaign.frames()).map(none).collect();
             for &i in &frames {
                 readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], campaign.noise(b).powi(-2));
             }
             normal.add(slopes, &readings);
             if campaign.is_ok(b) {
                 let expected = campaign.recording.header.noise[b];
-                let of_monitor = chi_square(&residual.select_rows(&frames), &terms.select_columns(&frames), expected);
-                (chi2, freedom) = (chi2 + of_monitor.0, freedom + of_monitor.1);
+                for time in 0..campaign.times.count() {
+                    let frames: Vec<usize> =
+                        frames.iter().copied().filter(|&i| campaign.times.of_frame[i] == time).collect();
+                    let of_monitor =
+                        chi_square(&residual.select_rows(&frames), &terms.select_columns(&frames), expected);
+                    (chi2, freedom) = (chi2 + of_monitor.0, freedom + of_monitor.1);
+                }
             }
         }
         (normal, (chi2, freedom))

@@ -135,18 +135,24 @@ impl Readings {
         let (repeats, drives) = (reduced.repeats(), reduced.campaign.ring.correctors.len() + 1);
         let of_monitor = |b: usize| {
             let terms = reduced.campaign.terms(b);
-            let (mut gram, mut common) = (DMatrix::zeros(drives, drives), Common::new(drives, terms.nrows(), 0.0));
+            let mut form = Form::new(drives);
+            let times = &reduced.campaign.times;
+            let mut common = vec![Common::new(drives, terms.nrows(), 0.0); times.count()];
             for (frame, &repeats) in repeats.iter().enumerate() {
                 let Some(reading) = reduced.reading(frame, b) else { continue };
                 let k = reduced.drive(frame);
                 // repeats share the error: their mean has the variance of one over n, plus all of it
                 let w = 1.0 / (reduced.noise(b).powi(2) + model.stated_error(b).powi(2) * repeats as f64);
-                gram.ger(w, &k, &k, 1.0);
-                common.add(&k.column(0), &Weighed::one(terms.column(frame).as_slice(), reading, w));
+                form.gram.ger(w, &k, &k, 1.0);
+                common[times.of_frame[frame]]
+                    .add(&k.column(0), &Weighed::one(terms.column(frame).as_slice(), reading, w));
             }
-            let Eliminated { columns, moment, square } = common.eliminated();
-            gram.gemm(-1.0, &columns, &columns.transpose(), 1.0);
-            Form { gram, moment, square }
+            for Eliminated { columns, moment, square } in common.iter().map(Common::eliminated) {
+                form.gram.gemm(-1.0, &columns, &columns.transpose(), 1.0);
+                form.moment += moment;
+                form.square += square;
+            }
+            form
         };
         reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes)
     }

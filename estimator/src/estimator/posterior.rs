@@ -59,6 +59,9 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
 }
 
 impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> Posterior<K, N, T, U, W> {
+    /// Channels of the monitors; those of the tune meter follow.
+    const BASELINES: usize = K - 2;
+
     /// Memory for one, all zero.
     pub const BLANK: Self = Self {
         gaussian: Gaussian::BLANK,
@@ -85,24 +88,24 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     pub fn solve(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior) {
         self.unsolved |= !self.solution.solve(&self.gaussian, prior);
         let ([x, y], first) = (layout.ring.monitors.map(usize::from), layout.first_vertical());
-        self.orbit = [self.gaussian.orbit(0, x), self.gaussian.orbit(first, first + y)];
+        // where times in the cycle have baselines of their own, the largest orbit
+        let (monitors, [mut in_x, mut in_y]) = (first + usize::from(layout.room.monitors[1]), [0.0_f32; 2]);
+        for at in (0..Self::BASELINES).step_by(monitors.max(1)) {
+            in_x = in_x.max(self.gaussian.orbit(at, at + x));
+            in_y = in_y.max(self.gaussian.orbit(at + first, at + first + y));
+        }
+        self.orbit = [in_x, in_y];
     }
 
     /// Let params and baselines walk for a time [s]; false if nothing has to.
     #[inline(never)]
-    pub fn walk<const B: usize>(
-        &mut self,
-        walk: &Walk,
-        seconds: f32,
-        layout: &Layout,
-        prior: impl Fn(usize) -> Prior + Copy,
-    ) -> bool {
+    pub fn walk(&mut self, walk: &Walk, seconds: f32, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) -> bool {
         if seconds <= 0.0 || *walk == Walk::NONE {
             return false;
         }
         self.walked += f64::from(seconds);
         let variance = |noise: f32| noise * noise * seconds;
-        self.gaussian.spread_baselines(variance(walk.baselines).into(), B);
+        self.gaussian.spread_baselines(variance(walk.baselines).into(), Self::BASELINES);
         let step = variance(walk.params);
         if step > 0.0 {
             // After a long silence a var is unknown, but not more than the range of the prior allows.
@@ -136,11 +139,11 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     /// right one of 24 candidates, all of them as probable, 3 sigma off after a step of 2 %. With the root of the probability it is
     /// 1.5 sigma, and 2 for one of probability 0.01.
     #[inline(never)]
-    pub fn let_loose<const B: usize>(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+    pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
         self.drift.weigh(&self.gaussian, libm::exp(self.narrowed).max(1.0));
         let Some(step) = self.drift.found() else { return };
         let probability = |i: usize| step.probability.get(i).copied().unwrap_or(0.0);
-        self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), B);
+        self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), Self::BASELINES);
         self.spread(|i| libm::sqrtf(probability(i)) * prior(i).sigma * prior(i).sigma, layout, prior);
         self.drift.clear();
         (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
@@ -154,7 +157,7 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     }
 
     /// True while all frames so far have seen the same ring, and the same baselines.
-    pub fn is_still<const B: usize>(&self, walk: &Walk) -> bool {
+    pub fn is_still(&self, walk: &Walk) -> bool {
         if self.stepped {
             return false;
         }
@@ -163,6 +166,7 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         let moved = walk.baselines * time;
         let least = |sigma: f32| WALKED * sigma;
         self.solution.sigma.iter().all(|sigma| walked <= least(*sigma))
-            && (moved == 0.0 || (0..B).all(|b| moved <= least(libm::sqrt(self.gaussian.baseline_variance(b)) as f32)))
+            && (moved == 0.0
+                || (0..Self::BASELINES).all(|b| moved <= least(libm::sqrt(self.gaussian.baseline_variance(b)) as f32)))
     }
 }

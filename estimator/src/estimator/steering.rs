@@ -28,7 +28,9 @@ impl<
         frame: &Frame<B, C, F, W>,
         estimate: &Estimate<B, N, W>,
     ) -> Steered {
-        state.steer(feedback, &self.response(model), frame, estimate)
+        // a frame that was taken in is within the ramp
+        let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
+        state.steer(feedback, &self.response(model, momentum), frame, estimate)
     }
 
     /// What can be done for the feedback between frames; after [`Estimator::prepare`]. See [`Steer::prepare`].
@@ -38,14 +40,16 @@ impl<
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
     ) -> bool {
-        state.prepare(feedback, &self.response(model), |i| self.posterior.solution.covariance_row(i))
+        // gains are made in kicks, whatever ampere makes them
+        state.prepare(feedback, &self.response(model, 1.0), |i| self.posterior.solution.covariance_row(i))
     }
 
-    fn response<'a>(&'a self, model: &Model<'a, G, B, C, F>) -> Response<'a, G, B, C, F, N> {
+    fn response<'a>(&'a self, model: &Model<'a, G, B, C, F>, momentum: f32) -> Response<'a, G, B, C, F, N> {
         Response {
             surrogate: model.surrogate,
             at: &self.tangent.linearised,
             kick_per_ampere: &model.setup.calibration.kick_per_ampere,
+            momentum,
         }
     }
 }

@@ -9,7 +9,8 @@ use crate::estimate::Estimate;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum Hold {
-    /// The first frame, or the first after too long a silence: where the correctors and the orbit are is only learnt by it.
+    /// The first frame, the first after too long a silence, or the first of another time in the cycle: where the correctors and the
+    /// orbit are is only learnt by it.
     Stale,
     /// The frame was put aside: no beam, or one that the model does not know.
     PutAside,

@@ -9,6 +9,7 @@ mod meter;
 mod normal;
 mod screen;
 mod setting;
+mod times;
 
 use core::f64::consts::FRAC_1_SQRT_2;
 
@@ -29,6 +30,7 @@ pub(crate) use normal::Normal;
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
+pub use times::Times;
 
 /// A recording and what follows from it before any fit.
 #[derive(Debug, Clone)]
@@ -49,6 +51,8 @@ pub struct Campaign {
     pub supplies: Vec<f64>,
     /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
     pub fluctuation: DMatrix<f64>,
+    /// Frames grouped by their time in the cycle.
+    pub times: Times,
     /// Frames grouped by setting.
     pub settings: Settings,
     /// Readings as recorded, rows frames, columns monitors; not a number where a monitor did not report [m].
@@ -61,7 +65,7 @@ pub struct Campaign {
     pub screened: Screened,
     /// The params that the screening ends with: a first guess.
     pub params: DVector<f64>,
-    /// Each monitor's baseline at these [B] [m]; none without readings.
+    /// Each monitor's baseline at these [B] [m], for each time in the cycle; none without readings.
     pub baselines: Vec<Option<f64>>,
     /// Rms of these in x and y [m].
     pub orbit: [f64; 2],
@@ -87,7 +91,8 @@ impl Campaign {
         let held = Machine::new(ring.clone(), Rf::FixedMomentum, &believed).expect("its sites are resolved");
         let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
         let supplies = drive::mean_supplies(&drives);
-        let settings = Settings::of(&drives, recording.nominal_kick());
+        let times = Times::of(recording);
+        let settings = Settings::of(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
         let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
@@ -96,8 +101,9 @@ impl Campaign {
             prior: &prior,
             drives: &drives,
             supplies: &supplies,
+            times: &times,
             settings: &settings,
-            groups: Groups::of(&drives, &settings),
+            groups: Groups::of(&drives, &times, &settings),
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
@@ -122,6 +128,7 @@ impl Campaign {
             prior,
             drives,
             supplies,
+            times,
             settings,
             readings,
             tunes,
@@ -142,6 +149,16 @@ impl Campaign {
     /// Number of monitors.
     pub fn monitors(&self) -> usize {
         self.readings.ncols()
+    }
+
+    /// Number of baselines: one for each monitor and time in the cycle.
+    pub(crate) fn channels(&self) -> usize {
+        self.times.count() * self.monitors()
+    }
+
+    /// Which of them a reading has.
+    pub(crate) fn channel(&self, frame: usize, b: usize) -> usize {
+        self.times.of_frame[frame] * self.monitors() + b
     }
 
     /// True if a reading counts.
@@ -226,9 +243,11 @@ fn tunes(recording: &Recording) -> DMatrix<f64> {
 
 /// Rms of the baselines that are known, in x and y [m].
 fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
-    let (x, y) = baselines.split_at(ring.horizontal_monitors());
-    [x, y].map(|baselines| {
-        let squares: Vec<f64> = baselines.iter().flatten().map(|x| x * x).collect();
+    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
+    [0, 1].map(|plane| {
+        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
+        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
+        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
         (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
     })
 }
