@@ -10,22 +10,27 @@ use crate::ramp::{TIMES, is_same_time, milliseconds};
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
-/// Times in the cycle that have baselines [us], in the order in which they came; none without a ramp.
+/// Times in the cycle that have baselines; none without a ramp.
 #[derive(Debug, Clone)]
-pub(super) struct Times(Vec<u32, TIMES>);
+pub(super) struct Times {
+    /// In the order in which they came [us].
+    known: Vec<u32, TIMES>,
+    /// Root of their number: by this factor the error of an RF offset grows that all times share, and each counts by itself.
+    pub root: f32,
+}
 
 impl Times {
     /// None so far.
-    pub const NONE: Self = Self(Vec::new());
+    pub const NONE: Self = Self { known: Vec::new(), root: 1.0 };
 
     /// Which one a time in the cycle is [us].
     fn index(&self, time_us: u32) -> Option<usize> {
-        self.0.iter().position(|known| is_same_time(*known, time_us))
+        self.known.iter().position(|known| is_same_time(*known, time_us))
     }
 
     /// How many sets of baselines are in use.
     pub fn count(&self) -> usize {
-        self.0.len().max(1)
+        self.known.len().max(1)
     }
 }
 
@@ -51,7 +56,7 @@ impl<
         model: &Model<'_, G, B, C, F>,
         frame: &Frame<B, C, F, W>,
     ) -> Result<(), IngestError> {
-        let Times(known) = &self.times;
+        let known = &self.times.known;
         let time_us = frame.cycle_time_us;
         if !model.setup.calibration.ramp.is_given()
             || known.len() < Self::TIMES.min(TIMES)
@@ -68,7 +73,8 @@ impl<
     pub(super) fn note_time(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
         if model.setup.calibration.ramp.is_given() && self.times.index(frame.cycle_time_us).is_none() {
             // there is room: it was checked
-            let _ = self.times.0.push(frame.cycle_time_us);
+            let _ = self.times.known.push(frame.cycle_time_us);
+            self.times.root = libm::sqrtf(self.times.count() as f32);
         }
         self.predicted.first_channel = self.first_channel(frame.cycle_time_us);
     }
@@ -80,6 +86,6 @@ impl<
 
     /// Time in the cycle by which a frame's setting is known [us]: that of its baselines.
     pub(super) fn setting_time(&self, time_us: u32) -> u32 {
-        self.times.index(time_us).and_then(|index| self.times.0.get(index)).copied().unwrap_or(time_us)
+        self.times.index(time_us).and_then(|index| self.times.known.get(index)).copied().unwrap_or(time_us)
     }
 }

@@ -358,7 +358,7 @@ fn no_setpoint_moves_faster_than_its_rate_and_the_direction_stays() {
 #[test]
 fn each_reason_holds() {
     type Change = fn(&mut Machine);
-    let reasons: [(Change, Hold); 6] = [
+    let reasons: [(Change, Hold); 7] = [
         (|m| m.time_us += 2_000_000, Hold::Stale),
         (|m| m.time_us -= 150_000, Hold::Stale),
         (|m| m.cycle_time_us += 20_000, Hold::Stale),

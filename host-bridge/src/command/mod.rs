@@ -169,7 +169,9 @@ fn campaign(ring: &Ring, recording: &Recording) -> Result<Campaign, CommandError
         let header = &recording.header;
         let mean = |f: usize| recording.rows.iter().map(|row| row.supply[f]).sum::<f64>() / recording.rows.len() as f64;
         let away = |f: &usize| (mean(*f) / header.nominal[*f]).ln().abs();
-        let furthest = (0..header.nominal.len()).max_by(|one, other| away(one).total_cmp(&away(other)));
+        // along a ramp no supply stays at its nominal current
+        let steady = if header.ramp.is_given() { 0 } else { header.nominal.len() };
+        let furthest = (0..steady).max_by(|one, other| away(one).total_cmp(&away(other)));
         let supply = furthest.map_or_else(String::new, |f| {
             let name = &recording.powered(ring).supplies[f].name;
             format!("; supply {name} is at {:.1} A, its nominal current is {:.1} A", mean(f), header.nominal[f])

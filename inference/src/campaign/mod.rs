@@ -23,10 +23,11 @@ use crate::recording::Recording;
 pub use common::chi_square;
 pub(crate) use common::{Common, Eliminated, Weighed};
 pub use drive::{Drive, supplies_of};
-pub(crate) use linear::Linearised;
+pub(crate) use linear::AtTimes;
+use linear::Linearised;
 pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::Normal;
+pub(crate) use normal::{Normal, Terms};
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
@@ -151,16 +152,6 @@ impl Campaign {
         self.readings.ncols()
     }
 
-    /// Number of baselines: one for each monitor and time in the cycle.
-    pub(crate) fn channels(&self) -> usize {
-        self.times.count() * self.monitors()
-    }
-
-    /// Which of them a reading has.
-    pub(crate) fn channel(&self, frame: usize, b: usize) -> usize {
-        self.times.of_frame[frame] * self.monitors() + b
-    }
-
     /// True if a reading counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
         self.screened.accepted[(frame, b)]
@@ -191,17 +182,20 @@ impl Campaign {
         following
     }
 
-    /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline, how it follows each supply,
-    /// and the dispersion of the unknown misalignments at the frame's RF offset; but for the first in standard deviations [m].
+    /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline at its time in the cycle and
+    /// 0 for those at others, then how it follows each supply, and the dispersion of the unknown misalignments at the frame's RF offset;
+    /// these in standard deviations [m].
     pub(crate) fn terms(&self, b: usize) -> DMatrix<f64> {
         let plane = self.plane(b);
         // `spurious` is stated for offsets of which two opposite ones are taken for independent
         let spurious = self.spurious[plane] * self.orbit[plane] * FRAC_1_SQRT_2;
         let following = self.following(b).transpose();
-        let mut terms = DMatrix::from_element(following.nrows() + 2, self.frames(), 1.0);
-        terms.rows_mut(1, following.nrows()).copy_from(&following);
+        let times = self.times.count();
+        let mut terms = DMatrix::zeros(times + following.nrows() + 1, self.frames());
+        self.times.of_frame.iter().enumerate().for_each(|(i, time)| terms[(*time, i)] = 1.0);
+        terms.rows_mut(times, following.nrows()).copy_from(&following);
         let offsets = self.drives.iter().map(|drive| spurious * drive.rf_offset);
-        terms.row_mut(1 + following.nrows()).iter_mut().zip(offsets).for_each(|(to, offset)| *to = offset);
+        terms.row_mut(times + following.nrows()).iter_mut().zip(offsets).for_each(|(to, offset)| *to = offset);
         terms
     }
 

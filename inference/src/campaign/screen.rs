@@ -13,7 +13,7 @@ use twin::{Machine, OrbitError, Ring};
 use super::common::Weighed;
 use super::drive::{self, Drive};
 use super::linear::Linearised;
-use super::normal::Normal;
+use super::normal::{Normal, Terms};
 use super::rms_by_plane;
 use super::setting::Settings;
 use super::times::Times;
@@ -69,8 +69,10 @@ pub(super) struct Seen {
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f64 = 0.02;
-/// The baseline is the only common term of a monitor's readings: how it follows the supplies is small beside the gate.
+/// The baseline is the only common term of a monitor's readings at one time in the cycle: how it follows the supplies is small beside
+/// the gate.
 const TERMS: [f64; 1] = [1.0];
+const COMMON: Terms = Terms { count: 1, baselines: 1, precision: 1.0 / (BASELINE * BASELINE) };
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f64 = 1.0;
 /// Growth of chi-square that counts as uphill.
@@ -164,7 +166,7 @@ impl Screener<'_> {
         }
         screening.drop_stuck();
         let Screening { accepted, monitors, model, best, normal, .. } = screening;
-        let baselines = self.baselines(&normal, &best.step);
+        let baselines = normal.baselines(&best.step);
         let health = monitors.iter().map(Monitor::health).collect();
         Ok(Seen { screened: Screened { accepted, health }, params: model.params + best.step, baselines })
     }
@@ -177,10 +179,6 @@ impl Screener<'_> {
     /// Which of them a reading has.
     fn channel(&self, frame: usize, b: usize) -> usize {
         self.times.of_frame[frame] * self.noise.len() + b
-    }
-
-    fn baselines(&self, normal: &Normal, step: &DVector<f64>) -> Vec<Option<f64>> {
-        (0..self.channels()).map(|channel| normal.baseline(channel, step)).collect()
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
@@ -209,7 +207,7 @@ impl<'c> Screening<'c> {
     fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
         let (frames, monitors) = (of.drives.len(), of.noise.len());
         let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
-        let normal = Normal::new(of.prior, &model.params, of.channels(), TERMS.len(), BASELINE.powi(-2));
+        let normal = Normal::new(of.prior, &model.params, of.channels(), COMMON);
         let expecting = |sigma: &f64| {
             let mut monitor = Monitor::BLANK;
             monitor.expect(*sigma as f32);
@@ -346,7 +344,9 @@ impl<'c> Screening<'c> {
     fn variance(&self, frame: usize, b: usize) -> f64 {
         let plane = usize::from(b >= self.of.ring.horizontal_monitors());
         let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
-        f64::from(self.monitors[b].variance()) + self.of.sharing[frame] * shared * shared
+        // frames of one RF offset share it, and so do those of all times in the cycle
+        let sharing = self.of.sharing[frame] * self.of.times.count() as f64;
+        f64::from(self.monitors[b].variance()) + sharing * shared * shared
     }
 
     fn weighed(&self, frame: usize, b: usize) -> Weighed {
@@ -398,8 +398,7 @@ impl<'c> Screening<'c> {
     /// The normal equations of the accepted readings of the first frames.
     fn rebuild(&mut self, frames: usize) {
         let monitors = self.monitors.len();
-        let channels = self.of.channels();
-        self.normal = Normal::new(self.of.prior, &self.model.params, channels, TERMS.len(), BASELINE.powi(-2));
+        self.normal = Normal::new(self.of.prior, &self.model.params, self.of.channels(), COMMON);
         for b in 0..monitors {
             let none = |time: &usize| (time * monitors + b, Weighed::none(TERMS.len()));
             let mut sums: Vec<(usize, Weighed)> = self.of.groups.times.iter().map(none).collect();
@@ -434,7 +433,7 @@ impl Best {
         let (cost, quadratic) = normal.eliminated();
         let factor = quadratic.factor().expect("a prior's precision is positive");
         let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
-        let baselines = of.baselines(normal, &step);
+        let baselines = normal.baselines(&step);
         Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost }
     }
 }

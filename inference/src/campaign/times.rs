@@ -1,6 +1,8 @@
 //! The times in the cycle at which the frames of a recording were read. Along a ramp each has baselines of its own: fields that the
 //! momentum does not scale, remanent ones above all, turn a beam of lower momentum by more.
 
+use core::fmt;
+
 use crate::recording::Recording;
 
 /// The frames by their time in the cycle.
@@ -34,5 +36,17 @@ impl Times {
     /// How many there are.
     pub fn count(&self) -> usize {
         self.known.len().max(1)
+    }
+
+    /// The times [ms], to the microsecond.
+    pub fn milliseconds(&self) -> Vec<f64> {
+        self.known.iter().map(|time| (time * 1e6).round() / 1e3).collect()
+    }
+}
+
+impl fmt::Display for Times {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let each: Vec<String> = self.milliseconds().iter().map(f64::to_string).collect();
+        write!(f, "{} ms", each.join(", "))
     }
 }
