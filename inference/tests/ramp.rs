@@ -224,6 +224,8 @@ impl Fitted {
             let theta = (self.core[i] - self.batch.map_params[i]).abs() / sigma(i);
             [theta, (self.core_covariance[(i, i)].sqrt() / sigma(i) - 1.0).abs()]
         });
+        let rms = (0..48).map(|i| ((self.core[i] - self.batch.map_params[i]) / sigma(i)).powi(2)).sum::<f64>() / 48.0;
+        print!(" rms {:.3} ", rms.sqrt());
         each.fold([0.0; 2], |most, this| [most[0].max(this[0]), most[1].max(this[1])])
     }
 

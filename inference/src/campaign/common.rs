@@ -72,7 +72,8 @@ impl Common {
     /// Add readings that share `x`.
     pub fn add(&mut self, x: &DVectorView<f64>, readings: &Weighed) {
         self.moments += &readings.0;
-        self.slope.ger(1.0, x, &readings.0.column(0), 1.0);
+        // the coefficient of one baseline is 1
+        (0..self.baselines).for_each(|time| self.slope.ger(1.0, x, &readings.0.column(time), 1.0));
     }
 
     fn terms(&self) -> usize {
