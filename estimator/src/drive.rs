@@ -28,8 +28,13 @@ impl<const L: usize> Each<L> {
 
     /// True if there is none, or one for each, and all are numbers above 0.
     pub fn is_positive(&self) -> bool {
-        let is_positive = |v: &f32| v.is_finite() && *v > 0.0;
-        is_positive(&self.all) && self.own.iter().all(is_positive) && (self.own.is_empty() || self.own.is_full())
+        self.is_finite() && self.all > 0.0 && self.own.iter().all(|v| *v > 0.0)
+    }
+
+    /// True if there is none, or one for each, and all are numbers.
+    pub fn is_finite(&self) -> bool {
+        let has_all = self.own.is_empty() || self.own.is_full();
+        has_all && self.all.is_finite() && self.own.iter().all(|v| v.is_finite())
     }
 }
 

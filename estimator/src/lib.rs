@@ -41,7 +41,7 @@ pub use prior::{Marginal, Prior};
 pub use ramp::{RAMP_POINTS, Ramp, RampPoint};
 pub use sizes::{Layout, Sizes, largest};
 pub use steer::{Feedback, Hold, Response, Steer, Steered};
-pub use stream::Core;
+pub use stream::{Core, Steering};
 pub use surrogate::{Prediction, Steerable, Surrogate, Tables};
 pub use triangle::Triangle;
 pub use wire::packet;

@@ -10,20 +10,54 @@ use nalgebra::{ArrayStorage, SMatrix};
 pub trait Real: Copy + PartialEq + Add<Output = Self> + AddAssign + Mul<Output = Self> + Sum + 'static {
     /// 0.
     const ZERO: Self;
+
+    /// The nearest to a number of double precision.
+    fn nearest(value: f64) -> Self;
+
+    /// In double precision.
+    fn double(self) -> f64;
 }
 
 impl Real for f32 {
     const ZERO: Self = 0.0;
+
+    fn nearest(value: f64) -> Self {
+        value as Self
+    }
+
+    fn double(self) -> f64 {
+        self.into()
+    }
 }
 
 impl Real for f64 {
     const ZERO: Self = 0.0;
+
+    fn nearest(value: f64) -> Self {
+        value
+    }
+
+    fn double(self) -> f64 {
+        self
+    }
 }
 
 /// `to += factor * from`.
-#[inline]
+#[inline(never)] // inlined for one length it becomes a line of code for each entry
 pub fn add<R: Real>(to: &mut [R], factor: R, from: &[R]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * *from);
+}
+
+/// [`add`] to numbers of another precision: `to` is rounded once.
+#[inline(never)]
+pub fn add_rounded<R: Real>(to: &mut [R], factor: f64, from: &[f64]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to = R::nearest(to.double() + factor * from));
+}
+
+/// `to -= from` of another precision.
+#[inline(never)]
+pub fn subtract<R: Real>(to: &mut [f64], from: &[R]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to -= from.double());
 }
 
 /// `to += sum of factor * row`, four rows at a time.
@@ -97,7 +131,7 @@ fn two_by_four<R: Real>(one: &mut [R], other: &mut [R], factors: [[R; 4]; 2], ro
 }
 
 /// Scalar product, summed in eight lanes; entries of one beyond the other's end are ignored.
-#[inline]
+#[inline(never)]
 pub fn dot<R: Real>(a: &[R], b: &[R]) -> R {
     let shared = a.len().min(b.len());
     let (Some(a), Some(b)) = (a.get(..shared), b.get(..shared)) else { return R::ZERO };

@@ -78,6 +78,7 @@ macro_rules! machine {
             Answer::MAX_BYTES,
             $crate::wire::link::Short::<Setpoints>::MAX_BYTES,
             Setup::MAX_BYTES,
+            Feedback::MAX_BYTES,
             Parcel::MAX_BYTES,
             $crate::wire::link::OTHER_BYTES,
         ]));
@@ -132,7 +133,7 @@ macro_rules! machine {
         /// A part of its tables.
         pub type Parcel = $crate::Parcel<LINE>;
         /// A request of its host.
-        pub type Request = $crate::wire::link::Request<Setup, Parcel>;
+        pub type Request = $crate::wire::link::Request<Setup, Parcel, Feedback>;
         /// Setpoints of its correctors.
         pub type Setpoints = $crate::wire::link::Setpoints<CORRECTORS>;
         /// A reply of its device.

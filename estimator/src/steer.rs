@@ -24,6 +24,8 @@ mod supplies;
 #[cfg(test)]
 mod tests;
 
+use serde::{Deserialize, Serialize};
+
 use crate::drive::{Drive, Each};
 use crate::estimate::{Estimate, MonitorState};
 use crate::linear::dot;
@@ -38,10 +40,10 @@ use hold::Watch;
 use supplies::Supplies;
 
 /// What is wanted of the orbit, and what the correctors may do; read only.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Feedback<const B: usize, const C: usize> {
     /// Wanted reading of each monitor [m].
-    pub orbit: [f32; B],
+    pub orbit: Each<B>,
     /// Share of a new orbit that is believed in one frame, 0 to 1: the low-pass against the noise of the readings.
     pub gain: f32,
     /// Kick of one corrector in one frame that costs as much as an orbit of one standard deviation at one monitor [rad].
@@ -65,10 +67,11 @@ impl<const B: usize, const C: usize> Feedback<B, C> {
     /// True if every number is one, and every size positive.
     pub fn is_sound(&self) -> bool {
         let sizes = [self.gain, self.step_kick, self.total_kick, self.rate, self.close];
-        self.orbit.iter().all(|x| x.is_finite())
+        self.orbit.is_finite()
             && sizes.iter().all(|v| v.is_finite() && *v > 0.0)
             && self.gain <= 1.0
             && self.probe.is_finite()
+            && self.probe >= 0.0
             && self.limit.is_positive()
     }
 
@@ -92,7 +95,7 @@ pub struct Response<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize
 }
 
 /// What is to be said of a frame's correction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[must_use]
 pub struct Steered {
     /// Why the setpoints stay as they were; none if they were moved.
@@ -139,6 +142,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     Response<'a, G, B, C, F, N>
 {
     /// The orbit that kicks make [m].
+    #[inline(never)]
     fn orbit(&self, kick: [f32; C]) -> [f32; B] {
         self.orbit_of(&Drive { kick, strength: [0.0; F], rf_offset: 0.0 })
     }
@@ -155,6 +159,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     }
 
     /// `R^T orbit` [m^2/rad].
+    #[inline(never)]
     fn pull(&self, orbit: &[f32; B]) -> [f32; C] {
         let mut pull = [0.0; C];
         self.surrogate.pull(self.at, orbit, &mut pull);
@@ -167,6 +172,7 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
     }
 
     /// Currents as kicks [rad].
+    #[inline(never)]
     fn kicks(&self, mut current: [f32; C]) -> [f32; C] {
         current.iter_mut().enumerate().for_each(|(c, current)| *current *= self.kick(c));
         current
@@ -310,9 +316,9 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
         self.heard = self.heard.saturating_add(1);
         let gain = feedback.gain.max(1.0 / f32::from(self.heard));
-        let each = self.residual.iter_mut().zip(reading).zip(&feedback.orbit).enumerate();
-        for (_, ((residual, reading), wanted)) in each.filter(|(b, _)| counts(*b)) {
-            *residual += gain * (reading.value() - wanted - *residual);
+        let each = self.residual.iter_mut().zip(reading).enumerate();
+        for (b, (residual, reading)) in each.filter(|(b, _)| counts(*b)) {
+            *residual += gain * (reading.value() - feedback.orbit.of(b) - *residual);
         }
     }
 
@@ -332,6 +338,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     }
 
     /// `W r`, less what is of momentum.
+    #[inline(never)]
     fn weighted(&self, orbit: &[f32; B]) -> [f32; B] {
         let off_momentum = dot(&self.momentum, orbit);
         let mut weighted = *orbit;
@@ -399,8 +406,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         let (pull_x, pull_y) = pull.split_at(CX.min(C));
         let mut step = [0.0; C];
         let (step_x, step_y) = step.split_at_mut(CX.min(C));
-        self.x.step(pull_x, room, rate, step_x);
-        self.y.step(pull_y, |c| room(CX + c), |c| rate(CX + c), step_y);
+        self.x.step(pull_x, &room, &rate, 0, step_x);
+        self.y.step(pull_y, &room, &rate, CX, step_y);
         step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick(c));
         self.supplies.change(&step, |c| feedback.edge(c))
     }

@@ -1,4 +1,4 @@
-//! The interface of a core to the loop around it, independent of its sizes.
+//! The interfaces of a core, and of a feedback on it, to the loop around them, independent of their sizes.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -6,9 +6,10 @@ use serde::de::DeserializeOwned;
 use crate::estimate::Estimate;
 use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
 use crate::sizes::Sizes;
-use crate::surrogate::{Surrogate, Tables, Unstable};
-use crate::wire::Frame;
-use crate::wire::link::{Answer, Setpoints, Short};
+use crate::steer::{Feedback, Steer, Steered};
+use crate::surrogate::{Steerable, Surrogate, Tables, Unstable};
+use crate::wire::link::{Answer, Correction, Setpoints, Short};
+use crate::wire::{Frame, listed};
 
 /// A core with its types; see [`Estimator`] for what each method does.
 #[allow(missing_docs)] // those of `Estimator`
@@ -21,8 +22,8 @@ pub trait Core: Sized {
     type Estimate;
     /// The same on the wire.
     type Answer: Serialize + DeserializeOwned + for<'e> From<&'e Self::Estimate>;
-    /// Setpoints of the correctors, or none.
-    type Setpoints: Serialize + DeserializeOwned + Default;
+    /// Setpoints of the correctors.
+    type Setpoints: Serialize + DeserializeOwned;
 
     /// Memory for one, all zero.
     const BLANK: Self;
@@ -47,10 +48,33 @@ pub trait Core: Sized {
     fn covariance(&self, i: usize, j: usize) -> f32;
     /// Number of the frame that an estimate is of.
     fn sequence(estimate: &Self::Estimate) -> u32;
-    /// What feedback needs of an estimate, with setpoints; `mismatch` is for the caller to know.
-    fn short(estimate: &Self::Estimate, mismatch: bool, setpoints: Self::Setpoints) -> Short<Self::Setpoints>;
+    /// What feedback needs of an estimate, with a correction if there is one.
+    fn short(estimate: &Self::Estimate, correction: Option<Correction<Self::Setpoints>>) -> Short<Self::Setpoints>;
     /// True if an operator should look: a monitor is not ok, or a var is clipped.
     fn needs_attention(estimate: &Self::Estimate) -> bool;
+}
+
+/// A feedback on a core; see [`Steer`] for what each method does.
+#[allow(missing_docs)] // those of `Steer` and of `Estimator`
+pub trait Steering<E: Core>: Sized {
+    /// What is wanted of the orbit, and what the correctors may do.
+    type Feedback: Clone + Serialize + DeserializeOwned;
+
+    /// Memory for one, all zero: it begins with the first frame.
+    const BLANK: Self;
+
+    fn is_sound(feedback: &Self::Feedback) -> bool;
+    /// Bytes to estimate to setpoints. See [`Estimator::ingest_and_steer`].
+    fn ingest(
+        &mut self,
+        core: &mut E,
+        model: (&E::Tables, &E::Setup),
+        feedback: &Self::Feedback,
+        bytes: &mut [u8],
+    ) -> Result<(E::Estimate, Steered), IngestError>;
+    /// See [`Estimator::prepare_steer`].
+    fn prepare(&mut self, core: &E, model: (&E::Tables, &E::Setup), feedback: &Self::Feedback) -> bool;
+    fn setpoints(&self) -> E::Setpoints;
 }
 
 impl<
@@ -116,13 +140,62 @@ impl<
         estimate.sequence
     }
 
-    fn short(e: &Self::Estimate, mismatch: bool, setpoints: Self::Setpoints) -> Short<Self::Setpoints> {
+    fn short(e: &Self::Estimate, correction: Option<Correction<Self::Setpoints>>) -> Short<Self::Setpoints> {
         let attention = Self::needs_attention(e);
-        Short { sequence: e.sequence, remarks: e.remarks, mismatch, attention, nis: e.nis, setpoints }
+        Short { sequence: e.sequence, remarks: e.remarks, attention, nis: e.nis, correction }
     }
 
     fn needs_attention(estimate: &Self::Estimate) -> bool {
         let is_faulty = |h: &crate::estimate::Health| h.state != crate::estimate::MonitorState::Ok;
         estimate.health.iter().any(is_faulty) || !estimate.clipped.is_empty()
+    }
+}
+
+impl<
+    G: Steerable<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const U: usize,
+    const W: usize,
+    const CX: usize,
+    const CY: usize,
+    const TX: usize,
+    const TY: usize,
+> Steering<Estimator<G, B, C, F, N, S, K, T, U, W>> for Steer<B, C, CX, CY, TX, TY>
+{
+    type Feedback = Feedback<B, C>;
+
+    const BLANK: Self = Self::BLANK;
+
+    fn is_sound(feedback: &Self::Feedback) -> bool {
+        feedback.is_sound()
+    }
+
+    fn ingest(
+        &mut self,
+        core: &mut Estimator<G, B, C, F, N, S, K, T, U, W>,
+        (surrogate, setup): (&G, &Setup<B, C, F>),
+        feedback: &Self::Feedback,
+        bytes: &mut [u8],
+    ) -> Result<(Estimate<B, N, W>, Steered), IngestError> {
+        core.ingest_and_steer(&Model { surrogate, setup }, feedback, self, bytes)
+    }
+
+    fn prepare(
+        &mut self,
+        core: &Estimator<G, B, C, F, N, S, K, T, U, W>,
+        (surrogate, setup): (&G, &Setup<B, C, F>),
+        feedback: &Self::Feedback,
+    ) -> bool {
+        core.prepare_steer(&Model { surrogate, setup }, feedback, self)
+    }
+
+    fn setpoints(&self) -> Setpoints<C> {
+        listed(self.setpoints().iter().copied())
     }
 }

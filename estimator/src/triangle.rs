@@ -161,6 +161,34 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
         }
     }
 
+    /// `L^T L` of a lower triangle, in place: `sum over i >= j of L_ij L_ik` by rows `j`, for which only later rows are needed.
+    #[inline(never)]
+    pub fn square(&mut self) {
+        for j in 0..N {
+            let Some((done, below)) = self.0.split_at_mut_checked(start(j + 1)) else { return };
+            let row = done.get_mut(start(j)..).unwrap_or_default();
+            let own = row.last().copied().unwrap_or(0.0);
+            row.iter_mut().for_each(|l| *l *= own);
+            let below = Rows { rest: below, length: j + 2 };
+            combine(row, below.map(|l| (l.get(j).copied().unwrap_or(0.0), l)));
+        }
+    }
+
+    /// `L x` for a lower triangle, in place.
+    pub fn apply_lower(&self, x: &mut [f64; N]) {
+        for i in (0..N).rev() {
+            let product = dot(self.row(i), x);
+            x.get_mut(i).into_iter().for_each(|x| *x = product);
+        }
+    }
+
+    /// `L^T x` for a lower triangle.
+    pub fn apply_upper(&self, x: &[f64; N]) -> [f64; N] {
+        let mut product = [0.0; N];
+        self.rows().zip(x).for_each(|(row, x)| add(&mut product, *x, row));
+        product
+    }
+
     /// `L x = b` for a lower triangle, in place.
     pub fn solve_lower(&self, x: &mut [f64; N]) {
         for (i, row) in self.rows().enumerate() {
@@ -286,6 +314,20 @@ mod tests {
                 assert!((product - f64::from(u8::from(i == j))).abs() < 1e-13);
             }
         }
+    }
+
+    #[test]
+    fn products_of_a_lower_triangle() {
+        let (_, lower) = example();
+        let l = SMatrix::<f64, 9, 9>::from_fn(|i, j| lower.row(i).get(j).copied().unwrap_or(0.0));
+        let x = SVector::<f64, 9>::from_fn(|i, _| i as f64 - 2.0);
+        let (mut low, mut square) = (x.into(), lower);
+        lower.apply_lower(&mut low);
+        square.square();
+        assert!((SVector::from(low) - l * x).norm() < 1e-12); // rounding
+        assert!((SVector::from(lower.apply_upper(&x.into())) - l.transpose() * x).norm() < 1e-12);
+        let expected = l.transpose() * l;
+        assert!((0..9).all(|i| (0..9).all(|j| (square.get(i, j) - expected[(i, j)]).abs() < 1e-12)));
     }
 
     #[test]

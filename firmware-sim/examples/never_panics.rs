@@ -10,7 +10,7 @@ mod chip {
 
     use embedded_hal::digital;
     use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
-    use estimator::booster::{Estimator, Green, LINE, PACKET};
+    use estimator::booster::{Estimator, Green, LINE, PACKET, Steer};
     use estimator::wire::link::Vitals;
     use firmware_sim::{Device, Panel};
 
@@ -71,16 +71,17 @@ mod chip {
     /// State of a device.
     struct Memory {
         core: Estimator,
+        steer: Steer,
         built_in: Green,
         slot: Green,
     }
 
     #[unsafe(no_mangle)]
     extern "C" fn _start() -> ! {
-        let Memory { core, built_in, slot } = unsafe { &mut *black_box(0x2000_0000 as *mut Memory) };
-        let mut device = Device::<_, LINE>::new(core, built_in, slot);
+        let Memory { core, steer, built_in, slot } = unsafe { &mut *black_box(0x2000_0000 as *mut Memory) };
+        let mut device = Device::<_, _, LINE>::new(core, steer, built_in, slot);
         let mut panel = Panel::new(Anything, Anything, Anything);
-        let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+        let run = firmware_sim::run::<_, _, _, _, LINE, PACKET>;
         let vitals = || black_box(Vitals::default());
         loop {
             let _ = black_box(run(&mut device, &mut Anything, &mut Anything, &mut panel, vitals));

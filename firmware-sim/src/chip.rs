@@ -2,7 +2,7 @@
 
 use estimator::Tables as _;
 use estimator::wire::link::Vitals;
-use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Steer, Tables};
 use firmware_sim::{Device, Panel};
 use static_cell::ConstStaticCell;
 
@@ -12,6 +12,8 @@ use crate::board::{stack, uart, watchdog};
 
 /// The posterior. All zero at first, so that it takes no flash.
 static CORE: ConstStaticCell<Estimator> = ConstStaticCell::new(Estimator::BLANK);
+/// The feedback on it.
+static STEER: ConstStaticCell<Steer> = ConstStaticCell::new(Steer::BLANK);
 /// Room for other tables.
 static SLOT: ConstStaticCell<Tables> = ConstStaticCell::new(Tables::BLANK);
 
@@ -29,7 +31,7 @@ fn main() -> ! {
     let pins = Pins::start();
     let (mut receiver, mut sender) = uart::start(BAUD, &clock);
     let mut panel = Panel::new(pins.heartbeat, pins.attention, watchdog::start(WATCHDOG_S, pins.supervisor));
-    let mut device = Device::<_, LINE>::new(CORE.take(), &BUILT_IN, SLOT.take());
+    let mut device = Device::<_, _, LINE>::new(CORE.take(), STEER.take(), &BUILT_IN, SLOT.take());
     let vitals = || Vitals {
         lost_bytes: uart::lost(),
         cycles: clock.now(),
@@ -37,6 +39,7 @@ fn main() -> ! {
         ..Vitals::default()
     };
     defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest::<LINE>());
-    let ended = firmware_sim::run::<_, _, _, LINE, PACKET>(&mut device, &mut receiver, &mut sender, &mut panel, vitals);
+    let ended =
+        firmware_sim::run::<_, _, _, _, LINE, PACKET>(&mut device, &mut receiver, &mut sender, &mut panel, vitals);
     panic!("the UART has ended: {}", ended.is_ok())
 }

@@ -1,31 +1,34 @@
-//! A device: the core, the tables that it goes by, and what it answers to each packet.
+//! A device: the core, the feedback on it, the tables that they go by, and what it answers to each packet.
 //!
 //! Each answer is a function of its own, not inlined, so that the stack holds the buffers of one of them at a time.
 
 use estimator::surrogate::Unstable;
-use estimator::wire::link::{Form, PIECE, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
+use estimator::wire::link::{Correction, Form, PIECE, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
 use estimator::wire::{ParcelError, link, listed};
-use estimator::{Core, Layout, Parcel, Prepared, Tables, packet};
+use estimator::{Core, Layout, Parcel, Prepared, Steered, Steering, Tables, packet};
 
 /// What a device of this core says.
 pub type Reply<E> = link::Reply<<E as Core>::Answer, <E as Core>::Setpoints>;
 /// What it is asked; a line of its tables has at most `L` entries.
-pub type Request<E, const L: usize> = link::Request<<E as Core>::Setup, Parcel<L>>;
+pub type Request<E, S, const L: usize> = link::Request<<E as Core>::Setup, Parcel<L>, <S as Steering<E>>::Feedback>;
 
-/// The core and its tables: those in flash, and one slot for others that came over the wire. A line of them has at most `L`
-/// entries.
+/// The core, the feedback, and their tables: those in flash, and one slot for others that came over the wire. A line of them has at most
+/// `L` entries.
 #[derive(Debug)]
-pub struct Device<'m, E: Core, const L: usize> {
+pub struct Device<'m, E: Core, S: Steering<E>, const L: usize> {
     core: &'m mut E,
+    steer: &'m mut S,
     built_in: &'m E::Tables,
     slot: &'m mut E::Tables,
     contents: Contents,
     setup: Option<E::Setup>,
     form: Form,
+    /// What is wanted of the orbit, while the device steers.
+    feedback: Option<S::Feedback>,
+    /// The work for the feedback after the last frame is done.
+    prepared: bool,
     /// Number of the request for a covariance that is due.
     wants_covariance: Option<u32>,
-    /// See [`estimator::FitQuality::is_mismatch`]; looked at when the core has linearised.
-    mismatch: bool,
     refused: u32,
 }
 
@@ -40,18 +43,20 @@ enum Contents {
     InUse,
 }
 
-impl<'m, E: Core, const L: usize> Device<'m, E, L> {
+impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
     /// A device that waits for its setup.
-    pub fn new(core: &'m mut E, built_in: &'m E::Tables, slot: &'m mut E::Tables) -> Self {
+    pub fn new(core: &'m mut E, steer: &'m mut S, built_in: &'m E::Tables, slot: &'m mut E::Tables) -> Self {
         Self {
             core,
+            steer,
             built_in,
             slot,
             contents: Contents::Nothing,
             setup: None,
             form: Form::Full,
+            feedback: None,
+            prepared: false,
             wants_covariance: None,
-            mismatch: false,
             refused: 0,
         }
     }
@@ -71,15 +76,17 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         self.ingest(bytes, reply)
     }
 
-    /// One slice of what can be done between packets. See [`estimator::Estimator::prepare`].
+    /// One slice of what can be done between packets: the core's first, then the feedback's, of which there is at most one a frame. See
+    /// [`estimator::Estimator::prepare`] and [`estimator::Estimator::prepare_steer`].
     pub fn prepare(&mut self) -> Prepared {
         let Some(setup) = &self.setup else { return Prepared::Nothing };
         let tables = tables(self.contents, self.built_in, self.slot);
         let prepared = self.core.prepare(tables, setup);
-        if prepared == Prepared::Linearised && self.form == Form::Short {
-            self.mismatch = self.core.fit_quality(tables, setup).is_mismatch();
-        }
-        prepared
+        let Some(feedback) = self.feedback.as_ref().filter(|_| prepared == Prepared::Nothing && !self.prepared) else {
+            return prepared;
+        };
+        self.prepared = true;
+        if self.steer.prepare(self.core, (tables, setup), feedback) { Prepared::Slice } else { Prepared::Nothing }
     }
 
     /// Packets refused so far.
@@ -106,33 +113,40 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
             self.refuse(Refusal::NotStarted, reply);
             return None;
         };
-        match self.core.ingest(tables(self.contents, self.built_in, self.slot), setup, bytes) {
-            Ok(estimate) => {
-                match self.form {
-                    Form::Full => reply(UNASKED, &link::Reply::Estimate((&estimate).into())),
-                    Form::Short => reply(UNASKED, &link::Reply::Short(self.short(&estimate))),
-                }
-                if let Some(number) = self.wants_covariance.take() {
-                    self.send_covariance(number, E::sequence(&estimate), reply);
-                }
-                Some(E::needs_attention(&estimate))
+        let tables = tables(self.contents, self.built_in, self.slot);
+        let answered = match &self.feedback {
+            None => {
+                let ingested = self.core.ingest(tables, setup, bytes);
+                ingested.map(|estimate| self.answer(&estimate, None, reply))
             }
-            Err(error) => {
-                self.refuse(error.into(), reply);
-                None
+            Some(feedback) => {
+                let ingested = self.steer.ingest(self.core, (tables, setup), feedback, bytes);
+                ingested.map(|(estimate, steered)| self.answer(&estimate, Some(steered), reply))
+            }
+        };
+        answered.map_err(|error| self.refuse(error.into(), reply)).ok()
+    }
+
+    /// Reply to a frame, and send what was asked for with it; true if an operator should look.
+    #[inline(never)]
+    fn answer(
+        &mut self,
+        estimate: &E::Estimate,
+        steered: Option<Steered>,
+        reply: &mut impl FnMut(u32, &Reply<E>),
+    ) -> bool {
+        let prepared = core::mem::take(&mut self.prepared);
+        match self.form {
+            Form::Full => say(UNASKED, || link::Reply::Estimate(estimate.into()), reply),
+            Form::Short => {
+                let correct = |steered| Correction { steered, prepared, setpoints: self.steer.setpoints() };
+                say(UNASKED, || link::Reply::Short(E::short(estimate, steered.map(correct))), reply);
             }
         }
-    }
-
-    #[inline(never)]
-    fn short(&mut self, estimate: &E::Estimate) -> link::Short<E::Setpoints> {
-        let setpoints = self.steer(estimate);
-        E::short(estimate, self.mismatch, setpoints)
-    }
-
-    /// Setpoints of the correctors after a frame: none, since nothing here steers.
-    fn steer(&mut self, _: &E::Estimate) -> E::Setpoints {
-        E::Setpoints::default()
+        if let Some(number) = self.wants_covariance.take() {
+            self.send_covariance(number, E::sequence(estimate), reply);
+        }
+        E::needs_attention(estimate)
     }
 
     #[inline(never)]
@@ -147,7 +161,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
 
     #[inline(never)]
     fn obey(&mut self, bytes: &mut [u8], vitals: impl FnOnce() -> Vitals, reply: &mut impl FnMut(u32, &Reply<E>)) {
-        let (number, request) = Request::<E, L>::decode(bytes);
+        let (number, request) = Request::<E, S, L>::decode(bytes);
         match request {
             Ok(link::Request::Restart(setup)) => self.restart(number, setup, reply),
             Ok(link::Request::ForgetSequence) => {
@@ -171,8 +185,21 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
                 self.form = form;
                 say(number, || link::Reply::Form(form), reply);
             }
+            Ok(link::Request::Feedback(feedback)) => self.switch(number, feedback, reply),
             Err(error) => self.refuse_to(number, error, reply),
         }
+    }
+
+    /// Steer from the next frame on, or no more.
+    #[inline(never)]
+    fn switch(&mut self, number: u32, feedback: Option<S::Feedback>, reply: &mut impl FnMut(u32, &Reply<E>)) {
+        if feedback.as_ref().is_some_and(|feedback| !S::is_sound(feedback)) {
+            self.refuse_to(number, Refusal::Setup, reply);
+            return;
+        }
+        *self.steer = S::BLANK;
+        (self.feedback, self.prepared) = (feedback, false);
+        say(number, || link::Reply::Feedback(self.feedback.is_some()), reply);
     }
 
     #[inline(never)]
@@ -190,7 +217,7 @@ impl<'m, E: Core, const L: usize> Device<'m, E, L> {
         }
         // a core that has not begun has lost its posterior: it waits for a setup again
         self.setup = began.is_ok().then_some(setup);
-        (self.form, self.mismatch) = (Form::Full, false);
+        (self.form, self.feedback) = (Form::Full, None);
         match began {
             Ok(()) => say(number, || link::Reply::Restarted, reply),
             Err(Unstable) => self.refuse_to(number, Refusal::NoDesign, reply),

@@ -5,16 +5,17 @@ use std::io::{self, Read as _, Write as _};
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::wire::link::Vitals;
-use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Steer, Tables};
 use firmware_sim::{Device, Panel};
 
 /// Run until standard input ends.
 pub fn run() -> io::Result<()> {
-    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Tables::BLANK));
-    let mut device = Device::<_, LINE>::new(&mut *core, &BUILT_IN, &mut *slot);
+    let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
+    let mut slot = Box::new(Tables::BLANK);
+    let mut device = Device::<_, _, LINE>::new(&mut *core, &mut *steer, &BUILT_IN, &mut *slot);
     let (mut source, mut sink) = (Stdin(io::stdin()), Stdout(io::stdout()));
     let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
-    let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+    let run = firmware_sim::run::<_, _, _, _, LINE, PACKET>;
     let ended = run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
     ended.map_err(|kind| io::Error::other(format!("{kind:?}")))
 }

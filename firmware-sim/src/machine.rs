@@ -8,7 +8,7 @@ include!(concat!(env!("OUT_DIR"), "/machine.rs"));
 
 /// RAM that `memory.x` grants, less the queue of received bytes [B]; the linker counts to the byte.
 const ROOM: usize = (243 - 4) * 1024;
-const _: () = assert!(size_of::<Estimator>() + size_of::<Tables>() <= ROOM, "{}", TOO_LARGE);
+const _: () = assert!(size_of::<Estimator>() + size_of::<Steer>() + size_of::<Tables>() <= ROOM, "{}", TOO_LARGE);
 
 /// The tables of its core.
 pub type Tables = <Estimator as estimator::Core>::Tables;

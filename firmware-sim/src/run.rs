@@ -3,7 +3,7 @@
 use embedded_hal::digital::OutputPin;
 use embedded_io::{Read, ReadReady, Write};
 use estimator::wire::link::Vitals;
-use estimator::{Core, Prepared};
+use estimator::{Core, Prepared, Steering};
 
 use crate::device::{Device, Reply};
 use crate::inbox::{Event, Inbox};
@@ -16,8 +16,8 @@ use crate::panel::Panel;
 ///
 /// # Errors
 /// What the source or the sink report.
-pub fn run<E: Core, R: Read + ReadReady, W: Write<Error = R::Error>, const L: usize, const P: usize>(
-    device: &mut Device<'_, E, L>,
+pub fn run<E: Core, S: Steering<E>, R: Read + ReadReady, W: Write<Error = R::Error>, const L: usize, const P: usize>(
+    device: &mut Device<'_, E, S, L>,
     source: &mut R,
     sink: &mut W,
     panel: &mut Panel<impl OutputPin, impl OutputPin>,

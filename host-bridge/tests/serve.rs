@@ -11,7 +11,7 @@ use std::thread::{self, JoinHandle};
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::Tables as _;
-use estimator::booster::{Estimator, Green, LINE, PACKET, Request};
+use estimator::booster::{Estimator, Green, LINE, PACKET, Request, Steer};
 use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Event, Inbox, Panel};
 use host_bridge::sink::shared_memory::Subscriber;
@@ -85,11 +85,12 @@ fn beside(path: &Path, run: impl FnOnce(UnixStream) + Send + 'static) -> JoinHan
 /// A device that serves one host.
 fn device(path: &Path, tables: Box<Green>) {
     beside(path, move |line| {
-        let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-        let mut device = Device::<_, LINE>::new(&mut *core, &tables, &mut *slot);
+        let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
+        let mut slot = Box::new(Green::BLANK);
+        let mut device = Device::<_, _, LINE>::new(&mut *core, &mut *steer, &tables, &mut *slot);
         let (mut source, mut sink) = (Socket(line.try_clone().unwrap()), Socket(line));
         let mut panel = Panel::new(NoLamp, NoLamp, NoLamp);
-        let run = firmware_sim::run::<_, _, _, LINE, PACKET>;
+        let run = firmware_sim::run::<_, _, _, _, LINE, PACKET>;
         let _ = run(&mut device, &mut source, &mut sink, &mut panel, Vitals::default);
     });
 }
@@ -142,7 +143,7 @@ fn tables_of_another_ring_are_not_answered_by() {
 
 /// A line on which a front end and a host talk to one device.
 struct Shared<'d> {
-    device: Device<'d, Estimator, LINE>,
+    device: Device<'d, Estimator, Steer, LINE>,
     host: UnixStream,
     inbox: Inbox<PACKET>,
     /// Replies until one that is spoiled on its way.
@@ -202,8 +203,9 @@ fn a_day_of_a_front_end(line: UnixStream) {
     let restart = || restart(&setup);
     let frame = |at: usize| stream::wire(&recording, &recording.rows[at]).unwrap();
     let tables = tables();
-    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
-    let device = Device::new(&mut *core, &tables, &mut *slot);
+    let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
+    let mut slot = Box::new(Green::BLANK);
+    let device = Device::new(&mut *core, &mut *steer, &tables, &mut *slot);
     let mut shared = Shared { device, host: line, inbox: Inbox::default(), spoiled: None };
     // the host begins to listen in the middle of a reply
     shared.host.write_all(&[9, 9, 9, 0]).unwrap();
@@ -219,9 +221,11 @@ fn a_day_of_a_front_end(line: UnixStream) {
     shared.spoiled = Some(3);
     shared.send(frame(3), 1);
     // the device is reset, and knows no more what was asked of it
-    let (mut core, mut slot) = (Box::new(Estimator::BLANK), Box::new(Green::BLANK));
+    let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
+    let mut slot = Box::new(Green::BLANK);
     let Shared { host, inbox, .. } = shared;
-    let mut shared = Shared { device: Device::new(&mut *core, &tables, &mut *slot), host, inbox, spoiled: None };
+    let mut shared =
+        Shared { device: Device::new(&mut *core, &mut *steer, &tables, &mut *slot), host, inbox, spoiled: None };
     shared.send(restart(), 0);
     shared.send(frame(4), 1);
     shared.send(frame(5), 2);

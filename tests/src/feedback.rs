@@ -1,4 +1,5 @@
-//! The loop closed in software: a machine, its frames as bytes, the core, the setpoints, the machine again.
+//! The loop closed in software: a machine, its frames as bytes, the core, the setpoints, the machine again; and beside the core, if it
+//! is wanted, the same core on the emulated chip.
 
 mod chip;
 mod known;
@@ -8,13 +9,15 @@ mod scenario;
 use core::error::Error;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback, Frame, MONITORS, PARAMS, Steer};
-use estimator::{Each, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Prepared, RfCode, Steered};
+use estimator::{
+    CurrentCode, Each, IngestError, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Prepared, RfCode, Steered,
+};
 use inference::simulate;
 use twin::Ring;
 
 use crate::machine::{ALL, Random, amperes, nees, wire_of};
 
-pub use chip::on_chip;
+pub use chip::Chip;
 pub use known::Known;
 pub use plant::{Orbit, Plant};
 pub use scenario::{Event, Scenario};
@@ -60,7 +63,7 @@ pub const GAIN: f32 = 0.1;
 /// What is recommended for the Booster; the wanted orbit is zero.
 pub fn recommended() -> Feedback {
     Feedback {
-        orbit: [0.0; MONITORS],
+        orbit: Each::same(0.0),
         gain: GAIN,
         step_kick: 2e-5,
         total_kick: 1e-3,
@@ -91,6 +94,8 @@ pub struct Loop<'k> {
     pub wire: Vec<u8>,
     /// What the supplies give [A].
     current: [f64; CORRECTORS],
+    /// The chip that hears the same frames: the core does as much between them as that has done.
+    pub chip: Option<Chip<'k>>,
 }
 
 impl<'k> Loop<'k> {
@@ -107,7 +112,7 @@ impl<'k> Loop<'k> {
         let vars = simulate::vars(&Ring::booster(), true, scenario.seed)?;
         let mut random = [Random::new(scenario.seed), Random::new(scenario.seed + 1_000_003)];
         let plant = Plant::new(&vars, &mut random[0])?;
-        feedback.orbit = core::array::from_fn(|b| plant.offset[b] as f32);
+        feedback.orbit.own = plant.offset.iter().map(|offset| *offset as f32).collect();
         let mut core = Box::new(Estimator::BLANK);
         core.restart(&Model { surrogate: &*known.surrogate, setup: &known.setup })
             .map_err(|_| "the design has no stable ring")?;
@@ -125,25 +130,39 @@ impl<'k> Loop<'k> {
             sequence: 0,
             wire: Vec::new(),
             current: [0.0; CORRECTORS],
+            chip: None,
         })
+    }
+
+    /// What is wanted of the orbit.
+    pub fn feedback(&self) -> &Feedback {
+        &self.feedback
+    }
+
+    /// Currents that the correctors are to have.
+    pub fn setpoints(&self) -> &[CurrentCode; CORRECTORS] {
+        self.steer.setpoints()
     }
 
     /// One cycle.
     ///
     /// # Errors
-    /// If the machine loses its orbit, or the core refuses the frame.
+    /// If the machine loses its orbit, the core refuses the frame, or the chip does not answer.
     pub fn cycle(&mut self) -> Result<Sample, Box<dyn Error>> {
         self.scenario.disturb(self.frame, &mut self.plant, &mut self.random[0])?;
         let lost = self.scenario.gap(self.frame);
         self.sequence += 1 + lost;
         self.supply();
         let (frame, rms) = self.read()?;
-        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
         self.wire = wire_of(&frame);
-        let estimate = self.core.ingest(&model, &mut self.wire.clone())?;
-        let steered = self.steer(&frame, &estimate);
-        while self.core.prepare(&model) != Prepared::Nothing {}
-        self.prepare_steer();
+        let steers = self.steers().then_some(&self.feedback);
+        let said = self.chip.as_mut().map(|chip| chip.hear(steers, self.sequence, &self.wire)).transpose()?;
+        let (slices, prepared) = said.as_ref().map_or((u32::MAX, true), |said| (said.slices(), said.prepared()));
+        self.prepare(slices, prepared);
+        let (estimate, steered) = self.ingest(&frame)?;
+        if let (Some(chip), Some(said)) = (&mut self.chip, &said) {
+            chip.compare(said, &self.core, &estimate, steered, self.steer.setpoints());
+        }
         self.frame += 1;
         let error = core::array::from_fn(|i| f64::from(estimate.map_params[i]) - self.plant.params[i]);
         Ok(Sample {
@@ -155,12 +174,12 @@ impl<'k> Loop<'k> {
         })
     }
 
-    /// All cycles of the scenario.
+    /// All cycles of the scenario that are left.
     ///
     /// # Errors
     /// As for one.
     pub fn run(&mut self) -> Result<Vec<Sample>, Box<dyn Error>> {
-        (0..self.scenario.frames).map(|_| self.cycle()).collect()
+        (self.frame..self.scenario.frames).map(|_| self.cycle()).collect()
     }
 
     /// The supplies take their setpoints over, but for those that stick.
@@ -217,24 +236,34 @@ impl<'k> Loop<'k> {
         Ok((frame, residual(&on_momentum, &(orbit - on_momentum))))
     }
 
-    fn steer(&mut self, frame: &Frame, estimate: &Estimate) -> Option<Steered> {
-        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
-        match self.control {
-            _ if self.frame < self.scenario.campaign => None,
-            Control::Off => None,
-            Control::Estimated => Some(self.core.steer(&model, &self.feedback, &mut self.steer, frame, estimate)),
-            Control::Design => Some(self.steer.steer(&self.feedback, &self.known.of_design(), frame, estimate)),
-        }
+    fn steers(&self) -> bool {
+        self.frame >= self.scenario.campaign && self.control != Control::Off
     }
 
-    fn prepare_steer(&mut self) {
+    /// Bytes to estimate, and to setpoints.
+    fn ingest(&mut self, frame: &Frame) -> Result<(Estimate, Option<Steered>), IngestError> {
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
-        match self.control {
-            _ if self.frame < self.scenario.campaign => false,
-            Control::Off => false,
-            Control::Estimated => self.core.prepare_steer(&model, &self.feedback, &mut self.steer),
-            Control::Design => self.steer.prepare(&self.feedback, &self.known.of_design(), |_| [0.0; PARAMS]),
-        };
+        let mut bytes = self.wire.clone();
+        if self.steers() && self.control == Control::Estimated {
+            let ingested = self.core.ingest_and_steer(&model, &self.feedback, &mut self.steer, &mut bytes);
+            return ingested.map(|(estimate, steered)| (estimate, Some(steered)));
+        }
+        let estimate = self.core.ingest(&model, &mut bytes)?;
+        let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), frame, &estimate);
+        let steered = self.steers().then(|| of_design(&mut self.steer));
+        Ok((estimate, steered))
+    }
+
+    /// What is done before a frame: so many slices of the core's work, as far as there are any, and the feedback's.
+    fn prepare(&mut self, slices: u32, prepared: bool) {
+        let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
+        let _ = (0..slices).take_while(|_| self.core.prepare(&model) != Prepared::Nothing).count();
+        if self.steers() && prepared {
+            let _ = match self.control {
+                Control::Estimated => self.core.prepare_steer(&model, &self.feedback, &mut self.steer),
+                _ => self.steer.prepare(&self.feedback, &self.known.of_design(), |_| [0.0; PARAMS]),
+            };
+        }
     }
 }
 

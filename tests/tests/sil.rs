@@ -50,7 +50,7 @@ fn the_image_fits_its_memory() {
     let sizes = IMAGE.sizes().unwrap();
     // a network of 760 kB has room in what is left of 1 MB
     assert!(sizes.flash <= 256 * 1024, "{} bytes of flash", sizes.flash);
-    assert!(sizes.ram <= 243 * 1024, "{} bytes of RAM", sizes.ram);
+    assert!(sizes.ram <= 238 * 1024, "{} bytes of RAM", sizes.ram);
 }
 
 /// The linker grants 18 kB and starts the stack there, so that a count ends at 18: one that is full has to be told by less.

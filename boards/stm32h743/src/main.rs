@@ -19,12 +19,14 @@ use embassy_stm32::gpio::{AnyPin, Level, Output, Speed};
 use embassy_stm32::wdg::IndependentWatchdog;
 use estimator::Tables as _;
 use estimator::wire::link::Vitals;
-use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Tables};
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Steer, Tables};
 use firmware_sim::{Bursts, Device, Panel, Supervisor};
 use static_cell::ConstStaticCell;
 
 /// The posterior. All zero at first, so that it takes no flash.
 static CORE: ConstStaticCell<Estimator> = ConstStaticCell::new(Estimator::BLANK);
+/// The feedback on it.
+static STEER: ConstStaticCell<Steer> = ConstStaticCell::new(Steer::BLANK);
 /// Room for other tables.
 static SLOT: ConstStaticCell<Tables> = ConstStaticCell::new(Tables::BLANK);
 /// Faults of the line, each of which has lost one byte or more.
@@ -46,7 +48,7 @@ fn main() -> ! {
     watchdog.unleash();
     let supervisor = Supervisor::new(low(part.PG0.into()), || watchdog.pet());
     let mut panel = Panel::new(low(part.PB0.into()), low(part.PB14.into()), supervisor);
-    let mut device = Device::<_, LINE>::new(CORE.take(), &BUILT_IN, SLOT.take());
+    let mut device = Device::<_, _, LINE>::new(CORE.take(), STEER.take(), &BUILT_IN, SLOT.take());
     let vitals = || Vitals {
         lost_bytes: LOST.load(Ordering::Relaxed),
         cycles: uart::cycles(),
@@ -54,6 +56,6 @@ fn main() -> ! {
         ..Vitals::default()
     };
     defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest::<LINE>());
-    let ended = firmware_sim::run::<_, _, _, LINE, PACKET>(&mut device, &mut source, &mut sender, &mut panel, vitals);
+    let ended = firmware_sim::run::<_, _, _, _, LINE, PACKET>(&mut device, &mut source, &mut sender, &mut panel, vitals);
     panic!("the UART has ended: {}", ended.is_ok())
 }

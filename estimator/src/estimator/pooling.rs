@@ -26,7 +26,7 @@ pub(super) struct Pooling<const S: usize, const K: usize, const N: usize, const 
     /// Chi-square of late repeats about the means of their settings: these frames count one by one, and not as repeats.
     late_scatter: f64,
     /// What has been counted.
-    pub gaussian: Gaussian<K, N, T, Independent<K>>,
+    pub gaussian: Gaussian<K, N, T, Independent<K, f64>>,
     pool: Pool<K>,
 }
 
@@ -199,7 +199,7 @@ impl<
                 let (_, slope) = model.surrogate.tune(&self.anew.tangent.linearised, plane, &[0.0; F]);
                 let mean =
                     Reading { channel: K - 2 + plane, innovation, variance: variance / count as f32, slope: &slope };
-                gaussian.condition([mean], |_| 0.0);
+                gaussian.condition([mean], &[0.0; N]);
                 gaussian.add_repeats(count, variance);
                 gaussian.add_scatter(squares / f64::from(variance), 0.0);
             }

@@ -3,7 +3,7 @@
 //! A campaign moves one corrector at a time from 0 A. A machine under feedback holds all of them somewhere, and moves them seldom,
 //! or one at a time about there. What is moved is told by the orbit that it makes, not by amperes.
 
-use super::{Estimator, Model, UNDERWEIGHT};
+use super::{Estimator, Model};
 use crate::campaign::{Setting, is_moved};
 use crate::drive::Drive;
 use crate::gaussian::Reading;
@@ -98,12 +98,12 @@ impl<
     }
 
     /// Look for another reference drive, if for a while no frame has repeated a setting: the median of the recent drives, if most of
-    /// them are settings about it.
+    /// them are settings about it. True if it was looked for.
     #[inline(never)]
-    pub(super) fn seek_reference(&mut self, model: &Model<'_, G, B, C, F>) {
+    pub(super) fn seek_reference(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
         let recent = self.past.recent.len();
         if !self.past.recent.is_full() || usize::from(self.past.reference.waited) < recent {
-            return;
+            return false;
         }
         self.past.reference.waited = 0;
         let former = self.past.reference.kick;
@@ -115,12 +115,14 @@ impl<
         } else {
             self.past.reference.kick = former;
         }
+        true
     }
 
     /// Make room for new settings, if there is none, by one setting of a former reference drive: it counts on as it is linearised now.
+    /// True if one was.
     #[inline(never)]
-    pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) {
-        let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return };
+    pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
+        let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return false };
         let drive = cell.drive();
         let first_channel = self.first_channel(cell.cycle_time());
         self.predict_drive(model, &drive);
@@ -131,10 +133,11 @@ impl<
                 let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
                 let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
                 let reading = Reading { channel: first_channel + b, innovation, variance, slope };
-                self.past.loose.condition([reading], |d| UNDERWEIGHT * self.posterior.solution.variance_of(d));
+                self.past.loose.condition([reading], &self.posterior.loose());
                 self.past.loose.add_repeats(number, self.noise_variance(b));
             }
         }
+        true
     }
 
     /// Median of the recent kicks of a corrector: that which as many exceed as fall short of.

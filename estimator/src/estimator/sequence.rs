@@ -42,13 +42,11 @@ pub(super) struct Sequence {
     pub rejected: u32,
     /// Time from one cycle to the next, once the clock has told [s].
     period: Option<f32>,
-    /// Time that has been accounted for since the last frame [s].
-    ahead: f32,
 }
 
 impl Sequence {
     /// None so far.
-    pub const EMPTY: Self = Self { last: None, frames: 0, rejected: 0, period: None, ahead: 0.0 };
+    pub const EMPTY: Self = Self { last: None, frames: 0, rejected: 0, period: None };
 
     /// Take the next frame as new, whatever its number.
     pub fn forget(&mut self) {
@@ -63,7 +61,7 @@ impl Sequence {
         self.last.map_or(Ok(()), |last| last.before(&cycle(frame)).map(drop))
     }
 
-    /// Count a frame; returns the time since the one before that is not accounted for yet [s].
+    /// Count a frame; returns the time since the one before [s].
     ///
     /// The frames' clock tells it. Where that has not advanced, or counts from an epoch of its own, the numbers do, at the
     /// period of the frames before.
@@ -75,23 +73,13 @@ impl Sequence {
         let this = cycle(frame);
         let Some(last) = self.last.replace(this) else { return 0.0 };
         let cycles = last.before(&this).unwrap_or(1) as f32;
-        let elapsed = if last.epoch == this.epoch && this.time_us > last.time_us {
+        if last.epoch == this.epoch && this.time_us > last.time_us {
             let elapsed = (this.time_us - last.time_us) as f32 / SECOND;
             self.period = Some(elapsed / cycles);
             elapsed
         } else {
             cycles * self.period.unwrap_or(PERIOD)
-        };
-        let rest = elapsed - self.ahead;
-        self.ahead = (-rest).max(0.0);
-        rest.max(0.0)
-    }
-
-    /// Account for the time until the next frame, as far as it can be known; returns what is not accounted for yet [s].
-    pub fn expect_next(&mut self) -> f32 {
-        let rest = (self.period.unwrap_or(0.0) - self.ahead).max(0.0);
-        self.ahead += rest;
-        rest
+        }
     }
 }
 
@@ -135,26 +123,14 @@ mod tests {
         assert_eq!(before([2, 0], [1, 901]), Err(IngestError::OutOfOrder { last: 0, got: 901 }));
     }
 
-    /// The time that a stream accounts for, in all: that of its clock, however much of it was accounted for beforehand.
     #[test]
     fn time_is_that_of_the_clock_and_without_one_that_of_the_numbers() {
         let mut sequence = Sequence::EMPTY;
-        let mut total = 0.0;
-        let mut take = |cycle, ms: u64, prepares: bool| {
-            total += sequence.advance(&frame(cycle, 1000 * ms));
-            if prepares {
-                total += sequence.expect_next();
-            }
-            total
-        };
-        assert_eq!(take([0, 0], 0, true), 0.0);
-        assert_eq!(take([0, 1], 100, false), 0.1);
-        // jitter is made up for
-        assert!((take([0, 2], 190, true) - 0.28).abs() < 1e-6);
-        assert!((take([0, 3], 300, false) - 0.3).abs() < 1e-6);
-        assert!((take([0, 5], 500, false) - 0.5).abs() < 1e-6);
+        let mut since = |cycle, ms: u64| sequence.advance(&frame(cycle, 1000 * ms));
+        assert_eq!([since([0, 0], 0), since([0, 1], 100), since([0, 2], 190)], [0.0, 0.1, 0.09]);
+        assert_eq!([since([0, 3], 300), since([0, 5], 500)], [0.11, 0.2]);
         // the clock is set back, and another epoch's is another one
-        assert!((take([0, 8], 100, false) - 0.8).abs() < 1e-6);
-        assert!((take([1, 0], 9_000_000, false) - 0.9).abs() < 1e-6);
+        assert!((since([0, 8], 100) - 0.3).abs() < 1e-6);
+        assert!((since([1, 0], 9_000_000) - 0.1).abs() < 1e-6);
     }
 }

@@ -1,10 +1,9 @@
 //! What a feedback takes from the estimate: the response at the estimated vars, and the covariance of the params.
 
-use super::{Estimator, Model};
+use super::{Estimator, IngestError, Model};
 use crate::estimate::Estimate;
 use crate::steer::{Feedback, Response, Steer, Steered};
 use crate::surrogate::Steerable;
-use crate::wire::Frame;
 
 impl<
     G: Steerable<B, C, F, N>,
@@ -19,21 +18,27 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    /// Setpoints after a frame and its estimate. See [`Steer::steer`].
-    pub fn steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(
-        &self,
+    /// Take one machine cycle in: bytes to estimate to setpoints. See [`Estimator::ingest`] and [`Steer::steer`].
+    ///
+    /// # Errors
+    /// [`IngestError`]; posterior and setpoints are then as they were before.
+    #[inline(never)]
+    pub fn ingest_and_steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(
+        &mut self,
         model: &Model<'_, G, B, C, F>,
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
-        frame: &Frame<B, C, F, W>,
-        estimate: &Estimate<B, N, W>,
-    ) -> Steered {
+        bytes: &mut [u8],
+    ) -> Result<(Estimate<B, N, W>, Steered), IngestError> {
+        let (frame, drive) = self.decode(model, bytes)?;
+        let estimate = self.update(model, &frame, &drive);
         // a frame that was taken in is within the ramp
         let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
-        state.steer(feedback, &self.response(model, momentum), frame, estimate)
+        let steered = state.steer(feedback, &self.response(model, momentum), &frame, &estimate);
+        Ok((estimate, steered))
     }
 
-    /// What can be done for the feedback between frames; after [`Estimator::prepare`]. See [`Steer::prepare`].
+    /// What can be done for the feedback after a frame, once [`Estimator::prepare`] has nothing more to do. See [`Steer::prepare`].
     pub fn prepare_steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(
         &self,
         model: &Model<'_, G, B, C, F>,

@@ -1,12 +1,15 @@
 //! The covariance of the baselines, params given: independent while the params are constant, else correlated.
 
-use nalgebra::SMatrix;
+use core::marker::PhantomData;
 
-use crate::linear::{add, dot};
+use crate::linear::{Real, add, add_four, add_four_twice, dot};
 use crate::triangle::Triangle;
 
 /// Covariance of the baselines, params given [m^2].
 pub trait Covariance<const B: usize>: Copy {
+    /// Precision of the slopes by which baselines follow the params.
+    type Slope: Real;
+
     /// All zero.
     const ZERO: Self;
 
@@ -22,20 +25,80 @@ pub trait Covariance<const B: usize>: Copy {
     /// Add to the variance of a monitor's.
     fn spread(&mut self, b: usize, variance: f64);
 
-    /// Take a reading of monitor `b` off, of innovation variance `s`. Returns the gain of each baseline from `from` on.
+    /// Take a reading of monitor `b` off, of innovation variance `s`.
     fn condition(&mut self, b: usize, s: f64) -> Gain<B>;
+
+    /// Move slopes by what readings of these rows have made wait; nothing, where each has moved its own.
+    fn settle<const N: usize>(_: &mut Moves<B>, _: &mut [[Self::Slope; N]; B], _: &[[f64; N]; 4]) {}
 }
 
-/// What a reading moves each baseline by, per unit of innovation: those from `from` up to `to`, the others by 0.
+/// What a reading moves baselines by, per unit of innovation.
 #[derive(Debug, Clone, Copy)]
-pub struct Gain<const B: usize> {
-    pub gain: [f64; B],
-    pub from: usize,
-    pub to: usize,
+pub enum Gain<const B: usize> {
+    /// That of its own monitor.
+    Own(f64),
+    /// Each.
+    All([f64; B]),
 }
 
-/// That of baselines which nothing correlates, as long as the params are constant.
-pub type Independent<const B: usize> = [f64; B];
+/// Gains of all baselines by as many readings as are staged; zero for those that have moved their own at once.
+#[derive(Debug, Clone)]
+pub struct Moves<const B: usize> {
+    gain: [[f64; B]; 4],
+    any: bool,
+}
+
+impl<const B: usize> Moves<B> {
+    /// None wait.
+    pub const NONE: Self = Self { gain: [[0.0; B]; 4], any: false };
+
+    /// Those of the reading at a place.
+    pub fn push(&mut self, at: usize, gain: &[f64; B]) {
+        self.gain.get_mut(at).into_iter().for_each(|to| *to = *gain);
+        self.any = true;
+    }
+
+    /// By how much the readings at the first `count` places move the slope of a baseline; `rows` are theirs.
+    pub fn wait_for<const N: usize>(
+        &self,
+        b: usize,
+        rows: &[[f64; N]; 4],
+        count: usize,
+        mut each: impl FnMut(f64, &[f64; N]),
+    ) {
+        if self.any {
+            let gains = self.gain.iter().map(|gain| gain.get(b).copied().unwrap_or(0.0));
+            gains.zip(rows).take(count).for_each(|(gain, row)| each(gain, row));
+        }
+    }
+
+    /// Move the slopes of all baselines by what waits.
+    fn settle<const N: usize>(&mut self, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
+        if !core::mem::take(&mut self.any) {
+            return;
+        }
+        let rows = rows.each_ref().map(<[f64; N]>::as_slice);
+        let of = |b: usize| self.gain.each_ref().map(|gain| gain.get(b).copied().unwrap_or(0.0));
+        for (i, slopes) in slopes.chunks_mut(2).enumerate() {
+            match slopes {
+                [one, other] => add_four_twice([one, other], [of(2 * i), of(2 * i + 1)], rows),
+                rest => rest.iter_mut().for_each(|one| add_four(one, of(2 * i), rows)),
+            }
+        }
+        self.gain = [[0.0; B]; 4];
+    }
+}
+
+/// That of baselines which nothing correlates, as long as the params are constant; `R` is the precision of their slopes.
+///
+/// Slopes are means of what the surrogate gives in single precision. A mean that is kept so is off by 3e-5 of itself after a
+/// million frames: enough where frames come one by one, each by its difference from that mean, but not where sums of many are
+/// subtracted from one another.
+#[derive(Debug, Clone, Copy)]
+pub struct Independent<const B: usize, R> {
+    variance: [f64; B],
+    slope: PhantomData<R>,
+}
 
 /// That of baselines which a walk of the params has correlated; `U` entries make a triangle of `B`.
 #[derive(Debug, Clone, Copy)]
@@ -44,36 +107,36 @@ pub struct Correlated<const B: usize, const U: usize> {
     walked: bool,
 }
 
-impl<const B: usize> Covariance<B> for Independent<B> {
-    const ZERO: Self = [0.0; B];
+impl<const B: usize, R: Real> Covariance<B> for Independent<B, R> {
+    type Slope = R;
+    const ZERO: Self = Self { variance: [0.0; B], slope: PhantomData };
 
     fn set(&mut self, variances: &[f64; B]) {
-        *self = *variances;
+        self.variance = *variances;
     }
 
     fn variances(&self) -> [f64; B] {
-        *self
+        self.variance
     }
 
     fn variance(&self, b: usize) -> f64 {
-        self.get(b).copied().unwrap_or(0.0)
+        self.variance.get(b).copied().unwrap_or(0.0)
     }
 
     fn spread(&mut self, b: usize, variance: f64) {
-        self.get_mut(b).into_iter().for_each(|own| *own += variance);
+        self.variance.get_mut(b).into_iter().for_each(|own| *own += variance);
     }
 
     fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
-        let mut gain = [0.0; B];
-        if let (Some(variance), Some(gain)) = (self.get_mut(b), gain.get_mut(b)) {
-            *gain = *variance / s;
-            *variance -= *gain * *variance;
-        }
-        Gain { gain, from: b, to: b + 1 }
+        let Some(variance) = self.variance.get_mut(b) else { return Gain::Own(0.0) };
+        let gain = *variance / s;
+        *variance -= gain * *variance;
+        Gain::Own(gain)
     }
 }
 
 impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
+    type Slope = f64;
     const ZERO: Self = Self { matrix: Triangle::ZERO, walked: false };
 
     fn set(&mut self, variances: &[f64; B]) {
@@ -96,23 +159,31 @@ impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
     }
 
     fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
+        if !self.walked {
+            let Some(variance) = self.matrix.row_mut(b).last_mut() else { return Gain::Own(0.0) };
+            let gain = *variance / s;
+            *variance -= gain * *variance;
+            return Gain::Own(gain);
+        }
         let mut gain = [0.0; B];
-        let (from, to) = if self.walked { (0, B) } else { (b, b + 1) };
         self.matrix.copy_row(b, &mut gain);
         gain.iter_mut().for_each(|gain| *gain /= s);
-        for (row, g) in self.matrix.rows_from_mut(from).zip(gain.get(from..to).unwrap_or_default()) {
-            add(row.get_mut(from..).unwrap_or_default(), -g * s, gain.get(from..).unwrap_or_default());
+        for (row, g) in self.matrix.rows_mut().zip(&gain) {
+            add(row, -g * s, &gain);
         }
-        Gain { gain, from, to }
+        Gain::All(gain)
+    }
+
+    fn settle<const N: usize>(moves: &mut Moves<B>, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
+        moves.settle(slopes, rows);
     }
 }
 
 impl<const B: usize, const U: usize> Correlated<B, U> {
     /// Add the products of columns `h`, one of each baseline: what they share of a walk.
-    pub fn correlate<const N: usize>(&mut self, h: &SMatrix<f64, N, B>) {
-        let h = h.as_slice().chunks_exact(N);
-        for (row, one) in self.matrix.rows_mut().zip(h.clone()) {
-            row.iter_mut().zip(h.clone()).for_each(|(c, other)| *c += dot(one, other));
+    pub fn correlate<const N: usize>(&mut self, h: &[[f64; N]; B]) {
+        for (row, one) in self.matrix.rows_mut().zip(h) {
+            row.iter_mut().zip(h).for_each(|(c, other)| *c += dot(one, other));
         }
         self.walked = true;
     }

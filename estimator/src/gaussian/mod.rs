@@ -24,13 +24,12 @@ mod solution;
 mod staged;
 mod walk;
 
-use nalgebra::SMatrix;
-
-use crate::linear::{add, column, dot, zeros};
+use crate::linear::{Real, add, add_rounded, dot, subtract};
 use crate::prior::Prior;
 use crate::triangle::Triangle;
 
-pub use baselines::{Correlated, Covariance, Gain, Independent};
+pub use baselines::{Correlated, Covariance, Independent};
+use baselines::{Gain, Moves};
 pub use pool::{Line, Pool, Repeats};
 pub use solution::Solution;
 use staged::Staged;
@@ -50,7 +49,7 @@ pub struct Reading<'h> {
 
 /// Information on `N` params and `B` baselines; `T` entries make a triangle of `N`.
 #[derive(Debug, Clone, Copy)]
-pub struct Gaussian<const B: usize, const N: usize, const T: usize, V> {
+pub struct Gaussian<const B: usize, const N: usize, const T: usize, V: Covariance<B>> {
     /// Params at which the readings were linearised.
     origin: [f32; N],
     /// Information matrix of the params, baselines eliminated.
@@ -59,8 +58,8 @@ pub struct Gaussian<const B: usize, const N: usize, const T: usize, V> {
     vector: [f64; N],
     /// Baselines at the origin [m].
     baseline: [f64; B],
-    /// How much less baseline a unit of a param leaves [m], one column a monitor.
-    slope: SMatrix<f64, N, B>,
+    /// How much less baseline a unit of a param leaves [m], a row for each monitor.
+    slope: [[V::Slope; N]; B],
     /// Covariance of the baselines, params given [m^2].
     covariance: V,
     /// Chi-square of everything at the origin.
@@ -76,7 +75,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         information: Triangle::ZERO,
         vector: [0.0; N],
         baseline: [0.0; B],
-        slope: zeros(),
+        slope: [[V::Slope::ZERO; N]; B],
         covariance: V::ZERO,
         cost: 0.0,
         volume: 0.0,
@@ -95,14 +94,16 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         }
         self.vector = [0.0; N];
         self.baseline = [0.0; B];
-        self.slope.fill(0.0);
+        self.slope = [[V::Slope::ZERO; N]; B];
         self.covariance.set(&core::array::from_fn(|b| square(baseline(b))));
     }
 
     /// Become what another one is.
     pub fn copy<U: Covariance<B>>(&mut self, other: &Gaussian<B, N, T, U>) {
         (self.origin, self.vector, self.baseline) = (other.origin, other.vector, other.baseline);
-        (self.information, self.slope) = (other.information, other.slope);
+        self.information = other.information;
+        let each = self.slope.as_flattened_mut().iter_mut().zip(other.slope.as_flattened());
+        each.for_each(|(to, from)| *to = V::Slope::nearest(from.double()));
         (self.cost, self.volume) = (other.cost, other.volume);
         self.covariance.set(&other.covariance.variances());
     }
@@ -128,32 +129,51 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.baseline.get(b).copied().unwrap_or(0.0)
     }
 
-    /// Add the readings of a frame, of one channel each; `own` is what the uncertain linearisation adds to a variance, for a
-    /// difference of reading and baseline of this derivative.
-    #[inline(never)] // rows of the information on the stack
-    pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, own: impl Fn(&[f64; N]) -> f64) {
-        let mut staged = Staged::NONE;
-        for Reading { channel, innovation, variance, slope } in readings {
-            let (d, baseline_variance) = self.effective(channel, slope);
-            let s = f64::from(variance) + own(&d) + baseline_variance;
-            let e = f64::from(innovation) - self.baseline(channel);
-            staged.push(&d, 1.0 / s, &mut self.information);
-            add(&mut self.vector, e / s, &d);
-            self.cost += e * e / s;
-            self.volume += ln_density(s);
-            self.learn_baselines(channel, &d, e, s);
+    /// Add the readings of a frame, of one channel each. What the uncertain linearisation adds to the variance of one is
+    /// `sum over i of loose_i d_i^2`, for the derivative `d` of the difference of reading and baseline.
+    #[inline(never)] // four rows and gains on the stack
+    pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, loose: &[f64; N]) {
+        let (mut staged, mut moves) = (Staged::NONE, Moves::NONE);
+        for reading in readings {
+            self.add_reading(&reading, loose, &mut staged, &mut moves);
         }
+        self.settle(&mut staged, &mut moves);
+    }
+
+    #[inline(never)] // one copy, whatever the readings come from
+    fn add_reading(&mut self, reading: &Reading<'_>, loose: &[f64; N], staged: &mut Staged<N>, moves: &mut Moves<B>) {
+        let channel = reading.channel;
+        let (mut d, baseline_variance) = self.effective(channel, reading.slope);
+        moves.wait_for(channel, staged.rows(), staged.count(), |gain, row| add(&mut d, -gain, row));
+        let own: f64 = d.iter().zip(loose).map(|(d, loose)| loose * (d * d)).sum();
+        let s = f64::from(reading.variance) + own + baseline_variance;
+        let e = f64::from(reading.innovation) - self.baseline(channel);
+        add(&mut self.vector, e / s, &d);
+        self.cost += e * e / s;
+        self.volume += ln_density(s);
+        match self.covariance.condition(channel, s) {
+            Gain::Own(gain) => self.move_baseline(channel, gain, e, &d),
+            Gain::All(gain) => {
+                add(&mut self.baseline, e, &gain);
+                moves.push(staged.count(), &gain);
+            }
+        }
+        staged.push(&d, 1.0 / s);
+        if staged.is_full() {
+            self.settle(staged, moves);
+        }
+    }
+
+    #[inline(never)]
+    fn settle(&mut self, staged: &mut Staged<N>, moves: &mut Moves<B>) {
+        V::settle(moves, &mut self.slope, staged.rows());
         staged.settle(&mut self.information);
     }
 
-    /// Move the baselines: without process noise that of monitor `b` alone, else all, for they are correlated.
-    fn learn_baselines(&mut self, b: usize, d: &[f64; N], e: f64, s: f64) {
-        let Gain { gain, from, to } = self.covariance.condition(b, s);
-        let slopes = self.slope.as_mut_slice().chunks_exact_mut(N);
-        let each = self.baseline.iter_mut().zip(slopes).zip(&gain);
-        for ((mean, slope), g) in each.skip(from).take(to - from) {
-            *mean += g * e;
-            add(slope, *g, d);
+    fn move_baseline(&mut self, b: usize, gain: f64, e: f64, d: &[f64; N]) {
+        if let (Some(mean), Some(slope)) = (self.baseline.get_mut(b), self.slope.get_mut(b)) {
+            *mean += gain * e;
+            add_rounded(slope, gain, d);
         }
     }
 
@@ -200,10 +220,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     }
 
     /// Baselines at some params [m].
+    #[inline(never)]
     pub fn baselines_at(&self, params: &[f32; N]) -> [f64; B] {
         let (step, mut baselines) = (self.step_to(params), self.baseline);
-        for (mean, slope) in baselines.iter_mut().zip(self.slope.as_slice().chunks_exact(N)) {
-            *mean -= dot(slope, &step);
+        for (mean, slope) in baselines.iter_mut().zip(&self.slope) {
+            *mean -= slope.iter().zip(&step).map(|(slope, step)| slope.double() * step).sum::<f64>();
         }
         baselines
     }
@@ -230,10 +251,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     }
 
     /// Derivative of the difference between a reading and its baseline, and the variance of the baseline.
+    #[inline(never)]
     pub fn effective(&self, b: usize, h: &[f32]) -> ([f64; N], f64) {
         let mut d = [0.0; N];
-        let slope = column(self.slope.as_slice(), N, b);
-        d.iter_mut().zip(h).zip(slope).for_each(|((d, h), slope)| *d = f64::from(*h) - slope);
+        d.iter_mut().zip(h).for_each(|(d, h)| *d = f64::from(*h));
+        self.slope.get(b).into_iter().for_each(|slope| subtract(&mut d, slope));
         (d, self.covariance.variance(b))
     }
 }
@@ -288,7 +310,7 @@ mod tests {
     fn conditioned() -> Gaussian<2, 2, 3, Correlated<2, 3>> {
         let mut gaussian = prior();
         for (b, innovation, h) in readings() {
-            gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
+            gaussian.condition([reading(b, innovation, &h)], &[0.0; 2]);
         }
         gaussian
     }
@@ -358,7 +380,7 @@ mod tests {
                 solution.solve(&gaussian, |_| WIDE);
                 act(&mut gaussian, &mut solution, *sigma);
             }
-            gaussian.condition([reading(b, innovation, &h)], |_| 0.0);
+            gaussian.condition([reading(b, innovation, &h)], &[0.0; 2]);
         }
         assert_equal(&gaussian, moves);
     }
@@ -385,11 +407,11 @@ mod tests {
     /// A million readings are as exact as one: their information is that of the sum.
     #[test]
     fn a_million_readings_lose_nothing() {
-        let mut gaussian = Gaussian::<1, 1, 1, Independent<1>>::BLANK;
+        let mut gaussian = Gaussian::<1, 1, 1, Independent<1, f64>>::BLANK;
         gaussian.reset(|_| WIDE, |_| BASELINE);
         let n = 500_000;
         for _ in 0..n {
-            gaussian.condition([reading(0, 1e-4, &[0.03]), reading(0, -1e-4, &[-0.03])], |_| 0.0);
+            gaussian.condition([reading(0, 1e-4, &[0.03]), reading(0, -1e-4, &[-0.03])], &[0.0]);
         }
         let precision = 1.0 / f64::from(VARIANCE);
         let expected = 1.0 / square(WIDE.sigma) + 2.0 * f64::from(n) * square(0.03) * precision;

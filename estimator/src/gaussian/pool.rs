@@ -1,7 +1,7 @@
 //! Many readings at once: settings of one kind share one derivative, and each monitor one baseline.
 
 use super::{Covariance, Gaussian, Staged, ln_density};
-use crate::linear::{add, column};
+use crate::linear::{Real, add, add_rounded, column};
 
 /// Readings of one monitor at settings of one kind: at the share `x` of a drive whose derivative is `h`,
 /// `residual = x h . delta + baseline + noise`. Its fields are sums of precision times `1, x, x^2, residual, x residual`.
@@ -53,8 +53,8 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         for b in 0..B {
             // what is known of a baseline is one more reading
             let mut h = [0.0; N];
-            if let Some(slope) = self.slope.as_mut_slice().as_chunks_mut::<N>().0.get_mut(b) {
-                h = core::mem::replace(slope, h);
+            if let Some(slope) = self.slope.get_mut(b) {
+                h = core::mem::replace(slope, [V::Slope::ZERO; N]).map(Real::double);
             }
             let precision = 1.0 / self.covariance.variance(b);
             let r = self.baseline(b) - pool.level.get(b).copied().unwrap_or(0.0);
@@ -99,29 +99,35 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         *precision += line.one;
         *pull += line.r;
         if h.iter().any(|h| *h != 0.0) {
-            staged.push(h, line.xx, &mut self.information);
+            self.stage(staged, h, line.xx);
             add(&mut self.vector, line.xr, h);
-            let slopes = self.slope.as_mut_slice().as_chunks_mut::<N>().0;
-            slopes.get_mut(b).into_iter().for_each(|slope| add(slope, line.x, h));
+            self.slope.get_mut(b).into_iter().for_each(|sum| add_rounded(sum, line.x, h));
+        }
+    }
+
+    fn stage(&mut self, staged: &mut Staged<N>, row: &[f64; N], weight: f64) {
+        staged.push(row, weight);
+        if staged.is_full() {
+            staged.settle(&mut self.information);
         }
     }
 
     /// Eliminate the baselines from what a pool has taken in.
     pub fn close(&mut self, pool: &Pool<B>) {
         let Pool { level, precision, pull } = pool;
-        let (mut variances, mut staged) = ([0.0; B], Staged::NONE);
-        let slopes = self.slope.as_mut_slice().as_chunks_mut::<N>().0.iter_mut();
-        let each = slopes.zip(self.baseline.iter_mut().zip(&mut variances));
-        let sums = precision.iter().zip(pull.iter().zip(level.iter())).enumerate();
-        for ((slope, (baseline, variance)), (b, (precision, (pull, level)))) in each.zip(sums) {
-            slope.iter_mut().for_each(|sum| *sum /= precision);
+        let (mut variances, mut staged) = (*precision, Staged::NONE);
+        for (b, (precision, (pull, level))) in precision.iter().zip(pull.iter().zip(level)).enumerate() {
+            let Some(sum) = self.slope.get_mut(b) else { continue };
+            let slope = sum.map(|sum| sum.double() / precision);
+            *sum = slope.map(V::Slope::nearest);
             let mean = pull / precision;
-            staged.push(slope, -precision, &mut self.information);
-            add(&mut self.vector, -pull, slope);
+            self.stage(&mut staged, &slope, -precision);
+            add(&mut self.vector, -pull, &slope);
             self.cost -= pull * mean;
             self.volume += libm::log(precision * self.covariance.variance(b));
-            (*baseline, *variance) = (level + mean, 1.0 / precision);
+            self.baseline.get_mut(b).into_iter().for_each(|baseline| *baseline = level + mean);
         }
+        variances.iter_mut().for_each(|variance| *variance = 1.0 / *variance);
         self.covariance.set(&variances);
         staged.settle(&mut self.information);
     }
@@ -142,8 +148,8 @@ mod tests {
         let residual = |b: usize, i: usize| 3e-3 + 2e-4 * libm::sinf((7 * b + i) as f32);
         let share = |i: usize| [1.0, -0.9, 0.0, 0.4][i % 4];
         for (b, innovation, h) in readings().into_iter().take(4) {
-            one_by_one.condition([reading(b, innovation, &h)], |_| 0.0);
-            pooled.condition([reading(b, innovation, &h)], |_| 0.0);
+            one_by_one.condition([reading(b, innovation, &h)], &[0.0; 2]);
+            pooled.condition([reading(b, innovation, &h)], &[0.0; 2]);
         }
         let mut pool = Pool::BLANK;
         pooled.open(&mut pool, [2.9e-3, 0.0]);
@@ -153,7 +159,7 @@ mod tests {
             for i in 0..20 {
                 pooled.count(line, share(i), f64::from(residual(b, i)) - level, &SINGLE);
                 let h = derivative(b).map(|h| share(i) * h);
-                one_by_one.condition([reading(b, residual(b, i), &h)], |_| 0.0);
+                one_by_one.condition([reading(b, residual(b, i), &h)], &[0.0; 2]);
             }
         }
         pooled.add_lines(&mut pool, 0, &lines, &[derivative(0), derivative(1)].concat());
@@ -169,7 +175,9 @@ mod tests {
             let variances = [&pooled, &one_by_one].map(|gaussian| gaussian.covariance.variance(i));
             assert!((variances[0] / variances[1] - 1.0).abs() < 1e-9);
         }
-        assert!((pooled.slope - one_by_one.slope).norm() < 1e-6 * one_by_one.slope.norm());
+        let each = pooled.slope.as_flattened().iter().zip(one_by_one.slope.as_flattened());
+        let (off, all) = each.fold((0.0, 0.0), |sum, (a, b)| (sum.0 + (a - b) * (a - b), sum.1 + b * b));
+        assert!(off < 1e-12 * all);
         let gap = solution.log_evidence - expected.log_evidence;
         assert!(gap.abs() < 1e-4, "{gap}");
     }

@@ -14,15 +14,27 @@ impl<const N: usize> Staged<N> {
     /// None wait.
     pub const NONE: Self = Self { rows: [[0.0; N]; 4], weight: [0.0; 4], count: 0 };
 
-    /// `information += weight row row^T`, now or later.
-    pub fn push<const T: usize>(&mut self, row: &[f64; N], weight: f64, information: &mut Triangle<N, T, f64>) {
+    /// `information += weight row row^T`, later.
+    pub fn push(&mut self, row: &[f64; N], weight: f64) {
         if let (Some(to), Some(its)) = (self.rows.get_mut(self.count), self.weight.get_mut(self.count)) {
             (*to, *its) = (*row, weight);
+            self.count += 1;
         }
-        self.count += 1;
-        if self.count >= self.rows.len() {
-            self.settle(information);
-        }
+    }
+
+    /// True if no more can wait.
+    pub fn is_full(&self) -> bool {
+        self.count == self.rows.len()
+    }
+
+    /// The rows that wait; others are of no weight.
+    pub fn rows(&self) -> &[[f64; N]; 4] {
+        &self.rows
+    }
+
+    /// How many wait: the place of the next one.
+    pub fn count(&self) -> usize {
+        self.count
     }
 
     /// Let all that wait enter.

@@ -41,12 +41,21 @@ impl<const C: usize, const T: usize> Gain<C, T> {
         }
     }
 
-    /// The kicks `-A^-1 pull` [rad], within the room that each corrector has, and scaled so that none moves faster than its rate.
+    /// The kicks `-A^-1 pull` [rad], within the room that each corrector has, and scaled so that none moves faster than its rate; the
+    /// plane's correctors are those from the `first` on.
     ///
     /// Where the best kicks are beyond a corrector's room, it is held at its edge and the others make up for it:
     /// `d -= A^-1 e_c (d_c - edge)/(A^-1)_cc` is the minimum on condition that `d_c = edge`.
     #[inline(never)]
-    pub fn step(&self, pull: &[f32], room: impl Fn(usize) -> [f32; 2], rate: impl Fn(usize) -> f32, step: &mut [f32]) {
+    pub fn step(
+        &self,
+        pull: &[f32],
+        room: &impl Fn(usize) -> [f32; 2],
+        rate: &impl Fn(usize) -> f32,
+        first: usize,
+        step: &mut [f32],
+    ) {
+        let (room, rate) = (|c| room(first + c), |c| rate(first + c));
         let mut best = [0.0; C];
         best.iter_mut().zip(pull).for_each(|(to, pull)| *to = -pull);
         best = self.inverse.multiply(&best);

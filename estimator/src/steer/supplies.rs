@@ -73,6 +73,7 @@ impl<const C: usize> Supplies<C> {
 
     /// Move each setpoint by so much one way or the other [A], as the `n`-th of a sequence of patterns; 0 is none. The same
     /// pattern takes it back.
+    #[inline(never)]
     pub fn probe(&mut self, size: f32, n: u32, limit: &Each<C>) {
         for (c, setpoint) in self.setpoint.iter_mut().enumerate().filter(|_| n != 0) {
             let room = (limit.of(c) - setpoint.value().abs()).max(0.0);

@@ -108,7 +108,7 @@ const KICK: Each<C> = Each::same(1e-5);
 /// Steps and kicks cost nothing, and nothing is in the way.
 fn free() -> Feedback<B, C> {
     Feedback {
-        orbit: [0.0; B],
+        orbit: Each::same(0.0),
         gain: 1.0,
         step_kick: 1.0,
         total_kick: 1.0,
@@ -242,7 +242,7 @@ fn a_known_response_removes_the_orbit_in_one_step() {
     assert_eq!(machine.cycle(), Steered { hold: None, left_out: 0, limited: 0 });
     assert!(machine.orbit().iter().all(|x| x.abs() < ROUNDING), "{:?}", machine.orbit());
     // to the wanted orbit, if that is another
-    machine.feedback.orbit = [1e-3; B];
+    machine.feedback.orbit = Each::same(1e-3);
     machine.cycles(1);
     assert!(machine.orbit().iter().all(|x| (x - 1e-3).abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
 }

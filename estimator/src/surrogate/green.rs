@@ -18,7 +18,7 @@
 //! Source: the resolvent (Dyson) form of the perturbed Green's function, by successive rank-one updates (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
-use super::quantised::Column;
+use super::quantised::{Column, dot_codes};
 use super::{Block, LowRank, Prediction, Steerable, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
 use crate::linear::{add, add_four, add_four_twice, dot};
@@ -374,9 +374,9 @@ impl<
         let (x, y) = weight.split_at(BX.min(B));
         let (slope, param) = (&at.slope, &self.param);
         if plane == 0 {
-            at.x.response_covariance(x, slope, param, covariance, add);
+            response_covariance(&at.x.seen, &at.x.driven, x, slope, param, covariance, add);
         } else {
-            at.y.response_covariance(y, slope, param, covariance, add);
+            response_covariance(&at.y.seen, &at.y.driven, y, slope, param, covariance, add);
         }
     }
 }
@@ -654,48 +654,49 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
 
     /// `R^T orbit` [m^2/rad].
     fn pull(&self, orbit: &[f32], pull: &mut [f32]) {
-        let mut all = [0.0; B];
-        all.iter_mut().zip(orbit).for_each(|(to, x)| *to = *x);
-        pull.iter_mut().zip(&self.response).for_each(|(pull, response)| *pull = response.dot(&all));
-    }
-
-    /// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
-    /// with `A_qp = 4 slope_q slope_p sum over b of weight_b Z_qb Z_pb`. The two nodes of a quadrupole count as one between
-    /// them: within half a metre an orbit hardly bends.
-    fn response_covariance<const N: usize>(
-        &self,
-        weight: &[f32],
-        slope: &[f32; M],
-        param: &[i16; M],
-        covariance: impl Fn(usize) -> [f32; N],
-        mut add: impl FnMut(&[f32], &[f32]),
-    ) {
-        for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
-            let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
-            let mut row = [0.0; M];
-            for (seen, weight) in self.seen.iter().zip(weight) {
-                let factor = weight * seen.scale * between(seen, q);
-                let nodes = seen.codes.as_chunks::<2>().0;
-                row.iter_mut().zip(nodes).for_each(|(to, [a, b])| *to += factor * (f32::from(*a) + f32::from(*b)));
-            }
-            let shared = covariance(own);
-            for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
-                let covariance = shared.get(*param as usize).copied().unwrap_or(0.0);
-                *to *= slope_q * slope * covariance;
-            }
-            let (mut here, mut there) = ([0.0; C], [0.0; C]);
-            for ((driven, here), there) in self.driven.iter().zip(&mut here).zip(&mut there) {
-                *here = between(driven, q);
-                let each = row.iter().zip(driven.codes.as_chunks::<2>().0);
-                *there = driven.scale * each.map(|(row, [a, b])| row * (f32::from(*a) + f32::from(*b))).sum::<f32>();
-            }
-            add(&here, &there);
-        }
+        let each = pull.iter_mut().zip(&self.response);
+        each.for_each(|(pull, response)| *pull = response.scale * dot_codes(&response.codes, orbit));
     }
 
     /// Add readings for kicks of nodes.
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
         reading.iter_mut().zip(&self.seen).for_each(|(reading, seen)| *reading += seen.dot(kick));
+    }
+}
+
+/// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
+/// with `A_qp = 4 slope_q slope_p sum over b of weight_b Z_qb Z_pb`. The two nodes of a quadrupole count as one between
+/// them: within half a metre an orbit hardly bends.
+#[inline(never)] // one for both planes
+fn response_covariance<const C: usize, const M: usize, const N: usize, const Q: usize>(
+    seen: &[Column<Q>],
+    driven: &[Column<Q>; C],
+    weight: &[f32],
+    slope: &[f32; M],
+    param: &[i16; M],
+    covariance: impl Fn(usize) -> [f32; N],
+    mut add: impl FnMut(&[f32], &[f32]),
+) {
+    for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
+        let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
+        let mut row = [0.0; M];
+        for (seen, weight) in seen.iter().zip(weight) {
+            let factor = weight * seen.scale * between(seen, q);
+            let nodes = seen.codes.as_chunks::<2>().0;
+            row.iter_mut().zip(nodes).for_each(|(to, [a, b])| *to += factor * (f32::from(*a) + f32::from(*b)));
+        }
+        let shared = covariance(own);
+        for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
+            let covariance = shared.get(*param as usize).copied().unwrap_or(0.0);
+            *to *= slope_q * slope * covariance;
+        }
+        let (mut here, mut there) = ([0.0; C], [0.0; C]);
+        for ((driven, here), there) in driven.iter().zip(&mut here).zip(&mut there) {
+            *here = between(driven, q);
+            let each = row.iter().zip(driven.codes.as_chunks::<2>().0);
+            *there = driven.scale * each.map(|(row, [a, b])| row * (f32::from(*a) + f32::from(*b))).sum::<f32>();
+        }
+        add(&here, &there);
     }
 }
 

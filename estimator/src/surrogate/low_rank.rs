@@ -4,7 +4,7 @@
 //! dispersion at the monitor times that at the corrector, a rolled monitor or corrector is one row or one column: each is a
 //! product `seen driven^T`, or few of them. They are constant: their dependence on the vars is left out.
 
-use super::quantised::{code, step};
+use super::quantised::{add_codes, code, dot_codes, step};
 
 /// Terms there is room for: three effects of two each, and two to spare.
 pub const TERMS: usize = 8;
@@ -71,9 +71,9 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank
         for ((scale, rf), ((seen_x, seen_y), (driven_x, driven_y))) in
             terms.take_while(|((scale, _), _)| **scale != 0.0)
         {
-            let amplitude = scale * (product(driven_x, kick_x) + product(driven_y, kick_y) + rf * rf_offset);
-            add(x, amplitude, seen_x);
-            add(y, amplitude, seen_y);
+            let amplitude = scale * (dot_codes(driven_x, kick_x) + dot_codes(driven_y, kick_y) + rf * rf_offset);
+            add_codes(x, amplitude, seen_x);
+            add_codes(y, amplitude, seen_y);
         }
     }
 
@@ -84,23 +84,15 @@ impl<const BX: usize, const BY: usize, const CX: usize, const CY: usize> LowRank
         for (scale, ((seen_x, seen_y), (driven_x, driven_y))) in
             self.scale.iter().zip(seen.zip(driven)).take_while(|(scale, _)| **scale != 0.0)
         {
-            let amplitude = scale * (product(seen_x, x) + product(seen_y, y));
-            add(pull_x, amplitude, driven_x);
-            add(pull_y, amplitude, driven_y);
+            let amplitude = scale * (dot_codes(seen_x, x) + dot_codes(seen_y, y));
+            add_codes(pull_x, amplitude, driven_x);
+            add_codes(pull_y, amplitude, driven_y);
         }
     }
 }
 
 fn quantise<const L: usize>(to: Option<&mut [i16; L]>, values: &[f64], step: f32) {
     to.into_iter().flatten().zip(values).for_each(|(to, value)| *to = code(*value, step));
-}
-
-fn product(codes: &[i16], values: &[f32]) -> f32 {
-    codes.iter().zip(values).map(|(code, value)| f32::from(*code) * value).sum()
-}
-
-fn add(to: &mut [f32], amplitude: f32, codes: &[i16]) {
-    to.iter_mut().zip(codes).for_each(|(to, code)| *to += amplitude * f32::from(*code));
 }
 
 #[cfg(test)]

@@ -48,14 +48,25 @@ impl<const R: usize> Column<R> {
 
     /// The scalar product with some values.
     pub fn dot(&self, values: &[f32; R]) -> f32 {
-        self.scale * self.codes.iter().zip(values).map(|(code, value)| f32::from(*code) * value).sum::<f32>()
+        self.scale * dot_codes(&self.codes, values)
     }
 
     /// `to += factor` times the column.
     pub fn add_to(&self, factor: f32, to: &mut [f32]) {
-        let step = factor * self.scale;
-        to.iter_mut().zip(&self.codes).for_each(|(to, code)| *to += step * f32::from(*code));
+        add_codes(to, factor * self.scale, &self.codes);
     }
+}
+
+/// The scalar product of codes with some values.
+#[inline(never)] // inlined for one length it becomes a line of code for each entry
+pub fn dot_codes(codes: &[i16], values: &[f32]) -> f32 {
+    codes.iter().zip(values).map(|(code, value)| f32::from(*code) * value).sum()
+}
+
+/// `to += factor` times codes.
+#[inline(never)]
+pub fn add_codes(to: &mut [f32], factor: f32, codes: &[i16]) {
+    to.iter_mut().zip(codes).for_each(|(to, code)| *to += factor * f32::from(*code));
 }
 
 impl<const R: usize, const C: usize> Block<R, C> {

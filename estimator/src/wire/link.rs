@@ -12,9 +12,10 @@ use crate::estimator::{GROUPS, IngestError, Setup};
 use crate::mask::Mask;
 use crate::ramp::RAMP_POINTS;
 use crate::sizes::Sizes;
+use crate::steer::{Feedback, Steered};
 
 /// Version of requests and replies.
-pub const VERSION: u8 = 3;
+pub const VERSION: u8 = 4;
 /// First byte of a request.
 pub const REQUEST: u8 = 0x10 | VERSION;
 /// First byte of a reply.
@@ -26,11 +27,11 @@ pub const PIECE: usize = 56;
 /// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
 pub const OTHER_BYTES: usize = VARINT_32 + 1 + VARINT_32 + VARINT_16 + LENGTH + 4 * PIECE;
 
-/// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables. On the wire its number comes first, which
-/// the reply repeats, so that a host never takes the reply to an earlier request for that to a later one.
+/// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables, `W` what is wanted of the orbit. On the wire
+/// its number comes first, which the reply repeats, so that a host never takes the reply to an earlier request for that to a later one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // there is no allocator to box one with
-pub enum Request<S, P> {
+pub enum Request<S, P, W> {
     /// Forget all frames and begin at the prior.
     Restart(S),
     /// Take the next frame whatever its number: the front end has restarted its counter.
@@ -45,6 +46,8 @@ pub enum Request<S, P> {
     BuiltIn,
     /// Reply to frames in this form, until told otherwise or restarted.
     Form(Form),
+    /// Steer from the next frame on, as if it were the first; or no more. Restarted, a device does not steer.
+    Feedback(Option<W>),
 }
 
 /// How a device replies to frames.
@@ -92,31 +95,45 @@ pub enum Reply<A, U> {
     Short(Short<U>),
     /// Frames are replied to in this form.
     Form(Form),
+    /// The device steers from the next frame on, or no more.
+    Feedback(bool),
 }
 
-/// What feedback needs after a frame: may the setpoints be used, and which are they?
+/// What feedback needs after a frame.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Short<U> {
     /// Sequence number of the frame.
     pub sequence: u32,
     /// What is to be said of the frame and of the posterior, see [`Remarks`].
     pub remarks: Remarks,
-    /// The model did not describe the frames so far when it was last linearised, see [`crate::FitQuality::is_mismatch`].
-    pub mismatch: bool,
     /// An operator should look, see [`crate::Core::needs_attention`].
     pub attention: bool,
     /// Normalised innovation squared of the readings used.
     pub nis: f32,
-    /// Currents that the correctors should have, in their order; none where the device does not steer, or holds them.
+    /// What the correctors are to do, while the device steers.
+    pub correction: Option<Correction<U>>,
+}
+
+/// What the correctors are to do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Correction<U> {
+    /// What became of the frame, a reason to hold if there is one.
+    pub steered: Steered,
+    /// The work for the feedback after the frame before was done ([`crate::Estimator::prepare_steer`], once): with the same slices and
+    /// the same work before each frame, another core arrives at the same bits.
+    pub prepared: bool,
+    /// Currents that the correctors should have, in their order, also those that hold or probe.
     pub setpoints: U,
 }
 
-/// Setpoints of `C` correctors, or none.
+/// Setpoints of `C` correctors.
 pub type Setpoints<const C: usize> = Vec<CurrentCode, C>;
 
 impl<const C: usize> Short<Setpoints<C>> {
     /// Largest body of a reply that holds one.
-    pub const MAX_BYTES: usize = VARINT_32 + 1 + VARINT_32 + 5 + 4 + LENGTH + VARINT_32 * C;
+    pub const MAX_BYTES: usize = VARINT_32 + 1 + VARINT_32 + 3 + VARINT_32 + 1 + VARINT_16 // the frame, remarks
+        + 1 + 4 // attention, nis
+        + 1 + 2 + 2 * VARINT_16 + 1 + LENGTH + VARINT_32 * C; // correction
 }
 
 /// What became of a part of new tables.
@@ -330,7 +347,12 @@ impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
         + 3 * 4 + 5; // gate, both walks, tunes
 }
 
-impl<S: Serialize, P: Serialize> Request<S, P> {
+impl<const B: usize, const C: usize> Feedback<B, C> {
+    /// Largest body of a request that holds one.
+    pub const MAX_BYTES: usize = VARINT_32 + 2 + 2 * (4 + LENGTH) + 4 * (B + C) + 6 * 4 + VARINT_64;
+}
+
+impl<S: Serialize, P: Serialize, W: Serialize> Request<S, P, W> {
     /// Write the request as a packet; returns its bytes.
     ///
     /// # Errors
@@ -340,7 +362,7 @@ impl<S: Serialize, P: Serialize> Request<S, P> {
     }
 }
 
-impl<S: DeserializeOwned, P: DeserializeOwned> Request<S, P> {
+impl<S: DeserializeOwned, P: DeserializeOwned, W: DeserializeOwned> Request<S, P, W> {
     /// Read a request and its number, which is [`UNASKED`] where that is damaged; `bytes` is used as work space.
     pub fn decode(bytes: &mut [u8]) -> (u32, Result<Self, FrameError>) {
         unseal(REQUEST, bytes)

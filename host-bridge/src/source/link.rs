@@ -11,7 +11,7 @@ use std::time::Instant;
 use estimator::wire::link::{Form, Refusal, Short, Status, Taken, UNASKED};
 use estimator::{FrameError, ParcelError, Tables as _};
 use inference::stream::{Estimate, Setup};
-use training::rooms::large::{PACKET, Reply, Request, Setpoints};
+use training::rooms::large::{Feedback, PACKET, Reply, Request, Setpoints};
 use training::{LINE, Tables};
 
 use super::address::Address;
@@ -223,6 +223,19 @@ impl<L: Read + Write> Link<L> {
         }
     }
 
+    /// Let the device steer from the next frame on, as if it were the first, or no more; restarted it does not.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn steer(&mut self, feedback: Option<Feedback>) -> Result<(), LinkError> {
+        let steers = feedback.is_some();
+        match self.ask(&Request::Feedback(feedback))? {
+            Reply::Feedback(got) if got == steers => Ok(()),
+            Reply::Refused { why, .. } => Err(LinkError::Refused { what: "a feedback", why }),
+            other => Err(unexpected("whether it steers", &other)),
+        }
+    }
+
     /// Send a frame and wait for the reply, with the covariance.
     ///
     /// # Errors
@@ -251,7 +264,7 @@ impl<L: Read + Write> Link<L> {
         }
     }
 
-    /// Send a frame to a device that replies in short, and wait for that.
+    /// Send a frame to a device that replies in short, and wait for that: with setpoints, if it steers.
     ///
     /// # Errors
     /// [`LinkError`].

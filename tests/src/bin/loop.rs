@@ -1,7 +1,8 @@
 //! The loop closed in software: one of everything that can happen to a machine, with estimated vars, with the design's, and
-//! without correction; the same frames through the emulated chip. A table, a figure, `target/loop.json`.
+//! without correction; the emulated chip steers the same machine, beside the core in process. A table, a figure, `target/loop.json`.
 
 use core::error::Error;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -10,8 +11,8 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
-use system_tests::feedback::{Control, GAIN, Known, Loop, Sample, Scenario, held, on_chip, recommended, rms, settled};
-use system_tests::qemu::Image;
+use system_tests::feedback::{Chip, Control, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
+use system_tests::qemu::{Counts, Emulator, Image, Options};
 
 /// Close the loop in software.
 #[derive(Debug, Parser)]
@@ -22,7 +23,7 @@ struct Arguments {
     /// Low-pass of the readings
     #[arg(long, default_value_t = GAIN)]
     gain: f32,
-    /// Frames that also go through the emulated chip
+    /// Frames from the beginning of the feedback on in which the emulated chip steers as well
     #[arg(long, value_name = "N", default_value_t = 500)]
     chip: usize,
     /// Where the figure goes
@@ -48,29 +49,67 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     let known = Known::read()?;
     let scenario = Scenario::of_everything(arguments.seed);
-    let close = |control| -> Result<_, Box<dyn Error>> {
-        let feedback = estimator::booster::Feedback { gain: arguments.gain, ..recommended() };
-        let mut closed = Loop::new(&known, feedback, control, scenario.clone())?;
-        let mut wires = Vec::new();
-        let mut samples = Vec::new();
-        for _ in 0..scenario.frames {
-            samples.push(closed.cycle()?);
-            wires.push(closed.wire.clone());
-        }
-        Ok((samples, wires))
+    let feedback = estimator::booster::Feedback { gain: arguments.gain, ..recommended() };
+    let closed = |control| Loop::new(&known, feedback.clone(), control, scenario.clone());
+    let [off, design] = [Control::Off, Control::Design].map(|control| closed(control)?.run());
+    let (estimated, chip) = match arguments.chip {
+        0 => (closed(Control::Estimated)?.run()?, OnChip::default()),
+        frames => steered_by_the_chip(
+            closed(Control::Estimated)?,
+            (scenario.campaign as usize + frames).min(scenario.frames as usize),
+        )?,
     };
-    let (off, _) = close(Control::Off)?;
-    let (design, _) = close(Control::Design)?;
-    let (estimated, wires) = close(Control::Estimated)?;
+    let (off, design) = (off?, design?);
     let all = [off.as_slice(), &design, &estimated];
     println!("{}", stretches(&scenario, all));
     output::bytes(&arguments.figure, figure(&scenario, all).svg.as_bytes())?;
-    let chip = &wires[..arguments.chip.min(wires.len())];
-    let different = if chip.is_empty() { 0 } else { on_chip(&Image::build()?, chip)? };
-    println!("{} of {} estimates of the emulated chip differ from the host's", different, chip.len());
-    output::json(&arguments.json, &summary(&scenario, all, (chip.len(), different)))?;
+    println!("{} of {} replies of the emulated chip differ from the host's", chip.different, chip.frames);
+    chip.most().into_iter().for_each(|(word, most)| println!("most instructions, {word}: {most}"));
+    output::json(&arguments.json, &summary(&scenario, all, &chip))?;
     println!("{} {}", arguments.figure.display(), arguments.json.display());
-    Ok(different == 0)
+    Ok(chip.different == 0)
+}
+
+/// Steps whose instructions are counted, by the words of the table and the function in the image.
+const REGIONS: [(&str, &str); 4] = [
+    ("frame to setpoints", "Estimator::ingest_and_steer"),
+    ("steer", "Steer::steer"),
+    ("gains of a plane", "Steer::prepare"),
+    ("reply", "Reply::encode"),
+];
+
+/// What the emulated chip showed.
+#[derive(Debug, Default)]
+struct OnChip {
+    frames: usize,
+    different: usize,
+    counts: Counts,
+}
+
+impl OnChip {
+    /// Most instructions of each region.
+    fn most(&self) -> Vec<(&'static str, u64)> {
+        let most = |name| self.counts.get(name).and_then(|runs| runs.iter().max()).copied();
+        REGIONS.iter().filter_map(|(word, name)| Some((*word, most(*name)?))).collect()
+    }
+}
+
+/// A loop in which the chip hears the first frames, and steers as soon as there is feedback.
+fn steered_by_the_chip(closed: Loop<'_>, frames: usize) -> Result<(Vec<Sample>, OnChip), Box<dyn Error>> {
+    let image = Image::build()?;
+    let regions = REGIONS.iter().map(|(_, name)| image.function(name)).collect::<Result<_, _>>()?;
+    let emulator = Emulator::start(&image, &Options { regions, ..Options::default() })?;
+    let mut closed = closed; // for no longer than there is the emulator
+    closed.chip = Some(Chip::start(&emulator)?);
+    let mut on_chip = OnChip::default();
+    let mut samples = (0..frames).map(|_| closed.cycle()).collect::<Result<Vec<_>, _>>()?;
+    if let Some(chip) = closed.chip.take() {
+        (on_chip.frames, on_chip.different) = (chip.frames, chip.different);
+    }
+    samples.extend(closed.run()?);
+    drop(closed);
+    on_chip.counts = emulator.stop()?.counts;
+    Ok((samples, on_chip))
 }
 
 fn stretches(scenario: &Scenario, all: [&[Sample]; 3]) -> comfy_table::Table {
@@ -106,7 +145,7 @@ fn figure(scenario: &Scenario, all: [&[Sample]; 3]) -> Figure {
     Figure::lines(&axes, &series.collect::<Vec<_>>())
 }
 
-fn summary(scenario: &Scenario, all: [&[Sample]; 3], (chip, different): (usize, usize)) -> serde_json::Value {
+fn summary(scenario: &Scenario, all: [&[Sample]; 3], chip: &OnChip) -> serde_json::Value {
     let rows = scenario.stretches().into_iter().map(|(name, frames)| {
         let [off, design, estimated] = all.map(|samples| 1e3 * rms(&samples[frames.clone()]));
         let [_, settled_design, settled] = all.map(|samples| 1e3 * rms(settled(&samples[frames.clone()])));
@@ -121,6 +160,6 @@ fn summary(scenario: &Scenario, all: [&[Sample]; 3], (chip, different): (usize, 
         "stretches": rows.collect::<Vec<_>>(),
         "nees": last.map(|sample| sample.nees),
         "sigma": last.map(|sample| sample.sigma),
-        "chip": {"frames": chip, "different": different},
+        "chip": {"frames": chip.frames, "different": chip.different, "instructions": chip.most().into_iter().collect::<BTreeMap<_, _>>()},
     })
 }

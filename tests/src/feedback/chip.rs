@@ -1,33 +1,145 @@
-//! The frames of a loop on the emulated chip, beside the core in process.
+//! The emulated chip in a loop, beside the core in process.
 
 use core::error::Error;
+use core::fmt;
+use std::os::unix::net::UnixStream;
 
-use estimator::booster::Frame;
-use host_bridge::source::link::Link;
+use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback};
+use estimator::wire::link::{Form, Short};
+use estimator::{CurrentCode, Each, Steered};
+use host_bridge::source::link::{Heard, Link, LinkError};
+use inference::stream;
+use training::rooms::large::{self, Setpoints};
 
 use super::Known;
 use crate::machine::LAYOUT;
-use crate::qemu::{Emulator, Image, Options};
-use crate::sil::is_same;
+use crate::qemu::Emulator;
+use crate::sil::bits;
 
-/// Send frames through the image; returns how many estimates differ from the host's in any bit, covariances included. The setpoints
-/// are a function of these and of the frames, and so are the host's.
-///
-/// # Errors
-/// Whatever stops the emulator, the line or the core.
-pub fn on_chip(image: &Image, wires: &[Vec<u8>]) -> Result<usize, Box<dyn Error>> {
-    let emulator = Emulator::start(image, &Options::default())?;
-    let mut core = Known::core()?;
-    let mut link = Link::new(emulator.uart());
-    link.restart(&core.setup)?;
-    let mut different = 0;
-    for wire in wires {
-        let sequence = Frame::decode(&LAYOUT, &mut wire.clone())?.sequence;
-        let heard = link.ingest(sequence, wire)?;
-        for _ in 0..heard.estimate.remarks.slices {
-            let _ = core.slice();
-        }
-        different += usize::from(!is_same(&mut core, wire.clone(), &heard));
+/// A device on the emulated chip.
+pub struct Chip<'e> {
+    link: Link<&'e UnixStream>,
+    steers: bool,
+    /// Frames that it has answered.
+    pub frames: usize,
+    /// Frames that the core in process has answered otherwise, in any bit.
+    pub different: usize,
+}
+
+impl fmt::Debug for Chip<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Chip").field("frames", &self.frames).field("different", &self.different).finish_non_exhaustive()
     }
-    Ok(different)
+}
+
+/// What it says of a frame: before it steers in full, with the covariance, then in short.
+#[derive(Debug)]
+pub enum Said {
+    /// The estimate.
+    Full(Box<Heard>),
+    /// With setpoints.
+    Short(Short<Setpoints>),
+}
+
+impl Said {
+    /// Slices of work that the core has done before the frame.
+    pub fn slices(&self) -> u32 {
+        match self {
+            Self::Full(heard) => heard.estimate.remarks.slices,
+            Self::Short(short) => short.remarks.slices,
+        }
+    }
+
+    /// True if the work for the feedback was done.
+    pub fn prepared(&self) -> bool {
+        match self {
+            Self::Full(_) => false,
+            Self::Short(short) => short.correction.as_ref().is_some_and(|correction| correction.prepared),
+        }
+    }
+}
+
+impl<'e> Chip<'e> {
+    /// At the prior.
+    ///
+    /// # Errors
+    /// If the device does not take its setup.
+    pub fn start(emulator: &'e Emulator) -> Result<Self, Box<dyn Error>> {
+        let mut link = Link::new(emulator.uart());
+        link.restart(&Known::core()?.setup)?;
+        Ok(Self { link, steers: false, frames: 0, different: 0 })
+    }
+
+    /// Send a frame, and hear what is said of it; the chip steers from the first frame on that has a feedback.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn hear(&mut self, feedback: Option<&Feedback>, sequence: u32, wire: &[u8]) -> Result<Said, LinkError> {
+        self.frames += 1;
+        let Some(feedback) = feedback else {
+            return self.link.ingest(sequence, wire).map(|heard| Said::Full(Box::new(heard)));
+        };
+        if !core::mem::replace(&mut self.steers, true) {
+            self.link.form(Form::Short)?;
+            self.link.steer(Some(on_wire(feedback)))?;
+        }
+        self.link.feedback(sequence, wire).map(Said::Short)
+    }
+
+    /// Hold what it said against the core in process, which has heard the same frame.
+    pub fn compare(
+        &mut self,
+        said: &Said,
+        core: &Estimator,
+        estimate: &Estimate,
+        steered: Option<Steered>,
+        setpoints: &[CurrentCode; CORRECTORS],
+    ) {
+        let is_same = match said {
+            Said::Full(heard) => is_same(heard, core, estimate),
+            Said::Short(short) => says(short, estimate, steered, setpoints),
+        };
+        self.different += usize::from(!is_same);
+    }
+}
+
+/// True if estimate and covariance are the same, bit for bit.
+fn is_same(heard: &Heard, core: &Estimator, estimate: &Estimate) -> bool {
+    let estimate = stream::Estimate::of(estimate, &LAYOUT);
+    let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));
+    bits(&heard.estimate) == bits(&estimate)
+        && places.all(|(i, j)| core.covariance(i, j).to_bits() == heard.covariance(i, j).to_bits())
+}
+
+/// True if a short reply says what the core in process does, bit for bit.
+fn says(
+    short: &Short<Setpoints>,
+    estimate: &Estimate,
+    steered: Option<Steered>,
+    setpoints: &[CurrentCode; CORRECTORS],
+) -> bool {
+    let Some(correction) = &short.correction else { return false };
+    short.nis.to_bits() == estimate.nis.to_bits()
+        && short.remarks == estimate.remarks
+        && Some(correction.steered) == steered
+        && correction.setpoints.as_slice() == setpoints
+}
+
+/// As a host sends it, which talks to devices of any size.
+pub fn on_wire(feedback: &Feedback) -> large::Feedback {
+    large::Feedback {
+        orbit: wide(&feedback.orbit),
+        gain: feedback.gain,
+        step_kick: feedback.step_kick,
+        total_kick: feedback.total_kick,
+        limit: wide(&feedback.limit),
+        rate: feedback.rate,
+        probe: feedback.probe,
+        close: feedback.close,
+        patience_us: feedback.patience_us,
+    }
+}
+
+fn wide<const L: usize, const M: usize>(each: &Each<L>) -> Each<M> {
+    Each { all: each.all, own: each.own.iter().copied().collect() }
 }
