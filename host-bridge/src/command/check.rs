@@ -10,7 +10,7 @@ use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
 
-use super::{CommandError, campaign, check_outputs, deliver, machine, not_modelled, recording};
+use super::{CommandError, campaign, check_outputs, deliver, machine, not_modelled, recording, strays};
 use crate::cli::Check;
 use crate::output::{lines, table};
 use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
@@ -202,6 +202,7 @@ fn replay(campaign: &Campaign) -> Usable {
         Err(error) => error.to_string(),
         Ok(()) => prior_only(campaign)
             .or_else(|| not_modelled(recording))
+            .or_else(|| strays(ring, recording))
             .unwrap_or_else(|| "each frame to an estimate".into()),
     };
     Usable { command: "replay", can: ready.is_ok(), what }

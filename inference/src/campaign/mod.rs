@@ -31,7 +31,7 @@ pub(crate) use normal::{Normal, Terms};
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
-pub use times::Times;
+pub use times::{Stray, Times, furthest_stray};
 
 /// A recording and what follows from it before any fit.
 #[derive(Debug, Clone)]

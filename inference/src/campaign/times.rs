@@ -3,6 +3,7 @@
 
 use core::fmt;
 
+use super::drive::{Drive, mean_supplies};
 use crate::recording::Recording;
 
 /// The frames by their time in the cycle.
@@ -42,6 +43,34 @@ impl Times {
     pub fn milliseconds(&self) -> Vec<f64> {
         self.known.iter().map(|time| (time * 1e6).round() / 1e3).collect()
     }
+}
+
+/// A supply that is off at one time in the cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stray {
+    /// Which supply.
+    pub supply: usize,
+    /// The time [ms].
+    pub milliseconds: f64,
+    /// Mean `ln` of its factor there, less that of all frames.
+    pub off: f64,
+}
+
+/// The supply that is furthest off the ramp at some time, from what it is on average; none without several times.
+pub fn furthest_stray(recording: &Recording) -> Option<Stray> {
+    let times = Times::of(recording);
+    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    let all = mean_supplies(&drives);
+    let at = |(time, milliseconds): (usize, f64)| {
+        let own: Vec<Drive> = (drives.iter().zip(&times.of_frame))
+            .filter(|(_, at)| **at == time)
+            .map(|(drive, _)| drive.clone())
+            .collect();
+        let off = mean_supplies(&own).into_iter().zip(&all).map(|(own, all)| own - all);
+        off.enumerate().map(|(supply, off)| Stray { supply, milliseconds, off }).collect::<Vec<_>>()
+    };
+    let each = times.milliseconds().into_iter().enumerate().flat_map(at).filter(|_| times.count() > 1);
+    each.max_by(|one, other| one.off.abs().total_cmp(&other.off.abs()))
 }
 
 impl fmt::Display for Times {
