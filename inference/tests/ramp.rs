@@ -7,11 +7,12 @@ use inference::recording::Row;
 use inference::simulate::{self, Hardware};
 use inference::stream::{self, Core, Walk};
 use inference::{
-    BatchFit, Campaign, Drive, Posterior, Readings, Recording, RecordingError, Reduced, ResponseModel, TuneUse,
+    BatchFit, Campaign, Drive, Estimate, Posterior, Readings, Recording, RecordingError, Reduced, ResponseModel,
+    TuneUse,
 };
 use nalgebra::{DMatrix, DVector};
-use rand::SeedableRng;
 use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use serde_json::{Value, json};
 use twin::{Cycle, Machine, Rf, Ring, Tracked};
@@ -97,12 +98,14 @@ struct Truth {
     apart: f64,
     /// The supplies are off their nominal currents by this times what [`TIMES`] says.
     off: f64,
+    /// Five correctors are moved at random in each cycle, in place of one after the other.
+    is_steered: bool,
     seed: u64,
 }
 
 impl Truth {
     fn of(ring: &Ring, seed: u64) -> Self {
-        Self { vars: simulate::vars(ring, true, seed).unwrap(), apart: 3e-4, off: 1.0, seed }
+        Self { vars: simulate::vars(ring, true, seed).unwrap(), apart: 3e-4, off: 1.0, is_steered: false, seed }
     }
 }
 
@@ -154,13 +157,19 @@ impl Built {
 
 /// A campaign of `paper-vars` with every cycle read at all times: the same currents in the correctors, which kick the slow beam more.
 fn campaign(truth: &Truth) -> Recording {
+    cycles(truth, usize::MAX)
+}
+
+/// The first cycles of it.
+fn cycles(truth: &Truth, count: usize) -> Recording {
     let template = Recording::read(&repository("recordings/paper-vars"), &Ring::booster()).unwrap();
     let hardware = Hardware::shipped(&Ring::booster(), &template);
     let mut streams = simulate::seeds(truth.seed).map(StdRng::seed_from_u64);
     let [mut machine, mut ripple, mut noise] = core::array::from_fn(|_| streams.next().unwrap());
     let built = Built::of(truth, &hardware, &mut machine);
     let mut recording = Recording { name: "ramp".into(), rows: Vec::new(), ..template.clone() };
-    for (number, given) in template.rows.iter().enumerate() {
+    for (number, given) in template.rows.iter().take(count).enumerate() {
+        let given = if truth.is_steered { steered(given, &mut machine) } else { given.clone() };
         for (k, (time, energy, off)) in TIMES.into_iter().enumerate() {
             let mut row = given.clone();
             let dipoles = 1.0 + RIPPLE * normal(&mut ripple);
@@ -185,6 +194,15 @@ fn campaign(truth: &Truth) -> Recording {
         }
     }
     recording
+}
+
+/// The row with five correctors at up to 10 A, as a feedback would have them.
+fn steered(row: &Row, random: &mut StdRng) -> Row {
+    let mut current = vec![0.0; row.corrector_current.len()];
+    for _ in 0..5 {
+        current[random.random_range(0..row.corrector_current.len())] = random.random_range(-10.0..10.0);
+    }
+    Row { correctors: Vec::new(), corrector_current: current, rf_offset: 0.0, ..row.clone() }
 }
 
 /// A recording written for a ring and read again.
@@ -257,6 +275,29 @@ fn vars_are_those_of_the_machine_at_four_times_in_the_cycle() {
         assert!([core, batch].iter().all(|nees| (0.6..1.6).contains(nees)), "seed {seed}: NEES/48 {core} {batch}");
         assert!(rms < 0.1 && most < 0.3 && ratio < 0.05, "seed {seed}: {rms} {most} {ratio}");
         assert!(chi2.iter().all(|chi2| (0.96..1.04).contains(chi2)), "seed {seed}: {chi2:?}");
+    }
+}
+
+/// No frame is of a setting, and vars and baselines may walk, as the daemon expects: each time's baselines are known all the same.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_stream_of_several_correctors_has_its_baselines_at_each_time() {
+    let ring = with_ramp();
+    for walk in [Walk::NONE, stream::FOLLOW] {
+        let truth = Truth { off: 1.0 / 3.0, is_steered: true, ..Truth::of(&ring, 13) };
+        let recording = through_files(&campaign(&truth), &ring).unwrap();
+        let mut core = stream::estimator(&ring, &recording, walk).unwrap();
+        let (mut last, mut aside) = (Vec::new(), 0);
+        let hear = |_: &Row, estimate: &Estimate| {
+            last.clone_from(&estimate.map_params);
+            aside += u32::from(estimate.remarks.put_aside);
+        };
+        stream::replay(&mut core, &recording, hear).unwrap();
+        let params: Vec<f64> = last.iter().map(|theta| f64::from(*theta)).collect();
+        let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
+        let nees = nees(&params, &covariance, &truth.vars);
+        println!("{walk:?}: NEES/48 {nees:.2}, {aside} frames put aside");
+        assert!((0.4..1.6).contains(&nees) && aside == 0, "{walk:?}: {nees} {aside}");
     }
 }
 
@@ -338,9 +379,7 @@ fn the_sampled_density_is_that_of_the_batch_fit() {
 
 /// A recording of one cycle, at all four times.
 fn one_cycle() -> Recording {
-    let mut recording = campaign(&Truth { vars: vec![1.0; 48], apart: 3e-4, off: 0.0, seed: 1 });
-    recording.rows.truncate(4);
-    recording
+    cycles(&Truth { vars: vec![1.0; 48], apart: 3e-4, off: 0.0, is_steered: false, seed: 1 }, 1)
 }
 
 #[test]
