@@ -70,7 +70,7 @@ pub struct Estimate<const B: usize, const N: usize, const W: usize> {
     pub sequence: u32,
     /// Time of the frame [us].
     pub time_us: u64,
-    /// Frames used so far.
+    /// Frames taken in so far, those that were put aside included.
     pub frames: u32,
     /// Frames refused so far: corrupted, repeated, out of order.
     pub rejected_frames: u32,

@@ -419,6 +419,9 @@ impl<
         self.note_time(model, frame);
         self.predict(model, drive);
         let setting = self.setting(model, frame, drive);
+        if setting.is_none() {
+            self.past.reference.wait();
+        }
         let (whole, expected) = self.judge_whole(model, frame, setting.is_some());
         if whole == Whole::Aside {
             return self.estimate(model, frame, None, &Screened::none_of(&frame.valid), 0.0, whole);
@@ -715,7 +718,6 @@ impl<
                 self.let_go(model, &oldest);
             }
         }
-        self.past.reference.wait();
         let first_channel = self.predicted.first_channel as u16;
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted, first_channel };
         // there is room: one has just left
@@ -803,7 +805,7 @@ impl<
         self.posterior.step_evidence()
     }
 
-    /// Frames used so far.
+    /// Frames taken in so far, those that were put aside included.
     pub fn frames(&self) -> u32 {
         self.sequence.frames
     }

@@ -12,6 +12,8 @@
 /// What repeats have shown of one monitor: the scatter, and how its baseline follows `F` supplies.
 #[derive(Debug, Clone, Copy)]
 pub struct Following<const F: usize> {
+    /// Repeats of settings, the first one of each not counted.
+    pub repeats: u32,
     /// Sum of squared deviations of repeats from their means [m^2].
     scatter: f64,
     /// Sums of products of the deviations of `ln` of the supplies' factors, `A`.
@@ -41,7 +43,7 @@ impl<const F: usize> Expected<F> {
 
 impl<const F: usize> Following<F> {
     /// No repeats so far: it does not follow.
-    pub const NONE: Self = Self { scatter: 0.0, ripple: [[0.0; F]; F], along: [0.0; F], slope: [0.0; F] };
+    pub const NONE: Self = Self { repeats: 0, scatter: 0.0, ripple: [[0.0; F]; F], along: [0.0; F], slope: [0.0; F] };
 
     /// Count the `n`-th repeat in a setting. `off_mean`: `ln` of the supplies' factors, off their mean with this one; `deviation`: the
     /// reading, moved to that mean by what is known so far, off the mean of those before [m].
@@ -56,6 +58,7 @@ impl<const F: usize> Following<F> {
         let n = f64::from(n);
         let growth = (n - 1.0) / n * f64::from(deviation) * f64::from(deviation);
         let deviation = f64::from(deviation + self.shift(off_mean));
+        self.repeats = self.repeats.saturating_add(1);
         self.scatter += (n - 1.0) / n * deviation * deviation;
         for ((row, along), s) in self.ripple.iter_mut().zip(&mut self.along).zip(off_mean) {
             *along += f64::from(*s) * deviation;

@@ -46,13 +46,6 @@ impl<const W: usize> Mask<W> {
     pub fn is_empty(&self) -> bool {
         self.0.iter().all(|word| *word == 0)
     }
-
-    /// Bits of either.
-    pub fn or(&self, other: &Self) -> Self {
-        let mut either = *self;
-        either.0.iter_mut().zip(&other.0).for_each(|(to, word)| *to |= word);
-        either
-    }
 }
 
 impl<const W: usize> Default for Mask<W> {
@@ -75,7 +68,6 @@ mod tests {
         assert_eq!((mask.count(), mask.as_words()), (4, [0x8000_0001; 2].as_slice()));
         mask.put(31, false);
         assert!(!mask.has(31) && mask.has(32) && !mask.is_empty());
-        assert_eq!(mask.or(&Mask::from_words(&[2, 0, 9])).as_words(), [3, 0x8000_0001]);
     }
 
     #[test]

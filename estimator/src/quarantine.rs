@@ -80,23 +80,26 @@ impl<const B: usize> Quarantine<B> {
     /// How far each baseline has moved [m], if that explains all frames put aside; `variance` is that of a surprise.
     ///
     /// Three quarters of the monitors must be off by the same in all frames, while their readings have followed the
-    /// correctors.
+    /// correctors. Of the others nobody knows, and they stay: repeats will outvote what they read before.
     pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[f32; B]> {
         if self.frames < ENOUGH {
             return None;
         }
         let (mut heard, mut steady, mut surprises, mut readings) = (0, 0, 0.0, 0.0);
-        for (b, said) in self.said.iter().enumerate().filter(|(_, said)| said.number >= ENOUGH) {
+        let mut shift = [0.0; B];
+        let each = self.said.iter().zip(&mut shift).enumerate();
+        for (b, (said, shift)) in each.filter(|(_, (said, _))| said.number >= ENOUGH) {
             heard += 1;
             let (allowed, variance) = (SAME * (said.number - 1) as f32, variance(b));
             if said.surprise.squares <= allowed * variance {
                 steady += 1;
                 surprises += said.surprise.squares / variance;
                 readings += said.reading.squares / variance;
+                *shift = said.surprise.mean;
             }
         }
         let explained = heard > 0 && 4 * steady >= 3 * heard && readings >= FOLLOWS * surprises;
-        explained.then(|| self.said.map(|said| said.surprise.mean))
+        explained.then_some(shift)
     }
 }
 
@@ -133,7 +136,9 @@ mod tests {
         assert_eq!(shift(&quarantine(9, 1e-3, moved)), None);
         // one monitor jumps besides
         let jumps = |b: usize, orbit: f32, noise: f32| moved(b, orbit, if b == 2 { 50.0 * noise } else { noise });
-        assert!(shift(&quarantine(10, 1e-3, jumps)).is_some());
+        let found = shift(&quarantine(10, 1e-3, jumps)).unwrap();
+        assert_eq!(found[2], 0.0, "of which it is not known");
+        assert!((found[3]).abs() < NOISE && (found[7] - 4e-3).abs() < NOISE);
         // readings of no beam: their noise about 0, or nothing at all, or anything
         assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)), None);
         assert_eq!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)), None);

@@ -58,8 +58,9 @@ impl<R: Read, const N: usize> Read for Bursts<'_, R, N> {
 }
 
 impl<R: Read + ReadReady, const N: usize> ReadReady for Bursts<'_, R, N> {
+    /// A fault is ready, too: the next read counts it.
     fn read_ready(&mut self) -> Result<bool, R::Error> {
-        Ok(self.rest.0 < self.rest.1 || self.receiver.read_ready()?)
+        Ok(self.rest.0 < self.rest.1 || self.receiver.read_ready().unwrap_or(true))
     }
 }
 
@@ -83,6 +84,24 @@ mod tests {
             to[..bytes.len()].copy_from_slice(bytes);
             Ok(bytes.len())
         }
+    }
+
+    impl ReadReady for Script<'_> {
+        fn read_ready(&mut self) -> Result<bool, ErrorKind> {
+            self.0.first().map_or(Ok(false), |first| first.map(|bytes| !bytes.is_empty()))
+        }
+    }
+
+    /// A receiver that finds its ring lapped says so when it is asked whether bytes wait.
+    #[test]
+    fn a_fault_that_is_found_before_the_read_is_counted_by_it() {
+        let lost = AtomicU32::new(0);
+        let mut source = Bursts::<_, 4>::new(Script(&[Err(ErrorKind::Other), Ok(&[7])]), &lost);
+        assert_eq!(source.read_ready(), Ok(true));
+        let mut bytes = [9; 2];
+        assert_eq!((source.read(&mut bytes), bytes), (Ok(1), [0, 9]), "what was lost ends a packet");
+        assert_eq!((lost.load(Ordering::Relaxed), source.read_ready()), (1, Ok(true)));
+        assert_eq!((source.read(&mut bytes), bytes, source.read_ready()), (Ok(1), [7, 9], Ok(false)));
     }
 
     #[test]

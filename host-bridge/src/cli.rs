@@ -157,8 +157,8 @@ pub struct Serve {
     /// Send it the tables of the machine first; otherwise the device keeps its tables
     #[arg(long, requires = "feed")]
     pub load: bool,
-    /// Random walk of each ln var, standard deviation per sqrt(cycle), of constant baselines; without it, vars walk by 1e-4 and
-    /// baselines by 0.02 mm per sqrt(hour)
+    /// Random walk of each ln var, standard deviation per sqrt(cycle), of constant baselines; without it, vars walk by 1.5e-4
+    /// and baselines by 2 um per sqrt(second)
     #[arg(long, value_name = "S", requires = "feed", value_parser = walk)]
     pub process_noise: Option<f32>,
     /// One CSV row a frame

@@ -5,9 +5,10 @@ mod tunes;
 mod var;
 
 use core::fmt;
+use std::borrow::Cow;
 
 use comfy_table::{CellAlignment, Table};
-use estimator::{FitQuality, Marginal};
+use estimator::{FitQuality, Marginal, Walk};
 use inference::campaign::supplies_of;
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
@@ -75,13 +76,16 @@ pub struct Timing {
 impl fmt::Display for Timing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max } = self;
-        writeln!(
+        write!(
             f,
             "frame to estimate: median {update_us_p50:.0} us, 99 % within {update_us_p99:.0} us, slowest {update_us_max:.0} us"
         )?;
+        if frame_us_max == update_us_max {
+            return Ok(()); // a device, which prepares unseen
+        }
         write!(
             f,
-            "with preparation: median {frame_us_p50:.0} us, 99 % within {frame_us_p99:.0} us, slowest {frame_us_max:.0} us"
+            "\nwith preparation: median {frame_us_p50:.0} us, 99 % within {frame_us_p99:.0} us, slowest {frame_us_max:.0} us"
         )
     }
 }
@@ -98,12 +102,26 @@ pub struct Sampling {
     pub seconds: f64,
 }
 
+/// Frames whose tunes are those of vars that walk: 20 s of the Booster, in which the walk of `--follow` is a quarter of an error bar.
+const LATEST: usize = 100;
+
+/// The last frames of a recording.
+fn latest(recording: &Recording) -> Cow<'_, Recording> {
+    let rows = recording.rows[recording.rows.len().saturating_sub(LATEST)..].to_vec();
+    Cow::Owned(Recording {
+        rows,
+        name: recording.name.clone(),
+        header: recording.header.clone(),
+        other: recording.other.clone(),
+    })
+}
+
 impl FitResult {
-    /// What a core says after its last frame, here or on a device.
+    /// What a core says after its last frame, here or on a device, whose params walked by so much.
     pub fn of_core(
         model: &'static str,
         ring: &Ring,
-        recording: &Recording,
+        (recording, walk): (&Recording, Walk),
         last: &EstimateRecord,
         quality: FitQuality,
         timing: Timing,
@@ -113,7 +131,9 @@ impl FitResult {
         let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
-        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &supplies_of(recording)));
+        // vars that walk are those of the last frames, and so are their tunes
+        let seen = if walk.params > 0.0 { latest(recording) } else { Cow::Borrowed(recording) };
+        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &supplies_of(&seen)));
         Self {
             recording: recording.name.clone(),
             method: "laplace",
@@ -122,7 +142,7 @@ impl FitResult {
             rejected_frames: last.rejected_frames,
             remarked: Some(last.remarked),
             covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),
-            tunes_measured: TunesMeasured::of_recording(recording, tunes.map(|tunes| [tunes.x, tunes.y])),
+            tunes_measured: TunesMeasured::of_recording(&seen, tunes.map(|tunes| [tunes.x, tunes.y])),
             lack: lack(recording).map(|lack| lack.to_string()),
             tunes,
             vars,

@@ -99,9 +99,11 @@ impl Times {
         timed(&mut self.preparations, prepare)
     }
 
-    /// Median, 99th percentile and largest of the answer and of the whole frame.
+    /// Median, 99th percentile and largest of the answer and of the whole frame, as far as its preparation was seen: a device prepares
+    /// by itself.
     pub fn quantiles(&self) -> Timing {
-        let whole = self.answers.iter().zip(&self.preparations).map(|(answer, preparation)| *answer + *preparation);
+        let preparations = self.preparations.iter().copied().chain(core::iter::repeat(Duration::ZERO));
+        let whole = self.answers.iter().zip(preparations).map(|(answer, preparation)| *answer + preparation);
         let [update_us_p50, update_us_p99, update_us_max] = quantiles(self.answers.clone());
         let [frame_us_p50, frame_us_p99, frame_us_max] = quantiles(whole.collect());
         Timing { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max }

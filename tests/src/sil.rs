@@ -91,7 +91,7 @@ pub fn compare(
         interrupting,
         status,
         counts,
-        result: FitResult::of_core(CoreModel::Green.word(), ring, recording, &last, quality, timing),
+        result: FitResult::of_core(CoreModel::Green.word(), ring, (recording, walk), &last, quality, timing),
     })
 }
 

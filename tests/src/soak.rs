@@ -22,7 +22,7 @@ pub enum Row {
     Several,
     /// Each corrector alone at ±22 A, and none, in turn: a campaign.
     Single,
-    /// All correctors within 0.9 A, below what counts as powered.
+    /// All correctors within 0.9 A: each moves the orbit by a few times the noise.
     Faint,
     /// Each corrector in turn at ±22 A about a steady ±3 A in all of them.
     Steady,

@@ -11,7 +11,7 @@ use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use system_tests::faults::{Body, FAULTS, faulty, is_sealed, sealed, serialised};
 use system_tests::machine::{LAYOUT, Machine, Random, nees, walk_per_cycle, wire_of};
-use system_tests::{repository, truth};
+use system_tests::{repository, sil, truth};
 use twin::Ring;
 
 fn paper_vars() -> (Ring, Recording) {
@@ -28,21 +28,10 @@ fn wires(recording: &Recording) -> Vec<Vec<u8>> {
 
 /// All of an estimate, to the bit, but the number of refused frames.
 fn bits(core: &Core, estimate: &Estimate) -> Vec<u64> {
-    let e = estimate;
-    let of = |values: &[f32]| values.iter().map(|v| u64::from(v.to_bits())).collect::<Vec<_>>();
-    let health = e.health.iter().flat_map(|h| {
-        [h.state as u64, u64::from(h.noise.to_bits()), u64::from(h.weighted_as.to_bits()), u64::from(h.rejected)]
-    });
-    let covariance: Vec<f32> =
-        (0..48).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| core.covariance(i, j)).collect();
-    let counts = [u64::from(e.sequence), e.time_us, u64::from(e.frames)];
-    let more = [e.setting.map_or(u64::MAX, u64::from), u64::from(e.linearised)];
-    let masks = [&e.clipped, &e.accepted, &e.rejected, &e.confirmed, &e.restarted].into_iter().flatten();
-    let masks: Vec<u64> = masks.map(|bit| u64::from(*bit)).collect();
-    let lists = [&e.mean, &e.sigma, &e.map_params, &e.centre, &e.params_sigma].map(|list| of(list)).concat();
-    let floats = [e.nis, e.log_evidence, e.tune_innovation[0].unwrap_or(9.0), e.tune_innovation[1].unwrap_or(9.0)];
-    let health: Vec<u64> = health.collect();
-    [&counts[..], &more, &masks, &lists, &of(&floats), &of(&covariance), &health].concat()
+    let pairs = (0..48).flat_map(|i| (0..=i).map(move |j| (i, j)));
+    let covariance = pairs.map(|(i, j)| u64::from(core.covariance(i, j).to_bits()));
+    let estimate = Estimate { rejected_frames: 0, ..estimate.clone() };
+    sil::bits(&estimate).into_iter().chain(covariance).collect()
 }
 
 #[test]

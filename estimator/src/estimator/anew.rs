@@ -27,7 +27,7 @@ const MOVED: f32 = 0.5;
 const UPHILL: f64 = 1.0;
 /// Attempts at a step, each half as long as the one before; the next one goes back to the origin.
 const ATTEMPTS: u32 = 4;
-/// Frames that can wait to be counted. A further one lets ingesting do a slice.
+/// Frames that can wait to be counted. With a further one all is counted anew.
 const LATE: usize = 2;
 
 /// A new linearisation on its way.
@@ -143,6 +143,7 @@ impl<
             ATTEMPTS => self.anew.to = *from,
             _ => {
                 self.anew.under_way = false;
+                self.past.stale |= self.anew.reweighted;
                 return;
             }
         }

@@ -64,6 +64,7 @@ impl<
         for ((b, _), following) in self.monitors.iter().enumerate().zip(&self.following).filter(|(m, _)| is_ok(m)) {
             sum +=
                 following.chi_square(&following::Expected { variance: expected(b) as f32, ..self.follows(model, b) });
+            readings += f64::from(following.repeats);
             baselines += self.times.count() as f64;
         }
         for cell in self.past.campaign.cells() {
@@ -72,7 +73,7 @@ impl<
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
             follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
-                let (mean, count) = cell.mean(b);
+                let (mean, count @ 1..) = cell.mean(b) else { continue };
                 let (slope, channel) = (column(self.predicted.prediction.jacobian.as_slice(), N, b), first_channel + b);
                 let (d, _) = self.posterior.gaussian.effective(channel, slope);
                 let measured = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
@@ -80,7 +81,7 @@ impl<
                     - self.posterior.gaussian.baseline(channel)
                     - dot(&d, &self.posterior.solution.delta);
                 sum += f64::from(count) * residual * residual / expected(b);
-                readings += f64::from(count);
+                readings += 1.0;
             }
         }
         let degrees_of_freedom = (readings - baselines - layout.params() as f64) as f32;

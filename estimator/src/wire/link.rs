@@ -222,7 +222,7 @@ pub struct Status {
     pub ring: Sizes,
     /// What its core has room for.
     pub room: Sizes,
-    /// Frames used so far.
+    /// Frames taken in so far, those that were put aside included.
     pub frames: u32,
     /// Packets refused so far.
     pub refused: u32,

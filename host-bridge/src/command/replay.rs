@@ -32,5 +32,8 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(options.model.word(), &ring, &recording, &last, quality, timing))
+    deliver(
+        &options.common,
+        &FitResult::of_core(options.model.word(), &ring, (&recording, walk), &last, quality, timing),
+    )
 }

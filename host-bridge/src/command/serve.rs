@@ -83,7 +83,10 @@ fn feed(
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
-    deliver(&options.common, &FitResult::of_core(options.model.word(), ring, recording, &last, quality, timing))
+    deliver(
+        &options.common,
+        &FitResult::of_core(options.model.word(), ring, (recording, setup.walk), &last, quality, timing),
+    )
 }
 
 /// A device uses the tables that it has, whatever their ring.

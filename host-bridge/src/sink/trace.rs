@@ -1,5 +1,5 @@
 //! Estimates as a CSV file, one row a frame: `seq`, mean and sigma of every var, `nis`, `rejected` readings, and the remarks on the
-//! frame, 1 where they are made.
+//! frame: 1 where they are made, the name of the var that has stepped.
 
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};

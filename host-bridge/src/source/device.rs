@@ -27,7 +27,7 @@ pub struct Fed<'r, L> {
     link: &'r mut Link<L>,
     clock: Clock,
     next: usize,
-    /// From frame to estimate, and until the device can take the next one, over the line.
+    /// From frame to estimate, over the line.
     pub times: Times,
 }
 
@@ -45,8 +45,6 @@ impl<'r, L: Read + Write> Fed<'r, L> {
         let Some(row) = self.recording.rows.get(self.next) else { return Ok(None) };
         self.next += 1;
         let wire = stream::wire(self.recording, row)?;
-        // it hears of nothing before it has prepared for the next frame
-        self.times.preparing(|| self.link.status())?;
         self.clock.wait();
         let heard = self.times.of(|| self.link.ingest(row.sequence, &wire));
         Ok(Some(heard.map_err(|error| format!("frame {}: {error}", row.sequence))?))
