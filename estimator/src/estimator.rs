@@ -610,7 +610,7 @@ impl<
         let of_plane = |pair: &[f32; 2]| pair.get(plane).copied().unwrap_or(0.0);
         let (now, design) = (of_plane(&at.chromatic), of_plane(&self.design_chromatic));
         let growth = if design > 0.0 { now / design } else { 1.0 };
-        model.surrogate.error_variance(b, rf_offset, growth * self.times.root * of_plane(&self.posterior.orbit))
+        model.surrogate.error_variance(b, rf_offset, growth * self.times.root() * of_plane(&self.posterior.orbit))
     }
 
     /// What a reading adds to its earlier repeats, as one of its own: innovation [m] and variance [m^2].

@@ -15,17 +15,22 @@ use crate::wire::Frame;
 pub(super) struct Times {
     /// In the order in which they came [us].
     known: Vec<u32, TIMES>,
-    /// Root of their number: by this factor the error of an RF offset grows that all times share, and each counts by itself.
-    pub root: f32,
+    /// Root of their number, less 1, so that none is all zero.
+    root_less_1: f32,
 }
 
 impl Times {
     /// None so far.
-    pub const NONE: Self = Self { known: Vec::new(), root: 1.0 };
+    pub const NONE: Self = Self { known: Vec::new(), root_less_1: 0.0 };
 
     /// Which one a time in the cycle is [us].
     fn index(&self, time_us: u32) -> Option<usize> {
         self.known.iter().position(|known| is_same_time(*known, time_us))
+    }
+
+    /// Root of their number: by this factor the error of an RF offset grows that all times share, and each counts by itself.
+    pub fn root(&self) -> f32 {
+        1.0 + self.root_less_1
     }
 
     /// How many sets of baselines are in use.
@@ -74,7 +79,7 @@ impl<
         if model.setup.calibration.ramp.is_given() && self.times.index(frame.cycle_time_us).is_none() {
             // there is room: it was checked
             let _ = self.times.known.push(frame.cycle_time_us);
-            self.times.root = libm::sqrtf(self.times.count() as f32);
+            self.times.root_less_1 = libm::sqrtf(self.times.count() as f32) - 1.0;
         }
         self.predicted.first_channel = self.first_channel(frame.cycle_time_us);
     }
