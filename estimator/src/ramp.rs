@@ -159,7 +159,7 @@ mod tests {
         let (one, next) = (point(50_000, 0.4), point(60_000, 0.5));
         assert!(ramp(&[]).is_sound() && ramp(&[one.clone(), next.clone()]).is_sound());
         let bad = [
-            ramp(&[one.clone()]),
+            ramp(core::slice::from_ref(&one)),
             ramp(&[next.clone(), one.clone()]),
             ramp(&[one.clone(), one.clone()]),
             ramp(&[one.clone(), RampPoint { momentum: 0.0, ..next.clone() }]),

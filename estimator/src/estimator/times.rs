@@ -53,7 +53,10 @@ impl<
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// Times in the cycle for which there are baselines.
-    pub(super) const TIMES: usize = if B == 0 { 1 } else { (K - 2) / B };
+    pub(super) const TIMES: usize = match (K - 2).checked_div(B) {
+        Some(times) => times,
+        None => 1,
+    };
 
     /// Refuse a frame of a time in the cycle for which no baselines are left.
     pub(super) fn check_time(
