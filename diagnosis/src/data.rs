@@ -90,6 +90,14 @@ pub enum DataError {
         /// How many there are.
         found: usize,
     },
+    /// Frames at several times in the cycle: their baselines differ, and a diagnosis knows one of each monitor.
+    #[error("{recording}: expected frames at one time in the cycle, found {found}")]
+    Times {
+        /// The recording.
+        recording: String,
+        /// The times.
+        found: String,
+    },
     /// An effect that is not defined for this ring.
     #[error(transparent)]
     Effect(#[from] EffectError),
@@ -111,6 +119,10 @@ impl Data {
     /// # Errors
     /// [`DataError`].
     pub fn of(campaign: &Campaign) -> Result<Self, DataError> {
+        if campaign.times.count() > 1 {
+            let (recording, found) = (campaign.recording.name.clone(), campaign.times.to_string());
+            return Err(DataError::Times { recording, found });
+        }
         let Campaign { ring, recording, drives: driven, supplies, screened, readings: recorded, .. } = campaign;
         let mut drives = drives_of(campaign);
         let believed = recording.header.believed(ring)?;
@@ -376,7 +388,7 @@ impl Data {
         let frames = self.frames(b);
         let mut terms = self.shared(b, frames).transpose();
         terms.row_mut(0).fill(1.0);
-        chi_square(&residual.select_rows(frames), &terms, self.expected_noise[b])
+        chi_square(&residual.select_rows(frames), &terms, 1, self.expected_noise[b])
     }
 
     /// Whiten columns over all frames as readings of one monitor.

@@ -9,6 +9,7 @@ use heapless::Vec;
 
 use crate::drive::Drive;
 use crate::monitor::Gate;
+use crate::ramp::is_same_time;
 use crate::wire::{PositionCode, RfCode};
 
 /// The setting that a frame repeats: at most one corrector moved from a reference drive, or the RF moved.
@@ -32,8 +33,6 @@ pub struct Setting {
 const SAME_KICK: i32 = 16;
 /// RF offsets this close belong to the same setting: 1e-6.
 const SAME_OFFSET: i32 = 1_000;
-/// Times in the cycle this close belong to the same setting [us].
-const SAME_TIME: u32 = 1_000;
 
 impl Setting {
     /// A frame in which no corrector is moved.
@@ -58,7 +57,7 @@ impl Setting {
 
     fn same_but_for_the_correctors(&self, other: &Self) -> bool {
         self.rf_offset.saturating_sub(other.rf_offset).saturating_abs() <= SAME_OFFSET
-            && self.cycle_time.abs_diff(other.cycle_time) <= SAME_TIME
+            && is_same_time(self.cycle_time, other.cycle_time)
     }
 }
 
@@ -155,6 +154,11 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
             count: [0; B],
             last: [Last::NONE; B],
         }
+    }
+
+    /// Its time in the cycle [us].
+    pub fn cycle_time(&self) -> u32 {
+        self.setting.cycle_time
     }
 
     /// What drove the beam, on average.

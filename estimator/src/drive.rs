@@ -3,6 +3,7 @@
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
+use crate::ramp::Ramp;
 use crate::wire::{CurrentCode, Frame};
 
 /// A number that holds for all of `L` things, or one for each.
@@ -55,6 +56,8 @@ pub struct Calibration<const C: usize, const F: usize> {
     pub dipole: Option<f32>,
     /// The supplies of quadrupoles.
     pub supplies: Vec<SupplyCalibration, F>,
+    /// What changes along the ramp.
+    pub ramp: Ramp<F>,
 }
 
 /// What acts on the beam in one frame, or on average over the frames of one setting.
@@ -113,6 +116,7 @@ impl<const C: usize, const F: usize> Calibration<C, F> {
             && self.dipole.is_none_or(is_positive)
             && self.supplies.is_full()
             && self.supplies.iter().all(SupplyCalibration::is_sound)
+            && self.ramp.is_sound()
     }
 
     /// What a frame's currents do.
@@ -121,20 +125,29 @@ impl<const C: usize, const F: usize> Calibration<C, F> {
     /// [`Beyond`] for currents that no model of this machine describes.
     ///
     /// The dipoles set the momentum, so kicks and gradients are divided by `I_dipole / nominal`:
-    /// `k1 = var * k1_design * p(I / I_nominal) / p(1) / (I_dipole / I_dipole_nominal)`.
+    /// `k1 = var * k1_design * p(I / I_nominal) / p(1) / (I_dipole / I_dipole_nominal)`. Along a ramp the nominal current of the
+    /// dipoles, the momentum that goes with it, and the gradients that make `k1_design` of it are those at the frame's time:
+    ///
+    /// `k1 = var * k1_design * p(I / I_nominal) / p(I(t) / I_nominal) / (I_dipole / I_dipole(t))`,
+    /// `kick = kick_per_ampere * I / (momentum(t) * I_dipole / I_dipole(t))`;
+    ///
+    /// the RF offset is the one that would move the momentum as much at the reference momentum, `f / slip(t)`.
     pub fn drive<const B: usize, const W: usize>(&self, frame: &Frame<B, C, F, W>) -> Result<Drive<C, F>, Beyond> {
-        let rigidity = self.dipole.map_or(1.0, |nominal| frame.magnets.dipole.value() / nominal);
+        let at = self.ramp.at(frame.cycle_time_us)?;
+        let rigidity = self.dipole.map_or(1.0, |nominal| frame.magnets.dipole.value() / (nominal * at.dipole));
         within("dipole current over nominal, less 1", rigidity - 1.0, STRENGTH)?;
         let mut kick = frame.corrector.map(CurrentCode::value);
-        kick.iter_mut().enumerate().for_each(|(c, kick)| *kick = *kick * self.kick_per_ampere.of(c) / rigidity);
+        let stiffness = rigidity * at.momentum;
+        kick.iter_mut().enumerate().for_each(|(c, kick)| *kick = *kick * self.kick_per_ampere.of(c) / stiffness);
         within("sum of kicks in rad", kick.iter().map(|k| k.abs()).sum(), KICKS)?;
         let mut strength = [0.0; F];
-        for ((to, supply), current) in strength.iter_mut().zip(&self.supplies).zip(frame.magnets.supply) {
-            let factor = supply.factor(current) / rigidity;
+        let each = self.supplies.iter().zip(frame.magnets.supply).zip(at.gradient);
+        for (to, ((supply, current), gradient)) in strength.iter_mut().zip(each) {
+            let factor = supply.factor(current) / (rigidity * gradient);
             within("common gradient factor, less 1", factor - 1.0, STRENGTH)?;
             *to = libm::logf(factor);
         }
-        Ok(Drive { kick, strength, rf_offset: within("rf offset", frame.rf_offset.value(), RF_OFFSET)? })
+        Ok(Drive { kick, strength, rf_offset: within("rf offset", frame.rf_offset.value() / at.slip, RF_OFFSET)? })
     }
 }
 

@@ -13,6 +13,7 @@ mod reference;
 mod screen;
 mod sequence;
 mod steering;
+mod times;
 mod whole;
 
 use core::fmt;
@@ -41,6 +42,7 @@ pub use posterior::Walk;
 use reference::Reference;
 use screen::Screened;
 use sequence::Sequence;
+use times::Times;
 use whole::{Whole, WholeFrames};
 
 /// Priors that groups of params can have.
@@ -92,7 +94,7 @@ pub struct Model<'a, G, const B: usize, const C: usize, const F: usize> {
 }
 
 /// The posterior that frames have made of a model: `B` monitors, `C` correctors, `F` supplies, `N` params, `S` settings; `K`
-/// channels are the monitors and two of the tune meter, `T` entries make a triangle of `N`, `U` one of `K`, `W` words have a bit
+/// channels are the monitors, once for each time in the cycle that frames may be read at, and two of the tune meter, `T` entries make a triangle of `N`, `U` one of `K`, `W` words have a bit
 /// for each monitor or param.
 #[derive(Debug, Clone)]
 pub struct Estimator<
@@ -109,6 +111,7 @@ pub struct Estimator<
 > {
     started: bool,
     sequence: Sequence,
+    times: Times,
     /// No frame has come since the last look at whether to linearise anew.
     looked: bool,
     /// Slices of work between frames since the last estimate.
@@ -188,6 +191,8 @@ struct Predicted<const B: usize, const F: usize, const N: usize> {
     /// The same, off the mean of the frame's setting.
     off_mean: [f32; F],
     rf_offset: f32,
+    /// First channel of the baselines at the frame's time in the cycle.
+    first_channel: usize,
 }
 
 /// All frames so far, in the form in which they can be linearised anew.
@@ -263,6 +268,8 @@ struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
     drive: Drive<C, F>,
     reading: [PositionCode; B],
     accepted: Mask<W>,
+    /// First channel of its baselines.
+    first_channel: u16,
 }
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
@@ -280,11 +287,11 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Loose<B, C,
         prediction: &'h Prediction<B, F, N>,
     ) -> impl Iterator<Item = Reading<'h>> {
         let each = self.reading.iter().zip(&prediction.reading).zip(variances).enumerate();
-        each.filter(|(b, _)| self.accepted.has(*b)).map(|(channel, ((reading, predicted), &variance))| Reading {
-            channel,
+        each.filter(|(b, _)| self.accepted.has(*b)).map(|(b, ((reading, predicted), &variance))| Reading {
+            channel: usize::from(self.first_channel) + b,
             innovation: reading.value() - predicted,
             variance,
-            slope: column(prediction.jacobian.as_slice(), N, channel),
+            slope: column(prediction.jacobian.as_slice(), N, b),
         })
     }
 }
@@ -311,12 +318,16 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    const FITS: () = assert!(K == B + 2, "a channel for each monitor and for each tune");
+    const FITS: () = assert!(
+        K >= B + 2 && K - 2 == B * Self::TIMES && K <= u16::MAX as usize,
+        "a channel for each monitor and time, and for each tune"
+    );
 
     /// Memory for one, all zero, so that it costs no flash; [`Estimator::restart`] gives it a posterior.
     pub const BLANK: Self = Self {
         started: false,
         sequence: Sequence::EMPTY,
+        times: Times::NONE,
         looked: false,
         slices: 0,
         tangent: Tangent::blank(G::UNLINEARISED),
@@ -328,6 +339,7 @@ impl<
             strength: [0.0; F],
             off_mean: [0.0; F],
             rf_offset: 0.0,
+            first_channel: 0,
         },
         monitors: [const { Monitor::BLANK }; B],
         following: [Following::NONE; B],
@@ -357,6 +369,7 @@ impl<
         self.tangent.follow(model.surrogate);
         self.design_chromatic = self.tangent.chromatic;
         (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
+        (self.times, self.predicted.first_channel) = (Times::NONE, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
         self.posterior.clear();
         for (b, monitor) in self.monitors.iter_mut().enumerate() {
@@ -369,9 +382,10 @@ impl<
         self.past.reference = Reference::ZERO;
         self.past.recent.clear();
         let calibration = model.setup.tune_calibration.unwrap_or(1.0);
-        self.past
-            .loose
-            .reset(|i| prior_of::<G, B, C, F, N>(model, i), |channel| if channel < B { BASELINE } else { calibration });
+        self.past.loose.reset(
+            |i| prior_of::<G, B, C, F, N>(model, i),
+            |channel| if channel < K - 2 { BASELINE } else { calibration },
+        );
         self.posterior.gaussian.copy(&self.past.loose);
         self.posterior.gaussian.recentre(&[0.0; N]);
         self.solve(model);
@@ -402,6 +416,7 @@ impl<
         drive: &Drive<C, F>,
     ) -> Estimate<B, N, W> {
         self.pass_time(model, frame);
+        self.note_time(model, frame);
         self.predict(model, drive);
         let setting = self.setting(model, frame, drive);
         if setting.is_none() {
@@ -504,6 +519,7 @@ impl<
         let frame = Frame::decode(&model.surrogate.layout(), bytes)?;
         self.sequence.check(&frame)?;
         let drive = model.setup.calibration.drive(&frame).map_err(IngestError::Beyond)?;
+        self.check_time(model, &frame)?;
         Ok((frame, drive))
     }
 
@@ -511,7 +527,7 @@ impl<
     fn pass_time(&mut self, model: &Model<'_, G, B, C, F>, frame: &Frame<B, C, F, W>) {
         let seconds = self.sequence.advance(frame);
         let prior = |i| prior_of::<G, B, C, F, N>(model, i);
-        self.posterior.pass::<B>(&model.setup.walk, seconds, &model.surrogate.layout(), prior);
+        self.posterior.pass(&model.setup.walk, seconds, &model.surrogate.layout(), prior);
         self.looked = false;
     }
 
@@ -594,7 +610,7 @@ impl<
         let of_plane = |pair: &[f32; 2]| pair.get(plane).copied().unwrap_or(0.0);
         let (now, design) = (of_plane(&at.chromatic), of_plane(&self.design_chromatic));
         let growth = if design > 0.0 { now / design } else { 1.0 };
-        model.surrogate.error_variance(b, rf_offset, growth * of_plane(&self.posterior.orbit))
+        model.surrogate.error_variance(b, rf_offset, growth * self.times.root() * of_plane(&self.posterior.orbit))
     }
 
     /// What a reading adds to its earlier repeats, as one of its own: innovation [m] and variance [m^2].
@@ -633,7 +649,7 @@ impl<
         cell: Option<u16>,
         screened: &Screened<W>,
     ) {
-        let still = self.posterior.is_still::<B>(&model.setup.walk);
+        let still = self.posterior.is_still(&model.setup.walk);
         let linearised_once = cell.is_none() || !still;
         // a mean over frames that have not seen the same ring says nothing
         let cell = cell.filter(|_| still);
@@ -642,11 +658,11 @@ impl<
             *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
         }
         let used = news.iter().enumerate().filter(|(b, _)| screened.accepted.has(*b));
-        let readings = used.map(|(channel, &(innovation, variance))| Reading {
-            channel,
+        let readings = used.map(|(b, &(innovation, variance))| Reading {
+            channel: self.predicted.first_channel + b,
             innovation,
             variance,
-            slope: column(self.predicted.prediction.jacobian.as_slice(), N, channel),
+            slope: column(self.predicted.prediction.jacobian.as_slice(), N, b),
         });
         let Posterior { gaussian, solution, .. } = &mut self.posterior;
         if linearised_once {
@@ -670,18 +686,18 @@ impl<
     fn look_for_steps(&mut self, model: &Model<'_, G, B, C, F>) {
         self.posterior.narrow();
         if model.setup.walk.params > 0.0 {
-            self.posterior.let_loose::<B>(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
+            self.posterior.let_loose(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
         }
     }
 
     /// Add the tunes that passed.
     fn condition_tunes(&mut self, model: &Model<'_, G, B, C, F>, screened: &Screened<W>) {
-        let linearised_once = !self.posterior.is_still::<B>(&model.setup.walk);
+        let linearised_once = !self.posterior.is_still(&model.setup.walk);
         for plane in 0..2 {
             let variance = self.tunes.get(plane).and_then(TuneMeter::variance);
             if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
                 let (_, slope) = model.surrogate.tune(&self.tangent.linearised, plane, &[0.0; F]);
-                let reading = Reading { channel: B + plane, innovation: *innovation, variance, slope: &slope };
+                let reading = Reading { channel: K - 2 + plane, innovation: *innovation, variance, slope: &slope };
                 let Posterior { gaussian, solution, .. } = &mut self.posterior;
                 if linearised_once {
                     gaussian.condition([reading], &underweighted(solution));
@@ -706,11 +722,12 @@ impl<
         {
             self.note_leaving(model, &oldest);
             // a past that has seen another ring is not counted anew
-            if self.posterior.is_still::<B>(&model.setup.walk) {
+            if self.posterior.is_still(&model.setup.walk) {
                 self.let_go(model, &oldest);
             }
         }
-        let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted };
+        let first_channel = self.predicted.first_channel as u16;
+        let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted, first_channel };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
     }

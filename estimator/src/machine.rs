@@ -1,8 +1,8 @@
 //! All types of one machine from the few numbers that are its own.
 
 /// Make the constants and the types of a core for a machine of so many monitors in x and y, correctors in x and y,
-/// quadrupoles, params and supplies. Everything else follows: two nodes a quadrupole, room for each corrector up and down,
-/// for none, and for two settings of the RF.
+/// quadrupoles, params and supplies, and of so many times in the cycle with baselines of their own (one if it is left out). Everything
+/// else follows: two nodes a quadrupole, room for each corrector up and down, for none, and for two settings of the RF.
 ///
 /// ```
 /// mod small {
@@ -18,6 +18,23 @@ macro_rules! machine {
         quadrupoles: $quadrupoles:expr,
         params: $params:expr,
         supplies: $supplies:expr
+    ) => {
+        $crate::machine!(
+            monitors: [$monitors_x, $monitors_y],
+            correctors: [$correctors_x, $correctors_y],
+            quadrupoles: $quadrupoles,
+            params: $params,
+            supplies: $supplies,
+            times: 1
+        );
+    };
+    (
+        monitors: [$monitors_x:expr, $monitors_y:expr],
+        correctors: [$correctors_x:expr, $correctors_y:expr],
+        quadrupoles: $quadrupoles:expr,
+        params: $params:expr,
+        supplies: $supplies:expr,
+        times: $times:expr
     ) => {
         /// Monitors in x and in y.
         pub const MONITORS_BY_PLANE: [usize; 2] = [$monitors_x, $monitors_y];
@@ -39,10 +56,12 @@ macro_rules! machine {
         pub const PAIRS: usize = NODES * (NODES + 1) / 2;
         /// Entries of the lower triangle of a covariance of the params.
         pub const TRIANGLE: usize = PARAMS * (PARAMS + 1) / 2;
-        /// Settings that are kept apart: each corrector up and down, none, two of the RF.
-        pub const SETTINGS: usize = 2 * CORRECTORS + 3;
-        /// The monitors and the two tunes.
-        pub const CHANNELS: usize = MONITORS + 2;
+        /// Times in the cycle that have baselines of their own, where the machine file has a ramp.
+        pub const TIMES: usize = $times;
+        /// Settings that are kept apart: each corrector up and down, none, two of the RF, at each time.
+        pub const SETTINGS: usize = TIMES * (2 * CORRECTORS + 3);
+        /// The monitors at each time, and the two tunes.
+        pub const CHANNELS: usize = TIMES * MONITORS + 2;
         /// Entries of the lower triangle of a covariance of the channels.
         pub const COUPLINGS: usize = CHANNELS * (CHANNELS + 1) / 2;
         /// Words of 32 bits with a bit for each monitor or param.

@@ -29,6 +29,7 @@ use serde::{Deserialize, Serialize};
 use crate::drive::{Drive, Each};
 use crate::estimate::{Estimate, MonitorState};
 use crate::linear::dot;
+use crate::ramp::is_same_time;
 use crate::surrogate::Steerable;
 use crate::triangle::Triangle;
 use crate::wire::{CurrentCode, Frame, PositionCode};
@@ -87,8 +88,10 @@ pub struct Response<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize
     pub surrogate: &'a G,
     /// At which vars.
     pub at: &'a G::Linearised,
-    /// Kick of each corrector [rad/A].
+    /// Kick of each corrector at the reference momentum [rad/A].
     pub kick_per_ampere: &'a Each<C>,
+    /// Momentum at the frame's time in the cycle, over the reference.
+    pub momentum: f32,
 }
 
 /// What is to be said of a frame's correction.
@@ -103,12 +106,14 @@ pub struct Steered {
     pub limited: u16,
 }
 
-/// The state of a feedback: `B` monitors, `C` correctors, `CX` and `CY` of them horizontal and vertical; `TX` and `TY` entries
+/// The state of a feedback on the orbit at one time in the cycle; each time takes one of its own. `B` monitors, `C` correctors, `CX` and `CY` of them horizontal and vertical; `TX` and `TY` entries
 /// make triangles of these.
 #[derive(Debug, Clone)]
 pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX: usize, const TY: usize> {
     /// Time of the last frame [us].
     clock: Option<u64>,
+    /// Time in the cycle of the orbit that is steered [us].
+    cycle_time: u32,
     /// Frames in the filtered orbit, counted up to a few.
     heard: u16,
     /// Filtered orbit at the last read-backs, less the wanted one [m].
@@ -162,10 +167,15 @@ impl<'a, G: Steerable<B, C, F, N>, const B: usize, const C: usize, const F: usiz
         pull
     }
 
+    /// Kick of a corrector [rad/A].
+    fn kick(&self, c: usize) -> f32 {
+        self.kick_per_ampere.of(c) / self.momentum
+    }
+
     /// Currents as kicks [rad].
     #[inline(never)]
     fn kicks(&self, mut current: [f32; C]) -> [f32; C] {
-        current.iter_mut().enumerate().for_each(|(c, current)| *current *= self.kick_per_ampere.of(c));
+        current.iter_mut().enumerate().for_each(|(c, current)| *current *= self.kick(c));
         current
     }
 }
@@ -178,6 +188,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     /// Memory for one, all zero: it begins with the first frame.
     pub const BLANK: Self = Self {
         clock: None,
+        cycle_time: 0,
         heard: 0,
         residual: [0.0; B],
         weight: [0.0; B],
@@ -216,7 +227,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         estimate: &Estimate<B, N, W>,
     ) -> Steered {
         let () = Self::FITS;
-        let is_stale = self.is_stale(feedback, frame.time_us);
+        let is_stale = self.is_stale(feedback, frame);
         if is_stale {
             self.begin(feedback, frame, estimate);
         } else {
@@ -260,9 +271,15 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         true
     }
 
-    fn is_stale(&mut self, feedback: &Feedback<B, C>, time_us: u64) -> bool {
-        let last = self.clock.replace(time_us);
-        last.is_none_or(|last| time_us.checked_sub(last).is_none_or(|gap| gap > feedback.patience_us))
+    /// True for a frame that does not go on where the last one was: too late, or of another time in the cycle.
+    fn is_stale<const F: usize, const W: usize>(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        frame: &Frame<B, C, F, W>,
+    ) -> bool {
+        let last = self.clock.replace(frame.time_us);
+        last.is_none_or(|last| frame.time_us.checked_sub(last).is_none_or(|gap| gap > feedback.patience_us))
+            || !is_same_time(self.cycle_time, frame.cycle_time_us)
     }
 
     /// Take over from whoever steered so far: setpoints are the read-backs, the orbit is that of this frame.
@@ -272,6 +289,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         frame: &Frame<B, C, F, W>,
         estimate: &Estimate<B, N, W>,
     ) {
+        self.cycle_time = frame.cycle_time_us;
         self.supplies.take_over(&frame.corrector);
         self.pattern = 0;
         (self.residual, self.heard) = ([0.0; B], 0);
@@ -386,17 +404,17 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
         let setpoints = self.supplies.setpoints();
         let room = |c: usize| {
-            let (limit, kick) = (feedback.edge(c), response.kick_per_ampere.of(c));
+            let (limit, kick) = (feedback.edge(c), response.kick(c));
             let current = setpoints.get(c).copied().unwrap_or_default().value();
             [(-limit - current) * kick, (limit - current) * kick]
         };
-        let rate = |c: usize| feedback.rate * response.kick_per_ampere.of(c);
+        let rate = |c: usize| feedback.rate * response.kick(c);
         let (pull_x, pull_y) = pull.split_at(CX.min(C));
         let mut step = [0.0; C];
         let (step_x, step_y) = step.split_at_mut(CX.min(C));
         self.x.step(pull_x, &room, &rate, 0, step_x);
         self.y.step(pull_y, &room, &rate, CX, step_y);
-        step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick_per_ampere.of(c));
+        step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick(c));
         self.supplies.change(&step, |c| feedback.edge(c))
     }
 }

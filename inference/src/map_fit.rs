@@ -15,7 +15,7 @@ use estimator::{FitQuality, Marginal};
 use nalgebra::{DMatrix, DVector, Vector2};
 use twin::{OrbitError, Tunes};
 
-use crate::campaign::{Campaign, Linearised, Normal, Weighed, chi_square};
+use crate::campaign::{AtTimes, Campaign, Normal, Terms, Weighed, chi_square};
 use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
 
 /// The batch result for one campaign.
@@ -166,8 +166,8 @@ impl Objective for Problem<'_> {
     type Error = OrbitError;
 
     fn evaluate(&self, params: &DVector<f64>) -> Result<(f64, Point), OrbitError> {
-        let Campaign { held, supplies, drives, prior, .. } = self.campaign;
-        let linearised = Linearised::of(held, params, supplies, drives)?;
+        let prior = &self.campaign.prior;
+        let linearised = AtTimes::of(self.campaign, params)?;
         let (mut normal, chi2) = self.orbits(params, &linearised);
         let (_, of_orbits) = normal.eliminated();
         if self.tunes == TuneUse::Readings {
@@ -175,9 +175,8 @@ impl Objective for Problem<'_> {
         }
         let (cost, quadratic) = normal.eliminated();
         let here = DVector::zeros(prior.len());
-        let baselines: Vec<Option<f64>> = (0..self.campaign.monitors()).map(|b| normal.baseline(b, &here)).collect();
-        let orbit = self.campaign.rms_by_plane(&baselines);
-        Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.tunes }))
+        let orbit = self.campaign.rms_by_plane(&normal.baselines(&here));
+        Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.at_mean.tunes }))
     }
 
     fn linearise(&self, _: &DVector<f64>, point: &Point) -> Result<(Quadratic, ()), OrbitError> {
@@ -187,24 +186,25 @@ impl Objective for Problem<'_> {
 
 impl Problem<'_> {
     /// Add up all readings that count.
-    fn orbits(&self, params: &DVector<f64>, linearised: &Linearised) -> (Normal, (f64, f64)) {
+    fn orbits(&self, params: &DVector<f64>, linearised: &AtTimes) -> (Normal, (f64, f64)) {
         let campaign = self.campaign;
         let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
-        let count = 2 + campaign.supplies.len();
-        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), count, 0.0);
+        let baselines = campaign.times.count();
+        let common = Terms { count: baselines + 1 + campaign.supplies.len(), baselines, precision: 0.0 };
+        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), common);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for (b, slopes) in slopes.iter().enumerate() {
             let terms = campaign.terms(b);
             let frames: Vec<usize> = (0..campaign.frames()).filter(|&i| campaign.counts(i, b)).collect();
             let residual = campaign.readings.column(b) - orbits.column(b);
-            let mut readings = vec![(b, Weighed::none(count)); campaign.frames()];
+            let mut readings = vec![(b, Weighed::none(common.count)); campaign.frames()];
             for &i in &frames {
                 readings[i].1 = Weighed::one(terms.column(i).as_slice(), residual[i], campaign.noise(b).powi(-2));
             }
             normal.add(slopes, &readings);
             if campaign.is_ok(b) {
-                let expected = campaign.recording.header.noise[b];
-                let of_monitor = chi_square(&residual.select_rows(&frames), &terms.select_columns(&frames), expected);
+                let (residual, terms) = (residual.select_rows(&frames), terms.select_columns(&frames));
+                let of_monitor = chi_square(&residual, &terms, baselines, campaign.recording.header.noise[b]);
                 (chi2, freedom) = (chi2 + of_monitor.0, freedom + of_monitor.1);
             }
         }
@@ -212,12 +212,12 @@ impl Problem<'_> {
     }
 
     /// The two whitened numbers of each meter: the tune and its change, which no constant ring has.
-    fn add_tunes(&self, normal: &mut Normal, linearised: &Linearised) {
-        let tunes = [linearised.tunes.x, linearised.tunes.y];
+    fn add_tunes(&self, normal: &mut Normal, linearised: &AtTimes) {
+        let tunes = [linearised.at_mean.tunes.x, linearised.at_mean.tunes.y];
         for (plane, meter) in self.campaign.meters.iter().enumerate() {
             let Some(meter) = meter else { continue };
             let miss = meter.miss(Vector2::new(tunes[plane], 0.0));
-            let slope = linearised.tune_slopes.row(plane).transpose();
+            let slope = linearised.at_mean.tune_slopes.row(plane).transpose();
             for number in 0..2 {
                 let slope = &slope * meter.whiten[(number, 0)];
                 normal.add_plain(&slope, miss[number]);

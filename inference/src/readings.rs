@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
 use twin::OrbitError;
 
-use crate::campaign::{Campaign, Common, Eliminated, Linearised, Meter, Weighed};
+use crate::campaign::{AtTimes, Campaign, Common, Eliminated, Meter, Weighed};
 use crate::map_fit::{BatchFit, TuneUse};
 use crate::model::{Prediction, ResponseModel};
 
@@ -67,9 +67,9 @@ impl Reduced {
     /// # Errors
     /// [`OrbitError`] if these have no closed orbit.
     pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
-        let Campaign { ring, held, supplies, drives, .. } = &campaign;
+        let Campaign { ring, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
-        let exact = Linearised::of(held, &params, supplies, drives)?.orbits(drives);
+        let exact = AtTimes::of(&campaign, &params)?.orbits(drives);
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;
@@ -135,7 +135,9 @@ impl Readings {
         let (repeats, drives) = (reduced.repeats(), reduced.campaign.ring.correctors.len() + 1);
         let of_monitor = |b: usize| {
             let terms = reduced.campaign.terms(b);
-            let (mut gram, mut common) = (DMatrix::zeros(drives, drives), Common::new(drives, terms.nrows(), 0.0));
+            let baselines = reduced.campaign.times.count();
+            let (mut gram, mut common) =
+                (DMatrix::zeros(drives, drives), Common::new(drives, terms.nrows(), baselines, 0.0));
             for (frame, &repeats) in repeats.iter().enumerate() {
                 let Some(reading) = reduced.reading(frame, b) else { continue };
                 let k = reduced.drive(frame);

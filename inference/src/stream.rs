@@ -11,7 +11,7 @@ use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
     Prepared, Prior, RfCode, Sizes, TuneCode,
 };
-use training::rooms::large;
+use training::rooms::{large, ramped};
 use training::{Tables, in_room, in_spare_room};
 use twin::Ring;
 
@@ -75,7 +75,8 @@ pub enum StreamError {
 }
 
 /// A core on the host for a ring of any size, with the model that it uses: the core of exactly the ring's sizes if there is one,
-/// else the smallest with room for it, see [`training::rooms`].
+/// else the smallest with room for it, see [`training::rooms`]. With a ramp it has baselines for four times in the cycle, if the ring
+/// is not larger than that room; else for one, and frames of others are refused.
 #[derive(Clone)]
 pub struct Core {
     /// The ring.
@@ -99,7 +100,11 @@ impl Core {
     /// # Errors
     /// [`StreamError::Unstable`].
     pub fn with_tables(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
-        let stream = in_room!(tables.sizes(), |room| Held::<room::Estimator>::boxed(&tables, &setup));
+        let stream = if setup.ramp.is_empty() || !ramped::SIZES.hold(&tables.sizes()) {
+            in_room!(tables.sizes(), |room| Held::<room::Estimator>::boxed(&tables, &setup))
+        } else {
+            Some(Held::<ramped::Estimator>::boxed(&tables, &setup))
+        };
         Self::holding(tables, setup, stream)
     }
 

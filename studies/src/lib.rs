@@ -118,6 +118,9 @@ pub struct VarNumbers {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StudyError {
+    /// Frames at several times in the cycle: the differences that are studied are of frames with one baseline.
+    #[error("expected frames at one time in the cycle, found {0}")]
+    Times(String),
     /// There is no batch fit.
     #[error(transparent)]
     Fit(#[from] BatchError),

@@ -120,6 +120,9 @@ impl<'p> Sampling<'p> {
 /// A recording with its batch fit. Measured tunes are left out, as in the published analysis.
 pub(crate) fn reduced(ring: &Ring, recording: &Recording) -> Result<Reduced, StudyError> {
     let campaign = Campaign::of(ring, recording)?;
+    if campaign.times.count() > 1 {
+        return Err(StudyError::Times(campaign.times.to_string()));
+    }
     let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ())?;
     Ok(Reduced::of(campaign, fit)?)
 }

@@ -8,6 +8,7 @@
 //! | medium | 64 + 64 | 64 + 64 | 96 | 8 |
 //! | wide | 128 + 128 | 128 + 128 | 128 | 8 |
 //! | large | 128 + 128 | 128 + 128 | 256 | 16 |
+//! | along a ramp | 24 + 24, at four times in the cycle | 24 + 24 | 48 | 4 |
 
 pub use estimator::booster;
 
@@ -33,6 +34,19 @@ pub mod wide {
 #[allow(missing_docs)] // those of `estimator::machine!`
 pub mod large {
     estimator::machine!(monitors: [128, 128], correctors: [128, 128], quadrupoles: 256, params: 256, supplies: 16);
+}
+
+/// Rings of a dozen cells whose machine file has a ramp: baselines for four times in the cycle.
+#[allow(missing_docs)] // those of `estimator::machine!`
+pub mod ramped {
+    estimator::machine!(
+        monitors: [24, 24],
+        correctors: [24, 24],
+        quadrupoles: 48,
+        params: 48,
+        supplies: 4,
+        times: 4
+    );
 }
 
 /// Evaluate an expression in the module of the room that a ring of these sizes takes, `None` if none is large enough:

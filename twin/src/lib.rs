@@ -36,7 +36,7 @@ pub use effects::{
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
-    Quadrupole, Ring, Supply,
+    Quadrupole, RampPoint, Ring, Supply,
 };
 pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};

@@ -62,6 +62,18 @@ fn supplies_priors_and_sectors_are_those_of_the_example() {
     assert_eq!(sectors, ["north", "south"]);
 }
 
+#[test]
+fn the_ramp_of_the_page_is_one_of_the_booster() {
+    let mut file: Value = serde_json::from_str(include_str!("../../machines/booster.json")).unwrap();
+    merge(&mut file, &serde_json::from_str(blocks()[2].0).unwrap());
+    let ring = Ring::parse(&file.to_string(), "booster.json").unwrap();
+    let [first, .., last] = ring.ramp.as_slice() else { panic!("it has two points or more") };
+    assert_eq!((first.time, first.dipole, first.supply["QV"], last.supply["QH"]), (0.05, Some(923.0), 692.2, 1800.0));
+    // p = sqrt(T (T + 2 m)) of protons of 0.35 and 1.5 GeV: 0.8828 and 2.2505 GeV/c
+    assert!((first.momentum(&ring.particle) - 0.3923).abs() < 5e-5 && last.momentum(&ring.particle) == 1.0);
+    assert!(Ring::booster().ramp.is_empty());
+}
+
 /// JSON merge patch (RFC 7386).
 fn merge(onto: &mut Value, patch: &Value) {
     let (Value::Object(onto), Value::Object(patch)) = (&mut *onto, patch) else {
@@ -79,11 +91,11 @@ fn merge(onto: &mut Value, patch: &Value) {
 
 #[test]
 fn what_is_refused_is_refused_in_these_words() {
-    let (base, behind) = blocks()[2];
+    let (base, behind) = blocks()[3];
     let base: Value = serde_json::from_str(base).unwrap();
     assert!(Ring::parse(&base.to_string(), "toy.json").is_ok());
     let rows = table(behind);
-    assert_eq!(rows.len(), 22);
+    assert_eq!(rows.len(), 29);
     for row in rows {
         let [patch, message] = [row[1], row[2]].map(|cell| cell.trim_matches('`'));
         let mut file = base.clone();

@@ -116,7 +116,7 @@ impl<
             .iter()
             .zip(self.posterior.gaussian.origin())
             .zip(&self.posterior.solution.sigma);
-        let stale = self.past.stale && self.posterior.is_still::<B>(&model.setup.walk);
+        let stale = self.past.stale && self.posterior.is_still(&model.setup.walk);
         stale || each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
     }
 
@@ -168,7 +168,7 @@ impl<
 
     /// Count a part of the past, or go over to the new linearisation. While the params walk, the past stays counted as it was.
     fn count_past(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
-        if !self.posterior.is_still::<B>(&model.setup.walk) {
+        if !self.posterior.is_still(&model.setup.walk) {
             self.posterior.gaussian.recentre(&self.anew.to);
             return self.go_over(model);
         }

@@ -53,7 +53,7 @@ impl<
     /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk:
     /// innovations, each against the vars of its own time, counted in NIS.
     pub fn fit_quality(&mut self, model: &Model<'_, G, B, C, F>) -> FitQuality {
-        if !self.posterior.is_still::<B>(&model.setup.walk) {
+        if !self.posterior.is_still(&model.setup.walk) {
             return FitQuality { chi_square: self.nis.0 as f32, degrees_of_freedom: self.nis.1 as f32 };
         }
         let layout = model.surrogate.layout();
@@ -65,19 +65,21 @@ impl<
             sum +=
                 following.chi_square(&following::Expected { variance: expected(b) as f32, ..self.follows(model, b) });
             readings += f64::from(following.repeats);
-            baselines += 1.0;
+            baselines += self.times.count() as f64;
         }
         for cell in self.past.campaign.cells() {
+            let first_channel = self.first_channel(cell.cycle_time());
             let drive = about(&cell.drive(), &self.tangent.supplies);
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
             follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {
                 let (mean, count @ 1..) = cell.mean(b) else { continue };
-                let (d, _) =
-                    self.posterior.gaussian.effective(b, column(self.predicted.prediction.jacobian.as_slice(), N, b));
+                let (slope, channel) = (column(self.predicted.prediction.jacobian.as_slice(), N, b), first_channel + b);
+                let (d, _) = self.posterior.gaussian.effective(channel, slope);
                 let measured = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
-                let residual =
-                    f64::from(measured) - self.posterior.gaussian.baseline(b) - dot(&d, &self.posterior.solution.delta);
+                let residual = f64::from(measured)
+                    - self.posterior.gaussian.baseline(channel)
+                    - dot(&d, &self.posterior.solution.delta);
                 sum += f64::from(count) * residual * residual / expected(b);
                 readings += 1.0;
             }

@@ -49,6 +49,8 @@ pub(super) struct Late<const B: usize, const C: usize, const F: usize, const W: 
     /// What each reading adds to those counted before it, as one of its own [m], and its variance [m^2].
     news: [(f32, f32); B],
     accepted: Mask<W>,
+    /// First channel of its baselines.
+    first_channel: u16,
 }
 
 impl<
@@ -119,6 +121,7 @@ impl<
         let Some((first, _)) = from_here.clone().next() else { return };
         model.surrogate.predict(linearised, &first.alone(), &mut self.predicted.prediction);
         let by_supply = self.predicted.prediction.by_supply;
+        let first_channel = self.first_channel(first.cycle_time());
         let mut lines = [Line::default(); B];
         for (cell, index) in from_here.filter(|(cell, _)| cell.is_kind_of(first)).take(TOGETHER) {
             let Work::Past(pooling) = &mut self.anew.work else { return };
@@ -135,7 +138,8 @@ impl<
                 Repeats { number, noise: self.noise_variance(b), variance }
             });
             let Work::Past(Pooling { gaussian, pool, .. }) = &mut self.anew.work else { return };
-            let each = lines.iter_mut().zip(&repeats).zip(by_supply.iter().zip(&pool.level)).zip(&self.following);
+            let level = pool.level.iter().skip(first_channel);
+            let each = lines.iter_mut().zip(&repeats).zip(by_supply.iter().zip(level)).zip(&self.following);
             for (b, (((line, repeats), (by_supply, level)), following)) in each.enumerate() {
                 let (Some(orbit), 1..) = (self.predicted.prediction.reading.get(b), repeats.number) else { continue };
                 let orbit = orbit + share * dot(&strength, by_supply) + following.shift(&strength);
@@ -144,7 +148,7 @@ impl<
             }
         }
         if let Work::Past(Pooling { gaussian, pool, .. }) = &mut self.anew.work {
-            gaussian.add_lines(pool, &lines, self.predicted.prediction.jacobian.as_slice());
+            gaussian.add_lines(pool, first_channel, &lines, self.predicted.prediction.jacobian.as_slice());
         }
     }
 
@@ -157,14 +161,16 @@ impl<
         follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
         let Work::Past(Pooling { gaussian, pool, .. }) = &mut self.anew.work else { return };
         let mut lines = [Line::default(); B];
-        let each = lines.iter_mut().zip(&frame.news).zip(self.predicted.prediction.reading.iter().zip(&pool.level));
+        let first_channel = usize::from(frame.first_channel);
+        let level = pool.level.iter().skip(first_channel);
+        let each = lines.iter_mut().zip(&frame.news).zip(self.predicted.prediction.reading.iter().zip(level));
         for (_, ((line, (reading, variance)), (predicted, level))) in
             each.enumerate().filter(|(b, _)| frame.accepted.has(*b))
         {
             let residual = f64::from(reading - predicted) - level;
             gaussian.count(line, 1.0, residual, &Repeats { number: 1, noise: *variance, variance: *variance });
         }
-        gaussian.add_lines(pool, &lines, self.predicted.prediction.jacobian.as_slice());
+        gaussian.add_lines(pool, first_channel, &lines, self.predicted.prediction.jacobian.as_slice());
     }
 
     /// Eliminate the baselines, and count what is known of all frames together.
@@ -191,7 +197,8 @@ impl<
                 let squares = meter.scatter();
                 let innovation = self.anew.tangent.tune_innovation(model, plane, mean, &strength);
                 let (_, slope) = model.surrogate.tune(&self.anew.tangent.linearised, plane, &[0.0; F]);
-                let mean = Reading { channel: B + plane, innovation, variance: variance / count as f32, slope: &slope };
+                let mean =
+                    Reading { channel: K - 2 + plane, innovation, variance: variance / count as f32, slope: &slope };
                 gaussian.condition([mean], &|_| 0.0);
                 gaussian.add_repeats(count, variance);
                 gaussian.add_scatter(squares / f64::from(variance), 0.0);
@@ -219,7 +226,8 @@ impl<
             let reading = frame.reading.get(b).map_or(0.0, |reading: &PositionCode| reading.value());
             self.news_of(model, b, reading, Some(cell))
         };
-        let late = Late { drive: *drive, news: core::array::from_fn(news), accepted: screened.accepted };
+        let first_channel = self.predicted.first_channel as u16;
+        let late = Late { drive: *drive, news: core::array::from_fn(news), accepted: screened.accepted, first_channel };
         self.await_count(late);
     }
 
@@ -245,6 +253,7 @@ impl<
         let reading = |b| frame.reading.get(b).map_or(0.0, |reading: &PositionCode| reading.value());
         let drive = about(&frame.drive, &self.anew.tangent.supplies);
         let news = |b| (reading(b), self.variance_at(model, &self.anew.tangent, b, &drive));
-        Late { drive: frame.drive, news: core::array::from_fn(news), accepted: frame.accepted }
+        let (accepted, first_channel) = (frame.accepted, frame.first_channel);
+        Late { drive: frame.drive, news: core::array::from_fn(news), accepted, first_channel }
     }
 }

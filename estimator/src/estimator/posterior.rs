@@ -66,6 +66,9 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
 }
 
 impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> Posterior<K, N, T, U, W> {
+    /// Channels of the monitors; those of the tune meter follow.
+    const BASELINES: usize = K - 2;
+
     /// Memory for one, all zero.
     pub const BLANK: Self = Self {
         gaussian: Gaussian::BLANK,
@@ -93,20 +96,20 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     pub fn solve(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior) {
         self.unsolved |= !self.solution.solve(&self.gaussian, prior);
         let ([x, y], first) = (layout.ring.monitors.map(usize::from), layout.first_vertical());
-        self.orbit = [self.gaussian.orbit(0, x), self.gaussian.orbit(first, first + y)];
+        // where times in the cycle have baselines of their own, the largest orbit
+        let (monitors, [mut in_x, mut in_y]) = (first + usize::from(layout.room.monitors[1]), [0.0_f32; 2]);
+        for at in (0..Self::BASELINES).step_by(monitors.max(1)) {
+            in_x = in_x.max(self.gaussian.orbit(at, at + x));
+            in_y = in_y.max(self.gaussian.orbit(at + first, at + first + y));
+        }
+        self.orbit = [in_x, in_y];
     }
 
     /// Time has passed before a frame [s]: baselines walk, and so do params, if it is long.
-    pub fn pass<const B: usize>(
-        &mut self,
-        walk: &Walk,
-        seconds: f32,
-        layout: &Layout,
-        prior: impl Fn(usize) -> Prior + Copy,
-    ) {
+    pub fn pass(&mut self, walk: &Walk, seconds: f32, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
         self.walked += f64::from(seconds);
         self.owed += seconds;
-        self.gaussian.spread_baselines((walk.baselines * walk.baselines * seconds).into(), B);
+        self.gaussian.spread_baselines((walk.baselines * walk.baselines * seconds).into(), Self::BASELINES);
         self.walk_by(BEFORE, walk, layout, prior);
     }
 
@@ -153,11 +156,11 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     /// right one of 24 candidates, all of them as probable, 3 sigma off after a step of 2 %. With the root of the probability it is
     /// 1.5 sigma, and 2 for one of probability 0.01.
     #[inline(never)]
-    pub fn let_loose<const B: usize>(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+    pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
         self.drift.weigh(&self.gaussian, libm::exp(self.narrowed).max(1.0));
         let Some(step) = self.drift.found() else { return };
         let probability = |i: usize| step.probability.get(i).copied().unwrap_or(0.0);
-        self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), B);
+        self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), Self::BASELINES);
         self.spread(|i| libm::sqrtf(probability(i)) * prior(i).sigma * prior(i).sigma, layout, prior);
         self.drift.clear();
         (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
@@ -171,7 +174,7 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     }
 
     /// True while all frames so far have seen the same ring, and the same baselines.
-    pub fn is_still<const B: usize>(&self, walk: &Walk) -> bool {
+    pub fn is_still(&self, walk: &Walk) -> bool {
         if self.stepped {
             return false;
         }
@@ -180,7 +183,8 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         let moved = walk.baselines * time;
         let least = |sigma: f32| WALKED * sigma;
         self.solution.sigma.iter().all(|sigma| walked <= least(*sigma))
-            && (moved == 0.0 || (0..B).all(|b| moved <= least(libm::sqrt(self.gaussian.baseline_variance(b)) as f32)))
+            && (moved == 0.0
+                || (0..Self::BASELINES).all(|b| moved <= least(libm::sqrt(self.gaussian.baseline_variance(b)) as f32)))
     }
 }
 
@@ -207,7 +211,7 @@ mod tests {
     fn a_walk_that_waits_is_walked_in_the_end() {
         let (mut posterior, mut walks) = (posterior(), 0);
         for frame in 1..=1000_u16 {
-            posterior.pass::<1>(&WALK, 0.2, &LAYOUT, |_| PRIOR);
+            posterior.pass(&WALK, 0.2, &LAYOUT, |_| PRIOR);
             walks += u32::from(posterior.walk(&WALK, &LAYOUT, |_| PRIOR));
             let expected = 9e-6 + 1e-6 * 0.2 * f32::from(frame);
             let share = posterior.solution.sigma[0] * posterior.solution.sigma[0] / expected;
@@ -219,11 +223,11 @@ mod tests {
     #[test]
     fn a_frame_after_a_long_silence_waits_for_the_walk() {
         let mut posterior = posterior();
-        posterior.pass::<1>(&WALK, 100.0, &LAYOUT, |_| PRIOR);
+        posterior.pass(&WALK, 100.0, &LAYOUT, |_| PRIOR);
         let variance = posterior.solution.sigma.map(|sigma| sigma * sigma);
         assert!(variance.iter().all(|v| (v / 109e-6 - 1.0).abs() < 1e-5), "{variance:?}");
         // and no longer than until nothing more is known than the prior says, twice over
-        posterior.pass::<1>(&WALK, 1e6, &LAYOUT, |_| PRIOR);
+        posterior.pass(&WALK, 1e6, &LAYOUT, |_| PRIOR);
         let variance = posterior.solution.sigma[0] * posterior.solution.sigma[0];
         assert!((variance / (2.0 * 9e-4) - 1.0).abs() < 1e-5, "{variance}");
     }

@@ -66,7 +66,8 @@ impl<
         drive: &Drive<C, F>,
     ) -> Option<Setting> {
         let reference = &self.past.reference;
-        let at_rest = Setting::at_rest(reference.number, frame.rf_offset, frame.cycle_time_us);
+        let time = self.setting_time(frame.cycle_time_us);
+        let at_rest = Setting::at_rest(reference.number, frame.rf_offset, time);
         let mut moved = reference.moved(drive);
         if self.is_idle(model, &moved) {
             return Some(at_rest);
@@ -123,6 +124,7 @@ impl<
     pub(super) fn retire(&mut self, model: &Model<'_, G, B, C, F>) -> bool {
         let Some(cell) = self.past.campaign.retire(self.past.reference.number) else { return false };
         let drive = cell.drive();
+        let first_channel = self.first_channel(cell.cycle_time());
         self.predict_drive(model, &drive);
         self.past.loose.recentre(self.posterior.gaussian.origin());
         for b in 0..B {
@@ -130,7 +132,7 @@ impl<
                 let variance = self.variance(model, &self.tangent, b, number, drive.rf_offset);
                 let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
                 let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
-                let reading = Reading { channel: b, innovation, variance, slope };
+                let reading = Reading { channel: first_channel + b, innovation, variance, slope };
                 self.past.loose.condition([reading], &underweighted(&self.posterior.solution));
                 self.past.loose.add_repeats(number, self.noise_variance(b));
             }

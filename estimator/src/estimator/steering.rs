@@ -35,7 +35,9 @@ impl<
         // at its place from the start: a copy is more than a kilobyte of stack
         let estimate = Ok(self.update(model, &frame, &drive));
         if let Ok(estimate) = &estimate {
-            let _ = state.steer(feedback, &self.response(model), &frame, estimate);
+            // a frame that was taken in is within the ramp
+            let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
+            let _ = state.steer(feedback, &self.response(model, momentum), &frame, estimate);
         }
         estimate
     }
@@ -47,14 +49,16 @@ impl<
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
     ) -> bool {
-        state.prepare(feedback, &self.response(model), |i| self.posterior.solution.covariance_row(i))
+        // gains are made in kicks, whatever ampere makes them
+        state.prepare(feedback, &self.response(model, 1.0), |i| self.posterior.solution.covariance_row(i))
     }
 
-    fn response<'a>(&'a self, model: &Model<'a, G, B, C, F>) -> Response<'a, G, B, C, F, N> {
+    fn response<'a>(&'a self, model: &Model<'a, G, B, C, F>, momentum: f32) -> Response<'a, G, B, C, F, N> {
         Response {
             surrogate: model.surrogate,
             at: &self.tangent.linearised,
             kick_per_ampere: &model.setup.calibration.kick_per_ampere,
+            momentum,
         }
     }
 }

@@ -107,8 +107,9 @@ impl<
         let mut expected = Expected { surprise: [0.0; B], certain: [0.0; B], within: Mask::NONE };
         let each = expected.surprise.iter_mut().zip(&mut expected.certain).zip(&frame.reading).enumerate();
         for (b, ((to, to_certain), reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
-            let (d, baseline_variance) = self.posterior.gaussian.effective(b, self.slope(b));
-            let predicted = self.posterior.gaussian.baseline(b) + dot(&d, &self.posterior.solution.delta);
+            let channel = self.predicted.first_channel + b;
+            let (d, baseline_variance) = self.posterior.gaussian.effective(channel, self.slope(b));
+            let predicted = self.posterior.gaussian.baseline(channel) + dot(&d, &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
             let certain = f64::from(
                 self.own_variance(model, b, &self.predicted.strength)
@@ -167,7 +168,8 @@ impl<
 
     /// Variance that the params' uncertainty gives a prediction [m^2].
     fn variance_of_params(&self, b: usize) -> f64 {
-        self.posterior.solution.variance_of(&self.posterior.gaussian.effective(b, self.slope(b)).0)
+        let channel = self.predicted.first_channel + b;
+        self.posterior.solution.variance_of(&self.posterior.gaussian.effective(channel, self.slope(b)).0)
     }
 
     fn resembles(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
@@ -190,10 +192,10 @@ impl<
         }
     }
 
-    /// Take the baselines as moved: all that was read before is moved with them.
+    /// Take the baselines as moved, by as much at each time in the cycle: all that was read before is moved with them.
     fn move_baselines(&mut self, shift: &[f32; B]) {
-        self.posterior.gaussian.move_baselines(shift);
-        self.past.loose.move_baselines(shift);
+        self.posterior.gaussian.move_baselines(shift, Self::TIMES);
+        self.past.loose.move_baselines(shift, Self::TIMES);
         self.past.campaign.move_readings(shift);
         self.reopen_pool();
         for frame in &mut self.past.recent {

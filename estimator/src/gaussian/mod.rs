@@ -207,9 +207,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         (0..monitors).for_each(|b| self.covariance.spread(b, variance));
     }
 
-    /// The baselines have moved by so much [m], those of monitors; the readings so far move with them.
-    pub fn move_baselines(&mut self, shift: &[f32]) {
-        self.baseline.iter_mut().zip(shift).for_each(|(baseline, by)| *baseline += f64::from(*by));
+    /// The baselines have moved by so much [m], those of monitors at each of so many times in the cycle; the readings so far move
+    /// with them.
+    pub fn move_baselines(&mut self, shift: &[f32], times: usize) {
+        let each = core::iter::repeat_n(shift, times).flatten();
+        self.baseline.iter_mut().zip(each).for_each(|(baseline, by)| *baseline += f64::from(*by));
     }
 
     /// Move the origin without changing the distribution.

@@ -82,14 +82,14 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.volume += ln_density(n * f64::from(repeats.variance)) + (n - 1.0) * ln_density(repeats.noise.into());
     }
 
-    /// Add lines, one of each monitor from the first on, whose derivatives are the columns of `h`.
+    /// Add lines, one of each monitor, whose derivatives are the columns of `h`; that of the first is of this channel.
     #[inline(never)]
-    pub fn add_lines(&mut self, pool: &mut Pool<B>, lines: &[Line], h: &[f32]) {
+    pub fn add_lines(&mut self, pool: &mut Pool<B>, first_channel: usize, lines: &[Line], h: &[f32]) {
         let mut staged = Staged::NONE;
         for (b, line) in lines.iter().enumerate().filter(|(_, line)| line.one > 0.0) {
             let mut of_line = [0.0; N];
             of_line.iter_mut().zip(column(h, N, b)).for_each(|(to, h)| *to = f64::from(*h));
-            self.add_line(pool, &mut staged, b, line, &of_line);
+            self.add_line(pool, &mut staged, first_channel + b, line, &of_line);
         }
         staged.settle(&mut self.information);
     }
@@ -162,7 +162,7 @@ mod tests {
                 one_by_one.condition([reading(b, residual(b, i), &h)], &|_| 0.0);
             }
         }
-        pooled.add_lines(&mut pool, &lines, &[derivative(0), derivative(1)].concat());
+        pooled.add_lines(&mut pool, 0, &lines, &[derivative(0), derivative(1)].concat());
         pooled.close(&pool);
         let (mut expected, mut solution) = (Solved::BLANK, Solved::BLANK);
         expected.solve(&one_by_one, |_| WIDE);

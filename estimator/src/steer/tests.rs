@@ -129,6 +129,9 @@ struct Machine {
     disturbance: [f32; B],
     current: [CurrentCode; C],
     time_us: u64,
+    cycle_time_us: u32,
+    /// Over the reference.
+    momentum: f32,
     estimate: Estimate<B, 1, 1>,
 }
 
@@ -144,6 +147,8 @@ impl Machine {
             disturbance: [0.0; B],
             current: [CurrentCode::default(); C],
             time_us: 0,
+            cycle_time_us: 0,
+            momentum: 1.0,
             estimate: estimate(health),
         };
         assert_eq!(machine.cycle().hold, Some(Hold::Stale));
@@ -151,7 +156,7 @@ impl Machine {
     }
 
     fn orbit(&self) -> [f32; B] {
-        let kick = self.current.map(|current| 1e-5 * current.value());
+        let kick = self.current.map(|current| 1e-5 / self.momentum * current.value());
         let mut orbit = [0.0; B];
         self.table.orbit(&(), &Drive { kick, strength: [0.0], rf_offset: 0.0 }, &mut orbit);
         core::array::from_fn(|b| orbit[b] + self.disturbance[b])
@@ -164,7 +169,7 @@ impl Machine {
             epoch: 0,
             sequence: 0,
             time_us: self.time_us,
-            cycle_time_us: 0,
+            cycle_time_us: self.cycle_time_us,
             corrector: self.current,
             magnets: MagnetCurrents { dipole: CurrentCode::default(), supply: [CurrentCode::default()] },
             rf_offset: RfCode::default(),
@@ -173,7 +178,7 @@ impl Machine {
             intensity: None,
             valid: Mask::from_words(&[15]),
         };
-        let response = Response { surrogate: &self.table, at: &(), kick_per_ampere: &KICK };
+        let response = Response { surrogate: &self.table, at: &(), kick_per_ampere: &KICK, momentum: self.momentum };
         let steered = self.state.steer(&self.feedback, &response, &frame, &self.estimate);
         for _ in 0..TURN {
             self.state.prepare(&self.feedback, &response, |_| [self.variance]);
@@ -240,6 +245,20 @@ fn a_known_response_removes_the_orbit_in_one_step() {
     machine.feedback.orbit = Each::same(1e-3);
     machine.cycles(1);
     assert!(machine.orbit().iter().all(|x| (x - 1e-3).abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
+}
+
+#[test]
+fn at_half_the_momentum_half_the_current_removes_the_orbit() {
+    let amperes = |momentum: f32| {
+        let mut machine = Machine::new(diagonal(), free(), 0.0);
+        machine.momentum = momentum;
+        machine.disturbance = [1e-3, -2e-3, 5e-4, 3e-3];
+        machine.cycles(1);
+        assert!(machine.orbit().iter().all(|x| x.abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
+        machine.amperes()
+    };
+    // one step of a setpoint, 0.1 mA, either way
+    assert!(amperes(1.0).iter().zip(amperes(0.5)).all(|(whole, half)| (half - 0.5 * whole).abs() < 2e-4));
 }
 
 #[test]
@@ -339,9 +358,10 @@ fn no_setpoint_moves_faster_than_its_rate_and_the_direction_stays() {
 #[test]
 fn each_reason_holds() {
     type Change = fn(&mut Machine);
-    let reasons: [(Change, Hold); 6] = [
+    let reasons: [(Change, Hold); 7] = [
         (|m| m.time_us += 2_000_000, Hold::Stale),
         (|m| m.time_us -= 150_000, Hold::Stale),
+        (|m| m.cycle_time_us += 20_000, Hold::Stale),
         (|m| m.estimate.remarks.put_aside = true, Hold::PutAside),
         (|m| m.estimate.remarks.unsolved = true, Hold::Unsolved),
         (|m| m.estimate.nis = 30.0, Hold::Surprising),

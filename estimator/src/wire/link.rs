@@ -10,6 +10,7 @@ use super::{CurrentCode, FrameError, ParcelError, listed};
 use crate::estimate::{Estimate, Health, MonitorState, Remarks};
 use crate::estimator::{GROUPS, IngestError, Setup};
 use crate::mask::Mask;
+use crate::ramp::RAMP_POINTS;
 use crate::sizes::Sizes;
 use crate::steer::{Feedback, Steered};
 
@@ -342,6 +343,7 @@ impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {
     pub const MAX_BYTES: usize = VARINT_32 + 1 + 16 * GROUPS // priors
         + 2 * (4 + LENGTH) + 4 * (B + C) // noise, kicks
         + 5 + LENGTH + 28 * F // dipole, supplies
+        + LENGTH + RAMP_POINTS * (VARINT_32 + 12 + LENGTH + 4 * F) // ramp
         + 3 * 4 + 5; // gate, both walks, tunes
 }
 

@@ -10,7 +10,7 @@ use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
 
-use super::{CommandError, campaign, check_outputs, deliver, machine, not_modelled, recording};
+use super::{CommandError, campaign, check_outputs, deliver, machine, not_modelled, recording, strays};
 use crate::cli::Check;
 use crate::output::{lines, table};
 use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
@@ -29,6 +29,8 @@ struct CheckResult {
     /// Frames that the counter has passed over.
     lost_frames: u64,
     seconds: f64,
+    /// Times in the cycle, of a machine with a ramp [ms].
+    cycle_times_ms: Vec<f64>,
     settings: Settings,
     noise: Noise,
     tunes: Option<Design>,
@@ -113,6 +115,7 @@ impl CheckResult {
             frames: rows.len(),
             lost_frames: passed.sum(),
             seconds: rows[rows.len() - 1].time - rows[0].time,
+            cycle_times_ms: cycle_times(campaign),
             settings: Settings::of(campaign),
             noise: Noise::of(campaign),
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
@@ -123,6 +126,16 @@ impl CheckResult {
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
         }
     }
+}
+
+/// Times in the cycle along a ramp [ms]; none where the machine file has none.
+fn cycle_times(campaign: &Campaign) -> Vec<f64> {
+    if campaign.recording.header.ramp.is_given() { campaign.times.milliseconds() } else { Vec::new() }
+}
+
+/// Why what knows one baseline of each monitor does not take a recording.
+fn several_times(campaign: &Campaign) -> Option<String> {
+    (campaign.times.count() > 1).then(|| format!("needs frames at one time in the cycle; found {}", campaign.times))
 }
 
 fn design_tunes(campaign: &Campaign) -> Option<Tunes> {
@@ -142,7 +155,7 @@ impl Settings {
         // idle ones scatter by a thousandth of what others are set to
         let unused: Vec<usize> = (0..names.len()).filter(|&c| largest(c) < 0.05 * nominal).collect();
         let mut offsets: Vec<f64> =
-            campaign.drives.iter().map(|drive| drive.rf_offset).filter(|offset| *offset != 0.0).collect();
+            campaign.recording.rows.iter().map(|row| row.rf_offset).filter(|offset| *offset != 0.0).collect();
         offsets.sort_by(f64::total_cmp);
         offsets.dedup();
         Self {
@@ -189,6 +202,7 @@ fn replay(campaign: &Campaign) -> Usable {
         Err(error) => error.to_string(),
         Ok(()) => prior_only(campaign)
             .or_else(|| not_modelled(recording))
+            .or_else(|| strays(ring, recording))
             .unwrap_or_else(|| "each frame to an estimate".into()),
     };
     Usable { command: "replay", can: ready.is_ok(), what }
@@ -213,16 +227,18 @@ fn study(campaign: &Campaign) -> Usable {
     } else {
         format!("all frames, and differences {}", kinds.join(", "))
     };
-    let not_modelled = not_modelled(&campaign.recording);
-    Usable { command: "study", can: not_modelled.is_none(), what: not_modelled.unwrap_or(what) }
+    let why_not = not_modelled(&campaign.recording).or_else(|| several_times(campaign));
+    Usable { command: "study", can: why_not.is_none(), what: why_not.unwrap_or(what) }
 }
 
 fn diagnose(campaign: &Campaign) -> Usable {
     let settings = Settings::of(campaign);
     let reading = (0..campaign.monitors()).filter(|&b| (0..campaign.frames()).any(|i| campaign.counts(i, b))).count();
     let moved = settings.correctors[0];
-    let can = reading >= LEAST && moved >= LEAST;
-    let what = if can {
+    let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1;
+    let what = if let Some(why_not) = several_times(campaign) {
+        why_not
+    } else if can {
         format!("{reading} monitors, {moved} correctors")
     } else {
         format!("needs {LEAST} monitors with readings and {LEAST} correctors that move; found {reading} and {moved}")
@@ -284,8 +300,10 @@ impl CheckResult {
                 format!(", RF offsets {}", offsets.iter().map(|o| format!("{o:+.1e}")).collect::<Vec<_>>().join(" "))
             }
         };
+        let times: Vec<String> = self.cycle_times_ms.iter().map(f64::to_string).collect();
+        let times = if times.is_empty() { String::new() } else { format!(", at {} ms in the cycle", times.join(", ")) };
         let facts = vec![
-            ("frames", format!("{} in {:.0} s{lost}", self.frames, self.seconds)),
+            ("frames", format!("{} in {:.0} s{lost}{times}", self.frames, self.seconds)),
             ("settings", format!("{}, with {fewest} to {most} frames each (median {median})", settings.count)),
             ("correctors", format!("{} of {} powered{offsets}", settings.correctors[0], settings.correctors[1])),
             ("largest kick", format!("{:.3} mrad", settings.largest_kick_mrad)),

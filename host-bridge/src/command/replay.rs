@@ -20,7 +20,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
-    warn_if_not_modelled(&recording);
+    warn_if_not_modelled(&ring, &recording);
     let powered = recording.powered(&ring);
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     let walk = if options.follow { stream::FOLLOW } else { stream::walk_per_cycle(&recording, options.process_noise) };

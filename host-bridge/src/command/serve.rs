@@ -63,7 +63,7 @@ fn feed(
     recording: &Recording,
     mut link: Link<Box<dyn Line>>,
 ) -> Result<(), CommandError> {
-    warn_if_not_modelled(recording);
+    warn_if_not_modelled(ring, recording);
     let powered = recording.powered(ring);
     let given = options.process_noise.map(|sigma| stream::walk_per_cycle(recording, sigma));
     let setup = stream::setup(&powered, recording, given.unwrap_or(stream::FOLLOW))?;

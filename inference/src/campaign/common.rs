@@ -1,7 +1,7 @@
 //! Sums over the readings of one monitor, from which the terms that they have in common are eliminated.
 //!
-//! A reading less its prediction obeys `r = x p + c t + noise`: `p` is wanted, `t` are the common terms (the baseline, whose
-//! coefficient is 1, then its change with each supply and with the RF offset, see [`super::Campaign::terms`]), each with a normal
+//! A reading less its prediction obeys `r = x p + c t + noise`: `p` is wanted, `t` are the common terms (the baseline at each time in
+//! the cycle, whose coefficient is 1 at that time and else 0, then its change with each supply and with the RF offset, see [`super::Campaign::terms`]), each with a normal
 //! prior of mean 0. With
 //! `M` the sum of weight times `c c^T` plus the prior precision of the terms,
 //!
@@ -22,6 +22,8 @@ pub(crate) struct Common {
     moments: DMatrix<f64>,
     /// Sum of weight times `x (c, r)^T` [X][K + 1].
     slope: DMatrix<f64>,
+    /// How many of the terms are baselines; they come first.
+    baselines: usize,
 }
 
 /// What readings say of `p` when the terms are at their best.
@@ -46,9 +48,9 @@ impl Weighed {
         Self(&all * all.transpose() * weight)
     }
 
-    /// Sum of the weights.
-    pub fn weight(&self) -> f64 {
-        self.0[(0, 0)]
+    /// Sum of the weights, of readings with one of so many baselines.
+    pub fn weight(&self, baselines: usize) -> f64 {
+        (0..baselines).map(|time| self.0[(time, time)]).sum()
     }
 }
 
@@ -59,29 +61,51 @@ impl core::ops::AddAssign<&Self> for Weighed {
 }
 
 impl Common {
-    /// No reading yet, of `size` wanted numbers; `baseline` is the precision to which the baseline is known to be 0, 0 for not at all. The
-    /// other terms are in units of their standard deviations.
-    pub fn new(size: usize, terms: usize, baseline: f64) -> Self {
+    /// No reading yet, of `size` wanted numbers; the first of the terms are `baselines`, and `baseline` is the precision to which each of
+    /// these is known to be 0, 0 for not at all. The other terms are in units of their standard deviations.
+    pub fn new(size: usize, terms: usize, baselines: usize, baseline: f64) -> Self {
         let mut moments = DMatrix::zeros(terms + 1, terms + 1);
-        (1..terms).for_each(|k| moments[(k, k)] = 1.0);
-        moments[(0, 0)] = baseline;
-        Self { moments, slope: DMatrix::zeros(size, terms + 1) }
+        (0..terms).for_each(|k| moments[(k, k)] = if k < baselines { baseline } else { 1.0 });
+        Self { moments, slope: DMatrix::zeros(size, terms + 1), baselines }
     }
 
     /// Add readings that share `x`.
     pub fn add(&mut self, x: &DVectorView<f64>, readings: &Weighed) {
         self.moments += &readings.0;
-        self.slope.ger(1.0, x, &readings.0.column(0), 1.0);
+        // the coefficient of one baseline is 1
+        (0..self.baselines).for_each(|time| self.slope.ger(1.0, x, &readings.0.column(time), 1.0));
     }
 
     fn terms(&self) -> usize {
         self.moments.ncols() - 1
     }
 
-    /// Factor of `M`; none without readings of a baseline that nothing is known of.
+    /// True if something is known of a baseline.
+    fn is_known(&self, baseline: usize) -> bool {
+        self.moments[(baseline, baseline)] > 0.0
+    }
+
+    /// Baselines that anything is known of.
+    fn known(&self) -> usize {
+        (0..self.baselines).filter(|baseline| self.is_known(*baseline)).count()
+    }
+
+    /// Factor of `M`; none where nothing is known of any baseline. Where nothing is of one of several, it is 0 and costs nothing.
     fn factor(&self) -> Option<Cholesky<f64, Dyn>> {
         let k = self.terms();
-        self.moments.view((0, 0), (k, k)).into_owned().cholesky()
+        let mut moments = self.moments.view((0, 0), (k, k)).into_owned();
+        let unknown = (0..self.baselines).filter(|baseline| !self.is_known(*baseline));
+        if self.known() > 0 {
+            unknown.for_each(|baseline| moments[(baseline, baseline)] = 1.0);
+        }
+        moments.cholesky()
+    }
+
+    /// Baselines at their best for given `p`, one for each time in the cycle; none of a time without readings.
+    pub fn best_baselines(&self, p: &DVector<f64>) -> Vec<Option<f64>> {
+        let best = self.best(p);
+        let known = |time: usize| best.as_ref().filter(|_| self.is_known(time)).map(|best| best[time]);
+        (0..self.baselines).map(known).collect()
     }
 
     /// Terms at their best for given `p`; none without readings.
@@ -115,22 +139,22 @@ impl Common {
 }
 
 /// Chi-square of some readings of a monitor by their noise [m] about what they have in common, and its degrees of freedom: the number of
-/// readings less 1 for the baseline and, for each other term, the share of it that the readings and not its prior determine.
-/// `terms`: a column for each reading, 1 for the baseline, then the others in standard deviations [m].
+/// readings less 1 for each baseline and, for each other term, the share of it that the readings and not its prior determine.
+/// `terms`: a column for each reading, first the coefficients of so many baselines, then the others in standard deviations [m].
 ///
 /// Source: T. Hastie, R. Tibshirani and J. Friedman, The Elements of Statistical Learning (2009), eq. 3.50.
-pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, noise: f64) -> (f64, f64) {
-    let mut common = Common::new(0, terms.nrows(), 0.0);
+pub fn chi_square(residual: &DVector<f64>, terms: &DMatrix<f64>, baselines: usize, noise: f64) -> (f64, f64) {
+    let mut common = Common::new(0, terms.nrows(), baselines, 0.0);
     for (residual, terms) in residual.iter().zip(terms.column_iter()) {
         common.add(&DVector::zeros(0).column(0), &Weighed::one(terms.as_slice(), *residual, noise.powi(-2)));
     }
     let Some((best, left)) = common.best(&DVector::zeros(0)).zip(common.factor().map(|factor| factor.inverse())) else {
         return (0.0, 0.0);
     };
-    let others = 1..best.len();
+    let others = baselines..best.len();
     let cost: f64 = others.clone().map(|k| best[k].powi(2)).sum();
     let learnt: f64 = others.map(|k| 1.0 - left[(k, k)]).sum();
-    (common.eliminated().square - cost, residual.len() as f64 - 1.0 - learnt)
+    (common.eliminated().square - cost, residual.len() as f64 - common.known() as f64 - learnt)
 }
 
 #[cfg(test)]
@@ -145,7 +169,7 @@ mod tests {
         let x = DMatrix::from_fn(size, readings, |p, i| wave(i, 1.1 + p as f64));
         let terms = DMatrix::from_fn(3, readings, |k, i| if k == 0 { 1.0 } else { wave(i, 0.5 + 0.2 * k as f64) });
         let residual = DVector::from_fn(readings, |i, _| 5.0 + wave(i, 2.3));
-        let mut common = Common::new(size, 3, 0.02);
+        let mut common = Common::new(size, 3, 1, 0.02);
         for i in 0..readings {
             let one = Weighed::one(terms.column(i).as_slice(), residual[i], f64::powi(noise, -2));
             common.add(&x.column(i).as_view(), &one);
@@ -171,7 +195,7 @@ mod tests {
         let noise = 0.4;
         let smoother = &all * (all.tr_mul(&all) + prior * f64::powi(noise, 2)).try_inverse().unwrap() * all.transpose();
         let left = (&residual - &smoother * &residual).norm_squared() / noise.powi(2);
-        let (chi2, freedom) = chi_square(&residual, &all.transpose(), noise);
+        let (chi2, freedom) = chi_square(&residual, &all.transpose(), 1, noise);
         assert!((chi2 - left).abs() < 1e-9 && (freedom - (9.0 - smoother.trace())).abs() < 1e-9, "{chi2} {freedom}");
     }
 
@@ -181,16 +205,29 @@ mod tests {
         let about_mean = residual.add_scalar(-residual.mean()).norm_squared();
         for terms in [0, 2] {
             let terms = DMatrix::zeros(terms, 4).insert_row(0, 1.0);
-            let (chi2, freedom) = chi_square(&residual, &terms, 0.5);
+            let (chi2, freedom) = chi_square(&residual, &terms, 1, 0.5);
             assert!((chi2 - 4.0 * about_mean).abs() < 1e-12 && (freedom - 3.0).abs() < 1e-12);
         }
     }
 
+    /// Two times in the cycle, one of them read: as if there were one; both read: each about its own mean.
+    #[test]
+    fn each_time_in_the_cycle_has_its_baseline() {
+        let residual = DVector::from_vec(vec![1.0, 2.0, 14.0, 7.0]);
+        let at_first = DMatrix::from_row_slice(2, 4, &[1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
+        let at_both = DMatrix::from_row_slice(2, 4, &[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
+        assert_eq!(chi_square(&residual, &at_first, 2, 1.0), (106.0, 3.0));
+        assert_eq!(chi_square(&residual, &at_both, 2, 1.0), (25.0, 2.0));
+        let mut common = Common::new(0, 2, 2, 0.0);
+        common.add(&DVector::zeros(0).column(0), &Weighed::one(&[0.0, 1.0], 3.0, 1.0));
+        assert_eq!(common.best_baselines(&DVector::zeros(0)), [None, Some(3.0)]);
+    }
+
     #[test]
     fn without_readings_nothing_is_left() {
-        let Eliminated { columns, moment, square } = Common::new(2, 3, 0.0).eliminated();
+        let Eliminated { columns, moment, square } = Common::new(2, 3, 1, 0.0).eliminated();
         assert_eq!((columns.ncols(), moment, square), (0, DVector::zeros(2), 0.0));
-        assert_eq!(Common::new(2, 3, 0.0).best(&DVector::zeros(2)), None);
-        assert_eq!(chi_square(&DVector::zeros(0), &DMatrix::zeros(2, 0), 0.1), (0.0, 0.0));
+        assert_eq!(Common::new(2, 3, 1, 0.0).best(&DVector::zeros(2)), None);
+        assert_eq!(chi_square(&DVector::zeros(0), &DMatrix::zeros(2, 0), 1, 0.1), (0.0, 0.0));
     }
 }

@@ -17,21 +17,29 @@ pub struct Drive {
 
 impl Drive {
     /// The header's formulas: `k1 = var k1_design p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`; what is in series with the dipoles
-    /// keeps its strength, and a kick falls with the dipoles' current.
+    /// keeps its strength, and a kick falls with the dipoles' current. Along a ramp, at the row's time in the cycle:
+    ///
+    /// `k1 = var k1_design p(I/I_nominal)/p(I(t)/I_nominal)/(I_dipole/I_dipole(t))`,
+    /// `kick = kick_per_A I/(momentum(t) I_dipole/I_dipole(t))`;
+    ///
+    /// the RF offset is the one that would move the momentum as much at the reference momentum.
+    ///
+    /// # Panics
+    /// If the row's time is not one of the ramp's: such recordings are refused.
     pub fn of(header: &Header, row: &Row) -> Self {
+        let at = header.ramp.at(row.cycle_time, row.supply.len()).expect("the ramp knows the times of its frames");
         let rigidity = match (row.dipole, header.nominal_dipole) {
-            (Some(current), Some(nominal)) => current / nominal,
+            (Some(current), Some(nominal)) => current / (nominal * at.dipole),
             _ => 1.0,
         };
-        let strength = |f: usize| {
-            let transfer = |r: f64| header.transfer[f].iter().rev().fold(0.0, |sum, c| sum * r + c);
-            (transfer(row.supply[f] / header.nominal[f]) / transfer(1.0) / rigidity).ln()
-        };
-        let kick = row.corrector_current.iter().zip(&header.kick_per_ampere).map(|(current, k)| current * k / rigidity);
+        let strength = |f: usize| (header.gradient(f, row.supply[f]) / (rigidity * at.gradient[f])).ln();
+        let stiffness = rigidity * at.momentum;
+        let kick =
+            row.corrector_current.iter().zip(&header.kick_per_ampere).map(|(current, k)| current * k / stiffness);
         Self {
             kick: DVector::from_iterator(row.corrector_current.len(), kick),
             strength: DVector::from_fn(row.supply.len(), |f, _| strength(f)),
-            rf_offset: row.rf_offset,
+            rf_offset: row.rf_offset / at.slip,
         }
     }
 }

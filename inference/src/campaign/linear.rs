@@ -3,7 +3,8 @@
 use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
-use super::drive::Drive;
+use super::Campaign;
+use super::drive::{Drive, mean_supplies};
 
 /// The ring at given params.
 #[derive(Debug, Clone)]
@@ -23,6 +24,56 @@ pub(crate) struct Linearised {
     pub tune_supply_slopes: DMatrix<f64>,
     /// Supplies about which it is linearised [F].
     supplies: DVector<f64>,
+}
+
+/// The ring at given params, at the mean supplies of the frames of each time in the cycle.
+#[derive(Debug, Clone)]
+pub(crate) struct AtTimes {
+    /// At the mean supplies of all frames.
+    pub at_mean: Linearised,
+    /// For each of several times, its frames and the ring; none where there is one time.
+    each: Vec<(Vec<usize>, Linearised)>,
+}
+
+impl AtTimes {
+    /// Of a campaign.
+    pub fn of(campaign: &Campaign, params: &DVector<f64>) -> Result<Self, OrbitError> {
+        let Campaign { held, supplies, drives, times, .. } = campaign;
+        let at = |time: usize| {
+            let frames: Vec<usize> = (0..drives.len()).filter(|&i| times.of_frame[i] == time).collect();
+            let drives = of_frames(drives, &frames);
+            let linearised = Linearised::of(held, params, &mean_supplies(&drives), &drives)?;
+            Ok((frames, linearised))
+        };
+        let several = if times.count() > 1 { times.count() } else { 0 };
+        let each = (0..several).map(at).collect::<Result<_, OrbitError>>()?;
+        Ok(Self { at_mean: Linearised::of(held, params, supplies, drives)?, each })
+    }
+
+    /// As [`Linearised::orbits`].
+    pub fn orbits(&self, drives: &[Drive]) -> DMatrix<f64> {
+        let mut orbits = self.at_mean.orbits(drives);
+        for (frames, linearised) in &self.each {
+            let own = linearised.orbits(&of_frames(drives, frames));
+            frames.iter().zip(own.row_iter()).for_each(|(&frame, orbit)| orbits.set_row(frame, &orbit));
+        }
+        orbits
+    }
+
+    /// As [`Linearised::slopes`].
+    pub fn slopes(&self, drives: &[Drive]) -> Vec<DMatrix<f64>> {
+        let mut slopes = self.at_mean.slopes(drives);
+        for (frames, linearised) in &self.each {
+            for (to, own) in slopes.iter_mut().zip(linearised.slopes(&of_frames(drives, frames))) {
+                frames.iter().zip(own.column_iter()).for_each(|(&frame, slope)| to.set_column(frame, &slope));
+            }
+        }
+        slopes
+    }
+}
+
+fn of_frames(drives: &[Drive], frames: &[usize]) -> Vec<Drive> {
+    frames.iter().map(|&frame| drives[frame].clone()).collect()
 }
 
 /// Orbit that an RF offset makes, exactly, and its derivatives.

@@ -9,6 +9,7 @@ mod meter;
 mod normal;
 mod screen;
 mod setting;
+mod times;
 
 use core::f64::consts::FRAC_1_SQRT_2;
 
@@ -22,13 +23,15 @@ use crate::recording::Recording;
 pub use common::chi_square;
 pub(crate) use common::{Common, Eliminated, Weighed};
 pub use drive::{Drive, supplies_of};
-pub(crate) use linear::Linearised;
+pub(crate) use linear::AtTimes;
+use linear::Linearised;
 pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::Normal;
+pub(crate) use normal::{Normal, Terms};
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
 pub use setting::Settings;
+pub use times::{Stray, Times, furthest_stray};
 
 /// A recording and what follows from it before any fit.
 #[derive(Debug, Clone)]
@@ -49,6 +52,8 @@ pub struct Campaign {
     pub supplies: Vec<f64>,
     /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
     pub fluctuation: DMatrix<f64>,
+    /// Frames grouped by their time in the cycle.
+    pub times: Times,
     /// Frames grouped by setting.
     pub settings: Settings,
     /// Readings as recorded, rows frames, columns monitors; not a number where a monitor did not report [m].
@@ -61,7 +66,7 @@ pub struct Campaign {
     pub screened: Screened,
     /// The params that the screening ends with: a first guess.
     pub params: DVector<f64>,
-    /// Each monitor's baseline at these [B] [m]; none without readings.
+    /// Each monitor's baseline at these [B] [m], for each time in the cycle; none without readings.
     pub baselines: Vec<Option<f64>>,
     /// Rms of these in x and y [m].
     pub orbit: [f64; 2],
@@ -87,7 +92,8 @@ impl Campaign {
         let held = Machine::new(ring.clone(), Rf::FixedMomentum, &believed).expect("its sites are resolved");
         let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
         let supplies = drive::mean_supplies(&drives);
-        let settings = Settings::of(&drives, recording.nominal_kick());
+        let times = Times::of(recording);
+        let settings = Settings::of(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
         let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
@@ -96,8 +102,9 @@ impl Campaign {
             prior: &prior,
             drives: &drives,
             supplies: &supplies,
+            times: &times,
             settings: &settings,
-            groups: Groups::of(&drives, &settings),
+            groups: Groups::of(&drives, &times, &settings),
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
@@ -122,6 +129,7 @@ impl Campaign {
             prior,
             drives,
             supplies,
+            times,
             settings,
             readings,
             tunes,
@@ -174,17 +182,20 @@ impl Campaign {
         following
     }
 
-    /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline, how it follows each supply,
-    /// and the dispersion of the unknown misalignments at the frame's RF offset; but for the first in standard deviations [m].
+    /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline at its time in the cycle and
+    /// 0 for those at others, then how it follows each supply, and the dispersion of the unknown misalignments at the frame's RF offset;
+    /// these in standard deviations [m].
     pub(crate) fn terms(&self, b: usize) -> DMatrix<f64> {
         let plane = self.plane(b);
         // `spurious` is stated for offsets of which two opposite ones are taken for independent
         let spurious = self.spurious[plane] * self.orbit[plane] * FRAC_1_SQRT_2;
         let following = self.following(b).transpose();
-        let mut terms = DMatrix::from_element(following.nrows() + 2, self.frames(), 1.0);
-        terms.rows_mut(1, following.nrows()).copy_from(&following);
+        let times = self.times.count();
+        let mut terms = DMatrix::zeros(times + following.nrows() + 1, self.frames());
+        self.times.of_frame.iter().enumerate().for_each(|(i, time)| terms[(*time, i)] = 1.0);
+        terms.rows_mut(times, following.nrows()).copy_from(&following);
         let offsets = self.drives.iter().map(|drive| spurious * drive.rf_offset);
-        terms.row_mut(1 + following.nrows()).iter_mut().zip(offsets).for_each(|(to, offset)| *to = offset);
+        terms.row_mut(times + following.nrows()).iter_mut().zip(offsets).for_each(|(to, offset)| *to = offset);
         terms
     }
 
@@ -226,9 +237,11 @@ fn tunes(recording: &Recording) -> DMatrix<f64> {
 
 /// Rms of the baselines that are known, in x and y [m].
 fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
-    let (x, y) = baselines.split_at(ring.horizontal_monitors());
-    [x, y].map(|baselines| {
-        let squares: Vec<f64> = baselines.iter().flatten().map(|x| x * x).collect();
+    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
+    [0, 1].map(|plane| {
+        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
+        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
+        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
         (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
     })
 }

@@ -17,17 +17,30 @@ pub(crate) struct Normal {
     vector: DVector<f64>,
     square: f64,
     monitors: Vec<Common>,
+    baselines: usize,
+}
+
+/// What readings of a monitor have in common.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Terms {
+    /// How many terms.
+    pub count: usize,
+    /// How many of them, from the first on, are baselines: one for each time in the cycle.
+    pub baselines: usize,
+    /// Precision to which each baseline is known to be 0, 0 for not at all.
+    pub precision: f64,
 }
 
 impl Normal {
-    /// The prior alone about params; the readings of each monitor have this many terms in common, and `baseline` is the precision to which
-    /// each baseline is known to be 0, 0 for not at all.
-    pub fn new(prior: &Prior, params: &DVector<f64>, monitors: usize, terms: usize, baseline: f64) -> Self {
+    /// The prior alone about params; the readings of each monitor have these terms in common.
+    pub fn new(prior: &Prior, params: &DVector<f64>, monitors: usize, terms: Terms) -> Self {
+        let Terms { count, baselines, precision } = terms;
         Self {
             matrix: DMatrix::from_diagonal(&prior.precision),
             vector: (&prior.mean - params).component_mul(&prior.precision),
             square: prior.cost(params),
-            monitors: vec![Common::new(params.len(), terms, baseline); monitors],
+            monitors: vec![Common::new(params.len(), count, baselines, precision); monitors],
+            baselines,
         }
     }
 
@@ -37,7 +50,10 @@ impl Normal {
             self.monitors[*b].add(&slope, readings);
         }
         let mut weighted = slopes.clone();
-        weighted.column_iter_mut().zip(readings).for_each(|(mut column, (_, readings))| column *= readings.weight());
+        weighted
+            .column_iter_mut()
+            .zip(readings)
+            .for_each(|(mut column, (_, readings))| column *= readings.weight(self.baselines));
         self.matrix.gemm(1.0, &weighted, &slopes.transpose(), 1.0);
     }
 
@@ -64,9 +80,10 @@ impl Normal {
         (cost, Quadratic { matrix, slope })
     }
 
-    /// Baseline of a monitor after a step of the params [m]; none without readings.
-    pub fn baseline(&self, b: usize, step: &DVector<f64>) -> Option<f64> {
-        self.monitors[b].best(step).map(|terms| terms[0])
+    /// Baselines of the monitors after a step of the params, for each time in the cycle [m]; none without readings.
+    pub fn baselines(&self, step: &DVector<f64>) -> Vec<Option<f64>> {
+        let of_monitors: Vec<Vec<Option<f64>>> = self.monitors.iter().map(|one| one.best_baselines(step)).collect();
+        (0..self.baselines).flat_map(|time| of_monitors.iter().map(move |baselines| baselines[time])).collect()
     }
 
     /// What is expected of a residual with these terms after a step, and the variance of that, given the factor of the params' precision:

@@ -13,9 +13,10 @@ use twin::{Machine, OrbitError, Ring};
 use super::common::Weighed;
 use super::drive::{self, Drive};
 use super::linear::Linearised;
-use super::normal::Normal;
+use super::normal::{Normal, Terms};
 use super::rms_by_plane;
 use super::setting::Settings;
+use super::times::Times;
 use crate::prior::Prior;
 
 /// The monitors, and their readings that count.
@@ -35,6 +36,7 @@ pub(super) struct Screener<'c> {
     pub prior: &'c Prior,
     pub drives: &'c [Drive],
     pub supplies: &'c [f64],
+    pub times: &'c Times,
     pub settings: &'c Settings,
     pub groups: Groups,
     /// Rows frames, columns monitors, not a number where a monitor did not report [m].
@@ -52,6 +54,8 @@ pub(super) struct Groups {
     of_frame: Vec<usize>,
     /// Mean drive of each.
     drives: Vec<Drive>,
+    /// Time in the cycle of each.
+    times: Vec<usize>,
 }
 
 /// What remains when all frames have been taken.
@@ -59,14 +63,16 @@ pub(super) struct Seen {
     pub screened: Screened,
     /// The best params.
     pub params: DVector<f64>,
-    /// Baselines [B] [m].
+    /// Baselines [B] [m], for each time in the cycle.
     pub baselines: Vec<Option<f64>>,
 }
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
 const BASELINE: f64 = 0.02;
-/// The baseline is the only common term of a monitor's readings: how it follows the supplies is small beside the gate.
+/// The baseline is the only common term of a monitor's readings at one time in the cycle: how it follows the supplies is small beside
+/// the gate.
 const TERMS: [f64; 1] = [1.0];
+const COMMON: Terms = Terms { count: 1, baselines: 1, precision: 1.0 / (BASELINE * BASELINE) };
 /// A param that has moved by this many error bars calls for a new linearisation.
 const MOVED: f64 = 1.0;
 /// Growth of chi-square that counts as uphill.
@@ -131,17 +137,19 @@ struct Best {
 }
 
 impl Groups {
-    pub fn of(drives: &[Drive], settings: &Settings) -> Self {
+    pub fn of(drives: &[Drive], times: &Times, settings: &Settings) -> Self {
         let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
+        let mut time_of = Vec::new();
         let mut group = |(frame, drive): (usize, _)| {
             let key = settings.of_frame[frame].ok_or(frame);
             let group = *known.entry(key).or_insert(members.len());
             members.resize(members.len().max(group + 1), Vec::new());
             members[group].push(drive);
+            time_of.resize(members.len(), times.of_frame[frame]);
             group
         };
         let of_frame = drives.iter().enumerate().map(&mut group).collect();
-        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect() }
+        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect(), times: time_of }
     }
 }
 
@@ -158,9 +166,19 @@ impl Screener<'_> {
         }
         screening.drop_stuck();
         let Screening { accepted, monitors, model, best, normal, .. } = screening;
-        let baselines = (0..monitors.len()).map(|b| normal.baseline(b, &best.step)).collect();
+        let baselines = normal.baselines(&best.step);
         let health = monitors.iter().map(Monitor::health).collect();
         Ok(Seen { screened: Screened { accepted, health }, params: model.params + best.step, baselines })
+    }
+
+    /// Number of baselines: one for each monitor and time in the cycle.
+    fn channels(&self) -> usize {
+        self.times.count() * self.noise.len()
+    }
+
+    /// Which of them a reading has.
+    fn channel(&self, frame: usize, b: usize) -> usize {
+        self.times.of_frame[frame] * self.noise.len() + b
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
@@ -189,7 +207,7 @@ impl<'c> Screening<'c> {
     fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
         let (frames, monitors) = (of.drives.len(), of.noise.len());
         let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
-        let normal = Normal::new(of.prior, &model.params, monitors, TERMS.len(), BASELINE.powi(-2));
+        let normal = Normal::new(of.prior, &model.params, of.channels(), COMMON);
         let expecting = |sigma: &f64| {
             let mut monitor = Monitor::BLANK;
             monitor.expect(*sigma as f32);
@@ -237,12 +255,13 @@ impl<'c> Screening<'c> {
     /// Add the readings of a frame that count to the normal equations.
     fn learn(&mut self, frame: usize) {
         let group = self.of.groups.of_frame[frame];
-        let counting = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]);
-        let readings: Vec<(usize, Weighed)> = counting.map(|b| (b, self.weighed(frame, b))).collect();
-        let mut slopes = DMatrix::zeros(self.model.params.len(), readings.len());
-        for (mut to, (b, _)) in slopes.column_iter_mut().zip(&readings) {
-            to.copy_from(&self.model.slope[*b].column(group));
+        let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).collect();
+        let mut slopes = DMatrix::zeros(self.model.params.len(), counting.len());
+        for (mut to, &b) in slopes.column_iter_mut().zip(&counting) {
+            to.copy_from(&self.model.slope[b].column(group));
         }
+        let weighed = |&b: &usize| (self.of.channel(frame, b), self.weighed(frame, b));
+        let readings: Vec<(usize, Weighed)> = counting.iter().map(weighed).collect();
         self.normal.add(&slopes, &readings);
     }
 
@@ -307,7 +326,8 @@ impl<'c> Screening<'c> {
     /// True if the model, with all its uncertainty, expects a reading.
     fn is_expected(&self, frame: usize, b: usize) -> bool {
         let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
-        let expectation = self.normal.expect(b, slope, &TERMS, &self.best.step, &self.best.factor);
+        let channel = self.of.channel(frame, b);
+        let expectation = self.normal.expect(channel, slope, &TERMS, &self.best.step, &self.best.factor);
         let (expected, of_baseline, of_params) = expectation.expect("a baseline's prior is known");
         let innovation = (self.residual(frame, b) - expected) as f32;
         let certain = self.variance(frame, b) + of_baseline;
@@ -324,7 +344,9 @@ impl<'c> Screening<'c> {
     fn variance(&self, frame: usize, b: usize) -> f64 {
         let plane = usize::from(b >= self.of.ring.horizontal_monitors());
         let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
-        f64::from(self.monitors[b].variance()) + self.of.sharing[frame] * shared * shared
+        // frames of one RF offset share it, and so do those of all times in the cycle
+        let sharing = self.of.sharing[frame] * self.of.times.count() as f64;
+        f64::from(self.monitors[b].variance()) + sharing * shared * shared
     }
 
     fn weighed(&self, frame: usize, b: usize) -> Weighed {
@@ -376,9 +398,10 @@ impl<'c> Screening<'c> {
     /// The normal equations of the accepted readings of the first frames.
     fn rebuild(&mut self, frames: usize) {
         let monitors = self.monitors.len();
-        self.normal = Normal::new(self.of.prior, &self.model.params, monitors, TERMS.len(), BASELINE.powi(-2));
+        self.normal = Normal::new(self.of.prior, &self.model.params, self.of.channels(), COMMON);
         for b in 0..monitors {
-            let mut sums = vec![(b, Weighed::none(TERMS.len())); self.of.groups.drives.len()];
+            let none = |time: &usize| (time * monitors + b, Weighed::none(TERMS.len()));
+            let mut sums: Vec<(usize, Weighed)> = self.of.groups.times.iter().map(none).collect();
             for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
                 sums[self.of.groups.of_frame[frame]].1 += &self.weighed(frame, b);
             }
@@ -410,7 +433,7 @@ impl Best {
         let (cost, quadratic) = normal.eliminated();
         let factor = quadratic.factor().expect("a prior's precision is positive");
         let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
-        let baselines: Vec<Option<f64>> = (0..of.noise.len()).map(|b| normal.baseline(b, &step)).collect();
+        let baselines = normal.baselines(&step);
         Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost }
     }
 }

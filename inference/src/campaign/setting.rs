@@ -11,9 +11,10 @@ pub struct Settings {
     pub count: usize,
 }
 
-/// What is moved in a frame: powered correctors with their kicks, and the RF.
+/// What is moved in a frame: powered correctors with their kicks, and the RF; and which of the times in the cycle it has.
 #[derive(Debug)]
 struct Moved {
+    time: usize,
     kicks: Vec<(usize, f64)>,
     rf_offset: f64,
 }
@@ -26,11 +27,11 @@ const SAME_KICK: f64 = 1.0 / 16.0;
 const SAME_OFFSET: f64 = 1e-6;
 
 impl Settings {
-    /// Group frames; `largest` is the largest kick that a corrector was set to [rad].
-    pub fn of(drives: &[Drive], largest: f64) -> Self {
+    /// Group frames, each with its time in the cycle; `largest` is the largest kick that a corrector was set to [rad].
+    pub fn of(drives: &[Drive], times: &[usize], largest: f64) -> Self {
         let mut settings: Vec<(Moved, usize)> = Vec::new();
-        let mut index = |drive: &Drive| {
-            let moved = Moved::of(drive, POWERED * largest);
+        let mut index = |(drive, time): (&Drive, &usize)| {
+            let moved = Moved::of(drive, *time, POWERED * largest);
             let at = settings.iter().position(|(known, _)| known.is_repeated_by(&moved)).unwrap_or_else(|| {
                 settings.push((moved, 0));
                 settings.len() - 1
@@ -38,16 +39,16 @@ impl Settings {
             settings[at].1 += 1;
             at
         };
-        let of_frame: Vec<usize> = drives.iter().map(&mut index).collect();
+        let of_frame: Vec<usize> = drives.iter().zip(times).map(&mut index).collect();
         let alone = |at: &usize| settings[*at].1 == 1 && settings[*at].0.things() > 1;
         Self { of_frame: of_frame.iter().map(|at| (!alone(at)).then_some(*at)).collect(), count: settings.len() }
     }
 }
 
 impl Moved {
-    fn of(drive: &Drive, powered: f64) -> Self {
+    fn of(drive: &Drive, time: usize, powered: f64) -> Self {
         let kicks = drive.kick.iter().copied().enumerate().filter(|(_, kick)| kick.abs() > powered);
-        Self { kicks: kicks.collect(), rf_offset: drive.rf_offset }
+        Self { time, kicks: kicks.collect(), rf_offset: drive.rf_offset }
     }
 
     /// How many things are moved.
@@ -59,7 +60,8 @@ impl Moved {
         let same = |((one, kick), (another, again)): (&(usize, f64), &(usize, f64))| {
             one == another && (kick - again).abs() <= SAME_KICK * kick.abs().max(again.abs())
         };
-        self.kicks.len() == other.kicks.len()
+        self.time == other.time
+            && self.kicks.len() == other.kicks.len()
             && self.kicks.iter().zip(&other.kicks).all(same)
             && (self.rf_offset - other.rf_offset).abs() <= SAME_OFFSET
     }
@@ -86,15 +88,17 @@ mod tests {
             frame([0.0, 0.0, 2.0], 0.0),
             frame([0.0, 0.0, 0.0], 2e-4),
         ];
-        let settings = Settings::of(&frames, 2e-4);
+        let settings = Settings::of(&frames, &[0; 7], 2e-4);
         assert_eq!(settings.of_frame, [0, 1, 0, 2, 3, 4, 5].map(Some));
         assert_eq!(settings.count, 6);
+        let at_two_times = Settings::of(&frames, &[0, 0, 1, 0, 0, 0, 0], 2e-4);
+        assert_eq!(at_two_times.of_frame, [0, 1, 2, 3, 4, 5, 6].map(Some));
     }
 
     #[test]
     fn several_correctors_at_once_are_a_setting_only_where_they_are_repeated() {
         let (bump, feedback) = (frame([1.0, -2.0, 1.0], 0.0), frame([1.5, 1.0, 0.0], 0.0));
-        let settings = Settings::of(&[bump.clone(), feedback, bump, frame([0.0, 1.0, 0.0], 0.0)], 2e-4);
+        let settings = Settings::of(&[bump.clone(), feedback, bump, frame([0.0, 1.0, 0.0], 0.0)], &[0; 4], 2e-4);
         assert_eq!(settings.of_frame, [Some(0), None, Some(0), Some(2)]);
     }
 }

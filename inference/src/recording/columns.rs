@@ -102,7 +102,8 @@ fn required(header: &Header, names: &Names) -> Vec<String> {
     let dipole = header.nominal_dipole.map(|_| "i_dipole_A".to_owned());
     let supplies = names.supplies.iter().map(|supply| supply_column(supply));
     let fixed = ["seq", "time_s"].map(String::from).into_iter();
-    fixed.chain(dipole).chain(supplies).chain(instruments(names)).collect()
+    let cycle_time = header.ramp.is_given().then(|| "t_cycle_ms".to_owned());
+    fixed.chain(cycle_time).chain(dipole).chain(supplies).chain(instruments(names)).collect()
 }
 
 /// Reports the first column that differs from the expected one.

@@ -8,7 +8,9 @@ use twin::Ring;
 use super::columns::Columns;
 use super::error::{Part, Place, RecordingError};
 use super::header::{Format, Header};
-use super::limit::{FINITE, Limit, NO_SETTING, NOT_NEGATIVE, POSITION, POSITIVE, RF_OFFSET, TUNE, from_milli};
+use super::limit::{
+    FINITE, Limit, NO_SETTING, NOT_NEGATIVE, POSITION, POSITIVE, RF_OFFSET, TUNE, from_milli, in_milli,
+};
 use super::names::Names;
 
 /// One machine cycle.
@@ -64,7 +66,7 @@ pub(super) fn parse(
     let mut rows: Vec<Row> = Vec::new();
     for (index, line) in lines.enumerate() {
         let cells = Cells::split(file, 2 + index, &columns, line)?;
-        let row = cells.row(header.format, names, rows.last())?;
+        let row = cells.row(header, names, rows.last())?;
         rows.push(row);
     }
     if rows.is_empty() {
@@ -95,8 +97,8 @@ impl<'a> Cells<'a> {
     }
 
     /// One row; the fields stand in the order of format 1's columns, so that its first fault is the one reported.
-    fn row(&self, format: Format, names: &Names, previous: Option<&Row>) -> Result<Row, RecordingError> {
-        let at = self.columns;
+    fn row(&self, header: &Header, names: &Names, previous: Option<&Row>) -> Result<Row, RecordingError> {
+        let (at, format) = (self.columns, header.format);
         let sequence = self.take(at.sequence, "a whole number from 0 to 4294967295", |cell| cell.parse().ok())?;
         self.rising(at.sequence, previous.map(|row| f64::from(row.sequence)), f64::from(sequence))?;
         let time = self.number(at.time, FINITE)?;
@@ -104,7 +106,7 @@ impl<'a> Cells<'a> {
         Ok(Row {
             sequence,
             time,
-            cycle_time: at.cycle_time.map_or(Ok(0.0), |column| self.number(column, FINITE).map(from_milli))?,
+            cycle_time: at.cycle_time.map_or(Ok(0.0), |column| self.cycle_time(column, header))?,
             correctors: at.set.map_or(Ok(Vec::new()), |columns| self.set(columns, format, names))?,
             rf_offset: at.rf_offset.map_or(Ok(0.0), |column| self.number(column, RF_OFFSET))?,
             dipole: at.dipole.map(|column| self.number(column, POSITIVE)).transpose()?,
@@ -115,6 +117,14 @@ impl<'a> Cells<'a> {
             intensity: self.maybe(at.intensity, NOT_NEGATIVE)?,
             tune: [self.maybe(at.tune[0], TUNE)?, self.maybe(at.tune[1], TUNE)?],
         })
+    }
+
+    /// A time in the cycle, which a ramp has to know.
+    fn cycle_time(&self, column: usize, header: &Header) -> Result<f64, RecordingError> {
+        let Some([first, last]) = header.ramp.span() else { return self.number(column, FINITE).map(from_milli) };
+        let words = format!("a time of the ramp, from {} to {} ms", in_milli(first), in_milli(last));
+        let within = |cell: &str| FINITE.parse(cell).map(from_milli).filter(|time| (first..=last).contains(time));
+        self.take(column, &words, within)
     }
 
     /// The correctors that were set and their settings; format 2 joins several by `;`.

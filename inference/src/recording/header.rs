@@ -15,6 +15,7 @@ use twin::{Effect, EffectError, EffectKind, Ring};
 use super::error::{Part, Place, RecordingError};
 use super::limit::{POSITIVE, from_milli, in_milli};
 use super::names::{Names, feeds};
+use super::ramp::Ramp;
 
 /// What `header.toml` says about the whole campaign.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,6 +52,8 @@ pub struct Header {
     pub radial_loop_monitors: Option<[String; 2]>,
     /// Remarks.
     pub note: String,
+    /// What changes along the ramp, from the machine file.
+    pub ramp: Ramp,
 }
 
 /// How a recording's files are written.
@@ -141,7 +144,7 @@ impl Header {
     pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
         let text = Text { file, text };
         text.check_name(ring)?;
-        let header = match text.format()? {
+        let mut header = match text.format()? {
             Format::One => text.first(ring)?,
             Format::Two => text.second(names)?,
         };
@@ -150,7 +153,15 @@ impl Header {
         }
         text.check_machine(&header, ring)?;
         text.check_loop(&header, ring)?;
+        header.ramp = Ramp::of(ring, &header).map_err(|(key, what)| text.refuse_key(key, &what))?;
+        text.check_ramp(&header)?;
         Ok(header)
+    }
+
+    /// Gradient of a supply's quadrupoles over that at its nominal current: `p(I/I_nominal)/p(1)`.
+    pub fn gradient(&self, supply: usize, current: f64) -> f64 {
+        let transfer = |r: f64| self.transfer[supply].iter().rev().fold(0.0, |sum, c| sum * r + c);
+        transfer(current / self.nominal[supply]) / transfer(1.0)
     }
 
     /// What is believed to be held instead of the momentum, as an effect.
@@ -262,6 +273,7 @@ impl Text<'_> {
             transfer: vec![file.quad_transfer.0; ring.supplies.len()],
             radial_loop_monitors: file.radial_loop_monitors,
             note: file.note,
+            ramp: Ramp::default(),
         })
     }
 
@@ -293,6 +305,7 @@ impl Text<'_> {
             transfer: transfer.into_iter().map(|Transfer(c)| c).collect(),
             radial_loop_monitors: file.radial_loop_monitors,
             note: file.note,
+            ramp: Ramp::default(),
         })
     }
 
@@ -379,6 +392,14 @@ impl Text<'_> {
     fn check_loop(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
         let held = header.radial_loop(ring).transpose();
         held.map(drop).map_err(|error| self.refuse_key("radial_loop_monitors", &error.to_string()))
+    }
+
+    /// Along a ramp a kick at fixed frequency moves the momentum by less and less, which the model leaves out.
+    fn check_ramp(&self, header: &Header) -> Result<(), RecordingError> {
+        if header.ramp.is_given() && header.believed_rf == BelievedRf::FixedFrequency {
+            return Err(self.refuse_key("believed_rf", "fixed_frequency is not modelled along the machine file's ramp"));
+        }
+        Ok(())
     }
 
     fn refuse(&self, span: Range<usize>, message: &str) -> RecordingError {

@@ -10,6 +10,7 @@ mod header;
 mod limit;
 mod names;
 mod plausible;
+mod ramp;
 mod write;
 
 use std::borrow::Cow;
@@ -22,6 +23,7 @@ pub use error::{Mismatch, Part, Place, RecordingError};
 pub use frames::Row;
 pub use header::{BelievedRf, Format, Header};
 use names::Names;
+pub use ramp::{At, Ramp};
 
 /// One campaign: what it was taken with, and one row a machine cycle.
 #[derive(Debug, Clone, PartialEq)]

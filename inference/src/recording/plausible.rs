@@ -44,7 +44,7 @@ fn check_kick(recording: &Recording) -> Result<(), Fault> {
 
 /// The noise of a monitor in the middle of all, by repeats and by the header.
 fn check_noise(recording: &Recording) -> Result<(), Fault> {
-    let pairs = repeats(&recording.rows);
+    let pairs = repeats(recording);
     let noise = |(b, stated): (usize, &f64)| Some((noise_of(recording, &pairs, b)?, *stated));
     let mut all: Vec<(f64, f64)> = recording.header.noise.iter().enumerate().filter_map(noise).collect();
     all.sort_by(|one, other| (one.0 / one.1).total_cmp(&(other.0 / other.1)));
@@ -58,10 +58,13 @@ fn check_noise(recording: &Recording) -> Result<(), Fault> {
 }
 
 /// Each frame with the last one before it that was driven alike, by the read-backs.
-fn repeats(rows: &[Row]) -> Vec<[usize; 2]> {
+fn repeats(recording: &Recording) -> Vec<[usize; 2]> {
+    let (rows, is_ramped) = (&recording.rows, recording.header.ramp.is_given());
     let largest = rows.iter().flat_map(|row| &row.corrector_current).fold(0.0, |most: f64, a| most.max(a.abs()));
     let steps = |current: &f64| (current / (SCATTER * largest)).round() as i64;
-    let drive = |row: &Row| (row.rf_offset.to_bits(), row.corrector_current.iter().map(steps).collect::<Vec<_>>());
+    let time = |row: &Row| if is_ramped { in_milli(row.cycle_time).round() as i64 } else { 0 };
+    let correctors = |row: &Row| row.corrector_current.iter().map(steps).collect::<Vec<_>>();
+    let drive = |row: &Row| (time(row), row.rf_offset.to_bits(), correctors(row));
     let steady = |one: &[f64], other: &[f64]| one.iter().zip(other).all(|(a, b)| (a - b).abs() <= MOVED * b.abs());
     let is_steady = |[before, here]: &[usize; 2]| {
         let (before, here) = (&rows[*before], &rows[*here]);

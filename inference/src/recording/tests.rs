@@ -505,3 +505,57 @@ fn another_machine_is_named_before_what_it_lacks() {
         "{error}"
     );
 }
+
+/// The toy machine with a ramp from 50 to 100 ms, something of it changed; what a recording of it is refused with, or nothing.
+fn ramped(change: impl Fn(&mut serde_json::Value), header: &str, frames: &str) -> Result<Recording, String> {
+    let point = |time: f64, energy: f64, p: f64| {
+        let supplies = serde_json::json!({"QF": p * 1800.0, "QD": p * 1790.0});
+        serde_json::json!({"t_cycle_ms": time, "kinetic_energy_GeV": energy, "dipole_A": p * 2400.0, "supply_A": supplies})
+    };
+    let mut file: serde_json::Value = serde_json::from_str(block_of(MACHINES, "json", 0)).expect("it is JSON");
+    // momentum of protons of 30 MeV over that at 50 MeV
+    file["ramp"] = vec![point(50.0, 0.03, 0.7706), point(100.0, 0.05, 1.0)].into();
+    change(&mut file);
+    let ring = Ring::parse(&file.to_string(), "machines/toy.json").expect("the ramp is right");
+    let home = tempfile::tempdir().expect("a temporary folder can be made");
+    fs::write(home.path().join("header.toml"), header).expect("it is writable");
+    fs::write(home.path().join("frames.csv"), frames).expect("it is writable");
+    let strip = |error: RecordingError| error.to_string().replace(&format!("{}/", home.path().display()), "");
+    Recording::read(home.path(), &ring).map_err(strip)
+}
+
+#[test]
+fn a_ramp_is_resolved_by_the_header() {
+    let read = ramped(|_| (), block("toml"), block("csv")).expect("the example is within the ramp");
+    let at = read.header.ramp.at(0.092, 2).expect("it is within");
+    let expected = 0.7706 + 0.84 * (1.0 - 0.7706);
+    // the momentum is that of the energy, to four digits the one stated above
+    assert!((at.momentum - expected).abs() < 1e-4 && (at.dipole - expected).abs() < 1e-12, "{at:?}");
+    // p(r) = r
+    assert!(at.gradient.iter().all(|gradient| (gradient - expected).abs() < 1e-12));
+    // far below transition: eta = alpha - 1/gamma^2, slower particles are further below
+    assert!(at.slip > 1.0 && at.slip < 1.1, "{at:?}");
+    assert_eq!(read.header.ramp.span(), Some([0.05, 0.1]));
+    assert!((read.header.ramp.at(0.049, 2), read.header.ramp.at(0.101, 2)) == (None, None));
+}
+
+#[test]
+fn what_does_not_go_with_a_ramp_is_refused() {
+    let (header, frames) = (block("toml"), block("csv"));
+    let late = ramped(|_| (), header, &frames.replace("8.000,92.0", "8.000,100.5")).unwrap_err();
+    let words = "expected a time of the ramp, from 50 to 100 ms, found \"100.5\"";
+    assert_eq!(late, format!("frames.csv, line 3, column t_cycle_ms: {words}"));
+    let held = header.replace("fixed_momentum", "fixed_frequency");
+    let words = "fixed_frequency is not modelled along the machine file's ramp";
+    assert_eq!(ramped(|_| (), &held, frames).unwrap_err(), format!("header.toml, line 9, key believed_rf: {words}"));
+    let no_dipole = |file: &mut serde_json::Value| {
+        for point in file["ramp"].as_array_mut().expect("it is a list") {
+            point.as_object_mut().expect("it is an object").remove("dipole_A");
+        }
+    };
+    let said = ramped(no_dipole, header, frames).unwrap_err();
+    assert_eq!(said, "header.toml, line 10, key nominal_A: has a dipole, the ramp at 50 ms has none");
+    // format 2 may leave the time out, unless it is needed
+    let said = ramped(|_| (), second("toml"), second("csv")).unwrap_err();
+    assert!(said.contains("expected t_cycle_ms, found no column of this name"), "{said}");
+}

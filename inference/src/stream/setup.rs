@@ -1,12 +1,12 @@
 //! Priors, noise and calibration of a core, for a ring of any size.
 
-use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, SupplyCalibration, Walk};
+use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, Ramp, RampPoint, SupplyCalibration, Walk};
 use training::rooms::large;
 use twin::Ring;
 
 use super::StreamError;
 use crate::campaign::TUNE_CALIBRATION;
-use crate::recording::{Recording, Row};
+use crate::recording::{At, Recording, Row};
 
 /// The walk of a machine that is followed for hours, and of what the daemon expects.
 ///
@@ -26,6 +26,8 @@ pub struct Setup {
     pub dipole: Option<f32>,
     /// The supplies of quadrupoles [F].
     pub supplies: Vec<SupplyCalibration>,
+    /// What changes along the ramp; none of a machine without one.
+    pub ramp: Vec<At>,
     /// Expected noise of a reading of each monitor [m] [B].
     pub noise: Vec<f32>,
     /// When readings agree.
@@ -66,6 +68,7 @@ pub fn setup(ring: &Ring, recording: &Recording, walk: Walk) -> Result<Setup, St
         kick_per_ampere: single(&header.kick_per_ampere),
         dipole: header.nominal_dipole.map(|a| a as f32),
         supplies: header.nominal.iter().zip(&header.transfer).map(supply).collect::<Result<_, _>>()?,
+        ramp: header.ramp.points.clone(),
         noise: single(&header.noise),
         gate: Gate::default(),
         walk,
@@ -87,6 +90,7 @@ impl Setup {
     pub fn on_wire(&self) -> large::Setup {
         let mut setup = self.sized(|b| b, |c| c);
         setup.calibration.supplies.truncate(self.supplies.len());
+        setup.calibration.ramp.points.iter_mut().for_each(|point| point.gradient.truncate(self.supplies.len()));
         setup.noise.own.truncate(self.noise.len());
         setup.calibration.kick_per_ampere.own.truncate(self.kick_per_ampere.len());
         setup
@@ -112,12 +116,25 @@ impl Setup {
                 kick_per_ampere: each(&self.kick_per_ampere, corrector),
                 dipole: self.dipole,
                 supplies: supplies.take(F).collect(),
+                ramp: Ramp { points: self.ramp.iter().map(point).collect() },
             },
             noise: each(&self.noise, monitor),
             gate: self.gate,
             walk: self.walk,
             tune_calibration: self.tune_calibration,
         }
+    }
+}
+
+/// A point of the ramp; a spare supply has no quadrupoles.
+fn point<const F: usize>(at: &At) -> RampPoint<F> {
+    let gradient = at.gradient.iter().map(|gradient| *gradient as f32).chain(core::iter::repeat(1.0));
+    RampPoint {
+        time_us: (at.time * 1e6).round() as u32,
+        momentum: at.momentum as f32,
+        dipole: at.dipole as f32,
+        slip: at.slip as f32,
+        gradient: gradient.take(F).collect(),
     }
 }
 

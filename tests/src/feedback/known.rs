@@ -64,6 +64,7 @@ impl Known {
             surrogate: &self.surrogate,
             at: &self.design,
             kick_per_ampere: &self.setup.calibration.kick_per_ampere,
+            momentum: 1.0,
         }
     }
 }

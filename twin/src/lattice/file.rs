@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::family::{Circuits, Families, Listed};
 use super::label::{Named, labels};
 use super::{
-    Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, ParameterPrior, Particle, Plane, Ring,
+    Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, ParameterPrior, Particle, Plane, Ring, ramp,
 };
 
 #[derive(Deserialize)]
@@ -21,6 +21,8 @@ struct MachineFile {
     data: Data,
     #[serde(default)]
     families: Families,
+    #[serde(default)]
+    ramp: Vec<ramp::Listed>,
     elements: Vec<Entry>,
 }
 
@@ -143,7 +145,9 @@ impl MachineFile {
             file,
             elements,
             particle,
+            ramp: Vec::new(),
         };
+        ring.set_ramp(self.ramp)?;
         for (plane, list) in [(Plane::X, &self.data.bpm_x), (Plane::Y, &self.data.bpm_y)] {
             read_monitors(&mut ring, plane, list.as_deref())?;
         }

@@ -7,10 +7,12 @@ mod file;
 mod label;
 mod parameter;
 mod particle;
+mod ramp;
 mod ring;
 
 pub use element::{Bend, Element, Kind, Misalignment, Plane};
 pub use error::LatticeError;
 pub use parameter::{Parameter, ParameterPrior, Quadrupole, Supply};
 pub use particle::Particle;
+pub use ramp::RampPoint;
 pub use ring::{Corrector, Monitor, Ring};

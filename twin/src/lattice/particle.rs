@@ -24,6 +24,11 @@ impl Particle {
         known.expect("made from a name of this list").0
     }
 
+    /// Momentum at the kinetic energy [GeV/c].
+    pub fn momentum(&self) -> f64 {
+        (self.kinetic_energy * (self.kinetic_energy + 2.0 * self.rest_energy)).sqrt()
+    }
+
     /// Lorentz factor at momentum `1 + delta` times the reference.
     pub fn gamma(&self, delta: f64) -> f64 {
         let gamma0 = 1.0 + self.kinetic_energy / self.rest_energy;
