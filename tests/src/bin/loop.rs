@@ -66,6 +66,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     println!("{}", stretches(&scenario, all));
     output::bytes(&arguments.figure, figure(&scenario, all).svg.as_bytes())?;
     println!("{} of {} replies of the emulated chip differ from the host's", chip.different, chip.frames);
+    println!("{} bytes of its stack were used", chip.stack_bytes);
     for (word, [median, most]) in chip.instructions() {
         println!("instructions, {word}: median {median}, most {most}");
     }
@@ -79,6 +80,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
 struct OnChip {
     frames: usize,
     different: usize,
+    stack_bytes: u32,
     counts: Counts,
 }
 
@@ -103,8 +105,9 @@ fn steered_by_the_chip(closed: Loop<'_>, frames: usize) -> Result<(Vec<Sample>, 
     closed.chip = Some(Chip::start(&emulator)?);
     let mut on_chip = OnChip::default();
     let mut samples = (0..frames).map(|_| closed.cycle()).collect::<Result<Vec<_>, _>>()?;
-    if let Some(chip) = closed.chip.take() {
+    if let Some(mut chip) = closed.chip.take() {
         (on_chip.frames, on_chip.different) = (chip.frames, chip.different);
+        on_chip.stack_bytes = chip.status()?.vitals.stack_bytes;
     }
     samples.extend(closed.run()?);
     drop(closed);
@@ -160,6 +163,6 @@ fn summary(scenario: &Scenario, all: [&[Sample]; 3], chip: &OnChip) -> serde_jso
         "stretches": rows.collect::<Vec<_>>(),
         "nees": last.map(|sample| sample.nees),
         "sigma": last.map(|sample| sample.sigma),
-        "chip": {"frames": chip.frames, "different": chip.different, "instructions": chip.instructions().into_iter().collect::<BTreeMap<_, _>>()},
+        "chip": {"frames": chip.frames, "different": chip.different, "stack_bytes": chip.stack_bytes, "instructions": chip.instructions().into_iter().collect::<BTreeMap<_, _>>()},
     })
 }
