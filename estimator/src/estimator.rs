@@ -392,7 +392,8 @@ impl<
         self.catch_up(model, &frame);
         self.predict(model, &drive);
         let setting = self.setting(model, &frame, &drive);
-        let (whole, expected) = self.judge_whole(model, &frame, setting.is_some());
+        let repeats = setting.is_some_and(|setting| self.repeats_decide(model, &setting));
+        let (whole, expected) = self.judge_whole(model, &frame, repeats);
         if whole == Whole::Aside {
             return Ok(self.estimate(model, &frame, None, &Screened::none_of(&frame.valid), 0.0, whole));
         }
@@ -756,8 +757,8 @@ impl<
     }
 
     /// Evidence that a param has stepped lately [nat].
-    pub fn step_evidence(&self) -> f32 {
-        self.posterior.step_evidence()
+    pub fn step_evidence(&self, model: &Model<'_, G, B, C, F>) -> f32 {
+        self.posterior.step_evidence(|i| prior_of::<G, B, C, F, N>(model, i))
     }
 
     /// Frames used so far.

@@ -40,6 +40,30 @@ struct Said {
     reading: Spread,
 }
 
+/// How far a baseline has moved.
+#[derive(Debug, Clone, Copy)]
+pub struct Shift {
+    /// By so much [m].
+    pub by: f32,
+    /// What is not known of it [m^2].
+    pub variance: f32,
+}
+
+impl Shift {
+    /// Somewhere within the beam pipe.
+    const UNKNOWN: Self = Self { by: 0.0, variance: 4e-4 };
+}
+
+impl Said {
+    /// The mean surprise, each of a variance [m^2].
+    fn shift(&self, variance: f32) -> Shift {
+        match self.number {
+            0 => Shift::UNKNOWN,
+            number => Shift { by: self.surprise.mean, variance: variance / number as f32 },
+        }
+    }
+}
+
 /// The frames put aside in a row, of `B` monitors.
 #[derive(Debug, Clone)]
 pub struct Quarantine<const B: usize> {
@@ -77,11 +101,11 @@ impl<const B: usize> Quarantine<B> {
         self.frames > PERSISTS
     }
 
-    /// How far each baseline has moved [m], if that explains all frames put aside; `variance` is that of a surprise.
+    /// How far each baseline has moved, if that explains all frames put aside; `variance` is that of a surprise.
     ///
     /// Three quarters of the monitors must be off by the same in all frames, while their readings have followed the
     /// correctors.
-    pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[f32; B]> {
+    pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[Shift; B]> {
         if self.frames < ENOUGH {
             return None;
         }
@@ -96,7 +120,8 @@ impl<const B: usize> Quarantine<B> {
             }
         }
         let explained = heard > 0 && 4 * steady >= 3 * heard && readings >= FOLLOWS * surprises;
-        explained.then(|| self.said.map(|said| said.surprise.mean))
+        explained
+            .then(|| core::array::from_fn(|b| self.said.get(b).map_or(Shift::UNKNOWN, |said| said.shift(variance(b)))))
     }
 }
 
@@ -121,7 +146,7 @@ mod tests {
         quarantine
     }
 
-    fn shift(quarantine: &Quarantine<8>) -> Option<[f32; 8]> {
+    fn shift(quarantine: &Quarantine<8>) -> Option<[Shift; 8]> {
         quarantine.shift(|_| NOISE * NOISE)
     }
 
@@ -129,17 +154,20 @@ mod tests {
     fn baselines_that_moved_are_told_from_a_beam_that_is_lost() {
         let moved = |b: usize, orbit: f32, noise: f32| orbit + noise + 1e-3 * (b as f32 - 3.0);
         let found = shift(&quarantine(10, 1e-3, moved)).unwrap();
-        assert!(found.iter().enumerate().all(|(b, to)| (to - 1e-3 * (b as f32 - 3.0)).abs() < NOISE));
-        assert_eq!(shift(&quarantine(9, 1e-3, moved)), None);
+        for (b, shift) in found.iter().enumerate() {
+            assert!((shift.by - 1e-3 * (b as f32 - 3.0)).abs() < NOISE);
+            assert_eq!(shift.variance, NOISE * NOISE / 10.0);
+        }
+        assert!(shift(&quarantine(9, 1e-3, moved)).is_none());
         // one monitor jumps besides
         let jumps = |b: usize, orbit: f32, noise: f32| moved(b, orbit, if b == 2 { 50.0 * noise } else { noise });
         assert!(shift(&quarantine(10, 1e-3, jumps)).is_some());
         // readings of no beam: their noise about 0, or nothing at all, or anything
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)), None);
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)), None);
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| 50.0 * noise)), None);
+        assert!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)).is_none());
+        assert!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)).is_none());
+        assert!(shift(&quarantine(20, 1e-3, |_, _, noise| 50.0 * noise)).is_none());
         // correctors that stand still do not tell
-        assert_eq!(shift(&quarantine(20, 0.0, moved)), None);
+        assert!(shift(&quarantine(20, 0.0, moved)).is_none());
     }
 
     #[test]

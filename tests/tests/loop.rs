@@ -3,7 +3,7 @@
 
 use estimator::Hold;
 use estimator::booster::Feedback;
-use system_tests::feedback::{Control, Event, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
+use system_tests::feedback::{Control, Event, Known, Loop, Sample, Scenario, WALK, held, recommended, rms, settled};
 
 fn run(known: &Known, feedback: &Feedback, control: Control, scenario: &Scenario) -> Vec<Sample> {
     Loop::new(known, feedback.clone(), control, scenario.clone()).unwrap().run().unwrap()
@@ -58,17 +58,17 @@ fn no_fault_at_any_time_makes_it_unstable() {
         Event::Gap(1000),
     ];
     for (seed, fault) in (201..).zip(faults) {
-        for (at, gain) in [(1, GAIN), (7, 3.0 * GAIN), (60, GAIN)] {
+        for (at, walk) in [(1, WALK), (7, 5.0 * WALK), (60, WALK)] {
             let scenario = Scenario { events: vec![(at, fault.clone())], campaign: 0, ..Scenario::quiet(seed, 150) };
-            let feedback = Feedback { gain, ..recommended() };
+            let feedback = Feedback { walk, ..recommended() };
             let samples = run(&known, &feedback, Control::Estimated, &scenario);
             let off = run(&known, &feedback, Control::Off, &scenario);
             for (frame, (sample, off)) in samples.iter().zip(&off).enumerate() {
                 let largest = 1.2 * off.rms + 3e-4; // probes move the orbit by 0.3 mm
-                assert!(sample.rms < largest, "{fault} at {at}, gain {gain}, frame {frame}: {} m", sample.rms);
+                assert!(sample.rms < largest, "{fault} at {at}, walk {walk}, frame {frame}: {} m", sample.rms);
             }
             let (last, off) = (rms(&samples[130..]), rms(&off[130..]));
-            assert!(last < off / 3.0, "{fault} at {at}, gain {gain}: {last} of {off} m");
+            assert!(last < off / 3.0, "{fault} at {at}, walk {walk}: {last} of {off} m");
         }
     }
 }

@@ -28,6 +28,7 @@ use nalgebra::SMatrix;
 
 use crate::linear::{add, column, dot, zeros};
 use crate::prior::Prior;
+use crate::quarantine::Shift;
 use crate::triangle::Triangle;
 
 pub use baselines::{Correlated, Covariance, Gain, Independent};
@@ -182,9 +183,12 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         (0..monitors).for_each(|b| self.covariance.spread(b, variance));
     }
 
-    /// The baselines have moved by so much [m], those of monitors; the readings so far move with them.
-    pub fn move_baselines(&mut self, shift: &[f32]) {
-        self.baseline.iter_mut().zip(shift).for_each(|(baseline, by)| *baseline += f64::from(*by));
+    /// The baselines have moved, those of monitors; the readings so far move with them.
+    pub fn move_baselines(&mut self, shift: &[Shift]) {
+        for (b, (baseline, shift)) in self.baseline.iter_mut().zip(shift).enumerate() {
+            *baseline += f64::from(shift.by);
+            self.covariance.spread(b, shift.variance.into());
+        }
     }
 
     /// Move the origin without changing the distribution.

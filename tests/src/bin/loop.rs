@@ -10,7 +10,7 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
-use system_tests::feedback::{Control, GAIN, Known, Loop, Sample, Scenario, held, on_chip, recommended, rms, settled};
+use system_tests::feedback::{Control, Known, Loop, Sample, Scenario, WALK, held, on_chip, recommended, rms, settled};
 use system_tests::qemu::Image;
 
 /// Close the loop in software.
@@ -19,9 +19,9 @@ struct Arguments {
     /// Machine, noise, and where things happen
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Low-pass of the readings
-    #[arg(long, default_value_t = GAIN)]
-    gain: f32,
+    /// How far the orbit is expected to walk in the root of a second [m]
+    #[arg(long, default_value_t = WALK)]
+    walk: f32,
     /// Frames that also go through the emulated chip
     #[arg(long, value_name = "N", default_value_t = 500)]
     chip: usize,
@@ -49,7 +49,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     let known = Known::read()?;
     let scenario = Scenario::of_everything(arguments.seed);
     let close = |control| -> Result<_, Box<dyn Error>> {
-        let feedback = estimator::booster::Feedback { gain: arguments.gain, ..recommended() };
+        let feedback = estimator::booster::Feedback { walk: arguments.walk, ..recommended() };
         let mut closed = Loop::new(&known, feedback, control, scenario.clone())?;
         let mut wires = Vec::new();
         let mut samples = Vec::new();
