@@ -15,8 +15,8 @@
 //! share `p/(p + noise^2)` of what is then left of the reading, `p` being the variance of the orbit as it is known: it grows by
 //! `walk^2` in a second, and each reading takes its share off. So a new orbit, at the beginning or once the baselines have moved,
 //! begins as the mean of its frames, and a monitor that does not report keeps its last orbit, moved by the correctors, and is
-//! believed the more when it comes back. Where the readings of some frames are off by more than `p` and the noise explain, the orbit has
-//! moved ([`pace`]), and `p` grows by what they are off.
+//! believed the more when it comes back. Where the readings of some frames are off by more than `p` and the noise explain, the
+//! orbit has moved (`pace.rs`), and `p` grows by what they are off.
 //!
 //! Source: S. Boyd and L. Vandenberghe, Convex Optimization (2004), sec. 6.4.1, stochastic robust approximation; K. J. Astrom and
 //! B. Wittenmark, Adaptive Control (1995), ch. 9, cautious control.
@@ -46,8 +46,8 @@ use supplies::Supplies;
 pub struct Feedback<const B: usize, const C: usize> {
     /// Wanted reading of each monitor [m].
     pub orbit: [f32; B],
-    /// How far the orbit walks by itself at a monitor, standard deviation per square root of a second [m]: the slower, the longer its
-    /// readings are averaged.
+    /// How far the orbit walks by itself at a monitor, standard deviation per square root of a second [m]: the slower, the longer
+    /// its readings are averaged.
     pub walk: f32,
     /// Kick of one corrector in one frame that costs as much as an orbit of one standard deviation at one monitor [rad].
     pub step_kick: f32,
@@ -181,7 +181,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     pub const BLANK: Self = Self {
         clock: None,
         residual: [0.0; B],
-        variance: [UNKNOWN; B],
+        variance: [0.0; B],
         weight: [0.0; B],
         momentum: [0.0; B],
         supplies: Supplies::BLANK,

@@ -5,26 +5,33 @@ use estimator::Hold;
 use estimator::booster::Feedback;
 use system_tests::feedback::{Control, Event, Known, Loop, Sample, Scenario, WALK, held, recommended, rms, settled};
 
+/// Orbit that noise of 0.15 mm and a walk of 2.2 um a frame leave in a filter, `sqrt(walk noise)` [m].
+const LEFT: f64 = 18e-6;
+
 fn run(known: &Known, feedback: &Feedback, control: Control, scenario: &Scenario) -> Vec<Sample> {
     Loop::new(known, feedback.clone(), control, scenario.clone()).unwrap().run().unwrap()
 }
 
-/// After every disturbance at most a fifth of what it is without correction; once it is corrected, on average below what it is
-/// with the design's response, and nowhere 5 % above it: a ring may be as its design where it matters.
+/// After every disturbance at most a fifth of what it is without correction; on average below what it is with the design's response,
+/// and nowhere above it by more than the noise that the filter leaves: a ring may be as its design where it matters. NEES/48 is 20
+/// after a var has stepped while the correctors stood still; what has moved them since, has told of it.
 fn holds_the_orbit(seed: u64) {
     let (known, scenario) = (Known::read().unwrap(), Scenario::of_everything(seed));
     let [off, design, estimated] = [Control::Off, Control::Design, Control::Estimated]
         .map(|control| run(&known, &recommended(), control, &scenario));
-    let mut ratios = Vec::new();
+    let mut logarithms = Vec::new();
     for (name, frames) in scenario.stretches() {
         let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
         assert!(rms(estimated) <= 0.2 * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
+        let [by_estimate, by_design] = [rms(estimated), rms(design)];
+        assert!(by_estimate < by_design + LEFT, "seed {seed}, {name}: {by_estimate}, by the design {by_design} m");
         let ratio = rms(settled(estimated)) / rms(settled(design));
-        assert!(ratio < 1.05, "seed {seed}, {name}: {ratio} of the design's");
-        ratios.push(ratio);
+        logarithms.push(ratio.ln());
     }
-    let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
+    let mean = (logarithms.iter().sum::<f64>() / logarithms.len() as f64).exp();
     assert!(mean < 1.0, "seed {seed}: {mean} of the design's on average");
+    let last = estimated.last().map(|sample| sample.nees).unwrap();
+    assert!(last < 5.0, "seed {seed}: NEES/48 of {last}");
     // what holds, holds for as long as it lasts and some frames more
     let of = |hold| estimated.iter().filter(|s| s.steered.is_some_and(|s| s.hold == Some(hold))).count();
     assert_eq!((of(Hold::Mismatch), of(Hold::Unsolved), of(Hold::Blind)), (0, 0, 0), "seed {seed}");

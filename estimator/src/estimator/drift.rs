@@ -9,8 +9,8 @@
 //! `z_i^2/2`,   `z_i = (sum of h_i/f)/sqrt(1/sigma_i^2 + sum of dY_ii/f)`,   `variance of h_i = dY_ii + (dY P dY)_ii <= f dY_ii`,
 //!
 //! with the prior's `sigma_i`: correctors that stand still say hardly anything of the vars, and an orbit that drifts by itself would
-//! else be the evidence of absurd steps. And with `f = det(Y + dY)/det Y`, which bounds what the posterior's own covariance `P` adds, so that `z` is never overstated. While
-//! the posterior still narrows fast, `f` is large, and nothing can be said of steps.
+//! else be the evidence of absurd steps. The factor `f = det(Y + dY)/det Y` bounds what the posterior's own covariance `P` adds, so
+//! that `z` is never overstated. While the posterior still narrows fast, `f` is large, and nothing can be said of steps.
 //!
 //! That something has stepped is known within some frames, mostly by the tunes; which param it was, takes the orbits of some
 //! hundred more, since neighbours by phase advance act alike. So all are let loose, each by its probability to be the one, and
