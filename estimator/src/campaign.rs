@@ -35,6 +35,11 @@ const SAME_KICK: i32 = 16;
 const SAME_OFFSET: i32 = 1_000;
 
 impl Setting {
+    /// True if a corrector is powered or the RF frequency moved.
+    pub fn is_driven(&self) -> bool {
+        self.corrector.is_some() || self.rf_offset.abs() > SAME_OFFSET
+    }
+
     /// A frame in which no corrector is moved.
     pub fn at_rest(reference: u16, rf_offset: RfCode, cycle_time: u32) -> Self {
         Self { reference, corrector: None, kick: 0, tolerance: 0, rf_offset: rf_offset.steps(), cycle_time }

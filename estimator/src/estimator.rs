@@ -422,7 +422,8 @@ impl<
         if setting.is_none() {
             self.past.reference.wait();
         }
-        let (whole, expected) = self.judge_whole(model, frame, setting.is_some());
+        let repeats = setting.is_some_and(|setting| self.repeats_decide(model, &setting));
+        let (whole, expected) = self.judge_whole(model, frame, repeats);
         if whole == Whole::Aside {
             return self.estimate(model, frame, None, &Screened::none_of(&frame.valid), 0.0, whole);
         }
@@ -809,8 +810,8 @@ impl<
     }
 
     /// Evidence that a param has stepped lately [nat].
-    pub fn step_evidence(&self) -> f32 {
-        self.posterior.step_evidence()
+    pub fn step_evidence(&self, model: &Model<'_, G, B, C, F>) -> f32 {
+        self.posterior.step_evidence(|i| prior_of::<G, B, C, F, N>(model, i))
     }
 
     /// Frames taken in so far, those that were put aside included.

@@ -40,6 +40,20 @@ struct Said {
     reading: Spread,
 }
 
+/// How far a baseline has moved.
+#[derive(Debug, Clone, Copy)]
+pub struct Shift {
+    /// By so much [m].
+    pub by: f32,
+    /// What is not known of it [m^2].
+    pub variance: f32,
+}
+
+impl Shift {
+    /// Somewhere within the beam pipe.
+    const UNKNOWN: Self = Self { by: 0.0, variance: 4e-4 };
+}
+
 /// The frames put aside in a row, of `B` monitors.
 #[derive(Debug, Clone)]
 pub struct Quarantine<const B: usize> {
@@ -77,16 +91,16 @@ impl<const B: usize> Quarantine<B> {
         self.frames > PERSISTS
     }
 
-    /// How far each baseline has moved [m], if that explains all frames put aside; `variance` is that of a surprise.
+    /// How far each baseline has moved, if that explains all frames put aside; `variance` is that of a surprise.
     ///
     /// Three quarters of the monitors must be off by the same in all frames, while their readings have followed the
-    /// correctors. Of the others nobody knows, and they stay: repeats will outvote what they read before.
-    pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[f32; B]> {
+    /// correctors. Of the others nobody knows by how much.
+    pub fn shift(&self, variance: impl Fn(usize) -> f32) -> Option<[Shift; B]> {
         if self.frames < ENOUGH {
             return None;
         }
         let (mut heard, mut steady, mut surprises, mut readings) = (0, 0, 0.0, 0.0);
-        let mut shift = [0.0; B];
+        let mut shift = [Shift::UNKNOWN; B];
         let each = self.said.iter().zip(&mut shift).enumerate();
         for (b, (said, shift)) in each.filter(|(_, (said, _))| said.number >= ENOUGH) {
             heard += 1;
@@ -95,7 +109,7 @@ impl<const B: usize> Quarantine<B> {
                 steady += 1;
                 surprises += said.surprise.squares / variance;
                 readings += said.reading.squares / variance;
-                *shift = said.surprise.mean;
+                *shift = Shift { by: said.surprise.mean, variance: variance / said.number as f32 };
             }
         }
         let explained = heard > 0 && 4 * steady >= 3 * heard && readings >= FOLLOWS * surprises;
@@ -124,7 +138,7 @@ mod tests {
         quarantine
     }
 
-    fn shift(quarantine: &Quarantine<8>) -> Option<[f32; 8]> {
+    fn shift(quarantine: &Quarantine<8>) -> Option<[Shift; 8]> {
         quarantine.shift(|_| NOISE * NOISE)
     }
 
@@ -132,19 +146,22 @@ mod tests {
     fn baselines_that_moved_are_told_from_a_beam_that_is_lost() {
         let moved = |b: usize, orbit: f32, noise: f32| orbit + noise + 1e-3 * (b as f32 - 3.0);
         let found = shift(&quarantine(10, 1e-3, moved)).unwrap();
-        assert!(found.iter().enumerate().all(|(b, to)| (to - 1e-3 * (b as f32 - 3.0)).abs() < NOISE));
-        assert_eq!(shift(&quarantine(9, 1e-3, moved)), None);
+        for (b, shift) in found.iter().enumerate() {
+            assert!((shift.by - 1e-3 * (b as f32 - 3.0)).abs() < NOISE);
+            assert_eq!(shift.variance, NOISE * NOISE / 10.0);
+        }
+        assert!(shift(&quarantine(9, 1e-3, moved)).is_none());
         // one monitor jumps besides
         let jumps = |b: usize, orbit: f32, noise: f32| moved(b, orbit, if b == 2 { 50.0 * noise } else { noise });
         let found = shift(&quarantine(10, 1e-3, jumps)).unwrap();
-        assert_eq!(found[2], 0.0, "of which it is not known");
-        assert!((found[3]).abs() < NOISE && (found[7] - 4e-3).abs() < NOISE);
+        assert_eq!((found[2].by, found[2].variance), (0.0, Shift::UNKNOWN.variance));
+        assert!(found[3].by.abs() < NOISE && (found[7].by - 4e-3).abs() < NOISE);
         // readings of no beam: their noise about 0, or nothing at all, or anything
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)), None);
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)), None);
-        assert_eq!(shift(&quarantine(20, 1e-3, |_, _, noise| 50.0 * noise)), None);
+        assert!(shift(&quarantine(20, 1e-3, |_, _, noise| noise)).is_none());
+        assert!(shift(&quarantine(20, 1e-3, |_, _, _| 0.0)).is_none());
+        assert!(shift(&quarantine(20, 1e-3, |_, _, noise| 50.0 * noise)).is_none());
         // correctors that stand still do not tell
-        assert_eq!(shift(&quarantine(20, 0.0, moved)), None);
+        assert!(shift(&quarantine(20, 0.0, moved)).is_none());
     }
 
     #[test]

@@ -11,15 +11,19 @@
 //! `A = R^T W R + Q + 1/step^2 + 1/total^2`; `A^-1` is made between frames ([`Steer::prepare`]), and a frame costs three products
 //! of a matrix and a vector ([`Steer::steer`]).
 //!
-//! `r` is filtered: what the correctors have done since the last frame is added by the response, and `gain` of what is then left
-//! of the reading; a new orbit, at the beginning or once the baselines have moved, begins as the mean of its frames. A monitor
-//! that does not report keeps its last orbit, moved by the correctors.
+//! `r` is filtered, each monitor for itself: what the correctors have done since the last frame is added by the response, and the
+//! share `p/(p + noise^2)` of what is then left of the reading, `p` being the variance of the orbit as it is known: it grows by
+//! `walk^2` in a second, and each reading takes its share off. So a new orbit, at the beginning or once the baselines have moved,
+//! begins as the mean of its frames, and a monitor that does not report keeps its last orbit, moved by the correctors, and is
+//! believed the more when it comes back. Where the readings of some frames are off by more than `p` and the noise explain, the
+//! orbit has moved (`pace.rs`), and `p` grows by what they are off.
 //!
 //! Source: S. Boyd and L. Vandenberghe, Convex Optimization (2004), sec. 6.4.1, stochastic robust approximation; K. J. Astrom and
 //! B. Wittenmark, Adaptive Control (1995), ch. 9, cautious control.
 
 mod gain;
 mod hold;
+mod pace;
 mod supplies;
 #[cfg(test)]
 mod tests;
@@ -37,6 +41,7 @@ use crate::wire::{CurrentCode, Frame, PositionCode};
 use gain::Gain;
 pub use hold::Hold;
 use hold::Watch;
+use pace::Pace;
 use supplies::Supplies;
 
 /// What is wanted of the orbit, and what the correctors may do; read only.
@@ -44,8 +49,9 @@ use supplies::Supplies;
 pub struct Feedback<const B: usize, const C: usize> {
     /// Wanted reading of each monitor [m].
     pub orbit: Each<B>,
-    /// Share of a new orbit that is believed in one frame, 0 to 1: the low-pass against the noise of the readings.
-    pub gain: f32,
+    /// How far the orbit walks by itself at a monitor, standard deviation per square root of a second [m]: the slower, the longer
+    /// its readings are averaged.
+    pub walk: f32,
     /// Kick of one corrector in one frame that costs as much as an orbit of one standard deviation at one monitor [rad].
     pub step_kick: f32,
     /// The same of its whole kick: what no monitor sees decays, and correctors stay near 0 [rad].
@@ -66,10 +72,9 @@ pub struct Feedback<const B: usize, const C: usize> {
 impl<const B: usize, const C: usize> Feedback<B, C> {
     /// True if every number is one, and every size positive.
     pub fn is_sound(&self) -> bool {
-        let sizes = [self.gain, self.step_kick, self.total_kick, self.rate, self.close];
+        let sizes = [self.walk, self.step_kick, self.total_kick, self.rate, self.close];
         self.orbit.is_finite()
             && sizes.iter().all(|v| v.is_finite() && *v > 0.0)
-            && self.gain <= 1.0
             && self.probe.is_finite()
             && self.probe >= 0.0
             && self.limit.is_positive()
@@ -114,10 +119,10 @@ pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usiz
     clock: Option<u64>,
     /// Time in the cycle of the orbit that is steered [us].
     cycle_time: u32,
-    /// Frames in the filtered orbit, counted up to a few.
-    heard: u16,
     /// Filtered orbit at the last read-backs, less the wanted one [m].
     residual: [f32; B],
+    /// Its variance [m^2].
+    variance: [f32; B],
     /// `1/noise^2` of each monitor [1/m^2]; 0 of one that is dead.
     weight: [f32; B],
     /// `W D/sqrt(D^T W D)` of the dispersion `D` [1/m].
@@ -130,11 +135,15 @@ pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usiz
     /// Frames since the gains of x were due.
     turn: u8,
     watch: Watch,
+    pace: Pace,
     steered: Steered,
 }
 
 /// Frames after which gains are made anew, for the estimate moves on.
 const TURN: u8 = 16;
+
+/// Variance of an orbit that nothing is known of [m^2]: 0.1 m, in a beam pipe.
+const UNKNOWN: f32 = 1e-2;
 
 /// RF offset whose orbit stands for the dispersion: small enough to be of first order.
 const RF_OFFSET: f32 = 1e-6;
@@ -189,8 +198,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     pub const BLANK: Self = Self {
         clock: None,
         cycle_time: 0,
-        heard: 0,
         residual: [0.0; B],
+        variance: [0.0; B],
         weight: [0.0; B],
         momentum: [0.0; B],
         supplies: Supplies::BLANK,
@@ -199,6 +208,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         y: Gain::BLANK,
         turn: 0,
         watch: Watch::BLANK,
+        pace: Pace::STEADY,
         steered: Steered { hold: None, left_out: 0, limited: 0 },
     };
 
@@ -227,13 +237,13 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         estimate: &Estimate<B, N, W>,
     ) -> Steered {
         let () = Self::FITS;
-        let is_stale = self.is_stale(feedback, frame);
-        if is_stale {
-            self.begin(feedback, frame, estimate);
-        } else {
-            self.observe(feedback, response, frame, estimate);
-        }
         self.weigh_monitors(estimate);
+        let gap = self.gap(feedback, frame);
+        match gap {
+            Some(seconds) => self.observe(feedback, response, frame, estimate, seconds),
+            None => self.begin(feedback, frame, estimate),
+        }
+        let is_stale = gap.is_none();
         let is_ready = self.x.is_ready() && self.y.is_ready();
         let hold = self.watch.judge(is_stale, is_ready, estimate, response.surrogate.layout().monitors());
         self.supplies.probe(-feedback.probe, core::mem::take(&mut self.pattern), &feedback.limit);
@@ -271,15 +281,15 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         true
     }
 
-    /// True for a frame that does not go on where the last one was: too late, or of another time in the cycle.
-    fn is_stale<const F: usize, const W: usize>(
+    /// Time since the last frame [s]; none if there was none that belongs to this one: too early, or of another time in the cycle.
+    fn gap<const F: usize, const W: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         frame: &Frame<B, C, F, W>,
-    ) -> bool {
-        let last = self.clock.replace(frame.time_us);
-        last.is_none_or(|last| frame.time_us.checked_sub(last).is_none_or(|gap| gap > feedback.patience_us))
-            || !is_same_time(self.cycle_time, frame.cycle_time_us)
+    ) -> Option<f32> {
+        let gap = frame.time_us.checked_sub(self.clock.replace(frame.time_us)?)?;
+        let goes_on = gap <= feedback.patience_us && is_same_time(self.cycle_time, frame.cycle_time_us);
+        goes_on.then_some(1e-6 * gap as f32)
     }
 
     /// Take over from whoever steered so far: setpoints are the read-backs, the orbit is that of this frame.
@@ -292,8 +302,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.cycle_time = frame.cycle_time_us;
         self.supplies.take_over(&frame.corrector);
         self.pattern = 0;
-        (self.residual, self.heard) = ([0.0; B], 0);
-        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
+        (self.residual, self.variance, self.pace) = ([0.0; B], [UNKNOWN; B], Pace::STEADY);
+        self.believe(feedback, 0.0, &frame.reading, |b| estimate.accepted.has(b));
     }
 
     /// Move the filtered orbit by what the correctors have done, then towards the readings.
@@ -304,6 +314,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         response: &Response<'_, G, B, C, F, N>,
         frame: &Frame<B, C, F, W>,
         estimate: &Estimate<B, N, W>,
+        seconds: f32,
     ) {
         let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close);
         if (changed || estimate.linearised) && self.turn > 1 {
@@ -312,21 +323,36 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         let moved = response.orbit(response.kicks(done));
         self.residual.iter_mut().zip(moved).for_each(|(residual, moved)| *residual += moved);
         if estimate.remarks.baselines_moved {
-            self.heard = 0;
+            self.variance = [UNKNOWN; B];
         }
-        self.believe(feedback, &frame.reading, |b| estimate.accepted.has(b));
+        self.believe(feedback, seconds, &frame.reading, |b| estimate.accepted.has(b));
     }
 
-    /// Move the filtered orbit towards the readings that count: it is their mean as long as they are few.
-    fn believe(&mut self, feedback: &Feedback<B, C>, reading: &[PositionCode; B], counts: impl Fn(usize) -> bool) {
-        if !(0..B).any(&counts) {
-            return;
+    /// Move the filtered orbit towards the readings that count, so many seconds after the last ones.
+    fn believe(
+        &mut self,
+        feedback: &Feedback<B, C>,
+        seconds: f32,
+        reading: &[PositionCode; B],
+        counts: impl Fn(usize) -> bool,
+    ) {
+        let walked = feedback.walk * feedback.walk * seconds;
+        self.variance.iter_mut().for_each(|variance| *variance = (*variance + walked).min(UNKNOWN));
+        let mut innovation = [0.0; B];
+        let each = innovation.iter_mut().zip(reading).zip(&self.residual).enumerate();
+        for (b, ((to, reading), residual)) in each.filter(|(b, _)| counts(*b)) {
+            *to = reading.value() - feedback.orbit.of(b) - residual;
         }
-        self.heard = self.heard.saturating_add(1);
-        let gain = feedback.gain.max(1.0 / f32::from(self.heard));
-        let each = self.residual.iter_mut().zip(reading).enumerate();
-        for (b, (residual, reading)) in each.filter(|(b, _)| counts(*b)) {
-            *residual += gain * (reading.value() - feedback.orbit.of(b) - *residual);
+        let moved = self.pace.hear((0..B).filter(|b| counts(*b)).filter_map(|b| {
+            let (innovation, weight) = (innovation.get(b)?, self.weight.get(b)?);
+            Some(innovation * innovation * weight / (1.0 + self.variance.get(b)? * weight))
+        }));
+        let each =
+            self.residual.iter_mut().zip(&mut self.variance).zip(innovation.iter().zip(&self.weight)).enumerate();
+        for (_, ((residual, variance), (innovation, weight))) in each.filter(|(b, _)| counts(*b)) {
+            let known = *variance * weight + moved;
+            *residual += known / (1.0 + known) * innovation;
+            *variance = if *weight > 0.0 { known / (1.0 + known) / weight } else { *variance };
         }
     }
 

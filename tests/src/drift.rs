@@ -183,7 +183,7 @@ pub fn follow(ring: &Ring, stream: &Stream) -> Result<Vec<Followed>, Box<dyn Err
             mean: estimate.mean.map(f64::from).to_vec(),
             sigma: estimate.sigma.map(f64::from).to_vec(),
             let_loose: estimate.remarks.let_loose.map(usize::from),
-            evidence: core.step_evidence(),
+            evidence: core.step_evidence(&model),
             nees,
         })
     })

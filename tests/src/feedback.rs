@@ -57,14 +57,14 @@ pub struct Sample {
     pub largest: f64,
 }
 
-/// The largest gain that is recommended; see `docs/feedback.md`.
-pub const GAIN: f32 = 0.1;
+/// How far the orbit is expected to walk in the root of a second [m]: what the core expects of the baselines.
+pub const WALK: f32 = known::WALK.baselines;
 
 /// What is recommended for the Booster; the wanted orbit is zero.
 pub fn recommended() -> Feedback {
     Feedback {
         orbit: Each::same(0.0),
-        gain: GAIN,
+        walk: WALK,
         step_kick: 2e-5,
         total_kick: 1e-3,
         limit: Each::same(20.0),

@@ -547,7 +547,7 @@ fn a_device_steers_from_one_request_to_the_next() {
     (0..20).for_each(|at| bytes.extend(wire(at)));
     bytes.extend(on());
     (20..100).for_each(|at| bytes.extend(wire(at)));
-    bytes.extend(request(&Request::Feedback(Some(Feedback { gain: f32::NAN, ..wanted.clone() }))));
+    bytes.extend(request(&Request::Feedback(Some(Feedback { walk: f32::NAN, ..wanted.clone() }))));
     (100..120).for_each(|at| bytes.extend(wire(at)));
     // off, on again, and restarted
     bytes.extend([request(&Request::Feedback(None)), wire(120), on(), wire(121), wire(122)].concat());

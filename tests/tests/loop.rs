@@ -3,28 +3,35 @@
 
 use estimator::Hold;
 use estimator::booster::Feedback;
-use system_tests::feedback::{Control, Event, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
+use system_tests::feedback::{Control, Event, Known, Loop, Sample, Scenario, WALK, held, recommended, rms, settled};
+
+/// Orbit that noise of 0.15 mm and a walk of 2.2 um a frame leave in a filter, `sqrt(walk noise)` [m].
+const LEFT: f64 = 18e-6;
 
 fn run(known: &Known, feedback: &Feedback, control: Control, scenario: &Scenario) -> Vec<Sample> {
     Loop::new(known, feedback.clone(), control, scenario.clone()).unwrap().run().unwrap()
 }
 
-/// After every disturbance at most a fifth of what it is without correction; once it is corrected, on average below what it is
-/// with the design's response, and nowhere 5 % above it: a ring may be as its design where it matters.
+/// After every disturbance at most a fifth of what it is without correction; on average below what it is with the design's response,
+/// and nowhere above it by more than the noise that the filter leaves: a ring may be as its design where it matters. NEES/48 is 20
+/// after a var has stepped while the correctors stood still; what has moved them since, has told of it.
 fn holds_the_orbit(seed: u64) {
     let (known, scenario) = (Known::read().unwrap(), Scenario::of_everything(seed));
     let [off, design, estimated] = [Control::Off, Control::Design, Control::Estimated]
         .map(|control| run(&known, &recommended(), control, &scenario));
-    let mut ratios = Vec::new();
+    let mut logarithms = Vec::new();
     for (name, frames) in scenario.stretches() {
         let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
         assert!(rms(estimated) <= 0.2 * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
+        let [by_estimate, by_design] = [rms(estimated), rms(design)];
+        assert!(by_estimate < by_design + LEFT, "seed {seed}, {name}: {by_estimate}, by the design {by_design} m");
         let ratio = rms(settled(estimated)) / rms(settled(design));
-        assert!(ratio < 1.05, "seed {seed}, {name}: {ratio} of the design's");
-        ratios.push(ratio);
+        logarithms.push(ratio.ln());
     }
-    let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
+    let mean = (logarithms.iter().sum::<f64>() / logarithms.len() as f64).exp();
     assert!(mean < 1.0, "seed {seed}: {mean} of the design's on average");
+    let last = estimated.last().map(|sample| sample.nees).unwrap();
+    assert!(last < 5.0, "seed {seed}: NEES/48 of {last}");
     // what holds, holds for as long as it lasts and some frames more
     let of = |hold| estimated.iter().filter(|s| s.steered.is_some_and(|s| s.hold == Some(hold))).count();
     assert_eq!((of(Hold::Mismatch), of(Hold::Unsolved), of(Hold::Blind)), (0, 0, 0), "seed {seed}");
@@ -58,17 +65,17 @@ fn no_fault_at_any_time_makes_it_unstable() {
         Event::Gap(1000),
     ];
     for (seed, fault) in (201..).zip(faults) {
-        for (at, gain) in [(1, GAIN), (7, 3.0 * GAIN), (60, GAIN)] {
+        for (at, walk) in [(1, WALK), (7, 5.0 * WALK), (60, WALK)] {
             let scenario = Scenario { events: vec![(at, fault.clone())], campaign: 0, ..Scenario::quiet(seed, 150) };
-            let feedback = Feedback { gain, ..recommended() };
+            let feedback = Feedback { walk, ..recommended() };
             let samples = run(&known, &feedback, Control::Estimated, &scenario);
             let off = run(&known, &feedback, Control::Off, &scenario);
             for (frame, (sample, off)) in samples.iter().zip(&off).enumerate() {
                 let largest = 1.2 * off.rms + 3e-4; // probes move the orbit by 0.3 mm
-                assert!(sample.rms < largest, "{fault} at {at}, gain {gain}, frame {frame}: {} m", sample.rms);
+                assert!(sample.rms < largest, "{fault} at {at}, walk {walk}, frame {frame}: {} m", sample.rms);
             }
             let (last, off) = (rms(&samples[130..]), rms(&off[130..]));
-            assert!(last < off / 3.0, "{fault} at {at}, gain {gain}: {last} of {off} m");
+            assert!(last < off / 3.0, "{fault} at {at}, walk {walk}: {last} of {off} m");
         }
     }
 }

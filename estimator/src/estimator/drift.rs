@@ -3,13 +3,14 @@
 //! What a frame says of the params, against what was expected of it, is its score: with its readings' derivatives `d`, variances
 //! `s`, and innovations `e`, `h = sum of d e/s`, whose expectation grows by `dY nu` once params have stepped by `nu`; `dY = sum of
 //! d d^T/s` is the information that the frame has added. Innovations of different frames are independent, so that their sum over
-//! the last frames, older ones forgotten, is compared with its own variance: the evidence for a step of param `i` alone, of the
-//! size that suits it best, is
+//! the last frames, older ones forgotten, is compared with its own variance: the evidence for a step of param `i` alone, of a size
+//! that is as probable as its prior has it, is
 //!
-//! `z_i^2/2`,   `z_i = (sum of h_i/f)/sqrt(sum of dY_ii/f)`,   `variance of h_i = dY_ii + (dY P dY)_ii <= f dY_ii`,
+//! `z_i^2/2`,   `z_i = (sum of h_i/f)/sqrt(1/sigma_i^2 + sum of dY_ii/f)`,   `variance of h_i = dY_ii + (dY P dY)_ii <= f dY_ii`,
 //!
-//! with `f = det(Y + dY)/det Y`, which bounds what the posterior's own covariance `P` adds, so that `z` is never overstated. While
-//! the posterior still narrows fast, `f` is large, and nothing can be said of steps.
+//! with the prior's `sigma_i`: correctors that stand still say hardly anything of the vars, and an orbit that drifts by itself would
+//! else be the evidence of absurd steps. The factor `f = det(Y + dY)/det Y` bounds what the posterior's own covariance `P` adds, so
+//! that `z` is never overstated. While the posterior still narrows fast, `f` is large, and nothing can be said of steps.
 //!
 //! That something has stepped is known within some frames, mostly by the tunes; which param it was, takes the orbits of some
 //! hundred more, since neighbours by phase advance act alike. So all are let loose, each by its probability to be the one, and
@@ -60,9 +61,9 @@ impl Score {
         self.variance = kept * kept * self.variance + variance;
     }
 
-    /// [nat]
-    fn evidence(&self) -> f32 {
-        if self.variance > 0.0 { 0.5 * self.sum * self.sum / self.variance } else { 0.0 }
+    /// Evidence of a step whose size is normal about 0, of this precision [nat].
+    fn evidence(&self, precision: f32) -> f32 {
+        0.5 * self.sum * self.sum / (self.variance + precision)
     }
 }
 
@@ -100,26 +101,26 @@ impl<const N: usize> Drift<N> {
         }
     }
 
-    /// The step for which there is most evidence.
-    pub fn likeliest(&self) -> Step<N> {
+    /// The step for which there is most evidence; `precision` is that of the prior of a param.
+    pub fn likeliest(&self, precision: impl Fn(usize) -> f32) -> Step<N> {
         let mut step = Step { param: 0, evidence: 0.0, probability: [0.0; N] };
         for scores in &self.windows {
-            let own = scores.iter().map(Score::evidence).enumerate();
-            let (param, evidence) = own.fold((0, 0.0), |most, this| if this.1 > most.1 { this } else { most });
+            let own = scores.iter().enumerate().map(|(i, score)| (i, score.evidence(precision(i))));
+            let (param, evidence) = own.clone().fold((0, 0.0), |most, this| if this.1 > most.1 { this } else { most });
             if evidence > step.evidence {
                 // of more evidence than it takes, what tells candidates apart is the error of linearising
                 let counts = (ENOUGH / evidence).min(1.0);
-                let weight = |score: &Score| libm::expf(counts * (score.evidence() - evidence));
-                let all: f32 = scores.iter().map(weight).sum();
+                let weight = |(_, own): (usize, f32)| libm::expf(counts * (own - evidence));
+                let all: f32 = own.clone().map(weight).sum();
                 (step.param, step.evidence) = (param, evidence);
-                step.probability.iter_mut().zip(scores).for_each(|(to, score)| *to = weight(score) / all);
+                step.probability.iter_mut().zip(own).for_each(|(to, this)| *to = weight(this) / all);
             }
         }
         step
     }
 
     /// That step, if the evidence suffices.
-    pub fn found(&self) -> Option<Step<N>> {
-        Some(self.likeliest()).filter(|step| step.evidence > ENOUGH)
+    pub fn found(&self, precision: impl Fn(usize) -> f32) -> Option<Step<N>> {
+        Some(self.likeliest(precision)).filter(|step| step.evidence > ENOUGH)
     }
 }

@@ -146,8 +146,8 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     }
 
     /// Evidence that a param has stepped lately [nat].
-    pub fn step_evidence(&self) -> f32 {
-        self.drift.likeliest().evidence
+    pub fn step_evidence(&self, prior: impl Fn(usize) -> Prior) -> f32 {
+        self.drift.likeliest(|i| 1.0 / (prior(i).sigma * prior(i).sigma)).evidence
     }
 
     /// Weigh what a frame has said of steps; if there is one, let the params loose, each by its probability to have stepped.
@@ -158,7 +158,8 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
     #[inline(never)]
     pub fn let_loose(&mut self, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
         self.drift.weigh(&self.gaussian, libm::exp(self.narrowed).max(1.0));
-        let Some(step) = self.drift.found() else { return };
+        let precision = |i: usize| 1.0 / (prior(i).sigma * prior(i).sigma);
+        let Some(step) = self.drift.found(precision) else { return };
         let probability = |i: usize| step.probability.get(i).copied().unwrap_or(0.0);
         self.gaussian.spread_baselines(f64::from(STEERED) * f64::from(STEERED), Self::BASELINES);
         self.spread(|i| libm::sqrtf(probability(i)) * prior(i).sigma * prior(i).sigma, layout, prior);

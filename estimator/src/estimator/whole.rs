@@ -1,11 +1,12 @@
 //! A frame as a whole, before any of it counts: is there a beam in it that the model knows?
 
 use super::{Estimator, Model, UNDERWEIGHT};
+use crate::campaign::Setting;
 use crate::estimate::MonitorState;
 use crate::linear::dot;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
-use crate::quarantine::Quarantine;
+use crate::quarantine::{Quarantine, Shift};
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -73,22 +74,29 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
+    /// True if the repeats of a setting decide on a whole frame, and not the model: while all frames have seen the same ring, or where
+    /// something is driven, whose response may be wrong in detail. Where nothing is, an orbit that has moved is not to be taken for
+    /// a change of the vars, however little it surprises each monitor.
+    pub(super) fn repeats_decide(&self, model: &Model<'_, G, B, C, F>, setting: &Setting) -> bool {
+        setting.is_driven() || self.posterior.is_still(&model.setup.walk)
+    }
+
     /// Judge a frame as a whole, and put it aside if need be.
     #[inline(never)]
     pub(super) fn judge_whole(
         &mut self,
         model: &Model<'_, G, B, C, F>,
         frame: &Frame<B, C, F, W>,
-        in_setting: bool,
+        repeats_decide: bool,
     ) -> (Whole, Expected<B, W>) {
         let expected = self.expected(model, frame);
         if self.is_beam_lost(frame) {
             return (Whole::Aside, expected);
         }
-        // in a setting the repeats decide, of an orbit that might be one
+        // the repeats decide of an orbit that might be one
         let is_expected = self.is_expected_but_for_a_few(frame, &expected)
-            && (in_setting || self.is_expected_together(frame, &expected));
-        if is_expected || (in_setting && self.resembles(frame, &expected)) {
+            && (repeats_decide || self.is_expected_together(frame, &expected));
+        if is_expected || (repeats_decide && self.resembles(frame, &expected)) {
             self.whole.quarantine.clear();
             return (Whole::Good, expected);
         }
@@ -193,13 +201,13 @@ impl<
     }
 
     /// Take the baselines as moved, by as much at each time in the cycle: all that was read before is moved with them.
-    fn move_baselines(&mut self, shift: &[f32; B]) {
+    fn move_baselines(&mut self, shift: &[Shift; B]) {
         self.posterior.gaussian.move_baselines(shift, Self::TIMES);
         self.past.loose.move_baselines(shift, Self::TIMES);
-        self.past.campaign.move_readings(shift);
+        self.past.campaign.move_readings(&shift.map(|shift| shift.by));
         self.reopen_pool();
         for frame in &mut self.past.recent {
-            frame.reading.iter_mut().zip(shift).for_each(|(reading, by)| *reading = reading.moved(*by));
+            frame.reading.iter_mut().zip(shift).for_each(|(reading, shift)| *reading = reading.moved(shift.by));
         }
     }
 }

@@ -26,6 +26,7 @@ mod walk;
 
 use crate::linear::{Real, add, add_rounded, dot, subtract};
 use crate::prior::Prior;
+use crate::quarantine::Shift;
 use crate::triangle::Triangle;
 
 pub use baselines::{Correlated, Covariance, Independent};
@@ -207,11 +208,13 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         (0..monitors).for_each(|b| self.covariance.spread(b, variance));
     }
 
-    /// The baselines have moved by so much [m], those of monitors at each of so many times in the cycle; the readings so far move
-    /// with them.
-    pub fn move_baselines(&mut self, shift: &[f32], times: usize) {
+    /// The baselines have moved, those of monitors at each of so many times in the cycle; the readings so far move with them.
+    pub fn move_baselines(&mut self, shift: &[Shift], times: usize) {
         let each = core::iter::repeat_n(shift, times).flatten();
-        self.baseline.iter_mut().zip(each).for_each(|(baseline, by)| *baseline += f64::from(*by));
+        for (b, (baseline, shift)) in self.baseline.iter_mut().zip(each).enumerate() {
+            *baseline += f64::from(shift.by);
+            self.covariance.spread(b, shift.variance.into());
+        }
     }
 
     /// Move the origin without changing the distribution.

@@ -12,7 +12,7 @@ use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
 use system_tests::feedback::{
-    Chip, Control, GAIN, Known, Loop, REGIONS, Sample, Scenario, held, recommended, rms, settled,
+    Chip, Control, Known, Loop, REGIONS, Sample, Scenario, WALK, held, recommended, rms, settled,
 };
 use system_tests::qemu::{Counts, Emulator, Image, Options};
 
@@ -22,9 +22,9 @@ struct Arguments {
     /// Machine, noise, and where things happen
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Low-pass of the readings
-    #[arg(long, default_value_t = GAIN)]
-    gain: f32,
+    /// How far the orbit is expected to walk in the root of a second [m]
+    #[arg(long, default_value_t = WALK)]
+    walk: f32,
     /// Frames from the beginning of the feedback on in which the emulated chip steers as well
     #[arg(long, value_name = "N", default_value_t = 500)]
     chip: usize,
@@ -51,7 +51,7 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     let known = Known::read()?;
     let scenario = Scenario::of_everything(arguments.seed);
-    let feedback = estimator::booster::Feedback { gain: arguments.gain, ..recommended() };
+    let feedback = estimator::booster::Feedback { walk: arguments.walk, ..recommended() };
     let closed = |control| Loop::new(&known, feedback.clone(), control, scenario.clone());
     let [off, design] = [Control::Off, Control::Design].map(|control| closed(control)?.run());
     let (estimated, chip) = match arguments.chip {

@@ -146,7 +146,7 @@ fn says(
 pub fn on_wire(feedback: &Feedback) -> large::Feedback {
     large::Feedback {
         orbit: wide(&feedback.orbit),
-        gain: feedback.gain,
+        walk: feedback.walk,
         step_kick: feedback.step_kick,
         total_kick: feedback.total_kick,
         limit: wide(&feedback.limit),

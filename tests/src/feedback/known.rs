@@ -12,7 +12,7 @@ use crate::machine::LAYOUT;
 use crate::repository;
 
 /// How far vars and baselines of the machine are believed to walk.
-const WALK: Walk = Walk { params: 2e-5, baselines: 5e-6 };
+pub(super) const WALK: Walk = Walk { params: 2e-5, baselines: 5e-6 };
 
 /// The tables, the setup and the linearised design of a Booster.
 #[derive(Debug, Clone)]
