@@ -25,7 +25,7 @@ use crate::campaign::{Campaign, Setting};
 use crate::drive::{Beyond, Calibration, Drive, Each};
 use crate::estimate::{Estimate, Remarks};
 use crate::following::{self, Following};
-use crate::gaussian::{Gaussian, Independent, Reading};
+use crate::gaussian::{Gaussian, Independent, Reading, Solution};
 use crate::linear::column;
 use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor, Peers};
@@ -664,8 +664,12 @@ impl<
             variance,
             slope: column(self.predicted.prediction.jacobian.as_slice(), N, b),
         });
-        let loose = if linearised_once { self.posterior.loose() } else { [0.0; N] };
-        self.posterior.gaussian.condition(readings, &loose);
+        let Posterior { gaussian, solution, .. } = &mut self.posterior;
+        if linearised_once {
+            gaussian.condition(readings, &underweighted(solution));
+        } else {
+            gaussian.condition(readings, &|_| 0.0);
+        }
         self.condition_tunes(model, screened);
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
@@ -693,9 +697,13 @@ impl<
             let variance = self.tunes.get(plane).and_then(TuneMeter::variance);
             if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
                 let (_, slope) = model.surrogate.tune(&self.tangent.linearised, plane, &[0.0; F]);
-                let loose = if linearised_once { self.posterior.loose() } else { [0.0; N] };
                 let reading = Reading { channel: K - 2 + plane, innovation: *innovation, variance, slope: &slope };
-                self.posterior.gaussian.condition([reading], &loose);
+                let Posterior { gaussian, solution, .. } = &mut self.posterior;
+                if linearised_once {
+                    gaussian.condition([reading], &underweighted(solution));
+                } else {
+                    gaussian.condition([reading], &|_| 0.0);
+                }
             }
         }
     }
@@ -732,7 +740,7 @@ impl<
         let drive = about(&frame.drive, &self.tangent.supplies);
         let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
         let readings = frame.readings(&variances, &self.predicted.prediction);
-        self.past.loose.condition(readings, &self.posterior.loose());
+        self.past.loose.condition(readings, &underweighted(&self.posterior.solution));
     }
 
     fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
@@ -814,6 +822,15 @@ impl<
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
         if i < N && j < N { self.posterior.solution.covariance(i, j) as f32 } else { 0.0 }
     }
+}
+
+/// What the uncertain linearisation adds to the variance of a reading, for a derivative of its difference from the baseline; nothing
+/// once all params are certain enough.
+fn underweighted<const N: usize, const T: usize, const W: usize>(
+    solution: &Solution<N, T, W>,
+) -> impl Fn(&[f64; N]) -> f64 {
+    let is_loose = solution.sigma.iter().any(|sigma| *sigma > CERTAIN);
+    move |d| if is_loose { UNDERWEIGHT * solution.variance_of(d) } else { 0.0 }
 }
 
 /// Prior of a param.

@@ -130,6 +130,7 @@ pub struct Steer<const B: usize, const C: usize, const CX: usize, const CY: usiz
     /// Frames since the gains of x were due.
     turn: u8,
     watch: Watch,
+    steered: Steered,
 }
 
 /// Frames after which gains are made anew, for the estimate moves on.
@@ -198,11 +199,17 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         y: Gain::BLANK,
         turn: 0,
         watch: Watch::BLANK,
+        steered: Steered { hold: None, left_out: 0, limited: 0 },
     };
 
     /// The currents that the correctors are to have.
     pub fn setpoints(&self) -> &[CurrentCode; C] {
         self.supplies.setpoints()
+    }
+
+    /// What is to be said of the last frame's correction.
+    pub fn steered(&self) -> Steered {
+        self.steered
     }
 
     /// False for a corrector that does not follow its setpoint, and is left out until it does.
@@ -235,7 +242,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
             self.pattern = (frame.time_us as u32).max(1);
             self.supplies.probe(feedback.probe, self.pattern, &feedback.limit);
         }
-        Steered { hold, left_out: self.supplies.left_out(), limited }
+        self.steered = Steered { hold, left_out: self.supplies.left_out(), limited };
+        self.steered
     }
 
     /// Make the gains of one plane anew if that is due; true if it was done. To be called after each frame.
@@ -359,24 +367,22 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     ) -> Triangle<CP, TP, f64> {
         let mut matrix = Triangle::ZERO;
         matrix.fill_diagonal(f64::from(diagonal));
-        let follows = |i: usize| self.supplies.follows(first + i);
-        let mut add = |i: usize, terms: &mut dyn Iterator<Item = f32>| {
-            for (j, (to, term)) in matrix.row_mut(i).iter_mut().zip(terms).enumerate() {
-                *to += if follows(i) && follows(j) { f64::from(term) } else { 0.0 };
-            }
-        };
-        for i in 0..CP {
+        for (i, row) in matrix.rows_mut().enumerate() {
             let mut kick = [0.0; C];
             kick.get_mut(first + i).into_iter().for_each(|kick| *kick = 1.0);
             let pull = response.pull(&self.weighted(&response.orbit(kick)));
-            add(i, &mut pull.iter().skip(first).copied());
+            add_single(row, 1.0, pull.get(first..).unwrap_or_default());
         }
         let plane = usize::from(first > 0);
         response.surrogate.response_covariance(response.at, plane, &self.weight, covariance, |here, there| {
-            for (i, h) in here.iter().enumerate() {
-                add(i, &mut there.iter().map(|t| h * t));
-            }
+            matrix.rows_mut().zip(here).for_each(|(row, h)| add_single(row, *h, there));
         });
+        let follows = |i: usize| self.supplies.follows(first + i);
+        for (i, row) in matrix.rows_mut().enumerate() {
+            for (j, to) in row.iter_mut().enumerate().filter(|(j, _)| !(follows(i) && follows(*j))) {
+                *to = if i == j { f64::from(diagonal) } else { 0.0 };
+            }
+        }
         matrix
     }
 
@@ -411,6 +417,12 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick(c));
         self.supplies.change(&step, |c| feedback.edge(c))
     }
+}
+
+/// `to += factor * from`, each product in single precision.
+#[inline(never)]
+fn add_single(to: &mut [f64], factor: f32, from: &[f32]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to += f64::from(factor * from));
 }
 
 /// `1/total^2` [1/rad^2].

@@ -71,9 +71,10 @@ pub trait Steering<E: Core>: Sized {
         model: (&E::Tables, &E::Setup),
         feedback: &Self::Feedback,
         bytes: &mut [u8],
-    ) -> Result<(E::Estimate, Steered), IngestError>;
+    ) -> Result<E::Estimate, IngestError>;
     /// See [`Estimator::prepare_steer`].
     fn prepare(&mut self, core: &E, model: (&E::Tables, &E::Setup), feedback: &Self::Feedback) -> bool;
+    fn steered(&self) -> Steered;
     fn setpoints(&self) -> E::Setpoints;
 }
 
@@ -182,7 +183,7 @@ impl<
         (surrogate, setup): (&G, &Setup<B, C, F>),
         feedback: &Self::Feedback,
         bytes: &mut [u8],
-    ) -> Result<(Estimate<B, N, W>, Steered), IngestError> {
+    ) -> Result<Estimate<B, N, W>, IngestError> {
         core.ingest_and_steer(&Model { surrogate, setup }, feedback, self, bytes)
     }
 
@@ -193,6 +194,10 @@ impl<
         feedback: &Self::Feedback,
     ) -> bool {
         core.prepare_steer(&Model { surrogate, setup }, feedback, self)
+    }
+
+    fn steered(&self) -> Steered {
+        self.steered()
     }
 
     fn setpoints(&self) -> Setpoints<C> {

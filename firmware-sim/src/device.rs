@@ -5,7 +5,7 @@
 use estimator::surrogate::Unstable;
 use estimator::wire::link::{Correction, Form, PIECE, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
 use estimator::wire::{ParcelError, link, listed};
-use estimator::{Core, Layout, Parcel, Prepared, Steered, Steering, Tables, packet};
+use estimator::{Core, Layout, Parcel, Prepared, Steering, Tables, packet};
 
 /// What a device of this core says.
 pub type Reply<E> = link::Reply<<E as Core>::Answer, <E as Core>::Setpoints>;
@@ -114,33 +114,29 @@ impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
             return None;
         };
         let tables = tables(self.contents, self.built_in, self.slot);
-        let answered = match &self.feedback {
-            None => {
-                let ingested = self.core.ingest(tables, setup, bytes);
-                ingested.map(|estimate| self.answer(&estimate, None, reply))
-            }
-            Some(feedback) => {
-                let ingested = self.steer.ingest(self.core, (tables, setup), feedback, bytes);
-                ingested.map(|(estimate, steered)| self.answer(&estimate, Some(steered), reply))
-            }
+        let ingested = match &self.feedback {
+            None => self.core.ingest(tables, setup, bytes),
+            Some(feedback) => self.steer.ingest(self.core, (tables, setup), feedback, bytes),
         };
-        answered.map_err(|error| self.refuse(error.into(), reply)).ok()
+        match &ingested {
+            Ok(estimate) => Some(self.answer(estimate, reply)),
+            Err(error) => {
+                self.refuse((*error).into(), reply);
+                None
+            }
+        }
     }
 
     /// Reply to a frame, and send what was asked for with it; true if an operator should look.
     #[inline(never)]
-    fn answer(
-        &mut self,
-        estimate: &E::Estimate,
-        steered: Option<Steered>,
-        reply: &mut impl FnMut(u32, &Reply<E>),
-    ) -> bool {
+    fn answer(&mut self, estimate: &E::Estimate, reply: &mut impl FnMut(u32, &Reply<E>)) -> bool {
         let prepared = core::mem::take(&mut self.prepared);
         match self.form {
             Form::Full => say(UNASKED, || link::Reply::Estimate(estimate.into()), reply),
             Form::Short => {
-                let correct = |steered| Correction { steered, prepared, setpoints: self.steer.setpoints() };
-                say(UNASKED, || link::Reply::Short(E::short(estimate, steered.map(correct))), reply);
+                let steer = self.feedback.as_ref().map(|_| &*self.steer);
+                let of = |steer: &S| Correction { steered: steer.steered(), prepared, setpoints: steer.setpoints() };
+                say(UNASKED, || link::Reply::Short(E::short(estimate, steer.map(of))), reply);
             }
         }
         if let Some(number) = self.wants_covariance.take() {

@@ -17,7 +17,7 @@ use twin::Ring;
 
 use crate::machine::{ALL, Random, amperes, nees, wire_of};
 
-pub use chip::Chip;
+pub use chip::{Chip, REGIONS, on_wire};
 pub use known::Known;
 pub use plant::{Orbit, Plant};
 pub use scenario::{Event, Scenario};
@@ -245,8 +245,8 @@ impl<'k> Loop<'k> {
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
         let mut bytes = self.wire.clone();
         if self.steers() && self.control == Control::Estimated {
-            let ingested = self.core.ingest_and_steer(&model, &self.feedback, &mut self.steer, &mut bytes);
-            return ingested.map(|(estimate, steered)| (estimate, Some(steered)));
+            let estimate = self.core.ingest_and_steer(&model, &self.feedback, &mut self.steer, &mut bytes)?;
+            return Ok((estimate, Some(self.steer.steered())));
         }
         let estimate = self.core.ingest(&model, &mut bytes)?;
         let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), frame, &estimate);

@@ -3,7 +3,7 @@
 use core::error::Error;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Frame, MONITORS, PARAMS};
-use estimator::{CurrentCode, Model, Prepared, Walk};
+use estimator::{CurrentCode, FitQuality, Model, Prepared, Walk};
 use inference::Recording;
 use inference::stream;
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -171,6 +171,10 @@ impl Soak {
     /// The next frame, as the machine sends it.
     pub fn cycle(&mut self) -> Frame {
         let corrector = self.row.drive(self.frames, &mut self.machine.random);
+        self.cycle_with(corrector)
+    }
+
+    fn cycle_with(&mut self, corrector: [CurrentCode; CORRECTORS]) -> Frame {
         let (epoch, sequence) = self.cycle;
         self.cycle.1 = sequence.wrapping_add(1);
         Frame { epoch, ..self.machine.cycle_with(sequence, corrector) }
@@ -196,6 +200,17 @@ impl Soak {
         let estimate = self.core.ingest(&model, &mut wire_of(frame)).expect("a good frame");
         self.frames += 1;
         estimate
+    }
+
+    /// The machine sends the correctors at these currents, and the core takes that in.
+    pub fn powered(&mut self, corrector: [CurrentCode; CORRECTORS]) -> Estimate {
+        let frame = self.cycle_with(corrector);
+        self.ingest(&frame)
+    }
+
+    /// How well the core says that its model describes the frames so far.
+    pub fn quality(&mut self) -> FitQuality {
+        self.core.fit_quality(&Model { surrogate: &*self.machine.surrogate, setup: &self.machine.setup })
     }
 
     /// Estimated less true params over the error bars of an estimate, squared: NEES over the number of params.

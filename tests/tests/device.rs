@@ -7,15 +7,16 @@ use std::hash::DefaultHasher;
 
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::booster::{
-    Answer, Estimator, Frame, Green, LINE, PACKET, Parcel, Reply, Request, SIZES, Setup, Steer, TRIANGLE,
+    Answer, Estimator, Feedback, Frame, Green, LINE, PACKET, Parcel, Reply, Request, SIZES, Setup, Steer, TRIANGLE,
 };
 use estimator::surrogate::Table;
-use estimator::wire::link::{self, Form, REPLY, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
-use estimator::{Gate, Parcel as AnyParcel, ParcelError, Sizes, Tables as _, Walk};
+use estimator::wire::link::{self, Correction, Form, REPLY, REQUEST, Refusal, Status, Taken, UNASKED, Vitals};
+use estimator::{Gate, Hold, Parcel as AnyParcel, ParcelError, Sizes, Tables as _, Walk};
 use firmware_sim::{Device, Panel};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use system_tests::faults::{Body, FAULTS, faulty, sealed};
+use system_tests::feedback::{Control, Known, Loop, Scenario, recommended};
 use system_tests::machine::{LAYOUT, Machine, Random, wire_of};
 use system_tests::repository;
 use training::{Tables, rooms};
@@ -521,6 +522,91 @@ fn a_short_reply_says_what_the_estimate_says() {
     let mut bytes = request(&Request::Form(Form::Short));
     bytes.extend([start(&core), heard(&good[0])].concat());
     assert!(matches!(replies(&in_flash(&core.tables), &bytes)[..], [_, Reply::Restarted, Reply::Estimate(_)]));
+}
+
+/// What the setpoints are, and why, while a device steers a loop: those of the loop in process, bit for bit.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
+fn a_device_steers_from_one_request_to_the_next() {
+    // given a loop with a lost beam and a corrector that sticks
+    let known = Known::read().unwrap();
+    let scenario = Scenario::of_faults(5);
+    let mut closed = Loop::new(&known, recommended(), Control::Estimated, scenario).unwrap();
+    let cycles: Vec<_> = (0..130)
+        .map(|_| {
+            let steered = closed.cycle().unwrap().steered;
+            (closed.wire.clone(), steered, closed.setpoints().to_vec())
+        })
+        .collect();
+    let wire = |at: usize| heard(&cycles[at].0);
+    let wanted = closed.feedback().clone();
+    let on = || request(&Request::Feedback(Some(wanted.clone())));
+    // when a device hears the same frames, is told to steer from the 21st on, and once what is not sound
+    let core = Known::core().unwrap();
+    let mut bytes = [start(&core), request(&Request::Form(Form::Short))].concat();
+    (0..20).for_each(|at| bytes.extend(wire(at)));
+    bytes.extend(on());
+    (20..100).for_each(|at| bytes.extend(wire(at)));
+    bytes.extend(request(&Request::Feedback(Some(Feedback { gain: f32::NAN, ..wanted.clone() }))));
+    (100..120).for_each(|at| bytes.extend(wire(at)));
+    // off, on again, and restarted
+    bytes.extend([request(&Request::Feedback(None)), wire(120), on(), wire(121), wire(122)].concat());
+    bytes.extend([start(&core), request(&Request::Form(Form::Short)), wire(123)].concat());
+    let replies = replies(&in_flash(&core.tables), &bytes);
+    let corrections: Vec<_> = replies
+        .iter()
+        .filter_map(|reply| match reply {
+            Reply::Short(short) => Some(short.correction.clone()),
+            _ => None,
+        })
+        .collect();
+    // then it steers as the loop does, and else not at all
+    assert_eq!(corrections.len(), 124);
+    let said: Vec<_> =
+        replies.iter().filter(|reply| matches!(reply, Reply::Feedback(_) | Reply::Refused { .. })).collect();
+    let refused = Reply::Refused { why: Refusal::Setup, count: 1 };
+    assert_eq!(said, [&Reply::Feedback(true), &refused, &Reply::Feedback(false), &Reply::Feedback(true)]);
+    assert!(corrections[..20].iter().chain([&corrections[120], &corrections[123]]).all(Option::is_none));
+    let mut holds = BTreeMap::new();
+    let mut left_out = 0;
+    for (at, (correction, (_, steered, setpoints))) in corrections.iter().zip(&cycles).enumerate().take(120).skip(20) {
+        let Correction { steered: got, prepared, setpoints: sent } = correction.as_ref().unwrap();
+        assert_eq!((Some(*got), *prepared, sent.as_slice()), (*steered, true, setpoints.as_slice()), "frame {at}");
+        got.hold.into_iter().for_each(|hold| *holds.entry(hold.to_string()).or_insert(0) += 1);
+        left_out = left_out.max(got.left_out);
+    }
+    assert_eq!((holds[&Hold::Stale.to_string()], left_out), (1, 1), "{holds:?}");
+    assert!(holds[&Hold::PutAside.to_string()] >= 6, "{holds:?}");
+    // switched on again it begins where the correctors are
+    let again = corrections[121].as_ref().unwrap();
+    let frame = Frame::decode(&LAYOUT, &mut cycles[121].0.clone()).unwrap();
+    assert_eq!((again.steered.hold, again.setpoints.as_slice()), (Some(Hold::Stale), frame.corrector.as_slice()));
+    assert_eq!(corrections[122].as_ref().unwrap().steered.hold, Some(Hold::Unprepared), "the other plane's gains");
+}
+
+/// The bytes that `docs/device.md` shows.
+#[test]
+fn the_packets_of_the_page_have_these_bytes() {
+    let page = include_str!("../../docs/device.md");
+    let reply = |number: u32, reply: Reply| {
+        let mut bytes = vec![0; PACKET];
+        let n = reply.encode(number, &mut bytes).unwrap();
+        bytes.truncate(n);
+        bytes
+    };
+    let packets = [
+        packet(1, &Request::Status),
+        packet(2, &Request::Covariance),
+        packet(4, &Request::Form(Form::Short)),
+        packet(5, &Request::Feedback(None)),
+        reply(3, Reply::Restarted),
+        reply(UNASKED, Reply::Refused { why: Refusal::NotStarted, count: 1 }),
+        reply(5, Reply::Feedback(false)),
+    ];
+    for bytes in packets {
+        let hex: Vec<String> = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+        assert!(page.contains(&format!("`{}`", hex.join(" "))), "{hex:?}");
+    }
 }
 
 // ---- A bad line ----

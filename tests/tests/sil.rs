@@ -8,13 +8,14 @@ use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
-use estimator::Tables as _;
 use estimator::booster::Frame;
 use estimator::wire::link::{Refusal, Status};
+use estimator::{Hold, Tables as _};
 use host_bridge::source::link::Link;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use system_tests::endurance::endure;
+use system_tests::feedback::{Chip, Control, Known, Loop, REGIONS, Scenario, recommended};
 use system_tests::machine::LAYOUT;
 use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
@@ -201,6 +202,32 @@ fn a_long_feedback_on_a_bad_line_is_the_same_on_the_chip() {
     assert_eq!((status.frames, status.refused, status.vitals.lost_bytes), (1000, endured.refused, 0));
     assert!(endured.refused > 300, "a fault in three frames: {} refused", endured.refused);
     check_stack(status);
+}
+
+/// The chip closes the loop: its setpoints are the host's, bit for bit, through a lost beam and a corrector that sticks. `make loop`
+/// shows what becomes of the orbit.
+#[test]
+fn the_chip_steers_as_the_host_does() {
+    let known = Known::read().unwrap();
+    let scenario = Scenario::of_faults(5);
+    let regions = REGIONS.iter().map(|(_, name)| IMAGE.function(name).unwrap()).collect();
+    let emulator = Emulator::start(&IMAGE, &Options { regions, ..Options::default() }).unwrap();
+    let mut closed = Loop::new(&known, recommended(), Control::Estimated, scenario).unwrap();
+    closed.chip = Some(Chip::start(&emulator).unwrap());
+    let samples = closed.run().unwrap();
+    let mut chip = closed.chip.take().unwrap();
+    let status = chip.status().unwrap();
+    assert_eq!((chip.frames, chip.different, status.frames, status.refused), (130, 0, 130, 0));
+    check_stack(&status);
+    let steered: Vec<_> = samples.iter().filter_map(|sample| sample.steered).collect();
+    let held = |why| steered.iter().filter(|steered| steered.hold == Some(why)).count();
+    assert!(held(Hold::PutAside) >= 6 && held(Hold::Stale) == 1, "{steered:?}");
+    assert!(steered.iter().any(|steered| steered.left_out == 1), "the corrector that sticks");
+    drop(closed);
+    let counts = emulator.stop().unwrap().counts;
+    let most = |name: &str| counts[name].iter().copied().max().unwrap();
+    assert!(most("Steer::prepare") <= 1_500_000, "{}", most("Steer::prepare"));
+    assert!(most("Steer::steer") <= 300_000, "{}", most("Steer::steer"));
 }
 
 /// 13 frames of 260 bytes come in 37 ms at 921,600 baud, longer than all slices together take, and far more than a front end

@@ -199,7 +199,7 @@ impl<
                 let (_, slope) = model.surrogate.tune(&self.anew.tangent.linearised, plane, &[0.0; F]);
                 let mean =
                     Reading { channel: K - 2 + plane, innovation, variance: variance / count as f32, slope: &slope };
-                gaussian.condition([mean], &[0.0; N]);
+                gaussian.condition([mean], &|_| 0.0);
                 gaussian.add_repeats(count, variance);
                 gaussian.add_scatter(squares / f64::from(variance), 0.0);
             }

@@ -3,7 +3,6 @@
 use serde::{Deserialize, Serialize};
 
 use super::drift::Drift;
-use super::{CERTAIN, UNDERWEIGHT};
 use crate::gaussian::{Correlated, Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
@@ -133,12 +132,6 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         let room = |i: usize| 2.0 * prior(i).sigma * prior(i).sigma - known.get(i).map_or(0.0, |sigma| sigma * sigma);
         self.spread(|i| step.min(room(i)), layout, prior);
         true
-    }
-
-    /// What each param's uncertainty adds to the variance of a reading that is linearised for good, for a derivative of 1: as if
-    /// params were independent, which all but overstates it, while their error bars are wide; nothing for those that are certain.
-    pub fn loose(&self) -> [f64; N] {
-        self.solution.sigma.map(|sigma| if sigma > CERTAIN { UNDERWEIGHT * f64::from(sigma * sigma) } else { 0.0 })
     }
 
     /// Take note of what is expected of the next frame.

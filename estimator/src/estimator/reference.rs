@@ -3,7 +3,7 @@
 //! A campaign moves one corrector at a time from 0 A. A machine under feedback holds all of them somewhere, and moves them seldom,
 //! or one at a time about there. What is moved is told by the orbit that it makes, not by amperes.
 
-use super::{Estimator, Model};
+use super::{Estimator, Model, underweighted};
 use crate::campaign::{Setting, is_moved};
 use crate::drive::Drive;
 use crate::gaussian::Reading;
@@ -133,7 +133,7 @@ impl<
                 let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
                 let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
                 let reading = Reading { channel: first_channel + b, innovation, variance, slope };
-                self.past.loose.condition([reading], &self.posterior.loose());
+                self.past.loose.condition([reading], &underweighted(&self.posterior.solution));
                 self.past.loose.add_repeats(number, self.noise_variance(b));
             }
         }

@@ -2,7 +2,7 @@
 
 use super::{Estimator, IngestError, Model};
 use crate::estimate::Estimate;
-use crate::steer::{Feedback, Response, Steer, Steered};
+use crate::steer::{Feedback, Response, Steer};
 use crate::surrogate::Steerable;
 
 impl<
@@ -18,7 +18,8 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    /// Take one machine cycle in: bytes to estimate to setpoints. See [`Estimator::ingest`] and [`Steer::steer`].
+    /// Take one machine cycle in: bytes to estimate to setpoints, which are in the feedback's state then. See [`Estimator::ingest`] and
+    /// [`Steer::steer`].
     ///
     /// # Errors
     /// [`IngestError`]; posterior and setpoints are then as they were before.
@@ -29,13 +30,16 @@ impl<
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
         bytes: &mut [u8],
-    ) -> Result<(Estimate<B, N, W>, Steered), IngestError> {
+    ) -> Result<Estimate<B, N, W>, IngestError> {
         let (frame, drive) = self.decode(model, bytes)?;
-        let estimate = self.update(model, &frame, &drive);
-        // a frame that was taken in is within the ramp
-        let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
-        let steered = state.steer(feedback, &self.response(model, momentum), &frame, &estimate);
-        Ok((estimate, steered))
+        // at its place from the start: a copy is more than a kilobyte of stack
+        let estimate = Ok(self.update(model, &frame, &drive));
+        if let Ok(estimate) = &estimate {
+            // a frame that was taken in is within the ramp
+            let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
+            let _ = state.steer(feedback, &self.response(model, momentum), &frame, estimate);
+        }
+        estimate
     }
 
     /// What can be done for the feedback after a frame, once [`Estimator::prepare`] has nothing more to do. See [`Steer::prepare`].

@@ -129,24 +129,29 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         self.baseline.get(b).copied().unwrap_or(0.0)
     }
 
-    /// Add the readings of a frame, of one channel each. What the uncertain linearisation adds to the variance of one is
-    /// `sum over i of loose_i d_i^2`, for the derivative `d` of the difference of reading and baseline.
+    /// Add the readings of a frame, of one channel each; `own` is what the uncertain linearisation adds to a variance, for a
+    /// difference of reading and baseline of this derivative.
     #[inline(never)] // four rows and gains on the stack
-    pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, loose: &[f64; N]) {
+    pub fn condition<'h>(&mut self, readings: impl IntoIterator<Item = Reading<'h>>, own: &dyn Fn(&[f64; N]) -> f64) {
         let (mut staged, mut moves) = (Staged::NONE, Moves::NONE);
         for reading in readings {
-            self.add_reading(&reading, loose, &mut staged, &mut moves);
+            self.add_reading(&reading, own, &mut staged, &mut moves);
         }
         self.settle(&mut staged, &mut moves);
     }
 
     #[inline(never)] // one copy, whatever the readings come from
-    fn add_reading(&mut self, reading: &Reading<'_>, loose: &[f64; N], staged: &mut Staged<N>, moves: &mut Moves<B>) {
+    fn add_reading(
+        &mut self,
+        reading: &Reading<'_>,
+        own: &dyn Fn(&[f64; N]) -> f64,
+        staged: &mut Staged<N>,
+        moves: &mut Moves<B>,
+    ) {
         let channel = reading.channel;
         let (mut d, baseline_variance) = self.effective(channel, reading.slope);
         moves.wait_for(channel, staged.rows(), staged.count(), |gain, row| add(&mut d, -gain, row));
-        let own: f64 = d.iter().zip(loose).map(|(d, loose)| loose * (d * d)).sum();
-        let s = f64::from(reading.variance) + own + baseline_variance;
+        let s = f64::from(reading.variance) + own(&d) + baseline_variance;
         let e = f64::from(reading.innovation) - self.baseline(channel);
         add(&mut self.vector, e / s, &d);
         self.cost += e * e / s;
@@ -310,7 +315,7 @@ mod tests {
     fn conditioned() -> Gaussian<2, 2, 3, Correlated<2, 3>> {
         let mut gaussian = prior();
         for (b, innovation, h) in readings() {
-            gaussian.condition([reading(b, innovation, &h)], &[0.0; 2]);
+            gaussian.condition([reading(b, innovation, &h)], &|_| 0.0);
         }
         gaussian
     }
@@ -380,7 +385,7 @@ mod tests {
                 solution.solve(&gaussian, |_| WIDE);
                 act(&mut gaussian, &mut solution, *sigma);
             }
-            gaussian.condition([reading(b, innovation, &h)], &[0.0; 2]);
+            gaussian.condition([reading(b, innovation, &h)], &|_| 0.0);
         }
         assert_equal(&gaussian, moves);
     }
@@ -411,7 +416,7 @@ mod tests {
         gaussian.reset(|_| WIDE, |_| BASELINE);
         let n = 500_000;
         for _ in 0..n {
-            gaussian.condition([reading(0, 1e-4, &[0.03]), reading(0, -1e-4, &[-0.03])], &[0.0]);
+            gaussian.condition([reading(0, 1e-4, &[0.03]), reading(0, -1e-4, &[-0.03])], &|_| 0.0);
         }
         let precision = 1.0 / f64::from(VARIANCE);
         let expected = 1.0 / square(WIDE.sigma) + 2.0 * f64::from(n) * square(0.03) * precision;

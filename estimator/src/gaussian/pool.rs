@@ -148,8 +148,8 @@ mod tests {
         let residual = |b: usize, i: usize| 3e-3 + 2e-4 * libm::sinf((7 * b + i) as f32);
         let share = |i: usize| [1.0, -0.9, 0.0, 0.4][i % 4];
         for (b, innovation, h) in readings().into_iter().take(4) {
-            one_by_one.condition([reading(b, innovation, &h)], &[0.0; 2]);
-            pooled.condition([reading(b, innovation, &h)], &[0.0; 2]);
+            one_by_one.condition([reading(b, innovation, &h)], &|_| 0.0);
+            pooled.condition([reading(b, innovation, &h)], &|_| 0.0);
         }
         let mut pool = Pool::BLANK;
         pooled.open(&mut pool, [2.9e-3, 0.0]);
@@ -159,7 +159,7 @@ mod tests {
             for i in 0..20 {
                 pooled.count(line, share(i), f64::from(residual(b, i)) - level, &SINGLE);
                 let h = derivative(b).map(|h| share(i) * h);
-                one_by_one.condition([reading(b, residual(b, i), &h)], &[0.0; 2]);
+                one_by_one.condition([reading(b, residual(b, i), &h)], &|_| 0.0);
             }
         }
         pooled.add_lines(&mut pool, 0, &lines, &[derivative(0), derivative(1)].concat());

@@ -10,10 +10,11 @@ use crate::estimate::Estimate;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
+#[repr(u8)] // from 1 on: none is 0 then, and a state of all zero takes no flash
 pub enum Hold {
     /// The first frame, the first after too long a silence, or the first of another time in the cycle: where the correctors and the
     /// orbit are is only learnt by it.
-    Stale,
+    Stale = 1,
     /// The frame was put aside: no beam, or one that the model does not know.
     PutAside,
     /// The estimate is not that of a positive information.

@@ -664,6 +664,18 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
     }
 }
 
+/// The sum of the codes of a quadrupole's two nodes, which is exact.
+fn both([a, b]: &[i16; 2]) -> f32 {
+    (i32::from(*a) + i32::from(*b)) as f32
+}
+
+/// That of every quadrupole.
+fn both_nodes<const M: usize, const Q: usize>(nodes: &Column<Q>) -> [f32; M] {
+    let mut sums = [0.0; M];
+    sums.iter_mut().zip(nodes.codes.as_chunks::<2>().0).for_each(|(to, pair)| *to = both(pair));
+    sums
+}
+
 /// `sum over b of weight_b cov(R_bc, R_bd)` as a sum over quadrupoles `q` of products `Z_qc (sum over p of A_qp cov_qp Z_pc)`
 /// with `A_qp = 4 slope_q slope_p sum over b of weight_b Z_qb Z_pb`. The two nodes of a quadrupole count as one between
 /// them: within half a metre an orbit hardly bends.
@@ -677,13 +689,14 @@ fn response_covariance<const C: usize, const M: usize, const N: usize, const Q: 
     covariance: impl Fn(usize) -> [f32; N],
     mut add: impl FnMut(&[f32], &[f32]),
 ) {
+    let pairs = driven.each_ref().map(both_nodes::<M, Q>);
     for (q, (own, slope_q)) in param.iter().zip(slope).enumerate() {
         let Some(own) = usize::try_from(*own).ok().filter(|own| *own < N) else { continue };
         let mut row = [0.0; M];
         for (seen, weight) in seen.iter().zip(weight) {
             let factor = weight * seen.scale * between(seen, q);
             let nodes = seen.codes.as_chunks::<2>().0;
-            row.iter_mut().zip(nodes).for_each(|(to, [a, b])| *to += factor * (f32::from(*a) + f32::from(*b)));
+            row.iter_mut().zip(nodes).for_each(|(to, pair)| *to += factor * both(pair));
         }
         let shared = covariance(own);
         for (to, (slope, param)) in row.iter_mut().zip(slope.iter().zip(param)) {
@@ -691,10 +704,9 @@ fn response_covariance<const C: usize, const M: usize, const N: usize, const Q: 
             *to *= slope_q * slope * covariance;
         }
         let (mut here, mut there) = ([0.0; C], [0.0; C]);
-        for ((driven, here), there) in driven.iter().zip(&mut here).zip(&mut there) {
+        for ((driven, pairs), (here, there)) in driven.iter().zip(&pairs).zip(here.iter_mut().zip(&mut there)) {
             *here = between(driven, q);
-            let each = row.iter().zip(driven.codes.as_chunks::<2>().0);
-            *there = driven.scale * each.map(|(row, [a, b])| row * (f32::from(*a) + f32::from(*b))).sum::<f32>();
+            *there = driven.scale * row.iter().zip(pairs).map(|(row, pair)| row * pair).sum::<f32>();
         }
         add(&here, &there);
     }

@@ -11,7 +11,9 @@ use comfy_table::CellAlignment;
 use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
 use serde_json::json;
-use system_tests::feedback::{Chip, Control, GAIN, Known, Loop, Sample, Scenario, held, recommended, rms, settled};
+use system_tests::feedback::{
+    Chip, Control, GAIN, Known, Loop, REGIONS, Sample, Scenario, held, recommended, rms, settled,
+};
 use system_tests::qemu::{Counts, Emulator, Image, Options};
 
 /// Close the loop in software.
@@ -64,33 +66,33 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     println!("{}", stretches(&scenario, all));
     output::bytes(&arguments.figure, figure(&scenario, all).svg.as_bytes())?;
     println!("{} of {} replies of the emulated chip differ from the host's", chip.different, chip.frames);
-    chip.most().into_iter().for_each(|(word, most)| println!("most instructions, {word}: {most}"));
+    println!("{} bytes of its stack were used", chip.stack_bytes);
+    for (word, [median, most]) in chip.instructions() {
+        println!("instructions, {word}: median {median}, most {most}");
+    }
     output::json(&arguments.json, &summary(&scenario, all, &chip))?;
     println!("{} {}", arguments.figure.display(), arguments.json.display());
     Ok(chip.different == 0)
 }
-
-/// Steps whose instructions are counted, by the words of the table and the function in the image.
-const REGIONS: [(&str, &str); 4] = [
-    ("frame to setpoints", "Estimator::ingest_and_steer"),
-    ("steer", "Steer::steer"),
-    ("gains of a plane", "Steer::prepare"),
-    ("reply", "Reply::encode"),
-];
 
 /// What the emulated chip showed.
 #[derive(Debug, Default)]
 struct OnChip {
     frames: usize,
     different: usize,
+    stack_bytes: u32,
     counts: Counts,
 }
 
 impl OnChip {
-    /// Most instructions of each region.
-    fn most(&self) -> Vec<(&'static str, u64)> {
-        let most = |name| self.counts.get(name).and_then(|runs| runs.iter().max()).copied();
-        REGIONS.iter().filter_map(|(word, name)| Some((*word, most(*name)?))).collect()
+    /// Median and most instructions of each region.
+    fn instructions(&self) -> Vec<(&'static str, [u64; 2])> {
+        let of = |name| {
+            let mut runs = self.counts.get(name)?.clone();
+            runs.sort_unstable();
+            Some([*runs.get(runs.len() / 2)?, *runs.last()?])
+        };
+        REGIONS.iter().filter_map(|(word, name)| Some((*word, of(*name)?))).collect()
     }
 }
 
@@ -103,8 +105,9 @@ fn steered_by_the_chip(closed: Loop<'_>, frames: usize) -> Result<(Vec<Sample>, 
     closed.chip = Some(Chip::start(&emulator)?);
     let mut on_chip = OnChip::default();
     let mut samples = (0..frames).map(|_| closed.cycle()).collect::<Result<Vec<_>, _>>()?;
-    if let Some(chip) = closed.chip.take() {
+    if let Some(mut chip) = closed.chip.take() {
         (on_chip.frames, on_chip.different) = (chip.frames, chip.different);
+        on_chip.stack_bytes = chip.status()?.vitals.stack_bytes;
     }
     samples.extend(closed.run()?);
     drop(closed);
@@ -160,6 +163,6 @@ fn summary(scenario: &Scenario, all: [&[Sample]; 3], chip: &OnChip) -> serde_jso
         "stretches": rows.collect::<Vec<_>>(),
         "nees": last.map(|sample| sample.nees),
         "sigma": last.map(|sample| sample.sigma),
-        "chip": {"frames": chip.frames, "different": chip.different, "instructions": chip.most().into_iter().collect::<BTreeMap<_, _>>()},
+        "chip": {"frames": chip.frames, "different": chip.different, "stack_bytes": chip.stack_bytes, "instructions": chip.instructions().into_iter().collect::<BTreeMap<_, _>>()},
     })
 }

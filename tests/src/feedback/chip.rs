@@ -5,7 +5,7 @@ use core::fmt;
 use std::os::unix::net::UnixStream;
 
 use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback};
-use estimator::wire::link::{Form, Short};
+use estimator::wire::link::{Form, Short, Status};
 use estimator::{CurrentCode, Each, Steered};
 use host_bridge::source::link::{Heard, Link, LinkError};
 use inference::stream;
@@ -15,6 +15,15 @@ use super::Known;
 use crate::machine::LAYOUT;
 use crate::qemu::Emulator;
 use crate::sil::bits;
+
+/// Steps whose instructions are counted, by the words of the table and the function in the image.
+pub const REGIONS: [(&str, &str); 5] = [
+    ("frame to setpoints", "ingest_and_steer"),
+    ("estimate", "Estimator::update"),
+    ("steer", "Steer::steer"),
+    ("gains of a plane", "Steer::prepare"),
+    ("reply", "Reply::encode"),
+];
 
 /// A device on the emulated chip.
 pub struct Chip<'e> {
@@ -38,7 +47,7 @@ pub enum Said {
     /// The estimate.
     Full(Box<Heard>),
     /// With setpoints.
-    Short(Short<Setpoints>),
+    Short(Box<Short<Setpoints>>),
 }
 
 impl Said {
@@ -83,7 +92,15 @@ impl<'e> Chip<'e> {
             self.link.form(Form::Short)?;
             self.link.steer(Some(on_wire(feedback)))?;
         }
-        self.link.feedback(sequence, wire).map(Said::Short)
+        self.link.feedback(sequence, wire).map(|short| Said::Short(Box::new(short)))
+    }
+
+    /// How the device is.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn status(&mut self) -> Result<Status, LinkError> {
+        self.link.status()
     }
 
     /// Hold what it said against the core in process, which has heard the same frame.

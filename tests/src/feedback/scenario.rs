@@ -80,6 +80,12 @@ impl Scenario {
         Self { events, ..Self::quiet(seed, 1450) }
     }
 
+    /// A lost beam, and a corrector that sticks while the orbit moves, in a few frames.
+    pub fn of_faults(seed: u64) -> Self {
+        let events = vec![(60, Event::Lost(6)), (80, Event::Sticks(30, 40)), (82, Event::Moves(11, [4e-4, -4e-4]))];
+        Self { campaign: 20, events, ..Self::quiet(seed, 130) }
+    }
+
     /// What a stretch of frames shows: from the first frame with feedback, and from each event on, to the next.
     pub fn stretches(&self) -> Vec<(String, Range<usize>)> {
         let begin = (self.campaign, "feedback is switched on".to_owned());
