@@ -12,7 +12,7 @@ use crate::recording::{At, Recording, Row};
 ///
 /// A supply or a magnet that warms up drifts by 1 % in minutes: 1.5e-4 in the root of a second is 1.2 % in the root of an hour and a
 /// half, and forgets in some minutes what contradicts it. Faster, vars that stay would be known worse than 0.3 %; slower, one that
-/// drifts by 3 % in ten minutes leaves its band. Orbits drift by 0.1 mm an hour: 2e-6 m in the root of a second.
+/// drifts by 3 % in ten minutes leaves its band, as it does in some streams as it is (`docs/drift.md`). Orbits drift by 0.1 mm an hour: 2e-6 m in the root of a second.
 pub const FOLLOW: Walk = Walk { params: 1.5e-4, baselines: 2e-6 };
 
 /// Priors, noise and calibration: [`estimator::Setup`] for a ring of any size.
