@@ -300,10 +300,20 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         estimate: &Estimate<B, N, W>,
     ) {
         self.cycle_time = frame.cycle_time_us;
+        if self.supplies.left_out() > 0 {
+            self.forget_gains();
+        }
         self.supplies.take_over(&frame.corrector);
         self.pattern = 0;
         (self.residual, self.variance, self.pace) = ([0.0; B], [UNKNOWN; B], Pace::STEADY);
         self.believe(feedback, 0.0, &frame.reading, |b| estimate.accepted.has(b));
+    }
+
+    /// Other correctors count from now on: gains that were made without one would give it ten times the kick that it should have.
+    fn forget_gains(&mut self) {
+        self.x.forget();
+        self.y.forget();
+        self.turn = 0;
     }
 
     /// Move the filtered orbit by what the correctors have done, then towards the readings.
@@ -317,7 +327,9 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         seconds: f32,
     ) {
         let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close);
-        if (changed || estimate.linearised) && self.turn > 1 {
+        if changed {
+            self.forget_gains();
+        } else if estimate.linearised && self.turn > 1 {
             self.turn = 0;
         }
         let moved = response.orbit(response.kicks(done));

@@ -17,6 +17,11 @@ impl<const C: usize, const T: usize> Gain<C, T> {
     /// Memory for one, all zero.
     pub const BLANK: Self = Self { inverse: Triangle::ZERO, ready: false };
 
+    /// They are not to be used any more: other correctors count.
+    pub fn forget(&mut self) {
+        self.ready = false;
+    }
+
     /// True once they are made.
     pub fn is_ready(&self) -> bool {
         self.ready

@@ -72,7 +72,7 @@ impl<const C: usize> Supplies<C> {
     }
 
     /// Move each setpoint by so much one way or the other [A], as the `n`-th of a sequence of patterns; 0 is none. The same
-    /// pattern takes it back.
+    /// pattern takes it back; one that the limit has cut, because it began too far out, ends further in.
     #[inline(never)]
     pub fn probe(&mut self, size: f32, n: u32, limit: &Each<C>) {
         for (c, setpoint) in self.setpoint.iter_mut().enumerate().filter(|_| n != 0) {
@@ -83,12 +83,13 @@ impl<const C: usize> Supplies<C> {
         }
     }
 
-    /// Move the setpoints [A], within their limits; returns how many are there.
+    /// Move the setpoints [A], none of them further out than its limit, or than it is already; returns how many are at their limit.
     pub fn change(&mut self, by: &[f32; C], limit: impl Fn(usize) -> f32) -> u16 {
         let mut limited = 0;
         for (c, (setpoint, by)) in self.setpoint.iter_mut().zip(by).enumerate() {
-            let limit = limit(c);
-            *setpoint = moved(*setpoint, by.min(limit - setpoint.value()).max(-limit - setpoint.value()));
+            let (limit, at) = (limit(c), setpoint.value());
+            let edge = limit.max(at.abs());
+            *setpoint = moved(*setpoint, by.min(edge - at).max(-edge - at));
             limited += u16::from(setpoint.steps().abs() >= moved(ZERO, limit).steps());
         }
         limited

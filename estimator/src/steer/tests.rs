@@ -140,6 +140,8 @@ struct Machine {
     /// Over the reference.
     momentum: f32,
     estimate: Estimate<B, 1, 1>,
+    /// Slices of work for the feedback between two frames.
+    slices: u8,
 }
 
 impl Machine {
@@ -157,6 +159,7 @@ impl Machine {
             cycle_time_us: 0,
             momentum: 1.0,
             estimate: estimate(health),
+            slices: TURN,
         };
         assert_eq!(machine.cycle().hold, Some(Hold::Stale));
         machine
@@ -187,7 +190,7 @@ impl Machine {
         };
         let response = Response { surrogate: &self.table, at: &(), kick_per_ampere: &KICK, momentum: self.momentum };
         let steered = self.state.steer(&self.feedback, &response, &frame, &self.estimate);
-        for _ in 0..TURN {
+        for _ in 0..self.slices {
             self.state.prepare(&self.feedback, &response, |_| [self.variance]);
         }
         steered
@@ -475,6 +478,43 @@ fn a_corrector_that_sticks_is_left_out_and_comes_back() {
 }
 
 /// While it is silent its orbit may walk, so that it is believed the more when it comes back.
+/// One slice a frame, as on a device: what was made with other correctors moves nothing.
+#[test]
+fn gains_of_other_correctors_are_not_used() {
+    let mut machine = Machine::new(diagonal(), free(), 0.0);
+    (machine.disturbance, machine.slices) = ([1e-3, 0.0, 0.0, 0.0], 1);
+    let stuck = machine.current[0];
+    let mut holds = std::vec::Vec::new();
+    for frame in 0..30 {
+        let steered = machine.cycle();
+        holds.extend(steered.hold);
+        if frame < 10 {
+            machine.current[0] = stuck;
+        }
+    }
+    // two frames once it is left out, and two when it is back
+    assert_eq!(holds, [Hold::Unprepared; 4]);
+    assert!(machine.orbit().iter().all(|x| x.abs() < ROUNDING), "{:?}", machine.orbit());
+}
+
+/// A feedback that takes over beyond its limit returns at its rate.
+#[test]
+fn a_setpoint_beyond_its_limit_returns_at_its_rate() {
+    let feedback = Feedback { limit: Each::same(20.0), rate: 2.0, ..free() };
+    let mut machine = Machine::new(diagonal(), feedback, 0.0);
+    machine.current =
+        [CurrentCode::nearest(25.0).unwrap(), CurrentCode::default(), CurrentCode::default(), CurrentCode::default()];
+    machine.time_us += 10_000_000;
+    assert_eq!(machine.cycle().hold, Some(Hold::Stale));
+    let amperes: std::vec::Vec<f32> = (0..3)
+        .map(|_| {
+            machine.cycles(1);
+            machine.amperes()[0]
+        })
+        .collect();
+    assert!(amperes.iter().zip([23.0, 21.0, 19.0]).all(|(is, expected)| (is - expected).abs() < 1e-3), "{amperes:?}");
+}
+
 #[test]
 fn a_monitor_that_does_not_report_keeps_its_orbit() {
     let mut machine = Machine::new(diagonal(), Feedback { walk: SLOW, ..free() }, 0.0);
