@@ -3,6 +3,7 @@
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
+use crate::beyond::Beyond;
 use crate::ramp::Ramp;
 use crate::wire::{CurrentCode, Frame};
 
@@ -77,18 +78,6 @@ const KICKS: f32 = 5e-3;
 const STRENGTH: f32 = 0.05;
 /// Largest RF offset: 1 % of momentum.
 const RF_OFFSET: f32 = 1e-3;
-
-/// A drive beyond what the model describes: another machine state, or a wrong read-back.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct Beyond {
-    /// Which part of it.
-    pub what: &'static str,
-    /// Largest magnitude described.
-    pub limit: f32,
-    /// What the frame has.
-    pub got: f32,
-}
 
 impl SupplyCalibration {
     /// A supply without quadrupoles.

@@ -21,8 +21,9 @@ use core::fmt;
 use heapless::Deque;
 use serde::{Deserialize, Serialize};
 
+use crate::beyond::Beyond;
 use crate::campaign::{Campaign, Setting};
-use crate::drive::{Beyond, Calibration, Drive, Each};
+use crate::drive::{Calibration, Drive, Each};
 use crate::estimate::{Estimate, Remarks};
 use crate::following::{self, Following};
 use crate::gaussian::{Gaussian, Independent, Reading, Solution};
@@ -34,9 +35,10 @@ use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
 use crate::wire::{Frame, FrameError, PositionCode};
 
+use anew::Anew;
 pub use anew::Prepared;
-use anew::{Anew, Work};
 pub use laplace::FitQuality;
+use pooling::Work;
 use posterior::Posterior;
 pub use posterior::Walk;
 use reference::Reference;

@@ -8,6 +8,7 @@
 #![no_std]
 #![forbid(unsafe_code)]
 
+mod beyond;
 pub mod booster;
 mod campaign;
 mod drive;
@@ -30,8 +31,9 @@ mod triangle;
 mod tune;
 pub mod wire;
 
+pub use beyond::Beyond;
 pub use campaign::{Campaign, Cell, Setting, Verdict};
-pub use drive::{Beyond, Calibration, Drive, Each, SupplyCalibration};
+pub use drive::{Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
 pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Prepared, Setup, Walk};
 pub use gaussian::{Correlated, Gaussian, Reading, Solution};

@@ -4,7 +4,7 @@
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use crate::drive::Beyond;
+use crate::beyond::Beyond;
 
 /// Most times that a ramp is given at.
 pub const RAMP_POINTS: usize = 8;

@@ -5,7 +5,7 @@
 
 use heapless::Deque;
 
-use super::pooling::{Late, Pooling};
+use super::pooling::{Late, Pooling, Work};
 use super::{Estimator, Model, Tangent};
 use crate::surrogate::{Surrogate, Unstable};
 
@@ -55,16 +55,6 @@ pub(super) struct Anew<
     pub work: Work<P, S, K, N, T>,
     /// Frames that came after what they belong to had been counted.
     pub late: Deque<Late<B, C, F, W>, LATE>,
-}
-
-/// Work space of either step: both are not needed at once.
-#[derive(Debug, Clone)]
-#[allow(clippy::large_enum_variant)] // there is no allocator; and both are large
-pub(super) enum Work<P, const S: usize, const K: usize, const N: usize, const T: usize> {
-    /// All frames so far are counted.
-    Past(Pooling<S, K, N, T>),
-    /// The surrogate is linearised.
-    Surrogate(P),
 }
 
 impl<

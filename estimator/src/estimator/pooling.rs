@@ -1,6 +1,5 @@
 //! All frames so far, counted into a second Gaussian at a new linearisation, a slice at a time.
 
-use super::anew::Work;
 use super::screen::Screened;
 use super::{Estimator, Loose, Model, Tangent, about, follow};
 use crate::drive::Drive;
@@ -40,6 +39,16 @@ impl<const S: usize, const K: usize, const N: usize, const T: usize> Pooling<S, 
         gaussian: Gaussian::BLANK,
         pool: Pool::BLANK,
     };
+}
+
+/// Work space of either step: both are not needed at once.
+#[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant)] // there is no allocator; and both are large
+pub(super) enum Work<P, const S: usize, const K: usize, const N: usize, const T: usize> {
+    /// All frames so far are counted.
+    Past(Pooling<S, K, N, T>),
+    /// The surrogate is linearised.
+    Surrogate(P),
 }
 
 /// A frame that came late.

@@ -5,7 +5,7 @@
 use heapless::Vec;
 
 use super::{Estimator, IngestError, Model};
-use crate::drive::Beyond;
+use crate::beyond::Beyond;
 use crate::ramp::{TIMES, is_same_time, milliseconds};
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;

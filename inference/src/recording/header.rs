@@ -15,7 +15,7 @@ use twin::{Effect, EffectError, EffectKind, Ring};
 use super::error::{Part, Place, RecordingError};
 use super::limit::{POSITIVE, from_milli, in_milli};
 use super::names::{Names, feeds};
-use super::ramp::Ramp;
+use super::ramp::{Nominal, Ramp};
 
 /// What `header.toml` says about the whole campaign.
 #[derive(Debug, Clone, PartialEq)]
@@ -153,7 +153,9 @@ impl Header {
         }
         text.check_machine(&header, ring)?;
         text.check_loop(&header, ring)?;
-        header.ramp = Ramp::of(ring, &header).map_err(|(key, what)| text.refuse_key(key, &what))?;
+        let gradient = |supply, current| header.gradient(supply, current);
+        let nominal = Nominal { dipole: header.nominal_dipole, supply: &header.nominal, gradient: &gradient };
+        header.ramp = Ramp::of(ring, &nominal).map_err(|(key, what)| text.refuse_key(key, &what))?;
         text.check_ramp(&header)?;
         Ok(header)
     }

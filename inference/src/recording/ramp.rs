@@ -2,8 +2,6 @@
 
 use twin::{Hold, Optics, RampPoint, Ring};
 
-use super::header::Header;
-
 /// The ramp; one of no points is a machine that is only looked at where it has its reference momentum.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Ramp {
@@ -26,6 +24,16 @@ pub struct At {
     pub gradient: Vec<f64>,
 }
 
+/// What a header says of the machine at its reference energy.
+pub(super) struct Nominal<'h> {
+    /// Current of the dipoles [A].
+    pub dipole: Option<f64>,
+    /// Current of each supply [A].
+    pub supply: &'h [f64],
+    /// Gradient of a supply's quadrupoles at a current [A], over that at its nominal one.
+    pub gradient: &'h dyn Fn(usize, f64) -> f64,
+}
+
 /// A key of the header, and why its value and the ramp do not go together.
 type Fault = (&'static str, String);
 
@@ -37,7 +45,7 @@ impl Ramp {
     ///
     /// # Errors
     /// What of the header does not go with it.
-    pub(super) fn of(ring: &Ring, header: &Header) -> Result<Self, Fault> {
+    pub(super) fn of(ring: &Ring, nominal: &Nominal<'_>) -> Result<Self, Fault> {
         if ring.ramp.is_empty() {
             return Ok(Self::default());
         }
@@ -46,7 +54,7 @@ impl Ramp {
         let slip = |momentum: f64| compaction - ring.particle.gamma(momentum - 1.0).powi(-2);
         let at = |point: &RampPoint| {
             let momentum = point.momentum(&ring.particle);
-            let (dipole, gradient) = (dipole(point, header)?, gradients(point, ring, header, momentum)?);
+            let (dipole, gradient) = (dipole(point, nominal)?, gradients(point, ring, nominal, momentum)?);
             Ok(At { time: point.time, momentum, dipole, slip: slip(momentum) / slip(1.0), gradient })
         };
         Ok(Self { points: ring.ramp.iter().map(at).collect::<Result<_, _>>()? })
@@ -83,26 +91,26 @@ impl Ramp {
 }
 
 /// Current of the dipoles over that of the header.
-fn dipole(point: &RampPoint, header: &Header) -> Result<f64, Fault> {
-    let Some(nominal) = header.nominal_dipole else { return Ok(1.0) };
+fn dipole(point: &RampPoint, nominal: &Nominal<'_>) -> Result<f64, Fault> {
+    let Some(nominal) = nominal.dipole else { return Ok(1.0) };
     let current = point.dipole.ok_or_else(|| ("nominal_A", format!("has a dipole, the {} has none", point.place())))?;
     Ok(current / nominal)
 }
 
 /// Gradient of each supply over that at the current of the header: the momentum, nearly.
-fn gradients(point: &RampPoint, ring: &Ring, header: &Header, momentum: f64) -> Result<Vec<f64>, Fault> {
+fn gradients(point: &RampPoint, ring: &Ring, nominal: &Nominal<'_>, momentum: f64) -> Result<Vec<f64>, Fault> {
     let of = |(f, supply): (usize, &twin::Supply)| {
         let (name, place) = (&supply.name, point.place());
         let current =
             point.supply.get(name).ok_or_else(|| ("nominal_A", format!("has {name}, the {place} has not")))?;
-        let gradient = header.gradient(f, *current);
+        let gradient = (nominal.gradient)(f, *current);
         if (gradient / momentum - 1.0).abs() <= APART {
             return Ok(gradient);
         }
         let said = format!(
             "{place}: {current} A of {name} make {gradient:.4} of the gradient that {} A make, the momentum is {momentum:.4} of that at \
              kinetic_energy_GeV",
-            header.nominal[f]
+            nominal.supply[f]
         );
         Err(("nominal_A", said))
     };
