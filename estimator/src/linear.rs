@@ -54,10 +54,10 @@ pub fn add_rounded<R: Real>(to: &mut [R], factor: f64, from: &[f64]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to = R::nearest(to.double() + factor * from));
 }
 
-/// `to -= from` of another precision.
+/// `to = a - b`.
 #[inline(never)]
-pub fn subtract<R: Real>(to: &mut [f64], from: &[R]) {
-    to.iter_mut().zip(from).for_each(|(to, from)| *to -= from.double());
+pub fn difference<R: Real>(a: &[f32], b: &[R], to: &mut [f64]) {
+    to.iter_mut().zip(a.iter().zip(b)).for_each(|(to, (a, b))| *to = f64::from(*a) - b.double());
 }
 
 /// `to += sum of factor * row`, four rows at a time.
@@ -144,6 +144,20 @@ pub fn dot<R: Real>(a: &[R], b: &[R]) -> R {
     lanes.into_iter().sum::<R>() + rest
 }
 
+/// `(a - b) . x`, summed in eight lanes; all of one length.
+#[inline(never)]
+pub fn dot_difference(a: &[f32], b: &[f64], x: &[f64]) -> f64 {
+    let ((a, a_rest), (b, b_rest), (x, x_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>(), x.as_chunks::<8>());
+    let mut lanes = [0.0; 8];
+    for (a, (b, x)) in a.iter().zip(b.iter().zip(x)) {
+        for i in 0..8 {
+            lanes[i] += (f64::from(a[i]) - b[i]) * x[i];
+        }
+    }
+    let rest = a_rest.iter().zip(b_rest.iter().zip(x_rest)).map(|(a, (b, x))| (f64::from(*a) - b) * x);
+    lanes.into_iter().sum::<f64>() + rest.sum::<f64>()
+}
+
 /// A matrix of zeros, known to the compiler.
 pub const fn zeros<T: Real, const R: usize, const C: usize>() -> SMatrix<T, R, C> {
     SMatrix::from_array_storage(ArrayStorage([[T::ZERO; R]; C]))
@@ -170,6 +184,11 @@ mod tests {
         let mut sum = [0.5; 3];
         combine(&mut sum, rows.iter().map(|row| (2.0, row.as_slice())));
         assert_eq!(sum, [30.5; 3]);
+        let (b, x): ([f64; 19], [f64; 19]) = ([1.0; 19], core::array::from_fn(|i| if i % 2 == 0 { 2.0 } else { 0.0 }));
+        assert_eq!(dot_difference(&a, &b, &x), 2.0 * (90.0 - 10.0));
+        let mut less = [0.0; 19];
+        difference(&a, &b, &mut less);
+        assert!(less.iter().enumerate().all(|(i, less)| *less == i as f64 - 1.0));
         assert_eq!(column(&a, 5, 2), [10.0, 11.0, 12.0, 13.0, 14.0]);
         assert!(column(&a, 5, 3).is_empty());
     }

@@ -3,7 +3,6 @@
 use super::{Estimator, Model, UNDERWEIGHT};
 use crate::campaign::Setting;
 use crate::estimate::MonitorState;
-use crate::linear::dot;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::quarantine::{Quarantine, Shift};
@@ -116,8 +115,8 @@ impl<
         let each = expected.surprise.iter_mut().zip(&mut expected.certain).zip(&frame.reading).enumerate();
         for (b, ((to, to_certain), reading)) in each.filter(|(b, _)| frame.valid.has(*b)) {
             let channel = self.predicted.first_channel + b;
-            let (d, baseline_variance) = self.posterior.gaussian.effective(channel, self.slope(b));
-            let predicted = self.posterior.gaussian.baseline(channel) + dot(&d, &self.posterior.solution.delta);
+            let (predicted, baseline_variance) =
+                self.posterior.gaussian.expected(channel, self.slope(b), &self.posterior.solution.delta);
             let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
             let certain = f64::from(
                 self.own_variance(model, b, &self.predicted.strength)
@@ -125,8 +124,7 @@ impl<
             ) + baseline_variance;
             let expects = |variance: f64| model.setup.gate.expects(surprise as f32, variance as f32);
             // the uncertainty of the params is only worked out for readings that need it
-            let within =
-                expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.posterior.solution.variance_of(&d));
+            let within = expects(certain) || expects(certain + (1.0 + UNDERWEIGHT) * self.variance_of_params(b));
             (*to, *to_certain) = (surprise as f32, certain as f32);
             expected.within.put(b, within);
         }

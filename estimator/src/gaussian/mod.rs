@@ -24,7 +24,7 @@ mod solution;
 mod staged;
 mod walk;
 
-use crate::linear::{Real, add, add_rounded, dot, subtract};
+use crate::linear::{Real, add, add_rounded, difference, dot, dot_difference};
 use crate::prior::Prior;
 use crate::quarantine::Shift;
 use crate::triangle::Triangle;
@@ -262,9 +262,16 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
     #[inline(never)]
     pub fn effective(&self, b: usize, h: &[f32]) -> ([f64; N], f64) {
         let mut d = [0.0; N];
-        d.iter_mut().zip(h).for_each(|(d, h)| *d = f64::from(*h));
-        self.slope.get(b).into_iter().for_each(|slope| subtract(&mut d, slope));
+        self.slope.get(b).into_iter().for_each(|slope| difference(h, slope, &mut d));
         (d, self.covariance.variance(b))
+    }
+}
+
+impl<const B: usize, const N: usize, const T: usize, const U: usize> Gaussian<B, N, T, Correlated<B, U>> {
+    /// Innovation that is expected of a reading of derivative `h` at params off the origin, and the variance of its baseline.
+    pub fn expected(&self, b: usize, h: &[f32], delta: &[f64; N]) -> (f64, f64) {
+        let along = self.slope.get(b).map_or(0.0, |slope| dot_difference(h, slope, delta));
+        (self.baseline(b) + along, self.covariance.variance(b))
     }
 }
 
