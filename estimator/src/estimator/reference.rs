@@ -140,16 +140,14 @@ impl<
         true
     }
 
-    /// Median of the recent kicks of a corrector: that which as many exceed as fall short of.
+    /// Median of the recent kicks of a corrector, whatever share of them is the same: the mean of the smallest that half of them do not
+    /// exceed, and of the largest that half of them do not fall short of.
     fn median_kick(&self, c: usize) -> f32 {
-        let kick =
-            |at: usize| self.past.recent.get(at).and_then(|frame| frame.drive.kick.get(c)).copied().unwrap_or(0.0);
-        let all = 0..self.past.recent.len();
-        let rank = |value: f32| all.clone().filter(|&at| kick(at) < value).count();
-        let half = all.len() / 2;
-        let above = all.clone().map(kick).filter(|&value| rank(value) >= half);
-        let below = all.clone().map(kick).filter(|&value| rank(value) <= half);
-        0.5 * (above.fold(f32::MAX, f32::min) + below.fold(f32::MIN, f32::max))
+        let kicks = || self.past.recent.iter().filter_map(|frame| frame.drive.kick.get(c)).copied();
+        let half = self.past.recent.len() / 2;
+        let low = kicks().filter(|value| kicks().filter(|kick| kick <= value).count() >= half);
+        let high = kicks().filter(|value| kicks().filter(|kick| kick >= value).count() >= half);
+        0.5 * (low.fold(f32::MAX, f32::min) + high.fold(f32::MIN, f32::max))
     }
 
     /// True if at most one corrector is moved from the reference in a recent frame.
