@@ -56,6 +56,7 @@ fn main() -> ! {
         ..Vitals::default()
     };
     defmt::info!("orbitcal device, tables {=u32:08x}, waiting for its setup", BUILT_IN.digest::<LINE>());
-    let ended = firmware_sim::run::<_, _, _, _, LINE, PACKET>(&mut device, &mut source, &mut sender, &mut panel, vitals);
+    let ended =
+        firmware_sim::run::<_, _, _, _, LINE, PACKET>(&mut device, &mut source, &mut sender, &mut panel, vitals);
     panic!("the UART has ended: {}", ended.is_ok())
 }
