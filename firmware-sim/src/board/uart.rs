@@ -17,8 +17,8 @@ use super::registers::{NVIC_ISER0, UART0_BAUDDIV, UART0_CTRL, UART0_DATA, UART0_
 
 /// Room for received bytes [B].
 ///
-/// Between two packets the main loop takes none while it updates (1.9 ms at 480 MHz and one instruction a cycle), sends the
-/// estimate (15 ms at 921,600 baud) and ends a slice of its work between frames (1.5 ms): 18 ms, and 55 ms more if it sends
+/// Between two packets the main loop takes none while it updates (2.4 ms at 400 MHz and one instruction a cycle), sends the
+/// estimate (15 ms at 921,600 baud) and ends a slice of its work between frames (3.7 ms): 21 ms, and 55 ms more if it sends
 /// a covariance. A sender without pauses fills this in 44 ms; what it sends then is lost, and counted. A front end that
 /// sends a frame of 260 bytes a cycle, and some requests, is far from that.
 const QUEUE: usize = 4096;
