@@ -162,16 +162,12 @@ impl<L, const F: usize> Tangent<L, F> {
         let (predicted, _) = model.surrogate.tune(&self.linearised, plane, &less(strength, &self.supplies));
         wrapped(tune - predicted)
     }
-}
 
-impl<L, const F: usize> Tangent<L, F> {
     /// Memory for one.
     const fn blank(unlinearised: L) -> Self {
         Self { linearised: unlinearised, supplies: [0.0; F], ripple: [[0.0; F]; 2], chromatic: [0.0; 2], is_new: false }
     }
-}
 
-impl<L, const F: usize> Tangent<L, F> {
     /// Work out how orbits follow the gradients there.
     fn follow<const B: usize, const C: usize, const N: usize>(
         &mut self,
@@ -668,11 +664,7 @@ impl<
             slope: column(self.predicted.prediction.jacobian.as_slice(), N, b),
         });
         let Posterior { gaussian, solution, .. } = &mut self.posterior;
-        if linearised_once {
-            gaussian.condition(readings, &underweighted(solution));
-        } else {
-            gaussian.condition(readings, &|_| 0.0);
-        }
+        gaussian.condition(readings, &underweighted(solution, linearised_once));
         self.condition_tunes(model, screened);
         // readings confirmed late or outvoted are counted when the past is weighted anew
         self.past.stale |= !screened.confirmed.is_empty() || !screened.restarted.is_empty();
@@ -702,11 +694,7 @@ impl<
                 let (_, slope) = model.surrogate.tune(&self.tangent.linearised, plane, &[0.0; F]);
                 let reading = Reading { channel: K - 2 + plane, innovation: *innovation, variance, slope: &slope };
                 let Posterior { gaussian, solution, .. } = &mut self.posterior;
-                if linearised_once {
-                    gaussian.condition([reading], &underweighted(solution));
-                } else {
-                    gaussian.condition([reading], &|_| 0.0);
-                }
+                gaussian.condition([reading], &underweighted(solution, linearised_once));
             }
         }
     }
@@ -743,7 +731,7 @@ impl<
         let drive = about(&frame.drive, &self.tangent.supplies);
         let variances: [f32; B] = core::array::from_fn(|b| self.variance_at(model, &self.tangent, b, &drive));
         let readings = frame.readings(&variances, &self.predicted.prediction);
-        self.past.loose.condition(readings, &underweighted(&self.posterior.solution));
+        self.past.loose.condition(readings, &underweighted(&self.posterior.solution, true));
     }
 
     fn solve(&mut self, model: &Model<'_, G, B, C, F>) {
@@ -828,11 +816,12 @@ impl<
 }
 
 /// What the uncertain linearisation adds to the variance of a reading, for a derivative of its difference from the baseline; nothing
-/// once all params are certain enough.
+/// where it can be linearised anew, and once all params are certain enough.
 fn underweighted<const N: usize, const T: usize, const W: usize>(
     solution: &Solution<N, T, W>,
+    linearised_once: bool,
 ) -> impl Fn(&[f64; N]) -> f64 {
-    let is_loose = solution.sigma.iter().any(|sigma| *sigma > CERTAIN);
+    let is_loose = linearised_once && solution.sigma.iter().any(|sigma| *sigma > CERTAIN);
     move |d| if is_loose { UNDERWEIGHT * solution.variance_of(d) } else { 0.0 }
 }
 

@@ -133,7 +133,7 @@ impl<
                 let slope = column(self.predicted.prediction.jacobian.as_slice(), N, b);
                 let innovation = mean - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0);
                 let reading = Reading { channel: first_channel + b, innovation, variance, slope };
-                self.past.loose.condition([reading], &underweighted(&self.posterior.solution));
+                self.past.loose.condition([reading], &underweighted(&self.posterior.solution, true));
                 self.past.loose.add_repeats(number, self.noise_variance(b));
             }
         }
