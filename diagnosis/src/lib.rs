@@ -18,6 +18,7 @@ pub mod fit;
 pub mod heldout;
 pub mod hypothesis;
 pub mod location;
+pub mod ordinary;
 pub mod page;
 pub mod place_scan;
 pub mod sample;
@@ -82,7 +83,8 @@ impl Diagnosis {
         let data = &found.data;
         progress("held-out frames");
         let folds = heldout::by_repeat(&campaign.settings);
-        let before = Score::of(data, &found.null, &folds)?;
+        let bare = if found.competitions.is_empty() { found.null.clone() } else { heldout::bare(data, &found.best)? };
+        let before = Score::of(data, &bare, &folds)?;
         let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
         let gains = verdict::gains(data, &found, &before, &after, &folds)?;
         let verdict = Verdict::of(&found, &gains);
@@ -93,7 +95,7 @@ impl Diagnosis {
         let folds = heldout::by_corrector(recording);
         let correctors = if whole && !folds.is_empty() {
             let scored = |fitted| Score::of(data, fitted, &folds).ok();
-            scored(&found.null).zip(scored(&found.best))
+            scored(&bare).zip(scored(&found.best))
         } else {
             None
         };

@@ -7,6 +7,7 @@ use comfy_table::ColumnConstraint;
 use diagnosis::average::Vars;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
+use diagnosis::ordinary;
 use diagnosis::{Diagnosis, Finding, page};
 use inference::Recording;
 use serde::Serialize;
@@ -35,8 +36,8 @@ struct DiagnosisResult {
     next_measurement: Option<String>,
     /// Probability that nothing (more) is missing, that an effect of the library is, and that something else is.
     probabilities: Probabilities,
-    /// Ordinary scatter of families that the fits include.
-    scatter: Vec<ScatterResult>,
+    /// Ordinary imperfections of the machine.
+    imperfections: Vec<Imperfection>,
 }
 
 #[derive(Debug, Serialize)]
@@ -92,9 +93,24 @@ struct Probabilities {
 }
 
 #[derive(Debug, Serialize)]
-struct ScatterResult {
+struct Imperfection {
     kind: &'static str,
-    width: f64,
+    at: &'static str,
+    /// What the members have in common, in the unit.
+    mean: f64,
+    /// Rms of the members about it.
+    scatter: f64,
+    /// Standard deviation of whichever of the two is not 0.
+    sigma: f64,
+    unit: &'static str,
+}
+
+impl From<&ordinary::Size> for Imperfection {
+    fn from(size: &ordinary::Size) -> Self {
+        let kind = size.family.kind;
+        let (mean, scatter) = if size.family.is_learnt() { (0.0, size.value) } else { (size.value, 0.0) };
+        Self { kind: kind.word(), at: size.family.place(), mean, scatter, sigma: size.sigma, unit: kind.unit().symbol }
+    }
 }
 
 impl From<DataError> for CommandError {
@@ -195,9 +211,7 @@ impl DiagnosisResult {
                 library: next.library(),
                 unknown: next.unknown(),
             },
-            scatter: (found.null.hypothesis.scatter.iter())
-                .map(|scatter| ScatterResult { kind: scatter.kind.word(), width: scatter.width })
-                .collect(),
+            imperfections: ordinary::sizes(&found.data, &found.best).iter().map(Into::into).collect(),
         })
     }
 }
