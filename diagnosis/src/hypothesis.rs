@@ -108,6 +108,11 @@ impl Hypothesis {
         Self { ordinary: Family::all(), ..Self::default() }
     }
 
+    /// The same with room for what a recording cannot show.
+    pub fn unseen(&self) -> Self {
+        Self { ordinary: self.ordinary.iter().map(Family::unseen).collect(), ..self.clone() }
+    }
+
     /// One more effect.
     pub fn with(&self, term: Term) -> Self {
         let mut more = self.clone();

@@ -103,7 +103,7 @@ impl Diagnosis {
         // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let sentence = verdict::sentence(data, &found, verdict, &findings);
-        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
+        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
         Ok(Self {
             found,
             verdict,

@@ -259,6 +259,7 @@ impl Search {
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
+        relearn(data, fitted, &mut weights);
         for discrepancy in discrepancy::scan(data, fitted)? {
             let prior = (UNMODELLED * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
@@ -329,9 +330,20 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
     };
-    let worth = refitted.log_evidence - fitted.log_evidence > WORTH;
-    let refitted = if worth { relearnt(data, refitted) } else { refitted };
     Alternative::exact(data, fitted, refitted, last)
+}
+
+/// Refit the best of some weighted candidates with the ordinary widths that the recording shows beside each.
+fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
+    let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
+    let is_near = |(one, weight): &&mut (Alternative, f64)| *weight > best - BEHIND && one.log_gain > WORTH;
+    for (alternative, weight) in weights.iter_mut().filter(is_near) {
+        let Some(fitted) = alternative.fitted.take() else { continue };
+        let last = fitted.hypothesis.terms.len() - 1;
+        let again = Alternative::exact(data, without, relearnt(data, fitted), last);
+        *weight += again.log_gain - alternative.log_gain;
+        *alternative = again;
+    }
 }
 
 /// The same fit with the ordinary widths that the recording then shows, if it is the better. What makes a fit poor is not ordinary.
