@@ -233,6 +233,7 @@ impl Fitted {
     pub fn slopes(&self, data: &Data) -> Result<Vec<DMatrix<f64>>, EffectError> {
         let vars = self.params.len();
         let (machine, drives) = self.machine(data)?;
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
         let by_frame = |signature: Signature, scale: f64| signature.by_frame(&drives.time) * scale;
         let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
@@ -301,6 +302,7 @@ impl<'d> Problem<'d> {
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
         let (machine, drives) = self.machine(u)?;
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
         let mut jacobian = DMatrix::zeros(data.size(), self.size());
         for (i, signature) in signatures.of_vars().iter().enumerate() {

@@ -140,6 +140,7 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let projection = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
@@ -195,6 +196,7 @@ pub fn separations(
     others: &[&Term],
 ) -> Result<Vec<f64>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let data = fitted.data(data);
     let columns: Vec<DVector<f64>> =
@@ -222,6 +224,7 @@ fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
 /// [`FitError`].
 pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let columns: Vec<DVector<f64>> = members
         .iter()
