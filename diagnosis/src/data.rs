@@ -18,6 +18,7 @@ use super::baseline::Baseline;
 use super::error::FitError;
 use super::evidence::Units;
 use super::settings::Settings;
+use super::wiring::Miswired;
 use inference::campaign::chi_square;
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
@@ -98,6 +99,14 @@ pub enum DataError {
         /// The times.
         found: String,
     },
+    /// Columns that are not what the header says.
+    #[error("{recording}: frames.csv: {wiring}")]
+    Miswired {
+        /// The recording.
+        recording: String,
+        /// What they look like.
+        wiring: Miswired,
+    },
     /// An effect that is not defined for this ring.
     #[error(transparent)]
     Effect(#[from] EffectError),
@@ -170,7 +179,7 @@ impl Data {
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let higher = self.higher_orders(machine)?;
-        let slopes = Signatures::of(machine, &self.drives)?.of_quadrupoles();
+        let slopes = Signatures::of(&machine.on_orbit(&self.drives.orbit), &self.drives)?.of_quadrupoles();
         let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
             let Some(supply) = quadrupole.supply else { continue };

@@ -100,6 +100,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let (machine, drives) = fitted.machine(data)?;
     let predicted = fitted.predicted(data)?;
     let miss = data.miss(&predicted);
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let mut all = Vec::new();
     for &b in &active {

@@ -265,6 +265,7 @@ impl Fitted {
     pub fn slopes(&self, data: &Data) -> Result<Vec<Signature>, EffectError> {
         let vars = self.params.len();
         let (machine, drives) = self.machine(data)?;
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
         let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
         let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
@@ -340,6 +341,7 @@ impl<'d> Problem<'d> {
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
         let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
         let mut jacobian = DMatrix::zeros(data.size(), self.others());
         for (i, signature) in signatures.of_vars().iter().enumerate() {
@@ -365,7 +367,8 @@ impl Ordinary {
         (machine, drives): (&Machine, &Drives),
         start: DVector<f64>,
     ) -> Result<Self, EffectError> {
-        let signatures = Signatures::of(machine, drives)?;
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, drives)?;
         let mut slopes = DMatrix::zeros(data.size(), unknowns.len());
         for (mut column, unknown) in slopes.column_iter_mut().zip(unknowns) {
             if let Unknown::Ordinary(terms, width) = unknown {

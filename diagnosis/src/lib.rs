@@ -1,7 +1,8 @@
 //! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
 //! better.
 //!
-//! [`Diagnosis::of`] is the path from top to bottom: the recording is whitened ([`data`]), fitted by the exact twin without any
+//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]); the recording is
+//! whitened ([`data`]), fitted by the exact twin without any
 //! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]), and so is an unmodelled discrepancy
 //! ([`discrepancy`]); the leading candidates are refitted and compete ([`search`]); what is found has to predict frames that it was
 //! not fitted to ([`heldout`]); [`verdict`] puts the result into one word and one sentence.
@@ -28,7 +29,10 @@ pub mod search;
 pub mod settings;
 pub mod validation;
 pub mod verdict;
+pub mod wiring;
 
+#[cfg(test)]
+mod forward;
 #[cfg(test)]
 mod testing;
 
@@ -42,6 +46,7 @@ use inference::Campaign;
 use inference::recording::Recording;
 use search::{Found, Search};
 pub use verdict::{Finding, Verdict};
+use wiring::Miswired;
 
 /// What is missing in the model of a recording.
 #[derive(Debug, Clone)]
@@ -75,6 +80,9 @@ impl Diagnosis {
     /// [`DataError`].
     pub fn of(ring: &Ring, recording: &Recording, mut progress: impl FnMut(&str)) -> Result<Self, DataError> {
         progress("reading");
+        if let Some(wiring) = Miswired::of(ring, recording)? {
+            return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
+        }
         let campaign = Campaign::of(ring, recording)?;
         let data = Data::of(&campaign)?;
         let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());

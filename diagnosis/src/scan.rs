@@ -135,6 +135,7 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let projection = Projection::of(fitted);
     let mut all = Vec::with_capacity(terms.len());
@@ -190,6 +191,7 @@ pub fn separations(
     others: &[&Term],
 ) -> Result<Vec<f64>, FitError> {
     let (machine, drives) = fitted.machine(data)?;
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let data = fitted.data(data);
     let columns: Vec<DVector<f64>> =

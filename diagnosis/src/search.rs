@@ -338,9 +338,11 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
     let is_near = |(one, weight): &&mut (Alternative, f64)| *weight > best - BEHIND && one.log_gain > WORTH;
     for (alternative, weight) in weights.iter_mut().filter(is_near) {
-        let Some(fitted) = alternative.fitted.take() else { continue };
-        let last = fitted.hypothesis.terms.len() - 1;
-        let again = Alternative::exact(data, without, relearnt(data, fitted), last);
+        let place = |fitted: &Fitted| fitted.hypothesis.terms.iter().position(|term| Some(term) == alternative.term());
+        let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {
+            continue;
+        };
+        let again = Alternative::exact(data, without, relearnt(data, fitted), term);
         *weight += again.log_gain - alternative.log_gain;
         *alternative = again;
     }

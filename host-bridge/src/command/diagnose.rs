@@ -116,7 +116,7 @@ impl From<&ordinary::Size> for Imperfection {
 impl From<DataError> for CommandError {
     fn from(error: DataError) -> Self {
         match error {
-            error @ DataError::TooLittle { .. } => Self::Input(error.to_string()),
+            error @ (DataError::TooLittle { .. } | DataError::Miswired { .. }) => Self::Input(error.to_string()),
             error => Self::Other(error.to_string()),
         }
     }
