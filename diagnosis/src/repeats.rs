@@ -1,0 +1,195 @@
+//! Readings that repeat a setting, and how likely they are for noise with a memory.
+//!
+//! What a setting changes, by the physics that the model holds or by any other, is the same in all its frames. A monitor's readings
+//! less their prediction are therefore
+//!
+//! `r_k = baseline + change of the setting + noise_k`,
+//!
+//! with an unknown change of each run of frames in one setting, but for the setting that comes back most, as a rule all correctors at
+//! 0 A: its frames are repeats of each other at all distances. Baseline and changes are diffuse states beside those of [`Memory`], so
+//! that the density is that of the differences within settings, and no missing physics of a setting enters it. The noise's scale is
+//! taken out in closed form.
+//!
+//! Source: J. Durbin and S. J. Koopman, Time Series Analysis by State Space Methods (2012), ch. 5 and 7.2, the diffuse likelihood, which
+//! is that of H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545, for contrasts.
+
+use super::memory::Memory;
+
+/// A monitor's readings less their prediction, in frames that count.
+#[derive(Debug, Clone)]
+pub struct Repeats {
+    readings: Vec<Repeat>,
+}
+
+/// One of them.
+#[derive(Debug, Clone, Copy)]
+struct Repeat {
+    frame: usize,
+    /// [m]
+    value: f64,
+    run: Run,
+}
+
+/// How a frame's setting goes on from the frame before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Run {
+    /// The setting that comes back most.
+    Base,
+    /// Another setting.
+    New,
+    /// The same setting as in the frame before.
+    Same,
+}
+
+/// What some readings say of a memory.
+#[derive(Debug, Clone, Default)]
+pub struct Weighed {
+    /// Differences, as many as there are readings less baseline and settings.
+    pub count: usize,
+    /// Sum of their squares over their variances in units of the noise's [m^2].
+    pub square: f64,
+    /// Sum of `ln` of these variances.
+    pub log_det: f64,
+}
+
+/// Variance of a diffuse state, in noise variances, and that above which a reading has told of nothing else: baselines are some thousand
+/// sigma, and rounding spoils a filter at 1e12.
+const DIFFUSE: f64 = 1e8;
+const TELLING: f64 = 1e4;
+
+/// The states of the filter: slow noise, walk with the baseline, and the change of the setting; lower half of their covariance.
+struct State {
+    mean: [f64; 3],
+    covariance: [[f64; 3]; 3],
+}
+
+impl Run {
+    /// Of every frame, from the setting of each.
+    pub fn of(settings: &[Option<usize>]) -> Vec<Self> {
+        let mut count = std::collections::BTreeMap::<usize, usize>::new();
+        settings.iter().flatten().for_each(|setting| *count.entry(*setting).or_default() += 1);
+        let base = count.into_iter().max_by_key(|(_, frames)| *frames).map(|(setting, _)| setting);
+        let of = |i: usize| match settings[i] {
+            None => Self::New,
+            setting if setting == base => Self::Base,
+            setting if i > 0 && settings[i - 1] == setting => Self::Same,
+            Some(_) => Self::New,
+        };
+        (0..settings.len()).map(of).collect()
+    }
+}
+
+impl Repeats {
+    /// From the frames that count, in rising order, and their readings less predictions [m].
+    pub fn of(frames: &[usize], values: &[f64], runs: &[Run]) -> Self {
+        let first = values.first().copied().unwrap_or(0.0);
+        let mut readings: Vec<Repeat> = Vec::new();
+        for (&frame, &value) in frames.iter().zip(values) {
+            // the first frame of a run may be missing
+            let since = readings.last().map_or(0, |last| last.frame + 1);
+            let begins = runs[since..=frame].iter().any(|run| *run != Run::Same) || readings.is_empty();
+            let run = if runs[frame] == Run::Same && begins { Run::New } else { runs[frame] };
+            readings.push(Repeat { frame, value: value - first, run });
+        }
+        Self { readings }
+    }
+
+    /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none without any.
+    pub fn of_neighbours(&self) -> Option<f64> {
+        let repeated = |pair: &&[Repeat]| {
+            let [one, other] = [pair[0], pair[1]];
+            other.frame == one.frame + 1
+                && (other.run == Run::Same || (one.run == Run::Base && other.run == Run::Base))
+        };
+        let squares: Vec<f64> =
+            self.readings.windows(2).filter(repeated).map(|pair| (pair[1].value - pair[0].value).powi(2)).collect();
+        (!squares.is_empty()).then(|| (0.5 * squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
+    }
+
+    /// Number of readings.
+    pub fn len(&self) -> usize {
+        self.readings.len()
+    }
+
+    /// Each difference, with its frame: `(innovation, variance)`, the latter in units of the noise's.
+    pub fn differences(&self, memory: Memory) -> impl Iterator<Item = (usize, f64, f64)> {
+        let mut state = State::new(memory);
+        let mut at = self.readings.first().map_or(0, |first| first.frame);
+        self.readings.iter().filter_map(move |reading| {
+            state.carry(memory, reading.frame - at);
+            at = reading.frame;
+            let (innovation, variance) = state.take(memory, reading);
+            (variance < TELLING).then_some((reading.frame, innovation, variance))
+        })
+    }
+
+    /// What they say of a memory.
+    pub fn weigh(&self, memory: Memory) -> Weighed {
+        let mut weighed = Weighed::default();
+        for (_, innovation, variance) in self.differences(memory) {
+            weighed.count += 1;
+            weighed.square += innovation * innovation / variance;
+            weighed.log_det += variance.ln();
+        }
+        weighed
+    }
+}
+
+impl Weighed {
+    /// `ln` likelihood at the most likely scale of the noise, up to a constant.
+    pub fn log_likelihood(&self) -> f64 {
+        let n = self.count as f64;
+        -0.5 * (n * (self.square / n.max(1.0)).max(f64::MIN_POSITIVE).ln() + self.log_det)
+    }
+
+    /// Most likely standard deviation of the noise [m]; none without differences.
+    pub fn sigma(&self) -> Option<f64> {
+        (self.count > 0).then(|| (self.square / self.count as f64).sqrt())
+    }
+}
+
+impl State {
+    fn new(memory: Memory) -> Self {
+        Self { mean: [0.0; 3], covariance: [[memory.share, 0.0, 0.0], [0.0, DIFFUSE, 0.0], [0.0, 0.0, 0.0]] }
+    }
+
+    /// Some frames later.
+    fn carry(&mut self, memory: Memory, frames: usize) {
+        if frames == 0 {
+            return;
+        }
+        let decay = memory.decay(frames);
+        self.mean[0] *= decay;
+        let [slow, walk, change] = &mut self.covariance;
+        slow[0] = slow[0] * decay * decay + memory.share * (1.0 - decay * decay);
+        walk[0] *= decay;
+        walk[1] += memory.steps * memory.steps * frames as f64;
+        change[0] *= decay;
+    }
+
+    /// Innovation of a reading and its variance; learn from it.
+    fn take(&mut self, memory: Memory, reading: &Repeat) -> (f64, f64) {
+        if reading.run == Run::New {
+            self.mean[2] = 0.0;
+            self.covariance[2] = [0.0, 0.0, DIFFUSE];
+        }
+        let c = &mut self.covariance;
+        let states = if reading.run == Run::Base { 2 } else { 3 };
+        let mut seen = [c[0][0] + c[1][0], c[1][0] + c[1][1], 0.0];
+        let mut expected = self.mean[0] + self.mean[1];
+        if states == 3 {
+            seen = [seen[0] + c[2][0], seen[1] + c[2][1], c[2][0] + c[2][1] + c[2][2]];
+            expected += self.mean[2];
+        }
+        let variance = seen[..states].iter().sum::<f64>() + 1.0 - memory.share;
+        let innovation = reading.value - expected;
+        for i in 0..states {
+            let gain = seen[i] / variance;
+            self.mean[i] += gain * innovation;
+            for j in 0..=i {
+                c[i][j] -= gain * seen[j];
+            }
+        }
+        (innovation, variance)
+    }
+}
