@@ -17,7 +17,10 @@
 
 use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, DVectorView, RowVector2, Vector2};
-use twin::{Cycle, Drives, Effect, EffectError, Hold, Machine, Optics, OrbitError, Rf, Ring, Signature, Signatures, Tracked, Tunes};
+use twin::{
+    Cycle, Drives, Effect, EffectError, Hold, Machine, Optics, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
+    Tunes,
+};
 
 use super::baseline::Baseline;
 use super::error::FitError;
@@ -428,7 +431,9 @@ impl Data {
         }
         let starts: Vec<usize> = (0..self.channels.len()).map(|b| self.start(b)).collect();
         let places = || {
-            let of = |(b, channel): (usize, &Channel)| channel.frames.iter().enumerate().map(move |(i, &frame)| (i, frame, b)).collect::<Vec<_>>();
+            let of = |(b, channel): (usize, &Channel)| {
+                channel.frames.iter().enumerate().map(move |(i, &frame)| (i, frame, b)).collect::<Vec<_>>()
+            };
             self.channels.iter().enumerate().flat_map(of)
         };
         for mut column in back.column_iter_mut() {

@@ -330,16 +330,11 @@ fn weighted(data: &Data, sums: &[Sums], monitors: &[usize], pattern: &DVector<f6
 }
 
 /// One amplitude for each pattern over the monitors (one a column), in proportion to `setting`.
-fn patterned(
-    data: &Data,
-    sums: &[Sums],
-    monitors: &[usize],
-    setting: &DVector<f64>,
-    patterns: &DMatrix<f64>,
-) -> Sums {
+fn patterned(data: &Data, sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
     let mut sum = Sums::none(patterns.ncols(), sums[monitors[0]].cross.ncols());
     let mut all = patterns.clone();
-    all.column_iter_mut().for_each(|mut pattern| pattern.copy_from(&data.accompanied(monitors, &pattern.clone_owned())));
+    all.column_iter_mut()
+        .for_each(|mut pattern| pattern.copy_from(&data.accompanied(monitors, &pattern.clone_owned())));
     for &b in monitors {
         let seen = patterns.row(b).transpose();
         let both = (&seen * all.row(b) + all.row(b).transpose() * seen.transpose()) * 0.5;
@@ -395,11 +390,7 @@ impl Data {
         monitors.iter().for_each(|&b| readings.set_column(b, &(signature.readings.column(b) / rms)));
         let columns: Vec<DVector<f64>> = stretches.column_iter().map(|step| self.stepping(&readings, &step)).collect();
         let back = DMatrix::from_columns(&columns).transpose();
-        Sums {
-            gram: &back * back.transpose(),
-            cross: &back * &fitted.jacobian,
-            pull: back * &fitted.residual,
-        }
+        Sums { gram: &back * back.transpose(), cross: &back * &fitted.jacobian, pull: back * &fitted.residual }
     }
 }
 

@@ -164,8 +164,8 @@ impl Expectation {
         let Column { kept, out, sigma, memory, .. } = column;
         let origin = kept.iter().chain(out).copied().min().unwrap_or(0);
         let remembers = !memory.is_none();
-        let known = remembers
-            .then(|| (Filter::of(*memory, origin, kept), Interpolation::of(*memory, origin, kept, out)));
+        let known =
+            remembers.then(|| (Filter::of(*memory, origin, kept), Interpolation::of(*memory, origin, kept, out)));
         let variances = known.as_ref().map_or_else(|| vec![1.0; out.len()], |(_, at)| at.variances(*memory));
         Self { sigma: *sigma, known, variances }
     }

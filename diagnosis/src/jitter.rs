@@ -151,6 +151,7 @@ fn strength(correlation: &DMatrix<f64>, groups: &[Vec<usize>]) -> f64 {
         let group = group.clone();
         (0..group.len()).flat_map(move |i| (0..i).map(|j| (group[i], group[j])).collect::<Vec<_>>()).collect::<Vec<_>>()
     };
-    let all: Vec<f64> = groups.iter().flat_map(|group| pairs(group)).map(|(b, other)| correlation[(b, other)]).collect();
+    let all: Vec<f64> =
+        groups.iter().flat_map(|group| pairs(group)).map(|(b, other)| correlation[(b, other)]).collect();
     all.iter().sum::<f64>() / (all.len().max(1) as f64).sqrt()
 }

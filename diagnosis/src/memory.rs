@@ -77,9 +77,7 @@ impl Memory {
     /// Covariance of the noise in two frames, the walk counted from frame 0.
     pub fn covariance(self, one: usize, other: usize) -> f64 {
         let white = if one == other { 1.0 - self.share } else { 0.0 };
-        white
-            + self.share * self.decay(one.abs_diff(other))
-            + self.steps * self.steps * one.min(other) as f64
+        white + self.share * self.decay(one.abs_diff(other)) + self.steps * self.steps * one.min(other) as f64
     }
 
     /// Covariance of the states, some frames later.
@@ -115,8 +113,10 @@ impl Belief {
 impl Filter {
     /// Over some frames in rising order, the walk counted from `origin`.
     pub fn of(memory: Memory, origin: usize, frames: &[usize]) -> Self {
-        let step = |belief: Belief| {
-            Step { decay: belief.carried[(0, 0)], gain: belief.gain().into(), root: belief.variance.sqrt() }
+        let step = |belief: Belief| Step {
+            decay: belief.carried[(0, 0)],
+            gain: belief.gain().into(),
+            root: belief.variance.sqrt(),
         };
         Self { steps: memory.beliefs(origin, frames, &vec![true; frames.len()]).into_iter().map(step).collect() }
     }
@@ -201,5 +201,71 @@ impl Interpolation {
         }
         let left = smoothed.iter().zip(&self.kept).filter(|(_, kept)| !**kept);
         left.map(|(covariance, _)| covariance.sum() + 1.0 - memory.share).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DVector;
+
+    use super::*;
+
+    const SLOW_AND_WALKING: Memory = Memory { share: 0.3, time: 7.0, steps: 0.05 };
+    /// Frames with gaps.
+    const FRAMES: [usize; 9] = [3, 4, 5, 9, 10, 17, 18, 30, 31];
+
+    fn dense(memory: Memory, origin: usize, rows: &[usize], columns: &[usize]) -> DMatrix<f64> {
+        let at = |i: usize, j: usize| memory.covariance(rows[i] - origin, columns[j] - origin);
+        DMatrix::from_fn(rows.len(), columns.len(), at)
+    }
+
+    fn some_noise(n: usize) -> DVector<f64> {
+        DVector::from_fn(n, |i, _| (1.3 * (i * i) as f64 + 0.4).sin() * 2.0)
+    }
+
+    #[test]
+    fn the_filter_whitens_as_the_cholesky_factor_of_the_covariance_does() {
+        for memory in
+            [SLOW_AND_WALKING, Memory { steps: 0.0, ..SLOW_AND_WALKING }, Memory { share: 0.0, ..SLOW_AND_WALKING }]
+        {
+            let factor = dense(memory, 2, &FRAMES, &FRAMES).cholesky().unwrap();
+            let noise = some_noise(FRAMES.len());
+            let expected = factor.l().solve_lower_triangular(&noise).unwrap();
+            let filter = Filter::of(memory, 2, &FRAMES);
+            let mut found = noise;
+            filter.whiten(found.iter_mut());
+            assert!((found - expected).amax() < 1e-12, "rounding");
+            assert!((filter.log_det() - factor.determinant().ln()).abs() < 1e-12, "rounding");
+        }
+    }
+
+    #[test]
+    fn white_noise_stays_as_it_is_to_the_bit() {
+        let noise = some_noise(FRAMES.len());
+        let filter = Filter::of(Memory::NONE, 0, &FRAMES);
+        let mut found = noise.clone();
+        filter.whiten(found.iter_mut());
+        assert_eq!((found, filter.log_det()), (noise, 0.0));
+    }
+
+    #[test]
+    fn what_is_expected_of_left_out_frames_is_the_conditional_of_the_covariance() {
+        let out = [4, 10, 17, 31];
+        let kept: Vec<usize> = FRAMES.into_iter().filter(|frame| !out.contains(frame)).collect();
+        for memory in
+            [SLOW_AND_WALKING, Memory { steps: 0.0, ..SLOW_AND_WALKING }, Memory { share: 0.0, ..SLOW_AND_WALKING }]
+        {
+            let noise = DMatrix::from_columns(&[some_noise(kept.len()), some_noise(kept.len()).add_scalar(1.0)]);
+            let factor = dense(memory, 3, &kept, &kept).cholesky().unwrap();
+            let cross = dense(memory, 3, &out, &kept);
+            let left = dense(memory, 3, &out, &out) - &cross * factor.solve(&cross.transpose());
+            let interpolation = Interpolation::of(memory, 3, &kept, &out);
+            // a state without variance is inverted as if it had the least
+            let off = interpolation.expected(&noise) - cross * factor.solve(&noise);
+            assert!(off.amax() < 1e-7, "{}", off.amax());
+            for (variance, expected) in interpolation.variances(memory).into_iter().zip(left.diagonal().iter()) {
+                assert!((variance - expected).abs() < 1e-7, "{variance} {expected}");
+            }
+        }
     }
 }

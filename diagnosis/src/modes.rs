@@ -95,3 +95,32 @@ impl Mixed {
         Self { basis: svd.u.expect("asked for"), shrink }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_is_whitened_by_the_symmetric_root_of_its_covariance() {
+        let factors = DMatrix::from_row_slice(4, 2, &[0.5, 0.0, -0.7, 0.0, 0.3, 0.6, 0.9, 0.6]);
+        let counts = |frame: usize, b: usize| frame == 0 || b != 1;
+        let mixing = Mixing::of(&Modes { factors: factors.clone() }, 2, counts);
+        let mut log_det = 0.0;
+        for frame in 0..2 {
+            let kept = DMatrix::from_fn(4, 2, |b, k| if counts(frame, b) { factors[(b, k)] } else { 0.0 });
+            let covariance = DMatrix::identity(4, 4) + &kept * kept.transpose();
+            log_det += covariance.determinant().ln();
+            let mut root = DMatrix::zeros(4, 4);
+            for b in 0..4 {
+                let mut values = DMatrix::zeros(2, 4);
+                values[(frame, b)] = 1.0;
+                mixing.apply(&mut values);
+                root.set_column(b, &values.row(frame).transpose());
+            }
+            assert!((&root * &covariance * &root - DMatrix::identity(4, 4)).amax() < 1e-12, "rounding");
+            let square = &root * &root;
+            (0..4).for_each(|b| assert!((mixing.own(frame, b) - square[(b, b)]).abs() < 1e-12, "rounding"));
+        }
+        assert!((mixing.log_det() - log_det).abs() < 1e-12, "rounding");
+    }
+}

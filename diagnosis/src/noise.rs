@@ -256,3 +256,80 @@ fn kurtosis(differences: &DMatrix<f64>) -> Measured {
     let moment = |power: i32| known.iter().map(|z| z.powi(power)).sum::<f64>() / n;
     Measured { value: (moment(4) / moment(2).powi(2)).max(1.0 + 1.0 / n), sigma: (24.0 / n).sqrt() }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Diagnosis;
+    use crate::data::Data;
+    use crate::testing::{Coloured, template};
+    use crate::verdict::Verdict;
+
+    /// What is learnt of a campaign, and what is true of it: scale, slow share, its time, walk, jitter, crate's share.
+    fn learnt(noise: &Noise, truth: &Coloured, header: f64) -> [(&'static str, Measured, f64); 6] {
+        let (share, time) = truth.slow;
+        let time = if share > 0.0 { time } else { 0.0 };
+        [
+            ("scale", noise.common_scale, truth.noise / header),
+            ("slow", noise.slow.share, share),
+            ("time", noise.slow.time, time),
+            ("walk", noise.slow.walk, truth.walk),
+            ("momentum", noise.momentum, truth.momentum),
+            ("crate", noise.crate_share, truth.crate_share),
+        ]
+    }
+
+    /// Noise of several kinds and sizes.
+    fn kinds(white: impl Fn() -> Coloured) -> [Coloured; 7] {
+        let sigma = white().noise;
+        [
+            Coloured { noise: 1.2 * sigma, ..white() },
+            Coloured { noise: 0.85 * sigma, ..white() },
+            Coloured { slow: (0.12, 12.0), ..white() },
+            Coloured { slow: (0.3, 4.0), ..white() },
+            Coloured { walk: 6e-6, ..white() },
+            Coloured { momentum: 3e-5, ..white() },
+            Coloured { crate_share: 0.15, ..white() },
+        ]
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn what_the_noise_is_like_is_learnt_within_three_errors() {
+        let (ring, recording) = template();
+        for seed in 0..2 {
+            for truth in kinds(|| Coloured::white(&ring, &recording, 100 + seed)) {
+                let made = truth.campaign(&ring, &recording, &[]);
+                let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+                for (name, found, truth) in learnt(&data.noise, &truth, recording.header.noise[0]) {
+                    println!("{seed} {name}: {:.3e} ± {:.1e}, true {truth:.3e}", found.value, found.sigma);
+                    assert!((found.value - truth).abs() <= 3.0 * found.sigma + 1e-12, "{name}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn nothing_is_learnt_where_the_noise_is_as_the_header_says() {
+        let (ring, recording) = template();
+        for seed in 0..4 {
+            let made = Coloured::white(&ring, &recording, 40 + seed).campaign(&ring, &recording, &[]);
+            let campaign = Campaign::of(&ring, &made).unwrap();
+            let data = Data::of(&campaign).unwrap();
+            assert!(data.noise.is_as_stated(), "{:?}", data.noise);
+            (0..campaign.monitors()).for_each(|b| assert_eq!(data.noise.own[b], campaign.noise(b), "monitor {b}"));
+        }
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn noise_of_any_kind_is_no_missing_physics() {
+        let (ring, recording) = template();
+        for truth in kinds(|| Coloured::white(&ring, &recording, 7)) {
+            let made = truth.campaign(&ring, &recording, &[]);
+            let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+            assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);
+        }
+    }
+}

@@ -98,8 +98,7 @@ impl Repeats {
     pub fn of_neighbours(&self) -> Option<f64> {
         let repeated = |pair: &&[Repeat]| {
             let [one, other] = [pair[0], pair[1]];
-            other.frame == one.frame + 1
-                && (other.run == Run::Same || (one.run == Run::Base && other.run == Run::Base))
+            other.frame == one.frame + 1 && (other.run == Run::Same || (one.run == Run::Base && other.run == Run::Base))
         };
         let squares: Vec<f64> =
             self.readings.windows(2).filter(repeated).map(|pair| (pair[1].value - pair[0].value).powi(2)).collect();
@@ -191,5 +190,63 @@ impl State {
             }
         }
         (innovation, variance)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    /// `ln` density of contrasts, `-(y^T P y + ln det S + ln det X^T S^-1 X)/2`, X the unknown baseline and changes.
+    fn restricted(memory: Memory, frames: &[usize], y: &DVector<f64>, x: &DMatrix<f64>) -> (f64, f64) {
+        let n = frames.len();
+        let s = DMatrix::from_fn(n, n, |i, j| memory.covariance(frames[i], frames[j]));
+        let factor = s.clone().cholesky().unwrap();
+        let solved = factor.solve(x);
+        let information = x.tr_mul(&solved);
+        let best = information.clone().cholesky().unwrap().solve(&solved.tr_mul(y));
+        let left = y - x * best;
+        (left.dot(&factor.solve(&left)), s.determinant().ln() + information.determinant().ln())
+    }
+
+    #[test]
+    fn the_filter_gives_the_likelihood_of_contrasts_within_settings() {
+        let settings = [0, 0, 1, 1, 1, 2, 2, 0, 0, 0, 3, 3, 0, 0].map(Some);
+        let runs = Run::of(&settings);
+        // frame 5 does not count, so that its run begins a frame later
+        let frames: Vec<usize> = (0..settings.len()).filter(|frame| *frame != 5).collect();
+        let y = DVector::from_fn(frames.len(), |i, _| (2.1 * (i * i) as f64).sin() + 30.0);
+        let x = DMatrix::from_fn(frames.len(), 4, |i, k| {
+            let setting = settings[frames[i]].unwrap();
+            if k == 0 || k == setting { 1.0 } else { 0.0 }
+        });
+        let repeats = Repeats::of(&frames, y.as_slice(), &runs);
+        let both = |memory: Memory| {
+            let (square, log_det) = restricted(memory, &frames, &y, &x);
+            let found = repeats.weigh(memory);
+            assert_eq!(found.count, frames.len() - 4);
+            // the diffuse variance is 1e8
+            assert!((found.square - square).abs() < 1e-5 * square, "{} {square}", found.square);
+            found.log_det - log_det
+        };
+        let slow = Memory { share: 0.3, time: 4.0, steps: 0.0 };
+        let walking = Memory { share: 0.1, time: 3.0, steps: 0.2 };
+        assert!((both(slow) - both(walking)).abs() < 1e-5);
+        assert!((both(slow) - both(Memory::NONE)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_change_of_the_setting_by_any_physics_changes_nothing() {
+        let settings = [0, 0, 1, 1, 1, 0, 0, 2, 2, 0].map(Some);
+        let runs = Run::of(&settings);
+        let frames: Vec<usize> = (0..10).collect();
+        let weigh = |change: f64| {
+            let value = |i: usize| (1.7 * (i * i) as f64).sin() + change * settings[i].unwrap() as f64;
+            let values: Vec<f64> = (0..10).map(value).collect();
+            Repeats::of(&frames, &values, &runs).weigh(Memory { share: 0.2, time: 5.0, steps: 0.1 }).square
+        };
+        assert!((weigh(0.0) / weigh(50.0) - 1.0).abs() < 1e-4, "the diffuse variance is 1e8");
     }
 }

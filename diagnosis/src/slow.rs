@@ -256,9 +256,9 @@ fn grid(frames: f64) -> Vec<Common> {
     let times = [-1.5, 0.0, 1.5].map(|z| (mean + z * width).exp());
     let of_share = |share: f64| {
         let times = if share == 0.0 { vec![1.0] } else { times.to_vec() };
-        times.into_iter().flat_map(move |time| {
-            STEPS.map(|step| Common { share: share * SHARE, time, steps: step * steps(frames) })
-        })
+        times
+            .into_iter()
+            .flat_map(move |time| STEPS.map(|step| Common { share: share * SHARE, time, steps: step * steps(frames) }))
     };
     SHARES.into_iter().flat_map(of_share).collect()
 }
