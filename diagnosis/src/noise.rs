@@ -75,7 +75,7 @@ pub struct Source<'c> {
 }
 
 /// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
-const FEWEST: usize = 20;
+const FEWEST: f64 = 20.0;
 /// Kurtosis of normal noise.
 const NORMAL: f64 = 3.0;
 /// Least share of a reading's variance that is not the momentum's.
@@ -140,7 +140,7 @@ impl Noise {
         for one in &learners {
             let own = (1.0 - jitter[one.b].powi(2)).max(OWN).sqrt() * one.sigma;
             let value = (own / campaign.recording.header.noise[one.b]).ln();
-            let count = one.repeats.weigh(Memory::NONE).count as f64;
+            let count = one.repeats.weigh(Memory::NONE).count;
             measured[one.b] = Some(Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() });
         }
         let Scales { common, scatter, each } = Scales::of(&measured);
@@ -233,6 +233,7 @@ fn learners(source: &Source) -> Vec<Learner> {
         let values: Vec<f64> = frames.iter().map(|&frame| source.residual[(frame, b)]).collect();
         let repeats = Repeats::of(&frames, &values, &runs);
         let sigma = repeats.of_neighbours().filter(|sigma| *sigma > 0.0)?;
+        let repeats = repeats.without(&campaign.following(b).select_rows(&frames), sigma);
         (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, sigma })
     };
     (0..campaign.monitors()).filter(|&b| campaign.is_ok(b)).filter_map(of).collect()

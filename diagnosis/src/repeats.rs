@@ -13,12 +13,16 @@
 //! Source: J. Durbin and S. J. Koopman, Time Series Analysis by State Space Methods (2012), ch. 5 and 7.2, the diffuse likelihood, which
 //! is that of H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545, for contrasts.
 
+use nalgebra::DMatrix;
+
 use super::memory::Memory;
 
 /// A monitor's readings less their prediction, in frames that count.
 #[derive(Debug, Clone)]
 pub struct Repeats {
     readings: Vec<Repeat>,
+    /// How many numbers were fitted to them before.
+    fitted: f64,
 }
 
 /// One of them.
@@ -44,8 +48,8 @@ pub enum Run {
 /// What some readings say of a memory.
 #[derive(Debug, Clone, Default)]
 pub struct Weighed {
-    /// Differences, as many as there are readings less baseline and settings.
-    pub count: usize,
+    /// Differences, as many as there are readings less baseline, settings and what was fitted before.
+    pub count: f64,
     /// Sum of their squares over their variances in units of the noise's [m^2].
     pub square: f64,
     /// Sum of `ln` of these variances.
@@ -91,7 +95,43 @@ impl Repeats {
             let run = if runs[frame] == Run::Same && begins { Run::New } else { runs[frame] };
             readings.push(Repeat { frame, value: value - first, run });
         }
-        Self { readings }
+        Self { readings, fitted: 0.0 }
+    }
+
+    /// Without what follows known drives, rows frames (those given to [`Repeats::of`]), columns drives, in prior standard deviations [m]: the
+    /// orbit follows the supplies by unknown factors. `sigma`: noise [m].
+    #[must_use]
+    pub fn without(mut self, following: &DMatrix<f64>, sigma: f64) -> Self {
+        let mut values = DMatrix::from_fn(self.len(), 1, |i, _| self.readings[i].value);
+        let mut known = following.clone();
+        self.centre(&mut values);
+        self.centre(&mut known);
+        let information = known.tr_mul(&known) / sigma.powi(2);
+        let mut normal = information.clone();
+        (0..normal.ncols()).for_each(|k| normal[(k, k)] += 1.0);
+        let Some(factor) = normal.cholesky() else { return self };
+        let off = following * factor.solve(&(known.tr_mul(&values) / sigma.powi(2)));
+        self.readings.iter_mut().zip(off.iter()).for_each(|(reading, off)| reading.value -= off);
+        self.fitted = factor.solve(&information).trace();
+        self
+    }
+
+    /// Take the mean of its setting off each row.
+    fn centre(&self, columns: &mut DMatrix<f64>) {
+        let mut groups: Vec<Vec<usize>> = vec![Vec::new()];
+        for (i, reading) in self.readings.iter().enumerate() {
+            match reading.run {
+                Run::Base => groups[0].push(i),
+                Run::New => groups.push(vec![i]),
+                Run::Same => groups.last_mut().expect("there is one").push(i),
+            }
+        }
+        for mut column in columns.column_iter_mut() {
+            for group in groups.iter().filter(|group| !group.is_empty()) {
+                let mean = group.iter().map(|&i| column[i]).sum::<f64>() / group.len() as f64;
+                group.iter().for_each(|&i| column[i] -= mean);
+            }
+        }
     }
 
     /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none without any.
@@ -124,9 +164,9 @@ impl Repeats {
 
     /// What they say of a memory.
     pub fn weigh(&self, memory: Memory) -> Weighed {
-        let mut weighed = Weighed::default();
+        let mut weighed = Weighed { count: -self.fitted, ..Weighed::default() };
         for (_, innovation, variance) in self.differences(memory) {
-            weighed.count += 1;
+            weighed.count += 1.0;
             weighed.square += innovation * innovation / variance;
             weighed.log_det += variance.ln();
         }
@@ -137,13 +177,13 @@ impl Repeats {
 impl Weighed {
     /// `ln` likelihood at the most likely scale of the noise, up to a constant.
     pub fn log_likelihood(&self) -> f64 {
-        let n = self.count as f64;
-        -0.5 * (n * (self.square / n.max(1.0)).max(f64::MIN_POSITIVE).ln() + self.log_det)
+        let n = self.count.max(1.0);
+        -0.5 * (n * (self.square / n).max(f64::MIN_POSITIVE).ln() + self.log_det)
     }
 
     /// Most likely standard deviation of the noise [m]; none without differences.
     pub fn sigma(&self) -> Option<f64> {
-        (self.count > 0).then(|| (self.square / self.count as f64).sqrt())
+        (self.count > 0.0).then(|| (self.square / self.count).sqrt())
     }
 }
 
@@ -195,7 +235,7 @@ impl State {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{DMatrix, DVector};
+    use nalgebra::DVector;
 
     use super::*;
 
@@ -226,7 +266,7 @@ mod tests {
         let both = |memory: Memory| {
             let (square, log_det) = restricted(memory, &frames, &y, &x);
             let found = repeats.weigh(memory);
-            assert_eq!(found.count, frames.len() - 4);
+            assert_eq!(found.count, frames.len() as f64 - 4.0);
             // the diffuse variance is 1e8
             assert!((found.square - square).abs() < 1e-5 * square, "{} {square}", found.square);
             found.log_det - log_det
