@@ -10,7 +10,6 @@
 
 use core::ops::{Mul, Sub};
 
-use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twin::{Drives, EffectError, Machine, Signature, Signatures, Tunes};
 
@@ -285,20 +284,15 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift),
-    /// per degree of freedom, as [`inference::BatchFit::chi2_per_dof`] counts it.
+    /// Sum of (residual/noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift), per
+    /// degree of freedom, as [`inference::BatchFit::chi2_per_dof`] counts it, but by the noise as learnt.
     ///
     /// # Errors
     /// [`EffectError`].
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
         let data = self.data(data);
-        let miss = data.miss(&self.predicted(data)?);
-        let (mut sum, mut degrees) = (0.0, -(self.params.len() as f64));
-        for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
-            let (chi2, freedom) = data.chi_square(b, &miss.column(b).into_owned());
-            (sum, degrees) = (sum + chi2, degrees + freedom);
-        }
-        Ok(sum / degrees)
+        let (sum, degrees) = data.chi_square(&data.miss(&self.predicted(data)?));
+        Ok(sum / (degrees - self.params.len() as f64))
     }
 
     /// Covariance of `ln` of the vars.
