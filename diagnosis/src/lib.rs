@@ -18,6 +18,7 @@ pub mod experiment;
 pub mod fit;
 pub mod heldout;
 pub mod hypothesis;
+pub mod imperfection;
 mod jitter;
 mod laplace;
 pub mod location;
@@ -50,6 +51,7 @@ use average::Vars;
 use data::{Data, DataError};
 use heldout::Score;
 use hypothesis::Term;
+use imperfection::Imperfection;
 use inference::Campaign;
 use inference::recording::Recording;
 use search::{Found, Search};
@@ -139,6 +141,12 @@ impl Diagnosis {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
         best.hypothesis.terms.iter().enumerate().map(of).collect()
+    }
+
+    /// What was learnt of the machine besides.
+    pub fn imperfections(&self) -> Vec<Imperfection> {
+        let Found { data, best, .. } = &self.found;
+        ordinary::rows(data, best).into_iter().chain(data.noise.rows()).collect()
     }
 
     /// Gain of held-out log predictive density by all effects, and its standard error.

@@ -14,11 +14,12 @@
 //! Source: D. J. C. MacKay, Neural Comput. 4 (1992) 415, eq. 4.8; A. Gelman, Bayesian Anal. 1 (2006) 515, half-normal priors of widths.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{EffectKind, Plane, Ring, Site};
+use twin::{EffectKind, Measured, Plane, Ring, Site};
 
 use super::data::Data;
 use super::fit::Fitted;
 use super::hypothesis::{Term, members};
+use super::imperfection::{Imperfection, Measure};
 
 /// Which members share an amplitude.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -218,25 +219,14 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
     families
 }
 
-/// What a fit says of one family.
-#[derive(Debug, Clone, Copy)]
-pub struct Size {
-    /// The family.
-    pub family: Family,
-    /// The learnt width, or the one amplitude that the members share, in the unit of the kind.
-    pub value: f64,
-    /// Its standard deviation.
-    pub sigma: f64,
-}
-
 /// The sizes of the ordinary imperfections in a fit. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's
 /// prior variance that the recording leaves: `1 - c` is 1 for a member that is well known, 0 for one that it does not show.
-pub fn sizes(data: &Data, fitted: &Fitted) -> Vec<Size> {
+pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
     let covariance = fitted.factor.inverse();
     let families = &fitted.hypothesis.ordinary;
     let members: usize = families.iter().map(|family| family.members(data).len()).sum();
     let mut at = fitted.u.len() - members;
-    let mut sizes = Vec::new();
+    let mut rows = Vec::new();
     for family in families {
         let own = at..at + family.members(data).len();
         at = own.end;
@@ -252,7 +242,15 @@ pub fn sizes(data: &Data, fitted: &Fitted) -> Vec<Size> {
                 (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
             }
         };
-        sizes.push(Size { family: *family, value, sigma });
+        rows.push(Imperfection {
+            name: family.name,
+            kind: family.kind.word(),
+            at: family.place(),
+            measure: if family.is_learnt() { Measure::Scatter } else { Measure::Mean },
+            measured: Measured { value, sigma },
+            unit: family.kind.unit(),
+            ordinary: family.tolerance,
+        });
     }
-    sizes
+    rows
 }
