@@ -47,6 +47,7 @@ use reference::Reference;
 pub(crate) use screen::Screened;
 use sequence::Sequence;
 use times::Times;
+#[cfg(test)]
 pub(crate) use whole::Expected;
 use whole::{Whole, WholeFrames};
 
@@ -402,9 +403,11 @@ impl<
         model: &Model<'_, G, B, C, F>,
         bytes: &mut [u8],
     ) -> Result<Estimate<B, N, W>, IngestError> {
-        let mut judged = self.judge(model, bytes)?;
-        self.learn(model, &mut judged);
-        Ok(self.estimate(model, &judged))
+        // at its place from the start: a copy is more than a kilobyte of stack
+        let mut judged = self.judge(model, bytes);
+        let judged = judged.as_mut().map_err(|error| *error)?;
+        self.learn(model, judged);
+        Ok(self.estimate(model, judged))
     }
 
     /// The first step of [`Estimator::ingest`]: which readings count, by all that is known before the frame. A feedback acts on that;

@@ -129,6 +129,7 @@ impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
     }
 
     /// Reply by what a frame has taught; its number.
+    #[inline(never)]
     fn answer(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Result<u32, Refusal> {
         let setup = self.setup.as_ref().ok_or(Refusal::NotStarted)?;
         let tables = tables(self.contents, self.built_in, self.slot);
@@ -141,21 +142,23 @@ impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
     }
 
     /// Steer, and reply by the setpoints if that is to be in short: the correctors do not wait until the frame is learnt. Its number.
+    #[inline(never)]
     fn act(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Result<u32, Refusal> {
         let (Some(setup), Some(feedback)) = (&self.setup, &self.feedback) else { return Err(Refusal::NotStarted) };
         let tables = tables(self.contents, self.built_in, self.slot);
-        let mut judged = self.steer.judge(self.core, (tables, setup), feedback, bytes)?;
+        // at its place from the start: a copy is more than a kilobyte of stack
+        let mut judged = self.steer.judge(self.core, (tables, setup), feedback, bytes);
+        let judged = judged.as_mut().map_err(|error| *error)?;
         let prepared = core::mem::take(&mut self.prepared);
         if self.form == Form::Short {
             let correction = Correction { steered: self.steer.steered(), prepared, setpoints: self.steer.setpoints() };
-            say(UNASKED, || link::Reply::Short(self.core.corrected(&judged, correction)), reply);
+            say(UNASKED, || link::Reply::Short(self.core.corrected(judged, correction)), reply);
         }
-        self.core.learn(tables, setup, &mut judged);
+        self.core.learn(tables, setup, judged);
         if self.form == Form::Full {
-            let estimate = self.core.estimate(tables, setup, &judged);
-            say(UNASKED, || link::Reply::Estimate((&estimate).into()), reply);
+            say(UNASKED, || link::Reply::Estimate((&self.core.estimate(tables, setup, judged)).into()), reply);
         }
-        Ok(E::number(&judged))
+        Ok(E::number(judged))
     }
 
     #[inline(never)]

@@ -2,7 +2,9 @@
 
 use core::error::Error;
 use core::fmt;
+use core::time::Duration;
 use std::os::unix::net::UnixStream;
+use std::thread;
 
 use estimator::Each;
 use estimator::booster::{self, Estimate, Estimator, Feedback};
@@ -89,6 +91,8 @@ impl<'e> Chip<'e> {
             return self.link.ingest(sequence, wire).map(|heard| Said::Full(Box::new(heard)));
         };
         if !core::mem::replace(&mut self.steers, true) {
+            // of a cycle's time the emulator has hardly any; an operator who switches the feedback on gives it seconds
+            thread::sleep(Duration::from_secs(2));
             self.link.form(Form::Short)?;
             self.link.steer(Some(on_wire(feedback)))?;
         }
