@@ -99,10 +99,10 @@ impl Family {
     }
 
     /// The same with room for what a recording cannot show: the vars near a straight absorb a gradient in it. One of the size of its kind's
-    /// prior counts as four standard deviations; the vars beside it, whose readings count too, are then off by less than three of theirs.
+    /// prior counts as three standard deviations, so that the vars beside it are off by less than three of theirs.
     pub fn unseen(&self) -> Self {
         match (self.kind, self.kind.prior_scale()) {
-            (EffectKind::StrayGradient, Some(scale)) => Self { width: scale / 4.0, ..*self },
+            (EffectKind::StrayGradient, Some(scale)) => Self { width: scale / 3.0, ..*self },
             _ => *self,
         }
     }

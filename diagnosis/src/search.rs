@@ -247,12 +247,13 @@ impl Search {
             if fitted.hypothesis.terms.contains(&candidate.term) {
                 continue;
             }
-            let known = present.clone().filter(|present| present.term() == Some(&candidate.term));
+            let known = present.as_ref().filter(|present| present.term() == Some(&candidate.term));
             let alternative = match leaders.contains(&i) {
                 true => refit(data, fitted, candidate, least),
                 false => Alternative::of(candidate),
             };
-            let alternative = known.filter(|known| known.log_gain > alternative.log_gain).unwrap_or(alternative);
+            let better = known.filter(|known| known.log_gain > alternative.log_gain).cloned();
+            let alternative = better.unwrap_or(alternative);
             // the costs of drifting baselines are of other numbers
             if let Some(fitted) = alternative.fitted.as_ref().filter(|_| !candidate.term.kind.moves_baselines()) {
                 least = least.min(fitted.cost);
