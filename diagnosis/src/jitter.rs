@@ -46,10 +46,19 @@ impl Differences {
         self.0.row_iter().map(|frame| of_frame(frame.iter().copied(), &own, modes)).sum()
     }
 
-    /// The rms momentum jitter of a pattern per momentum [1/1], with `width` that of its prior.
+    /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior.
     pub fn momentum(&self, pattern: &DVector<f64>, width: f64) -> Measured {
         let modes = |jitter: f64| DMatrix::from_columns(&[pattern * jitter]);
-        learnt(|jitter| self.log_likelihood(&modes(jitter)), width, 0.0)
+        let found = learnt(|jitter| self.log_likelihood(&modes(jitter)), width, 0.0);
+        self.sampled(found, 0.5)
+    }
+
+    /// With the error of a sample of the frames: readings are in units of their rms in these, that of the mode included. `power`: 1/2 of an
+    /// rms, 1 of a variance.
+    fn sampled(&self, found: Measured, power: f64) -> Measured {
+        let frames = self.0.row_iter().filter(|frame| frame.iter().any(|z| !z.is_nan())).count();
+        let sample = found.value * power * (2.0 / frames.max(1) as f64).sqrt();
+        Measured { sigma: found.sigma.hypot(sample), ..found }
     }
 
     /// Crates, beside the momentum's jitter (its mode), and what the recording allows of one more, whose neighbours are in one of some
@@ -73,6 +82,7 @@ impl Differences {
                 modes
             };
             let share = learnt(|share| self.log_likelihood(&with(share)) - without, CRATE, correction);
+            let share = self.sampled(share, 1.0);
             if share.value == 0.0 || crates.len() == MOST {
                 return (crates, share);
             }

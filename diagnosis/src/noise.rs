@@ -146,10 +146,10 @@ impl Noise {
         let jitter = &pattern * momentum.value;
         let (crates, one_more) = differences.crates(&jitter, &orders(campaign, &learners));
         let measured = |one: &Learner| {
-            let own = (1.0 - jitter[one.b].powi(2)).max(OWN).sqrt() * one.sigma;
+            let own = (1.0 - jitter[one.b].powi(2)).max(OWN);
             let count = one.repeats.weigh(Memory::NONE).count;
-            let value = (own / campaign.recording.header.noise[one.b]).ln();
-            Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() }
+            let value = (own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
+            Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() / own }
         };
         let mut scales = vec![None; campaign.monitors()];
         learners.iter().for_each(|one| scales[one.b] = Some(measured(one)));
