@@ -29,6 +29,7 @@ use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::settings::Settings;
+use super::wiring::Miswired;
 use inference::campaign::chi_square;
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
@@ -116,6 +117,14 @@ pub enum DataError {
         /// The times.
         found: String,
     },
+    /// Columns that are not what the header says.
+    #[error("{recording}: frames.csv: {wiring}")]
+    Miswired {
+        /// The recording.
+        recording: String,
+        /// What they look like.
+        wiring: Miswired,
+    },
     /// An effect that is not defined for this ring.
     #[error(transparent)]
     Effect(#[from] EffectError),
@@ -194,7 +203,7 @@ impl Data {
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let higher = self.higher_orders(machine)?;
-        let slopes = Signatures::of(machine, &self.drives)?.of_quadrupoles();
+        let slopes = Signatures::of(&machine.on_orbit(&self.drives.orbit), &self.drives)?.of_quadrupoles();
         let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
             let Some(supply) = quadrupole.supply else { continue };

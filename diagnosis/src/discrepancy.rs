@@ -116,6 +116,7 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let (machine, drives) = fitted.machine(data)?;
     let predicted = fitted.predicted(data)?;
     let miss = data.miss(&predicted);
+    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let mut all = Vec::new();
     for &b in &active {
@@ -181,7 +182,16 @@ impl Linearised<'_> {
     /// `1 + omega^2 G = D - omega^2 C A^-1 C^T`, whose determinant is `det D det B/det A`, `B = A - omega^2 C^T D^-1 C`,
     ///
     /// and whose inverse `D^-1 + omega^2 D^-1 C B^-1 C^T D^-1`; `D`, `C^T D^-1 C` and the like are sums over the monitors.
+    ///
+    /// Where there are fewer amplitudes than unknowns of the fit, the one large matrix is the quicker way.
     fn judge_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
+        if each.iter().map(|sums| sums.pull.len()).sum::<usize>() < self.fitted.u.len() {
+            return self.judge(at, &Sums::stacked(each), sites);
+        }
+        self.taken_apart(at, each, apart, sites)
+    }
+
+    fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
         let taken = self.fitted.free.solve(&self.fitted.slope);
         let sides: Vec<DMatrix<f64>> =
             each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &taken))).collect();
@@ -251,7 +261,7 @@ impl Discrepancy {
 }
 
 /// `ln` Bayes factor of free amplitudes of one standard deviation, given their projected pull and Gram matrix.
-pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
+fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let variance = size * size;
     let mut grown = gram * variance;
     (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
@@ -408,6 +418,21 @@ impl Sums {
         Self { gram, cross, pull: DVector::zeros(numbers) }
     }
 
+    /// Of several monitors, each with its own amplitudes.
+    fn stacked(each: &[Self]) -> Self {
+        let amplitudes = each.iter().map(|sums| sums.pull.len()).sum();
+        let mut all = Self::none(amplitudes, each.first().map_or(0, |sums| sums.cross.ncols()));
+        let mut at = 0;
+        for sums in each {
+            let n = sums.pull.len();
+            all.gram.view_mut((at, at), (n, n)).copy_from(&sums.gram);
+            all.cross.rows_mut(at, n).copy_from(&sums.cross);
+            all.pull.rows_mut(at, n).copy_from(&sums.pull);
+            at += n;
+        }
+        all
+    }
+
     /// Of some of the groups.
     fn select(&self, groups: &[usize]) -> Self {
         let gram = self.gram.select_rows(groups).select_columns(groups);
@@ -481,17 +506,12 @@ mod tests {
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
         let each = sums.each_ref().map(|sums| sums.select(&some));
         let apart = [0, 1, 2].map(|i| Apart::of(&data, monitors[i], &settings, &sums[i]).select(&some));
-        let (n, unknowns) = (some.len(), fitted.u.len());
-        let mut all = Sums::none(n * each.len(), unknowns);
-        for (at, (sums, apart)) in each.iter().zip(&apart).enumerate() {
+        for (sums, apart) in each.iter().zip(&apart) {
             let gram = DMatrix::from_diagonal(&apart.alone) - &apart.common * apart.common.transpose();
             assert!((gram - &sums.gram).amax() < 1e-9 * sums.gram.amax(), "rounding");
-            all.gram.view_mut((n * at, n * at), (n, n)).copy_from(&sums.gram);
-            all.cross.rows_mut(n * at, n).copy_from(&sums.cross);
-            all.pull.rows_mut(n * at, n).copy_from(&sums.pull);
         }
-        let one = linearised.judge(Location::Corrector(0), &all, 1);
-        let other = linearised.judge_apart(Location::Corrector(0), &each, &apart, 1);
+        let one = linearised.judge(Location::Corrector(0), &Sums::stacked(&each), 1);
+        let other = linearised.taken_apart(Location::Corrector(0), &each, &apart, 1);
         assert_eq!(one.size, other.size);
         assert!((one.log_bayes / other.log_bayes - 1.0).abs() < 1e-9, "{} {}", one.log_bayes, other.log_bayes);
     }

@@ -75,7 +75,8 @@ impl Derivatives {
         other: Option<&Term>,
         weight: f64,
     ) -> Result<Self, FitError> {
-        let signatures = Signatures::of(machine, drives)?;
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, drives)?;
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
         let columns: Vec<_> =

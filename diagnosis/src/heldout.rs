@@ -1,8 +1,8 @@
 //! Held-out frames: how well a hypothesis predicts frames that it was not fitted to.
 //!
 //! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
-//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z`, of a monitor or of the tune meter, has a
-//! normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
+//! hypothesis is fitted to the rest, by one Gauss-Newton step from its fit to all frames, and each left-out reading `z`, of a monitor or of
+//! the tune meter, has a normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
 //! like, `U`) as estimated from its kept readings with covariance `C`,
 //!
 //! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less its projection on the common terms.
@@ -20,7 +20,8 @@
 use std::collections::BTreeMap;
 
 use estimator::MonitorState;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use twin::Signature;
 
 use super::data::Data;
 use super::error::FitError;
@@ -95,10 +96,10 @@ impl Score {
         let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
         let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
         let (mut squares, mut plain) = (0.0, 0usize);
+        let data = fitted.data(data);
+        let linear = Linear::of(data, fitted)?;
         for fold in folds {
-            let kept = data.without(fold);
-            let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
-            for left in predict(data, fit.data(&kept), &fit, fold)? {
+            for left in linear.predict(data, fold)? {
                 let z = left.innovation / left.variance.sqrt();
                 score.log_density[(left.frame, left.column)] -=
                     0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
@@ -201,47 +202,89 @@ fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
     monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
 }
 
-/// Predict the left-out readings by a fit to the kept ones.
-fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, FitError> {
-    let (residual, slopes) = (all.miss(&fit.predicted(kept)?), fit.slopes(kept)?);
-    let mut left = Vec::new();
-    for column in columns(all, kept, fold) {
-        let at = column.index;
-        let expectation = Expectation::of(&column);
-        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], at)]);
-        let of = |frames: &[usize]| DMatrix::from_fn(frames.len(), 1, |i, _| residual[(frames[i], at)]);
-        let Column { kept: frames, out, shared: [u_in, u_out], .. } = &column;
-        let (u_in, u_out) = expectation.apart(u_in.clone(), u_out.clone());
-        let (known, left_out) = expectation.apart(of(frames), of(out));
-        let (slopes_in, slopes_out) = expectation.apart(rows(frames), rows(out));
-        let mut normal = u_in.tr_mul(&u_in);
-        (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
-        let Some(normal) = normal.cholesky() else { continue };
-        // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
-        let innovation = left_out - &u_out * normal.solve(&u_in.tr_mul(&known));
-        let d = slopes_out - &u_out * normal.solve(&u_in.tr_mul(&slopes_in));
-        let unknown = normal.l().solve_lower_triangular(&u_out.transpose()).unwrap_or_else(|| u_out.transpose() * 0.0);
-        let params = fit.factor.l().solve_lower_triangular(&d.transpose()).unwrap_or_else(|| d.transpose() * 0.0);
-        for (i, &frame) in out.iter().enumerate() {
-            let noise = expectation.variances[i];
-            let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
-            let sigma = expectation.sigma;
-            left.push(Left {
-                frame,
-                column: at,
-                innovation: innovation[i] * sigma,
-                variance: variance * sigma * sigma,
-            });
-        }
+/// A fit to all frames, linearised.
+struct Linear<'f> {
+    fitted: &'f Fitted,
+    /// Derivatives of the predictions with respect to every u.
+    slopes: Vec<Signature>,
+    /// The same, columns monitors and tunes, rows frames.
+    by_frame: Vec<DMatrix<f64>>,
+    /// Readings and tunes less those predicted.
+    miss: DMatrix<f64>,
+}
+
+impl<'f> Linear<'f> {
+    fn of(data: &Data, fitted: &'f Fitted) -> Result<Self, FitError> {
+        let slopes = fitted.slopes(data)?;
+        let by_frame = slopes.iter().map(|slope| slope.clone().by_frame(&data.drives.time)).collect();
+        Ok(Self { fitted, miss: data.miss(&fitted.predicted(data)?), slopes, by_frame })
     }
-    Ok(left)
+
+    /// The step from the fit to all frames to that to the kept ones, and the factor of the latter's precision.
+    fn step(&self, kept: &Data) -> Result<(DVector<f64>, Cholesky<f64, Dyn>), FitError> {
+        let columns: Vec<DVector<f64>> = self.slopes.iter().map(|slope| kept.signature(slope)).collect();
+        let jacobian = DMatrix::from_columns(&columns);
+        let back = jacobian.transpose();
+        let normal = DMatrix::identity(columns.len(), columns.len()) + &back * jacobian;
+        let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
+        let slope = back * self.fitted.residual_of(kept)? - &self.fitted.u;
+        Ok((factor.solve(&slope), factor))
+    }
+
+    /// Predict the left-out readings by a fit to the kept ones.
+    fn predict(&self, all: &Data, fold: &Fold) -> Result<Vec<Left>, FitError> {
+        let kept = &all.without(fold);
+        let (step, factor) = self.step(kept)?;
+        let mut left = Vec::new();
+        for column in columns(all, kept, fold) {
+            let at = column.index;
+            let expectation = Expectation::of(&column);
+            let rows =
+                |frames: &[usize]| DMatrix::from_fn(frames.len(), step.len(), |i, p| self.by_frame[p][(frames[i], at)]);
+            let miss = |frames: &[usize]| DMatrix::from_fn(frames.len(), 1, |i, _| self.miss[(frames[i], at)]);
+            let Column { kept, out, shared: [u_in, u_out], .. } = &column;
+            let (u_in, u_out) = expectation.apart(u_in.clone(), u_out.clone());
+            let (slopes_in, slopes_out) = expectation.apart(rows(kept), rows(out));
+            let (known, left_out) = expectation.apart(miss(kept), miss(out));
+            let (known, left_out) = (known - &slopes_in * &step, left_out - &slopes_out * &step);
+            let mut normal = u_in.tr_mul(&u_in);
+            (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
+            let Some(normal) = normal.cholesky() else { continue };
+            // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
+            let innovation = left_out - &u_out * normal.solve(&u_in.tr_mul(&known));
+            let d = slopes_out - &u_out * normal.solve(&(u_in.transpose() * slopes_in));
+            let lower = |factor: &Cholesky<f64, Dyn>, rows: &DMatrix<f64>| {
+                factor.l_dirty().solve_lower_triangular(&rows.transpose()).unwrap_or_else(|| rows.transpose() * 0.0)
+            };
+            let (unknown, params) = (lower(&normal, &u_out), lower(&factor, &d));
+            for (i, &frame) in out.iter().enumerate() {
+                let noise = expectation.variances[i];
+                let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
+                let sigma = expectation.sigma;
+                left.push(Left {
+                    frame,
+                    column: at,
+                    innovation: innovation[i] * sigma,
+                    variance: variance * sigma * sigma,
+                });
+            }
+        }
+        Ok(left)
+    }
+}
+
+/// The same fit without its effects, what is ordinary being of the same size.
+pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
+    let without = Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() };
+    Fitted::of(data, &without, &fitted.guess(data, &without))
+        .or_else(|_| Fitted::of(data, &without, &DVector::zeros(fitted.params.len())))
 }
 
 /// The same fit without one of its terms.
 pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
     let vars = fitted.params.len();
     let without: Hypothesis = fitted.hypothesis.without(term);
-    let near = Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned());
+    let near = Fitted::of(data, &without, &fitted.guess(data, &without));
     // vars that are stable with the term may be unstable without it
     near.or_else(|_| Fitted::of(data, &without, &DVector::zeros(vars)))
 }

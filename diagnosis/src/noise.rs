@@ -14,6 +14,7 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
+use super::imperfection::{Imperfection, Measure};
 use super::jitter::{CRATE, Crate, Differences};
 use super::memory::Memory;
 use super::modes::Modes;
@@ -52,19 +53,6 @@ pub struct Noise {
     pub ordinary_momentum: f64,
     /// Noise in common, in units of the monitors' own.
     pub(super) modes: Modes,
-}
-
-/// One row of the table of a machine's ordinary imperfections.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Row {
-    /// What it is.
-    pub name: &'static str,
-    /// Value and standard deviation.
-    pub measured: Measured,
-    /// Unit.
-    pub unit: Unit,
-    /// Size up to which it is ordinary, none if it has no such size.
-    pub ordinary: Option<f64>,
 }
 
 /// What noise is learnt from.
@@ -230,20 +218,34 @@ impl Noise {
     }
 
     /// The rows of a table.
-    pub fn rows(&self) -> Vec<Row> {
+    pub fn rows(&self) -> Vec<Imperfection> {
         const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
-        const FRAMES: Unit = Unit { symbol: "frames", shown: "frames", factor: 1.0 };
-        let row = |name, measured, unit, ordinary| Row { name, measured, unit, ordinary };
         let off = Measured { value: self.common_scale.value - 1.0, ..self.common_scale };
+        let row = |(name, kind), measured, unit, ordinary| Imperfection {
+            name,
+            kind,
+            at: "all",
+            measure: Measure::Scatter,
+            measured,
+            unit,
+            ordinary,
+        };
+        let mean = |what, measured, unit, ordinary| Imperfection {
+            measure: Measure::Mean,
+            ..row(what, measured, unit, ordinary)
+        };
         vec![
-            row("noise of all monitors, over the header's, less 1", off, Unit::PERCENT, Some(QUOTED)),
-            row("scatter of the noise between monitors", self.scatter, Unit::PERCENT, Some(ALIKE)),
-            row("slow share of the noise's variance", self.slow.share, Unit::PERCENT, Some(SHARE)),
-            row("correlation time of the slow noise", self.slow.time, FRAMES, None),
-            row("walk of a monitor per root frame", self.slow.walk, LENGTH, Some(self.ordinary_walk)),
-            row("rms jitter of the momentum", self.momentum, Unit::PER_MILLE, Some(self.ordinary_momentum)),
-            row("share of the noise that a crate has in common", self.crate_share, Unit::PERCENT, Some(CRATE)),
-            row("kurtosis of the noise", self.kurtosis, Unit::NONE, None),
+            mean(("noise over the header's, less 1", "noise"), off, Unit::PERCENT, QUOTED),
+            row(("noise of single monitors", "noise"), self.scatter, Unit::PERCENT, ALIKE),
+            mean(("slow share of the noise's variance", "slow_noise"), self.slow.share, Unit::PERCENT, SHARE),
+            row(("walk per root frame", "walk"), self.slow.walk, LENGTH, self.ordinary_walk),
+            row(
+                ("momentum from frame to frame", "momentum_jitter"),
+                self.momentum,
+                Unit::PER_MILLE,
+                self.ordinary_momentum,
+            ),
+            mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
         ]
     }
 }

@@ -63,6 +63,7 @@ impl PlaceScan {
         let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
         let (machine, drives) = fitted.machine(data)?;
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
         let scale = kind.kind().prior_scale().unwrap_or(1.0);
         let judge = |segments: Vec<Segment>| -> Self {

@@ -69,6 +69,7 @@ impl Form {
         match kind {
             EffectKind::StrayGradient | EffectKind::DipoleGradient | EffectKind::DipoleEdge => Self::Optics,
             EffectKind::BpmGain
+            | EffectKind::BpmPolarity
             | EffectKind::BpmSwap
             | EffectKind::CorrectorGain
             | EffectKind::CorrectorPolarity
@@ -95,6 +96,9 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
             (EffectKind::MomentumOffset, _) => instruments.delta += amplitude,
             (EffectKind::BpmGain, Site::Monitor(at)) => {
                 read(at).into_iter().for_each(|b| instruments.monitor_gain[b] *= 1.0 + amplitude);
+            }
+            (EffectKind::BpmPolarity, Site::Monitor(at)) => {
+                read(at).into_iter().for_each(|b| instruments.monitor_gain[b] *= -1.0);
             }
             (EffectKind::BpmSwap, Site::MonitorPair(one, other)) => {
                 if let (Some(one), Some(other)) = (read(one), read(other)) {

@@ -20,7 +20,7 @@
 
 use nalgebra::{DMatrix, Matrix5, Matrix6, RowVector6, Vector6};
 
-use crate::lattice::{Corrector, Plane, Ring};
+use crate::lattice::{Corrector, Element, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, inverse};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError, invert};
 
@@ -171,6 +171,26 @@ impl<'r> Optics<'r> {
         let mut all = Vector6::zeros();
         (all[X], all[PX], all[Y], all[PY]) = (step[0], step[1], step[2], step[3]);
         Source { place, column: inverse(&self.transfer(place)) * all }
+    }
+
+    /// Linear map from the start to the middle of an element, in the ring's axes.
+    fn transfer_to_middle(&self, element: usize) -> (Place, Matrix6<f64>) {
+        let Element { length, misalignment, .. } = &self.ring.elements[element];
+        let place = Place { element, depth: 0.5 * length };
+        (place, misalignment.rotation().transpose() * self.transfer_into(place))
+    }
+
+    /// Observers of x and y in the middle of an element, in the ring's axes whatever its roll.
+    pub(crate) fn observe_middle(&self, element: usize) -> [Observer; 2] {
+        let (place, map) = self.transfer_to_middle(element);
+        [X, Y].map(|index| Observer { place, row: map.row(index).into_owned() })
+    }
+
+    /// Thin kicks along x and along y in the middle of an element, in the ring's axes whatever its roll.
+    pub(crate) fn kick_middle(&self, element: usize) -> [Source; 2] {
+        let (place, map) = self.transfer_to_middle(element);
+        let back = inverse(&map);
+        [PX, PY].map(|index| Source { place, column: back.column(index).into_owned() })
     }
 
     /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one.

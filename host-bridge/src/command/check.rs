@@ -4,6 +4,8 @@ use core::fmt;
 use estimator::Walk;
 
 use comfy_table::CellAlignment;
+use diagnosis::data::DataError;
+use diagnosis::wiring::Miswired;
 use inference::stream::{self, Core};
 use inference::{Campaign, Lack, Recording};
 use serde::Serialize;
@@ -97,7 +99,11 @@ pub fn run(options: &Check) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = recording(&options.recording, &ring)?;
-    let campaign = campaign(&ring, &recording)?;
+    // columns that are not what the header says may leave no stable ring
+    let campaign = campaign(&ring, &recording).map_err(|error| match Miswired::of(&ring, &recording) {
+        Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
+        _ => error,
+    })?;
     deliver(&options.common, &CheckResult::of(&ring, &campaign))
 }
 
@@ -235,9 +241,12 @@ fn diagnose(campaign: &Campaign) -> Usable {
     let settings = Settings::of(campaign);
     let reading = (0..campaign.monitors()).filter(|&b| (0..campaign.frames()).any(|i| campaign.counts(i, b))).count();
     let moved = settings.correctors[0];
-    let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1;
+    let wiring = Miswired::of(&campaign.ring, &campaign.recording).ok().flatten();
+    let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1 && wiring.is_none();
     let what = if let Some(why_not) = several_times(campaign) {
         why_not
+    } else if let Some(wiring) = wiring {
+        wiring.to_string()
     } else if can {
         format!("{reading} monitors, {moved} correctors")
     } else {

@@ -190,6 +190,7 @@ impl Lattice {
     fn distort(&mut self, how: MonitorEffect, monitor: usize, amplitude: f64) -> bool {
         match how {
             MonitorEffect::Gain => self.monitors[monitor].gain *= 1.0 + amplitude,
+            MonitorEffect::Polarity => self.monitors[monitor].gain *= -1.0,
             MonitorEffect::Roll => {
                 let element = self.monitors[monitor].element;
                 let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);

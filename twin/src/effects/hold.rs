@@ -64,18 +64,19 @@ impl Mechanism for HoldEffect {
         }
     }
 
-    /// A radial position is known to some mm at a dispersion of 2 m.
+    /// A radial position is known to some mm at a dispersion of 2 m. A loop holds all of its error, or with a gain of 1 to 10 a share of
+    /// 0.5 to 0.9: as a normal of width 0.5 these are one to two standard deviations.
     fn prior_scale(&self) -> Option<f64> {
         match self {
             Self::Momentum => Some(3e-3),
-            Self::Frequency | Self::RadialLoop => None,
+            Self::Frequency | Self::RadialLoop => Some(0.5),
         }
     }
 
     fn unit(&self) -> Unit {
         match self {
             Self::Momentum => Unit::PER_MILLE,
-            Self::Frequency | Self::RadialLoop => Unit::NONE,
+            Self::Frequency | Self::RadialLoop => Unit::PERCENT,
         }
     }
 
@@ -120,9 +121,15 @@ impl Mechanism for HoldEffect {
     fn phrase(&self, ring: &Ring, site: Site, amplitude: Measured) -> String {
         match self {
             Self::Momentum => format!("the beam is off momentum by {} per mille", amplitude.signed(1e3)),
-            Self::Frequency => "the RF frequency was held, not the momentum".into(),
+            Self::Frequency => {
+                format!("the RF frequency was held instead of the momentum, by {} %", amplitude.signed(100.0))
+            }
             Self::RadialLoop => {
-                format!("a radial loop held the mean of {}, not the momentum", site.names(ring).join(" and "))
+                let pair = site.names(ring).join(" and ");
+                format!(
+                    "a radial loop held the mean of {pair} instead of the momentum, by {} %",
+                    amplitude.signed(100.0)
+                )
             }
         }
     }

@@ -11,10 +11,12 @@
 
 use nalgebra::DMatrix;
 
+use super::drift;
 use super::drives::Drives;
+use super::field::Crossed;
 use super::machine::Machine;
-use super::{drift, field};
-use crate::orbit::OrbitError;
+use crate::orbit::{Hold, OrbitError};
+use crate::response::Optics;
 use crate::tune::Tunes;
 
 impl Machine {
@@ -24,7 +26,7 @@ impl Machine {
     /// # Errors
     /// [`OrbitError`] if the machine is unstable.
     pub fn readings(&self, drives: &Drives) -> Result<(DMatrix<f64>, Tunes, [f64; 2]), OrbitError> {
-        let ring = field::on_orbit(&self.ring, &self.sextupoles, &drives.orbit);
+        let ring = self.on_orbit(&drives.orbit).ring;
         let seen = self.seen(&ring)?;
         let kick = self.kicks(drives);
         let mut positions = drives.positions(&seen, &kick);
@@ -34,8 +36,10 @@ impl Machine {
             add(&mut positions, change);
             tune_drift = of_tunes;
         }
-        for &sextupole in &self.sextupoles {
-            add(&mut positions, field::curved(&self.ring, sextupole, drives, &kick)?);
+        if !self.sextupoles.is_empty() {
+            let optics = Optics::of(&ring, Hold::Momentum { delta: self.hold.delta })?;
+            let held = self.held_of(&ring, &optics)?;
+            add(&mut positions, Crossed::of(&optics, &held, &self.sextupoles, drives, &kick).curved());
         }
         let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(|monitor| drives.orbit[monitor.element]).collect();
         self.monitors.iter().for_each(|reading| reading.of_changes(&self.ring, &mut base, &mut positions));

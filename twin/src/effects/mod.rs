@@ -84,6 +84,8 @@ kinds! {
     QuadRoll => Field(FieldEffect::QuadRoll),
     /// A monitor reads x (1 + a x^2), a in [1/mm^2]; a response, the limit of small kicks, shows it on a displaced orbit.
     BpmCubic => Monitor(MonitorEffect::Cubic),
+    /// A monitor's sign is reversed.
+    BpmPolarity => Monitor(MonitorEffect::Polarity),
     /// Two monitors' names are exchanged.
     BpmSwap => Monitor(MonitorEffect::Swap),
     /// A corrector's sign is reversed.
@@ -425,6 +427,7 @@ mod tests {
             ("corrector_roll@H_A4=0.02", 0.003, "corrector H_A4 is rolled by +20.0 ± 3.0 mrad"),
             ("quad_roll@D8=0.01", 0.0005, "quadrupole D8 is rolled by +10.00 ± 0.50 mrad"),
             ("bpm_cubic@x_A6=1e-3", 1e-4, "BPM x_A6 is not linear: +2.50 ± 0.25 % of the position at 5 mm"),
+            ("bpm_polarity@x_E4", 0.0, "BPM x_E4 reads with the wrong sign"),
             ("bpm_swap@x_E4,x_E6", 0.0, "BPMs x_E4 and x_E6 are exchanged"),
             ("corrector_polarity@H_A4", 0.0, "corrector H_A4 has the wrong polarity"),
             ("corrector_even@H_A4=0.04", 0.01, "corrector H_A4 kicks 8.0 ± 2.0 % more at + than at -"),
@@ -435,8 +438,12 @@ mod tests {
             ("dipole_edge@B_C4=0.01", 0.001, "dipole B_C4 has edge angles of +10.0 ± 1.0 mrad"),
             ("sextupole_error@SX_A1=1.5", 0.2, "sextupole SX_A1 has a field K2L = +1.50 ± 0.20 /m2"),
             ("momentum_offset=-2e-3", 1e-4, "the beam is off momentum by -2.00 ± 0.10 per mille"),
-            ("fixed_rf_frequency", 0.0, "the RF frequency was held, not the momentum"),
-            ("radial_loop@x_D8,x_E6", 0.0, "a radial loop held the mean of x_D8 and x_E6, not the momentum"),
+            ("fixed_rf_frequency", 0.02, "the RF frequency was held instead of the momentum, by +100.0 ± 2.0 %"),
+            (
+                "radial_loop@x_D8,x_E6=0.8",
+                0.01,
+                "a radial loop held the mean of x_D8 and x_E6 instead of the momentum, by +80.0 ± 1.0 %",
+            ),
             ("quad_drift=1e-3", 1e-4, "all quadrupoles drifted by +2.00 ± 0.20 per mille from start to end"),
         ];
         let of = |text: &str| Effect::parse(text, &ring).unwrap();

@@ -1,4 +1,4 @@
-//! Errors of monitors: gain, roll, cubic term, exchanged names.
+//! Errors of monitors: gain, roll, cubic term, reversed sign, exchanged names.
 //!
 //! The reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
 //! cycle is its value, a frame's is a difference of two values, the response its slope in the position, the signature its slope in
@@ -22,6 +22,8 @@ pub enum MonitorEffect {
     Roll,
     /// It reads `x (1 + a x^2)`, x the true position in mm, before its offset.
     Cubic,
+    /// Its sign is reversed.
+    Polarity,
     /// Its name and another one's are exchanged.
     Swap,
 }
@@ -39,6 +41,7 @@ impl MonitorEffect {
         let own = |position: T| match self {
             Self::Gain => position * (amplitude + 1.0),
             Self::Cubic => position + amplitude * (position * 1e3).powi(2) * position,
+            Self::Polarity => position * (amplitude * -2.0 + 1.0),
             Self::Roll | Self::Swap => position,
         };
         match (self, plane) {
@@ -60,7 +63,7 @@ impl MonitorEffect {
     fn monitors(self, ring: &Ring, monitor: usize) -> Vec<usize> {
         match self {
             Self::Roll => of_element(ring, ring.monitors[monitor].element).collect(),
-            Self::Gain | Self::Cubic | Self::Swap => vec![monitor],
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Swap => vec![monitor],
         }
     }
 
@@ -68,6 +71,7 @@ impl MonitorEffect {
     fn factor(self, amplitude: f64) -> f64 {
         match self {
             Self::Gain => 1.0 + amplitude,
+            Self::Polarity => 1.0 - 2.0 * amplitude,
             Self::Roll | Self::Cubic | Self::Swap => 1.0,
         }
     }
@@ -79,6 +83,7 @@ impl Mechanism for MonitorEffect {
             Self::Gain => "bpm_gain",
             Self::Roll => "bpm_roll",
             Self::Cubic => "bpm_cubic",
+            Self::Polarity => "bpm_polarity",
             Self::Swap => "bpm_swap",
         }
     }
@@ -92,7 +97,7 @@ impl Mechanism for MonitorEffect {
             Self::Gain => Some(0.08),
             Self::Roll => Some(0.06),
             Self::Cubic => Some(1.5e-3),
-            Self::Swap => None,
+            Self::Polarity | Self::Swap => None,
         }
     }
 
@@ -101,14 +106,14 @@ impl Mechanism for MonitorEffect {
             Self::Gain => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
             Self::Cubic => Unit::PER_SQUARE_MILLIMETRE,
-            Self::Swap => Unit::NONE,
+            Self::Polarity | Self::Swap => Unit::NONE,
         }
     }
 
     fn sites(&self, ring: &Ring) -> Vec<Site> {
         let read = &ring.read_monitors;
         match self {
-            Self::Gain | Self::Cubic => read.iter().map(|&at| Site::Monitor(at)).collect(),
+            Self::Gain | Self::Cubic | Self::Polarity => read.iter().map(|&at| Site::Monitor(at)).collect(),
             Self::Roll => {
                 let first = |&&at: &&usize| rolled(ring, at) == at;
                 read.iter().filter(first).map(|&at| Site::Monitor(at)).collect()
@@ -125,14 +130,14 @@ impl Mechanism for MonitorEffect {
 
     fn expected(&self) -> &'static str {
         match self {
-            Self::Gain | Self::Roll | Self::Cubic => "a monitor",
+            Self::Gain | Self::Roll | Self::Cubic | Self::Polarity => "a monitor",
             Self::Swap => "two monitors of one plane",
         }
     }
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         match self {
-            Self::Gain | Self::Cubic => Site::monitor(ring, name).map(Site::Monitor),
+            Self::Gain | Self::Cubic | Self::Polarity => Site::monitor(ring, name).map(Site::Monitor),
             Self::Roll => either_plane(ring, name).map(|at| Site::Monitor(rolled(ring, at))),
             Self::Swap => {
                 let [one, other] = Site::monitors(ring, name)?;
@@ -147,7 +152,7 @@ impl Mechanism for MonitorEffect {
             (Self::Swap, Site::MonitorPair(one, other)) => {
                 Reading::Exchanged { plane: ring.monitors[one].plane, monitors: [one, other] }
             }
-            (Self::Gain | Self::Roll | Self::Cubic, Site::Monitor(at)) => {
+            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity, Site::Monitor(at)) => {
                 Reading::Distorted { how: *self, monitors: self.monitors(ring, at), amplitude }
             }
             _ => return Err(self.misplaced(ring, site.name(ring))),
@@ -170,7 +175,7 @@ impl Mechanism for MonitorEffect {
                 signature.readings.set_column(j, &-&difference);
                 signature.readings.set_column(i, &difference);
             }
-            (Self::Gain | Self::Roll | Self::Cubic, Site::Monitor(at)) => {
+            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity, Site::Monitor(at)) => {
                 let read =
                     self.monitors(ring, at).into_iter().filter_map(|monitor| Some((monitor, about.read(monitor)?)));
                 let read: Vec<(usize, usize)> = read.collect();
@@ -201,6 +206,7 @@ impl Mechanism for MonitorEffect {
             Self::Cubic => {
                 format!("BPM {name} is not linear: {} % of the position at 5 mm", amplitude.signed(25.0 * 100.0))
             }
+            Self::Polarity => format!("BPM {name} reads with the wrong sign"),
             Self::Swap => format!("BPMs {} are exchanged", site.names(ring).join(" and ")),
         }
     }
