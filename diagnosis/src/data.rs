@@ -219,17 +219,17 @@ impl Data {
         Ok(moved.norm_squared())
     }
 
-    /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting.
-    pub fn trim(&mut self, residual: &DVector<f64>) {
-        for (r, place) in residual.iter().zip(self.places()) {
-            if let Some((frame, b)) = place
-                && r.abs() > FAULTY
-                && self.health()[b].state != MonitorState::Ok
-            {
-                self.screened.accepted[(frame, b)] = false;
-            }
+    /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
+    /// there are any.
+    pub fn trim(&mut self, residual: &DVector<f64>) -> bool {
+        let places = self.places().into_iter().zip(residual.iter()).filter(|(_, r)| r.abs() > FAULTY);
+        let is_faulty = |(_, b): &(usize, usize)| self.health()[*b].state != MonitorState::Ok;
+        let dropped: Vec<(usize, usize)> = places.filter_map(|(place, _)| place).filter(is_faulty).collect();
+        dropped.iter().for_each(|&place| self.screened.accepted[place] = false);
+        if !dropped.is_empty() {
+            self.prepare();
         }
-        self.prepare();
+        !dropped.is_empty()
     }
 
     /// Terms of the exact orbits of a machine above first order in kicks and RF offset, rows frames, the same for all repeats [m].

@@ -43,4 +43,36 @@ impl Imperfection {
     pub fn is_large(&self) -> bool {
         self.is_seen() && self.measured.value.abs() > 2.0 * self.ordinary
     }
+
+    /// As a row of a table: what it is, its size, what is ordinary, and a remark.
+    pub fn row(&self) -> [String; 4] {
+        let Self { name, at, measure, measured, unit, ordinary, .. } = *self;
+        let what = if at == "all" { name.to_owned() } else { format!("{name}, {at}") };
+        let size = match measure {
+            Measure::Mean => format!("{} {}", measured.signed(unit.factor), unit.shown),
+            Measure::Scatter => format!("{} {} rms", measured.size(unit.factor), unit.shown),
+        };
+        let remark = if self.is_large() { "large" } else { "" };
+        [what, size, unit.rounded(ordinary), remark.to_owned()]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_says_what_is_seen_and_what_is_large() {
+        let one = |value: f64| Imperfection {
+            name: "gains of monitors",
+            kind: "bpm_gain",
+            at: "all",
+            measure: Measure::Scatter,
+            measured: Measured { value, sigma: 0.004 },
+            unit: Unit::PERCENT,
+            ordinary: 0.02,
+        };
+        assert_eq!(one(0.05).row(), ["gains of monitors", "5.00 ± 0.40 % rms", "2.0 %", "large"]);
+        assert!(!one(0.03).is_large() && one(0.03).is_seen() && !one(0.007).is_seen());
+    }
 }

@@ -190,31 +190,36 @@ impl Projected {
         let mean = factor.solve(&self.pull.component_mul(&w));
         Some((mean, factor.inverse().diagonal()))
     }
+
+    /// The most likely widths of the families that are learnt, from a start, in units of their tolerances.
+    fn widths(&self, mut width: Vec<f64>, is_learnt: &[bool]) -> Vec<f64> {
+        for _ in 0..STEPS {
+            let Some((mean, variance)) = self.posterior(&width) else { break };
+            let next = |f: usize| {
+                let own = || (0..mean.len()).filter(|&i| self.family[i] == f);
+                let squares: f64 = own().map(|i| mean[i].powi(2)).sum();
+                let known: f64 = own().map(|i| 1.0 - variance[i]).sum();
+                width[f] * (squares / (known + width[f].powi(2))).sqrt()
+            };
+            let next: Vec<f64> = (0..width.len()).map(|f| if is_learnt[f] { next(f) } else { width[f] }).collect();
+            let moved = next.iter().zip(&width).map(|(next, width)| (next - width).abs()).fold(0.0, f64::max);
+            width = next;
+            if moved < SETTLED {
+                break;
+            }
+        }
+        width
+    }
 }
 
 /// The families of a fit with the widths that its recording shows; those that it shows none of are left out.
 pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
     let mut families = fitted.hypothesis.ordinary.clone();
     let Some(projected) = Projected::of(data, fitted) else { return families };
-    let mut width: Vec<f64> = families.iter().map(|family| family.width / family.tolerance).collect();
-    for _ in 0..STEPS {
-        let Some((mean, variance)) = projected.posterior(&width) else { break };
-        let mut moved = 0.0_f64;
-        for f in (0..families.len()).filter(|&f| families[f].is_learnt()) {
-            let of = |i: &usize| projected.family[*i] == f;
-            let (mut squares, mut known) = (0.0, 0.0);
-            (0..mean.len())
-                .filter(of)
-                .for_each(|i| (squares, known) = (squares + mean[i].powi(2), known + 1.0 - variance[i]));
-            let next = width[f] * (squares / (known + width[f].powi(2))).sqrt();
-            moved = moved.max((next - width[f]).abs());
-            width[f] = next;
-        }
-        if moved < SETTLED {
-            break;
-        }
-    }
-    families.iter_mut().zip(&width).for_each(|(family, width)| family.width = family.tolerance * width);
+    let start = families.iter().map(|family| family.width / family.tolerance).collect();
+    let is_learnt: Vec<bool> = families.iter().map(Family::is_learnt).collect();
+    let widths = projected.widths(start, &is_learnt);
+    families.iter_mut().zip(&widths).for_each(|(family, width)| family.width = family.tolerance * width);
     families.retain(|family| !family.is_learnt() || family.width > NONE * family.tolerance);
     families
 }
@@ -253,4 +258,49 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         });
     }
     rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hypothesis::Hypothesis;
+    use crate::testing::template;
+    use inference::Campaign;
+
+    /// Members that the recording shows in full are as wide as their rms; those that it does not show at all get no width.
+    #[test]
+    fn a_width_is_the_rms_of_well_known_members_and_none_without_any() {
+        let family = vec![0; 20].into_iter().chain(vec![1; 20]).collect();
+        let amplitudes = DVector::from_fn(40, |i, _| if i < 20 { f64::sin(2.4 * i as f64) } else { 0.0 });
+        let gram = DMatrix::from_diagonal_element(40, 40, 1e6);
+        let projected = Projected { pull: &gram * amplitudes, gram, family };
+        let width = projected.widths(vec![1.0, 1.0], &[true, true]);
+        // rms 0.71 of 20, and the prior of width 1 takes the square root of 1 - 0.5/20
+        assert!((width[0] - 0.70).abs() < 0.02 && width[1] < NONE, "{width:?}");
+    }
+
+    /// What all monitors of a plane have in common, and what each has for itself, are families of their own.
+    #[test]
+    fn families_hold_every_instrument_once() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
+        assert_eq!(of("gains of monitors").len(), 33);
+        let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
+        assert_eq!(together.map(|members| members.iter().map(Vec::len).collect::<Vec<_>>()), [vec![15], vec![18]]);
+        assert_eq!(of("gradient in all dipoles").len(), 1);
+        assert_eq!(of("edge angle of all dipoles")[0].len(), 1);
+    }
+
+    /// Gains of 2 % change the fit to first order: what the exact machine adds is far below the noise.
+    #[test]
+    fn ordinary_imperfections_are_of_first_order() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let fitted = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
+        let exact = fitted.residual_of(&data).unwrap();
+        // in standard deviations of a reading; the root of the sum of squares is what a fit notices
+        let (off, all) = ((&exact - &fitted.residual).norm(), exact.len() as f64);
+        assert!(off < 0.05 * all.sqrt() && off < 3.0, "{off}");
+    }
 }

@@ -135,12 +135,13 @@ impl Search {
 
     /// The fit of the vars and of what is ordinary.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
-        let hypothesis = Hypothesis::plain();
-        let start = DVector::zeros(data.units.len());
-        let fitted = fit_linearised(&mut data, &hypothesis, &start)?;
-        let learnt = Hypothesis { ordinary: ordinary::learnt(&data, &fitted), ..hypothesis };
-        let guess = fitted.guess(&data, &learnt);
-        let null = if fitted.is_gross() { fitted } else { fit_linearised(&mut data, &learnt, &guess)? };
+        let plain = Hypothesis::plain();
+        let first = Fitted::of(&data, &plain, &DVector::zeros(data.units.len()))?;
+        // what makes a fit poor is not ordinary
+        let ordinary = if first.is_gross() { plain.ordinary.clone() } else { ordinary::learnt(&data, &first) };
+        let hypothesis = Hypothesis { ordinary, ..plain };
+        let guess = first.guess(&data, &hypothesis);
+        let null = fit_linearised(&mut data, &hypothesis, &guess)?;
         let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
     }
@@ -296,8 +297,7 @@ impl Search {
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    if !fitted.is_gross() {
-        data.trim(&fitted.residual);
+    if !fitted.is_gross() && data.trim(&fitted.residual) {
         fitted = Fitted::of(data, hypothesis, &fitted.u)?;
     }
     for _ in 0..PASSES {

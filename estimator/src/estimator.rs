@@ -1,11 +1,12 @@
-//! The path of a frame: bytes, drive, prediction, innovation, gate, Gaussian, estimate. What decides on readings stands
-//! in `screen.rs`, what linearises anew between frames in `anew.rs` and
+//! The path of a frame: bytes, drive, prediction, innovation, gate ([`Estimator::judge`]), Gaussian ([`Estimator::learn`]), estimate.
+//! What decides on readings stands in `screen.rs`, what linearises anew between frames in `anew.rs` and
 //! `pooling.rs`, all below this file.
 //!
 //! The steps are not inlined: a chip's stack then holds one of them at a time, and instruction counts can name them.
 
 mod anew;
 mod drift;
+mod judged;
 mod laplace;
 mod pooling;
 mod posterior;
@@ -24,7 +25,7 @@ use serde::{Deserialize, Serialize};
 use crate::beyond::Beyond;
 use crate::campaign::{Campaign, Setting};
 use crate::drive::{Calibration, Drive, Each};
-use crate::estimate::{Estimate, Remarks};
+use crate::estimate::Estimate;
 use crate::following::{self, Following};
 use crate::gaussian::{Gaussian, Independent, Reading, Solution};
 use crate::linear::column;
@@ -37,14 +38,16 @@ use crate::wire::{Frame, FrameError, PositionCode};
 
 use anew::Anew;
 pub use anew::Prepared;
+pub use judged::Judged;
 pub use laplace::FitQuality;
 use pooling::Work;
 use posterior::Posterior;
 pub use posterior::Walk;
 use reference::Reference;
-use screen::Screened;
+pub(crate) use screen::Screened;
 use sequence::Sequence;
 use times::Times;
+pub(crate) use whole::Expected;
 use whole::{Whole, WholeFrames};
 
 /// Priors that groups of params can have.
@@ -363,9 +366,7 @@ impl<
         let () = Self::FITS;
         self.started = false;
         self.linearise_design(model)?;
-        (self.tangent.supplies, self.tangent.is_new, self.predicted.rf_offset) = ([0.0; F], false, 0.0);
-        self.tangent.follow(model.surrogate);
-        self.design_chromatic = self.tangent.chromatic;
+        (self.tangent.is_new, self.predicted.rf_offset) = (false, 0.0);
         (self.sequence, self.whole, self.looked, self.slices) = (Sequence::EMPTY, WholeFrames::NONE, true, 0);
         (self.times, self.predicted.first_channel) = (Times::NONE, 0);
         (self.nis, self.past.stale) = ((0.0, 0), false);
@@ -401,45 +402,70 @@ impl<
         model: &Model<'_, G, B, C, F>,
         bytes: &mut [u8],
     ) -> Result<Estimate<B, N, W>, IngestError> {
-        let (frame, drive) = self.decode(model, bytes)?;
-        Ok(self.update(model, &frame, &drive))
+        let mut judged = self.judge(model, bytes)?;
+        self.learn(model, &mut judged);
+        Ok(self.estimate(model, &judged))
     }
 
-    /// Take a decoded frame in, and what drove the beam in it.
-    #[inline(never)]
-    fn update(
+    /// The first step of [`Estimator::ingest`]: which readings count, by all that is known before the frame. A feedback acts on that;
+    /// [`Estimator::learn`] must follow.
+    ///
+    /// # Errors
+    /// [`IngestError`]; the posterior is then as it was before.
+    pub fn judge(
         &mut self,
         model: &Model<'_, G, B, C, F>,
-        frame: &Frame<B, C, F, W>,
-        drive: &Drive<C, F>,
-    ) -> Estimate<B, N, W> {
-        self.pass_time(model, frame);
-        self.note_time(model, frame);
-        self.predict(model, drive);
-        let setting = self.setting(model, frame, drive);
+        bytes: &mut [u8],
+    ) -> Result<Judged<B, C, F, W>, IngestError> {
+        let (frame, drive) = self.decode(model, bytes)?;
+        Ok(self.judge_frame(model, frame, drive))
+    }
+
+    /// Judge a decoded frame, and what drove the beam in it.
+    #[inline(never)]
+    fn judge_frame(
+        &mut self,
+        model: &Model<'_, G, B, C, F>,
+        frame: Frame<B, C, F, W>,
+        drive: Drive<C, F>,
+    ) -> Judged<B, C, F, W> {
+        self.pass_time(model, &frame);
+        self.note_time(model, &frame);
+        self.predict(model, &drive);
+        let setting = self.setting(model, &frame, &drive);
         if setting.is_none() {
             self.past.reference.wait();
         }
         let repeats = setting.is_some_and(|setting| self.repeats_decide(model, &setting));
-        let (whole, expected) = self.judge_whole(model, frame, repeats);
+        let (whole, expected) = self.judge_whole(model, &frame, repeats);
         if whole == Whole::Aside {
-            return self.estimate(model, frame, None, &Screened::none_of(&frame.valid), 0.0, whole);
+            let none = Screened::none_of(&frame.valid);
+            return self.judged(frame, drive, (whole, expected), (None, none));
         }
-        let cell = setting.and_then(|setting| self.find_cell(model, &setting, drive));
-        let screened = self.screen(model, frame, drive, cell, whole, &expected);
-        if let Some(cell) = cell {
-            self.note_late(model, frame, drive, cell, &screened);
+        let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
+        let screened = self.screen(model, &frame, &drive, cell, whole, &expected);
+        self.judged(frame, drive, (whole, expected), (cell, screened))
+    }
+
+    /// The second step of [`Estimator::ingest`]: what a frame that was judged says of the params.
+    #[inline(never)]
+    pub fn learn(&mut self, model: &Model<'_, G, B, C, F>, judged: &mut Judged<B, C, F, W>) {
+        if judged.remarks.put_aside {
+            return;
+        }
+        let Judged { frame, drive, cell, screened, nis, .. } = judged;
+        if let Some(cell) = *cell {
+            self.note_late(model, frame, drive, cell, screened);
         }
         let before = self.posterior.solution.cost;
         self.posterior.expect();
-        self.condition(model, frame, cell, &screened);
+        self.condition(model, frame, *cell, screened);
         self.solve(model);
-        let nis = self.count_nis(before, &screened);
+        *nis = self.count_nis(before, screened);
         self.look_for_steps(model);
         if cell.is_none() {
-            self.keep_loose(model, frame, drive, &screened);
+            self.keep_loose(model, frame, drive, screened);
         }
-        self.estimate(model, frame, cell, &screened, nis, whole)
     }
 
     /// One slice of what can be done between frames, so that the next one is answered at once: let the params walk, and linearise
@@ -482,10 +508,14 @@ impl<
     /// [`Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
     pub fn adopt(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         self.past.stale = true;
-        if self.started { self.linearise_anew(model) } else { Ok(()) }
+        if !self.started {
+            return Ok(());
+        }
+        self.linearise_design(model)?;
+        self.linearise_anew(model)
     }
 
-    /// Linearise at vars = 1, all steps at once.
+    /// Linearise at vars = 1, all steps at once, and keep how orbits follow the gradients there.
     fn linearise_design(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
         (self.anew.work, self.anew.under_way) = (Work::Surrogate(G::BEGIN), false);
         while let Work::Surrogate(progress) = &mut self.anew.work {
@@ -493,6 +523,9 @@ impl<
                 break;
             }
         }
+        self.tangent.supplies = [0.0; F];
+        self.tangent.follow(model.surrogate);
+        self.design_chromatic = self.tangent.chromatic;
         Ok(())
     }
 
@@ -558,8 +591,8 @@ impl<
     }
 
     /// Measured minus predicted at the origin, before the baseline [m].
-    fn innovation(&self, b: usize, code: i32) -> f32 {
-        metres(code) - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0)
+    fn innovation(&self, b: usize, reading: PositionCode) -> f32 {
+        reading.value() - self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0)
     }
 
     fn slope(&self, b: usize) -> &[f32] {
@@ -654,7 +687,7 @@ impl<
         let cell = cell.filter(|_| still);
         let mut news = [(0.0, 0.0); B];
         for (b, (news, reading)) in news.iter_mut().zip(&frame.reading).enumerate() {
-            *news = self.news_of(model, b, self.innovation(b, reading.steps()), cell);
+            *news = self.news_of(model, b, self.innovation(b, *reading), cell);
         }
         let used = news.iter().enumerate().filter(|(b, _)| screened.accepted.has(*b));
         let readings = used.map(|(b, &(innovation, variance))| Reading {
@@ -738,24 +771,11 @@ impl<
         self.posterior.solve(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
     }
 
+    /// The estimate after a frame that was learnt; its remarks are said with it.
     #[inline(never)]
-    fn estimate(
-        &mut self,
-        model: &Model<'_, G, B, C, F>,
-        frame: &Frame<B, C, F, W>,
-        cell: Option<u16>,
-        screened: &Screened<W>,
-        nis: f32,
-        whole: Whole,
-    ) -> Estimate<B, N, W> {
-        let linearised = core::mem::take(&mut self.tangent.is_new);
-        let remarks = Remarks {
-            put_aside: whole == Whole::Aside,
-            baselines_moved: whole == Whole::Moved,
-            unsolved: core::mem::take(&mut self.posterior.unsolved),
-            slices: core::mem::take(&mut self.slices),
-            let_loose: self.posterior.let_loose.take(),
-        };
+    pub fn estimate(&mut self, model: &Model<'_, G, B, C, F>, judged: &Judged<B, C, F, W>) -> Estimate<B, N, W> {
+        let remarks = self.remark(judged);
+        let Judged { frame, screened, .. } = judged;
         let solution = &self.posterior.solution;
         let mut estimate = Estimate {
             sequence: frame.sequence,
@@ -768,17 +788,17 @@ impl<
             centre: core::array::from_fn(|i| self.centre(i)),
             params_sigma: solution.sigma,
             clipped: solution.clipped,
-            nis,
+            nis: judged.nis,
             accepted: screened.accepted,
             rejected: screened.rejected,
             confirmed: screened.confirmed,
             restarted: screened.restarted,
             tune_innovation: screened.tune,
-            setting: cell,
+            setting: judged.cell,
             log_evidence: solution.log_evidence as f32,
-            linearised,
+            linearised: judged.linearised,
             remarks,
-            health: core::array::from_fn(|b| self.monitors.get(b).map(Monitor::health).unwrap_or_default()),
+            health: judged.health,
         };
         for i in 0..N {
             let moments = estimate.marginal(i, &prior_of::<G, B, C, F, N>(model, i)).map(|m| m.moments());
@@ -847,8 +867,4 @@ fn less<const F: usize>(strength: &[f32; F], supplies: &[f32; F]) -> [f32; F] {
 /// Add to readings what their baselines are off their means, at `ln` of the supplies' factors about these.
 fn follow<const B: usize, const F: usize>(following: &[Following<F>; B], strength: &[f32; F], readings: &mut [f32; B]) {
     readings.iter_mut().zip(following).for_each(|(reading, following)| *reading += following.shift(strength));
-}
-
-fn metres(code: i32) -> f32 {
-    code as f32 * PositionCode::METRES_PER_LSB
 }

@@ -35,7 +35,7 @@ pub use beyond::Beyond;
 pub use campaign::{Campaign, Cell, Setting, Verdict};
 pub use drive::{Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
-pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Prepared, Setup, Walk};
+pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Judged, Model, Prepared, Setup, Walk};
 pub use gaussian::{Correlated, Gaussian, Reading, Solution};
 pub use mask::{Mask, words};
 pub use monitor::{Gate, Monitor, Noise};

@@ -94,15 +94,14 @@ pub fn add_four_twice<R: Real>(to: [&mut [R]; 2], factors: [[R; 4]; 2], rows: [&
     let [one, other] = to;
     let n = one.len().min(other.len());
     for (to, factors) in [&mut *one, &mut *other].into_iter().zip(factors) {
-        for (i, to) in to.iter_mut().enumerate().skip(n) {
-            let terms = rows.iter().zip(factors);
-            *to = terms.fold(*to, |sum, (row, factor)| sum + factor * row.get(i).copied().unwrap_or(R::ZERO));
+        if let Some(rest) = to.get_mut(n..).filter(|rest| !rest.is_empty()) {
+            add_four(rest, factors, rows.map(|row| row.get(n..).unwrap_or_default()));
         }
     }
     two_by_four(one.get_mut(..n).unwrap_or_default(), other.get_mut(..n).unwrap_or_default(), factors, rows);
 }
 
-/// The part of [`add_four_twice`] that both share, eight entries at a time: within a block, addresses are fixed distances
+/// The part of [`add_four_twice`] that both share, on a chip eight entries at a time: within a block, addresses are fixed distances
 /// from six pointers. The two are separate arguments, so that the compiler knows that they do not alias the rows, and keeps
 /// loaded values.
 #[inline(never)]
@@ -112,6 +111,15 @@ fn two_by_four<R: Real>(one: &mut [R], other: &mut [R], factors: [[R; 4]; 2], ro
     let [first, second, third, fourth] = rows.map(|row| row.get(..n));
     let (Some(first), Some(second), Some(third), Some(fourth)) = (first, second, third, fourth) else { return };
     let [[a, b, c, d], [e, f, g, h]] = factors;
+    // registers of a chip hold one number: there, blocks save counting; elsewhere they keep a plain loop from becoming vector code
+    if cfg!(not(target_arch = "arm")) {
+        for i in 0..n {
+            let (w, x, y, z) = (first[i], second[i], third[i], fourth[i]);
+            one[i] = (((one[i] + a * w) + b * x) + c * y) + d * z;
+            other[i] = (((other[i] + e * w) + f * x) + g * y) + h * z;
+        }
+        return;
+    }
     let ((ones, one), (others, other)) = (one.as_chunks_mut::<8>(), other.as_chunks_mut::<8>());
     let ((firsts, first), (seconds, second)) = (first.as_chunks::<8>(), second.as_chunks::<8>());
     let ((thirds, third), (fourths, fourth)) = (third.as_chunks::<8>(), fourth.as_chunks::<8>());

@@ -31,7 +31,8 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 use crate::drive::{Drive, Each};
-use crate::estimate::{Estimate, MonitorState};
+use crate::estimate::{Health, MonitorState};
+use crate::estimator::Judged;
 use crate::linear::dot;
 use crate::ramp::is_same_time;
 use crate::surrogate::Steerable;
@@ -39,8 +40,8 @@ use crate::triangle::Triangle;
 use crate::wire::{CurrentCode, Frame, PositionCode};
 
 use gain::Gain;
-pub use hold::Hold;
 use hold::Watch;
+pub use hold::{Hold, is_surprising};
 use pace::Pace;
 use supplies::Supplies;
 
@@ -227,29 +228,28 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.supplies.follows(corrector)
     }
 
-    /// Take a frame in, and move the setpoints, or say why not.
+    /// Take a frame in that was judged, and move the setpoints, or say why not.
     #[inline(never)]
     pub fn steer<G: Steerable<B, C, F, N>, const F: usize, const N: usize, const W: usize>(
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,
-        frame: &Frame<B, C, F, W>,
-        estimate: &Estimate<B, N, W>,
+        judged: &Judged<B, C, F, W>,
     ) -> Steered {
         let () = Self::FITS;
-        self.weigh_monitors(estimate);
-        let gap = self.gap(feedback, frame);
+        self.weigh_monitors(&judged.health);
+        let gap = self.gap(feedback, &judged.frame);
         match gap {
-            Some(seconds) => self.observe(feedback, response, frame, estimate, seconds),
-            None => self.begin(feedback, frame, estimate),
+            Some(seconds) => self.observe(feedback, response, judged, seconds),
+            None => self.begin(feedback, judged),
         }
         let is_stale = gap.is_none();
         let is_ready = self.x.is_ready() && self.y.is_ready();
-        let hold = self.watch.judge(is_stale, is_ready, estimate, response.surrogate.layout().monitors());
+        let hold = self.watch.judge(is_stale, is_ready, judged, response.surrogate.layout().monitors());
         self.supplies.probe(-feedback.probe, core::mem::take(&mut self.pattern), &feedback.limit);
         let limited = if hold.is_none() { self.correct(feedback, response) } else { 0 };
         if hold.is_some_and(Hold::is_doubt) {
-            self.pattern = (frame.time_us as u32).max(1);
+            self.pattern = (judged.frame.time_us as u32).max(1);
             self.supplies.probe(feedback.probe, self.pattern, &feedback.limit);
         }
         self.steered = Steered { hold, left_out: self.supplies.left_out(), limited };
@@ -293,12 +293,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
     }
 
     /// Take over from whoever steered so far: setpoints are the read-backs, the orbit is that of this frame.
-    fn begin<const F: usize, const N: usize, const W: usize>(
-        &mut self,
-        feedback: &Feedback<B, C>,
-        frame: &Frame<B, C, F, W>,
-        estimate: &Estimate<B, N, W>,
-    ) {
+    fn begin<const F: usize, const W: usize>(&mut self, feedback: &Feedback<B, C>, judged: &Judged<B, C, F, W>) {
+        let frame = &judged.frame;
         self.cycle_time = frame.cycle_time_us;
         if self.supplies.left_out() > 0 {
             self.forget_gains();
@@ -306,7 +302,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.supplies.take_over(&frame.corrector);
         self.pattern = 0;
         (self.residual, self.variance, self.pace) = ([0.0; B], [UNKNOWN; B], Pace::STEADY);
-        self.believe(feedback, 0.0, &frame.reading, |b| estimate.accepted.has(b));
+        self.believe(feedback, 0.0, &frame.reading, |b| judged.screened.accepted.has(b));
     }
 
     /// Other correctors count from now on: gains that were made without one would give it ten times the kick that it should have.
@@ -322,22 +318,22 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         &mut self,
         feedback: &Feedback<B, C>,
         response: &Response<'_, G, B, C, F, N>,
-        frame: &Frame<B, C, F, W>,
-        estimate: &Estimate<B, N, W>,
+        judged: &Judged<B, C, F, W>,
         seconds: f32,
     ) {
+        let frame = &judged.frame;
         let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close);
         if changed {
             self.forget_gains();
-        } else if estimate.linearised && self.turn > 1 {
+        } else if judged.linearised && self.turn > 1 {
             self.turn = 0;
         }
         let moved = response.orbit(response.kicks(done));
         self.residual.iter_mut().zip(moved).for_each(|(residual, moved)| *residual += moved);
-        if estimate.remarks.baselines_moved {
+        if judged.remarks.baselines_moved {
             self.variance = [UNKNOWN; B];
         }
-        self.believe(feedback, seconds, &frame.reading, |b| estimate.accepted.has(b));
+        self.believe(feedback, seconds, &frame.reading, |b| judged.screened.accepted.has(b));
     }
 
     /// Move the filtered orbit towards the readings that count, so many seconds after the last ones.
@@ -368,8 +364,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
     }
 
-    fn weigh_monitors<const N: usize, const W: usize>(&mut self, estimate: &Estimate<B, N, W>) {
-        for (weight, health) in self.weight.iter_mut().zip(&estimate.health) {
+    fn weigh_monitors(&mut self, health: &[Health; B]) {
+        for (weight, health) in self.weight.iter_mut().zip(health) {
             let is_of_use = health.state != MonitorState::Dead && health.weighted_as > 0.0;
             *weight = if is_of_use { 1.0 / (health.weighted_as * health.weighted_as) } else { 0.0 };
         }

@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::estimate::Estimate;
-use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
+use crate::estimator::{Estimator, FitQuality, IngestError, Judged, Model, Prepared, Setup};
 use crate::sizes::Sizes;
 use crate::steer::{Feedback, Steer, Steered};
 use crate::surrogate::{Steerable, Surrogate, Tables, Unstable};
@@ -18,6 +18,8 @@ pub trait Core: Sized {
     type Tables: Tables;
     /// Priors, noise and calibration.
     type Setup: Clone + Serialize + DeserializeOwned;
+    /// A frame that was judged.
+    type Judged;
     /// The estimate after a frame.
     type Estimate;
     /// The same on the wire.
@@ -40,6 +42,8 @@ pub trait Core: Sized {
         setup: &Self::Setup,
         bytes: &mut [u8],
     ) -> Result<Self::Estimate, IngestError>;
+    fn learn(&mut self, tables: &Self::Tables, setup: &Self::Setup, judged: &mut Self::Judged);
+    fn estimate(&mut self, tables: &Self::Tables, setup: &Self::Setup, judged: &Self::Judged) -> Self::Estimate;
     fn prepare(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Prepared;
     fn adopt(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Result<(), Unstable>;
     fn fit_quality(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> FitQuality;
@@ -48,10 +52,13 @@ pub trait Core: Sized {
     fn covariance(&self, i: usize, j: usize) -> f32;
     /// Number of the frame that an estimate is of.
     fn sequence(estimate: &Self::Estimate) -> u32;
-    /// What feedback needs of an estimate, with a correction if there is one.
-    fn short(estimate: &Self::Estimate, correction: Option<Correction<Self::Setpoints>>) -> Short<Self::Setpoints>;
-    /// True if an operator should look: a monitor is not ok, or a var is clipped.
-    fn needs_attention(estimate: &Self::Estimate) -> bool;
+    /// What feedback needs of an estimate.
+    fn short(&self, estimate: &Self::Estimate) -> Short<Self::Setpoints>;
+    /// The same of a frame that was steered by, learnt or not.
+    fn corrected(&mut self, judged: &Self::Judged, correction: Correction<Self::Setpoints>) -> Short<Self::Setpoints>;
+    /// Number of the frame that was judged.
+    fn number(judged: &Self::Judged) -> u32;
+    fn needs_attention(&self) -> bool;
 }
 
 /// A feedback on a core; see [`Steer`] for what each method does.
@@ -64,14 +71,14 @@ pub trait Steering<E: Core>: Sized {
     const BLANK: Self;
 
     fn is_sound(feedback: &Self::Feedback) -> bool;
-    /// Bytes to estimate to setpoints. See [`Estimator::ingest_and_steer`].
-    fn ingest(
+    /// Bytes to setpoints; the frame is to be learnt then. See [`Estimator::judge_and_steer`].
+    fn judge(
         &mut self,
         core: &mut E,
         model: (&E::Tables, &E::Setup),
         feedback: &Self::Feedback,
         bytes: &mut [u8],
-    ) -> Result<E::Estimate, IngestError>;
+    ) -> Result<E::Judged, IngestError>;
     /// See [`Estimator::prepare_steer`].
     fn prepare(&mut self, core: &E, model: (&E::Tables, &E::Setup), feedback: &Self::Feedback) -> bool;
     fn steered(&self) -> Steered;
@@ -93,6 +100,7 @@ impl<
 {
     type Tables = G;
     type Setup = Setup<B, C, F>;
+    type Judged = Judged<B, C, F, W>;
     type Estimate = Estimate<B, N, W>;
     type Answer = Answer<B, N, W>;
     type Setpoints = Setpoints<C>;
@@ -111,6 +119,14 @@ impl<
 
     fn ingest(&mut self, surrogate: &G, setup: &Self::Setup, bytes: &mut [u8]) -> Result<Self::Estimate, IngestError> {
         self.ingest(&Model { surrogate, setup }, bytes)
+    }
+
+    fn learn(&mut self, surrogate: &G, setup: &Self::Setup, judged: &mut Self::Judged) {
+        self.learn(&Model { surrogate, setup }, judged);
+    }
+
+    fn estimate(&mut self, surrogate: &G, setup: &Self::Setup, judged: &Self::Judged) -> Self::Estimate {
+        self.estimate(&Model { surrogate, setup }, judged)
     }
 
     fn prepare(&mut self, surrogate: &G, setup: &Self::Setup) -> Prepared {
@@ -141,14 +157,22 @@ impl<
         estimate.sequence
     }
 
-    fn short(e: &Self::Estimate, correction: Option<Correction<Self::Setpoints>>) -> Short<Self::Setpoints> {
-        let attention = Self::needs_attention(e);
-        Short { sequence: e.sequence, remarks: e.remarks, attention, nis: e.nis, correction }
+    fn short(&self, e: &Self::Estimate) -> Short<Self::Setpoints> {
+        let attention = self.needs_attention();
+        Short { sequence: e.sequence, remarks: e.remarks, attention, nis: e.nis, correction: None }
     }
 
-    fn needs_attention(estimate: &Self::Estimate) -> bool {
-        let is_faulty = |h: &crate::estimate::Health| h.state != crate::estimate::MonitorState::Ok;
-        estimate.health.iter().any(is_faulty) || !estimate.clipped.is_empty()
+    fn corrected(&mut self, judged: &Self::Judged, correction: Correction<Self::Setpoints>) -> Short<Self::Setpoints> {
+        let (remarks, attention) = (self.remark(judged), self.needs_attention());
+        Short { sequence: judged.frame.sequence, remarks, attention, nis: judged.nis, correction: Some(correction) }
+    }
+
+    fn number(judged: &Self::Judged) -> u32 {
+        judged.frame.sequence
+    }
+
+    fn needs_attention(&self) -> bool {
+        self.needs_attention()
     }
 }
 
@@ -177,14 +201,14 @@ impl<
         feedback.is_sound()
     }
 
-    fn ingest(
+    fn judge(
         &mut self,
         core: &mut Estimator<G, B, C, F, N, S, K, T, U, W>,
         (surrogate, setup): (&G, &Setup<B, C, F>),
         feedback: &Self::Feedback,
         bytes: &mut [u8],
-    ) -> Result<Estimate<B, N, W>, IngestError> {
-        core.ingest_and_steer(&Model { surrogate, setup }, feedback, self, bytes)
+    ) -> Result<Judged<B, C, F, W>, IngestError> {
+        core.judge_and_steer(&Model { surrogate, setup }, feedback, self, bytes)
     }
 
     fn prepare(

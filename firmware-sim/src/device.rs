@@ -106,43 +106,56 @@ impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
         reply(number, &link::Reply::Refused { why: why.into(), count: self.refused });
     }
 
-    /// A frame: the answer, and what was asked for with it.
+    /// A frame: the answer, and what was asked for with it; true if an operator should look.
     #[inline(never)]
     fn ingest(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Option<bool> {
-        let Some(setup) = &self.setup else {
-            self.refuse(Refusal::NotStarted, reply);
-            return None;
+        let taken = match (&self.setup, &self.feedback) {
+            (None, _) => Err(Refusal::NotStarted),
+            (Some(_), None) => self.answer(bytes, reply),
+            (Some(_), Some(_)) => self.act(bytes, reply),
         };
-        let tables = tables(self.contents, self.built_in, self.slot);
-        let ingested = match &self.feedback {
-            None => self.core.ingest(tables, setup, bytes),
-            Some(feedback) => self.steer.ingest(self.core, (tables, setup), feedback, bytes),
-        };
-        match &ingested {
-            Ok(estimate) => Some(self.answer(estimate, reply)),
-            Err(error) => {
-                self.refuse((*error).into(), reply);
+        match taken {
+            Ok(sequence) => {
+                if let Some(number) = self.wants_covariance.take() {
+                    self.send_covariance(number, sequence, reply);
+                }
+                Some(self.core.needs_attention())
+            }
+            Err(why) => {
+                self.refuse(why, reply);
                 None
             }
         }
     }
 
-    /// Reply to a frame, and send what was asked for with it; true if an operator should look.
-    #[inline(never)]
-    fn answer(&mut self, estimate: &E::Estimate, reply: &mut impl FnMut(u32, &Reply<E>)) -> bool {
-        let prepared = core::mem::take(&mut self.prepared);
+    /// Reply by what a frame has taught; its number.
+    fn answer(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Result<u32, Refusal> {
+        let setup = self.setup.as_ref().ok_or(Refusal::NotStarted)?;
+        let tables = tables(self.contents, self.built_in, self.slot);
+        let estimate = self.core.ingest(tables, setup, bytes)?;
         match self.form {
-            Form::Full => say(UNASKED, || link::Reply::Estimate(estimate.into()), reply),
-            Form::Short => {
-                let steer = self.feedback.as_ref().map(|_| &*self.steer);
-                let of = |steer: &S| Correction { steered: steer.steered(), prepared, setpoints: steer.setpoints() };
-                say(UNASKED, || link::Reply::Short(E::short(estimate, steer.map(of))), reply);
-            }
+            Form::Full => say(UNASKED, || link::Reply::Estimate((&estimate).into()), reply),
+            Form::Short => say(UNASKED, || link::Reply::Short(self.core.short(&estimate)), reply),
         }
-        if let Some(number) = self.wants_covariance.take() {
-            self.send_covariance(number, E::sequence(estimate), reply);
+        Ok(E::sequence(&estimate))
+    }
+
+    /// Steer, and reply by the setpoints if that is to be in short: the correctors do not wait until the frame is learnt. Its number.
+    fn act(&mut self, bytes: &mut [u8], reply: &mut impl FnMut(u32, &Reply<E>)) -> Result<u32, Refusal> {
+        let (Some(setup), Some(feedback)) = (&self.setup, &self.feedback) else { return Err(Refusal::NotStarted) };
+        let tables = tables(self.contents, self.built_in, self.slot);
+        let mut judged = self.steer.judge(self.core, (tables, setup), feedback, bytes)?;
+        let prepared = core::mem::take(&mut self.prepared);
+        if self.form == Form::Short {
+            let correction = Correction { steered: self.steer.steered(), prepared, setpoints: self.steer.setpoints() };
+            say(UNASKED, || link::Reply::Short(self.core.corrected(&judged, correction)), reply);
         }
-        E::needs_attention(estimate)
+        self.core.learn(tables, setup, &mut judged);
+        if self.form == Form::Full {
+            let estimate = self.core.estimate(tables, setup, &judged);
+            say(UNASKED, || link::Reply::Estimate((&estimate).into()), reply);
+        }
+        Ok(E::number(&judged))
     }
 
     #[inline(never)]

@@ -61,7 +61,8 @@ pub struct FitResult {
     pub notes: Vec<String>,
 }
 
-/// Time from wire bytes to estimate (`update`), and of the whole frame, its preparation included [us].
+/// Time from wire bytes to estimate (`update`); with the longest slice of work before it, for whose end it may have to wait (`frame`);
+/// and with all such work since the frame before (`prepared`) [us].
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct Timing {
@@ -71,22 +72,22 @@ pub struct Timing {
     pub frame_us_p50: f64,
     pub frame_us_p99: f64,
     pub frame_us_max: f64,
+    pub prepared_us_p50: f64,
+    pub prepared_us_p99: f64,
+    pub prepared_us_max: f64,
 }
 
 impl fmt::Display for Timing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max } = self;
-        write!(
-            f,
-            "frame to estimate: median {update_us_p50:.0} us, 99 % within {update_us_p99:.0} us, slowest {update_us_max:.0} us"
-        )?;
-        if frame_us_max == update_us_max {
+        let line = |f: &mut fmt::Formatter<'_>, what: &str, [p50, p99, max]: [f64; 3]| {
+            write!(f, "{what}: median {p50:.0} us, 99 % within {p99:.0} us, slowest {max:.0} us")
+        };
+        line(f, "frame to estimate", [self.update_us_p50, self.update_us_p99, self.update_us_max])?;
+        if self.prepared_us_max == self.update_us_max {
             return Ok(()); // a device, which prepares unseen
         }
-        write!(
-            f,
-            "\nwith preparation: median {frame_us_p50:.0} us, 99 % within {frame_us_p99:.0} us, slowest {frame_us_max:.0} us"
-        )
+        line(f, "\nwith a slice of preparation", [self.frame_us_p50, self.frame_us_p99, self.frame_us_max])?;
+        line(f, "\nwith all preparation", [self.prepared_us_p50, self.prepared_us_p99, self.prepared_us_max])
     }
 }
 

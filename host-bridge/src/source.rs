@@ -9,6 +9,8 @@ use core::str::FromStr;
 use core::time::Duration;
 use std::time::Instant;
 
+use estimator::Prepared;
+
 use crate::record::EstimateRecord;
 use crate::result::Timing;
 use crate::stop::Stop;
@@ -81,11 +83,20 @@ impl Clock {
     }
 }
 
-/// How long each frame took: what had to be done, after the one before, until it could come, and the answer to it.
+/// How long each frame took: what was done between the one before and it, slice by slice, and the answer to it.
 #[derive(Debug, Default)]
 pub struct Times {
     answers: Vec<Duration>,
-    preparations: Vec<Duration>,
+    preparations: Vec<Preparation>,
+}
+
+/// Work between two frames.
+#[derive(Debug, Clone, Copy, Default)]
+struct Preparation {
+    /// The longest slice: a frame that comes at its beginning waits for its end.
+    longest: Duration,
+    /// All slices.
+    all: Duration,
 }
 
 impl Times {
@@ -94,19 +105,37 @@ impl Times {
         timed(&mut self.answers, answer)
     }
 
-    /// Run what prepares for a frame, and note how long it took.
-    pub fn preparing<T>(&mut self, prepare: impl FnOnce() -> T) -> T {
-        timed(&mut self.preparations, prepare)
+    /// Run the slices that prepare for a frame, until there is nothing to do, and note how long they took.
+    pub fn preparing(&mut self, mut slice: impl FnMut() -> Prepared) {
+        let (mut slices, mut prepared) = (Vec::new(), Prepared::Slice);
+        while prepared != Prepared::Nothing {
+            prepared = timed(&mut slices, &mut slice);
+        }
+        let longest = slices.iter().copied().max().unwrap_or_default();
+        self.preparations.push(Preparation { longest, all: slices.iter().sum() });
     }
 
-    /// Median, 99th percentile and largest of the answer and of the whole frame, as far as its preparation was seen: a device prepares
-    /// by itself.
+    /// Median, 99th percentile and largest of the answer, of the whole frame, and of the frame with all that is done before the next
+    /// one, as far as preparations were seen: a device prepares by itself.
     pub fn quantiles(&self) -> Timing {
-        let preparations = self.preparations.iter().copied().chain(core::iter::repeat(Duration::ZERO));
-        let whole = self.answers.iter().zip(preparations).map(|(answer, preparation)| *answer + preparation);
+        let preparations = self.preparations.iter().copied().chain(core::iter::repeat(Preparation::default()));
+        let each = self.answers.iter().zip(preparations);
+        let whole = each.clone().map(|(answer, preparation)| *answer + preparation.longest);
+        let all = each.map(|(answer, preparation)| *answer + preparation.all);
         let [update_us_p50, update_us_p99, update_us_max] = quantiles(self.answers.clone());
         let [frame_us_p50, frame_us_p99, frame_us_max] = quantiles(whole.collect());
-        Timing { update_us_p50, update_us_p99, update_us_max, frame_us_p50, frame_us_p99, frame_us_max }
+        let [prepared_us_p50, prepared_us_p99, prepared_us_max] = quantiles(all.collect());
+        Timing {
+            update_us_p50,
+            update_us_p99,
+            update_us_max,
+            frame_us_p50,
+            frame_us_p99,
+            frame_us_max,
+            prepared_us_p50,
+            prepared_us_p99,
+            prepared_us_max,
+        }
     }
 }
 
@@ -131,12 +160,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_whole_frame_is_its_answer_and_its_preparation() {
-        let ms = |times: &[u64]| times.iter().map(|time| Duration::from_millis(*time)).collect::<Vec<_>>();
-        let times = Times { answers: ms(&[1, 3, 2]), preparations: ms(&[30, 10, 20]) };
-        let Timing { update_us_p50, update_us_max, frame_us_p50, frame_us_max, .. } = times.quantiles();
-        assert_eq!([update_us_p50, update_us_max, frame_us_p50, frame_us_max], [2e3, 3e3, 22e3, 31e3]);
+    fn a_whole_frame_waits_for_one_slice_of_its_preparation() {
+        let ms = Duration::from_millis;
+        let preparation = |longest, all| Preparation { longest: ms(longest), all: ms(all) };
+        let times = Times {
+            answers: [1, 3, 2].map(ms).to_vec(),
+            preparations: vec![preparation(10, 30), preparation(7, 10), preparation(9, 20)],
+        };
+        let Timing { update_us_max, frame_us_p50, frame_us_max, prepared_us_p50, prepared_us_max, .. } =
+            times.quantiles();
+        assert_eq!([update_us_max, frame_us_p50, frame_us_max], [3e3, 11e3, 11e3]);
+        assert_eq!([prepared_us_p50, prepared_us_max], [22e3, 31e3]);
         assert_eq!(Times::default().quantiles().frame_us_p99, 0.0);
+    }
+
+    #[test]
+    fn preparing_ends_with_nothing_to_do() {
+        let (mut times, mut left) = (Times::default(), 3);
+        times.preparing(|| {
+            left -= 1;
+            if left > 0 { Prepared::Slice } else { Prepared::Nothing }
+        });
+        assert_eq!((left, times.preparations.len()), (0, 1));
+        assert!(times.preparations[0].longest <= times.preparations[0].all);
     }
 
     #[test]

@@ -27,7 +27,7 @@ fn whole_frames() -> Timing {
     let (campaign, mut times) = (Campaign::read(), Times::default());
     for mut core in vec![campaign.core; CAMPAIGNS] {
         for mut wire in campaign.wires.clone() {
-            times.preparing(|| core.prepare());
+            times.preparing(|| core.slice());
             times.of(|| core.ingest(black_box(&mut wire))).unwrap();
         }
     }

@@ -8,9 +8,11 @@ mod scenario;
 
 use core::error::Error;
 
-use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback, Frame, MONITORS, PARAMS, Steer};
+use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback, Frame, MONITORS, PARAMS, Setpoints, Steer};
+use estimator::wire::link::{Correction, Short};
 use estimator::{
-    CurrentCode, Each, IngestError, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Prepared, RfCode, Steered,
+    Core as _, CurrentCode, Each, IngestError, IntensityCode, MagnetCurrents, Mask, Model, PositionCode, Prepared,
+    RfCode, Steered,
 };
 use inference::simulate;
 use twin::Ring;
@@ -55,6 +57,14 @@ pub struct Sample {
     pub sigma: f64,
     /// Largest current of a corrector [A].
     pub largest: f64,
+}
+
+/// What becomes of a frame.
+struct Answer {
+    estimate: Estimate,
+    steered: Option<Steered>,
+    /// What a device says that steers.
+    short: Option<Short<Setpoints>>,
 }
 
 /// How far the orbit is expected to walk in the root of a second [m]: what the core expects of the baselines.
@@ -159,9 +169,9 @@ impl<'k> Loop<'k> {
         let said = self.chip.as_mut().map(|chip| chip.hear(steers, self.sequence, &self.wire)).transpose()?;
         let (slices, prepared) = said.as_ref().map_or((u32::MAX, true), |said| (said.slices(), said.prepared()));
         self.prepare(slices, prepared);
-        let (estimate, steered) = self.ingest(&frame)?;
+        let Answer { estimate, steered, short } = self.ingest(prepared)?;
         if let (Some(chip), Some(said)) = (&mut self.chip, &said) {
-            chip.compare(said, &self.core, &estimate, steered, self.steer.setpoints());
+            chip.compare(said, &self.core, &estimate, short.as_ref());
         }
         self.frame += 1;
         let error = core::array::from_fn(|i| f64::from(estimate.map_params[i]) - self.plant.params[i]);
@@ -240,18 +250,24 @@ impl<'k> Loop<'k> {
         self.frame >= self.scenario.campaign && self.control != Control::Off
     }
 
-    /// Bytes to estimate, and to setpoints.
-    fn ingest(&mut self, frame: &Frame) -> Result<(Estimate, Option<Steered>), IngestError> {
+    /// Bytes to setpoints, and to estimate; `prepared` tells whether the feedback's work was done before.
+    fn ingest(&mut self, prepared: bool) -> Result<Answer, IngestError> {
         let model = Model { surrogate: &*self.known.surrogate, setup: &self.known.setup };
         let mut bytes = self.wire.clone();
         if self.steers() && self.control == Control::Estimated {
-            let estimate = self.core.ingest_and_steer(&model, &self.feedback, &mut self.steer, &mut bytes)?;
-            return Ok((estimate, Some(self.steer.steered())));
+            let mut judged = self.core.judge_and_steer(&model, &self.feedback, &mut self.steer, &mut bytes)?;
+            let (steered, setpoints) = (self.steer.steered(), self.steer.setpoints().iter().copied().collect());
+            let short = self.core.corrected(&judged, Correction { steered, prepared, setpoints });
+            self.core.learn(&model, &mut judged);
+            // of a copy: what this frame has taught is said with the next one
+            let estimate = self.core.clone().estimate(&model, &judged);
+            return Ok(Answer { estimate, steered: Some(steered), short: Some(short) });
         }
-        let estimate = self.core.ingest(&model, &mut bytes)?;
-        let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), frame, &estimate);
+        let mut judged = self.core.judge(&model, &mut bytes)?;
+        let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), &judged);
         let steered = self.steers().then(|| of_design(&mut self.steer));
-        Ok((estimate, steered))
+        self.core.learn(&model, &mut judged);
+        Ok(Answer { estimate: self.core.estimate(&model, &judged), steered, short: None })
     }
 
     /// What is done before a frame: so many slices of the core's work, as far as there are any, and the feedback's.

@@ -7,6 +7,7 @@ mod evidence;
 mod experiment;
 mod findings;
 mod heldout;
+mod imperfections;
 mod monitors;
 mod place;
 mod residuals;
@@ -41,6 +42,7 @@ pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, FitErr
         heldout::section(diagnosis),
         vars::section(diagnosis),
         experiment::section(diagnosis)?,
+        imperfections::section(diagnosis),
         monitors::section(diagnosis),
     ];
     Ok(Page {
@@ -81,7 +83,7 @@ mod tests {
         let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
         let page = page(&diagnosis, &made).unwrap();
         assert!(page.lead.contains("x_E4"), "{}", page.lead);
-        assert_eq!(page.sections.len(), 10);
+        assert_eq!(page.sections.len(), 11);
         let figures: usize = page.sections.iter().map(|section| section.figures.len()).sum();
         // ring, maps, two of chi-square, evidence, two scans, vars
         assert_eq!(figures, 8);

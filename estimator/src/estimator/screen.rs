@@ -15,7 +15,7 @@ const NARROWS: f64 = 0.5;
 
 /// Which readings of a frame are used.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Screened<const W: usize> {
+pub(crate) struct Screened<const W: usize> {
     pub accepted: Mask<W>,
     pub rejected: Mask<W>,
     pub confirmed: Mask<W>,

@@ -1,7 +1,6 @@
 //! What a feedback takes from the estimate: the response at the estimated vars, and the covariance of the params.
 
-use super::{Estimator, IngestError, Model};
-use crate::estimate::Estimate;
+use super::{Estimator, IngestError, Judged, Model};
 use crate::steer::{Feedback, Response, Steer};
 use crate::surrogate::Steerable;
 
@@ -18,28 +17,28 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    /// Take one machine cycle in: bytes to estimate to setpoints, which are in the feedback's state then. See [`Estimator::ingest`] and
-    /// [`Steer::steer`].
+    /// Judge one machine cycle, and steer: bytes to setpoints, which are in the feedback's state then. The frame is to be learnt after
+    /// that. See [`Estimator::judge`] and [`Steer::steer`].
     ///
     /// # Errors
     /// [`IngestError`]; posterior and setpoints are then as they were before.
     #[inline(never)]
-    pub fn ingest_and_steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(
+    pub fn judge_and_steer<const CX: usize, const CY: usize, const TX: usize, const TY: usize>(
         &mut self,
         model: &Model<'_, G, B, C, F>,
         feedback: &Feedback<B, C>,
         state: &mut Steer<B, C, CX, CY, TX, TY>,
         bytes: &mut [u8],
-    ) -> Result<Estimate<B, N, W>, IngestError> {
-        let (frame, drive) = self.decode(model, bytes)?;
+    ) -> Result<Judged<B, C, F, W>, IngestError> {
         // at its place from the start: a copy is more than a kilobyte of stack
-        let estimate = Ok(self.update(model, &frame, &drive));
-        if let Ok(estimate) = &estimate {
+        let mut judged = self.judge(model, bytes);
+        if let Ok(judged) = &mut judged {
+            judged.nis = self.surprise(judged);
             // a frame that was taken in is within the ramp
-            let momentum = model.setup.calibration.ramp.at(frame.cycle_time_us).map_or(1.0, |at| at.momentum);
-            let _ = state.steer(feedback, &self.response(model, momentum), &frame, estimate);
+            let momentum = model.setup.calibration.ramp.at(judged.frame.cycle_time_us).map_or(1.0, |at| at.momentum);
+            let _ = state.steer(feedback, &self.response(model, momentum), judged);
         }
-        estimate
+        judged
     }
 
     /// What can be done for the feedback after a frame, once [`Estimator::prepare`] has nothing more to do. See [`Steer::prepare`].

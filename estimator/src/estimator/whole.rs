@@ -1,11 +1,12 @@
 //! A frame as a whole, before any of it counts: is there a beam in it that the model knows?
 
-use super::{Estimator, Model, UNDERWEIGHT};
+use super::{Estimator, Judged, Model, UNDERWEIGHT};
 use crate::campaign::Setting;
 use crate::estimate::MonitorState;
 use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::quarantine::{Quarantine, Shift};
+use crate::steer::is_surprising;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -51,7 +52,7 @@ impl<const B: usize> WholeFrames<B> {
 
 /// What the model makes of each reading.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Expected<const B: usize, const W: usize> {
+pub(crate) struct Expected<const B: usize, const W: usize> {
     /// Measured minus expected [m]; 0 where none is reported.
     pub surprise: [f32; B],
     /// Its variance but for the uncertainty of the params [m^2].
@@ -117,7 +118,7 @@ impl<
             let channel = self.predicted.first_channel + b;
             let (predicted, baseline_variance) =
                 self.posterior.gaussian.expected(channel, self.slope(b), &self.posterior.solution.delta);
-            let surprise = f64::from(self.innovation(b, reading.steps())) - predicted;
+            let surprise = f64::from(self.innovation(b, *reading)) - predicted;
             let certain = f64::from(
                 self.own_variance(model, b, &self.predicted.strength)
                     + self.shared_variance(model, &self.tangent, b, self.predicted.rf_offset),
@@ -156,20 +157,33 @@ impl<
     /// True if the readings within the gate are not all near its edge: an orbit that has moved by three standard deviations
     /// everywhere surprises no single monitor, and would be taken for a change of the vars.
     fn is_expected_together(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
-        let sum = |uncertain: f64| {
-            let (mut all, mut squares) = (0.0, 0.0);
-            for (b, _) in self.alive(frame).filter(|(b, _)| expected.within.has(*b)) {
-                let (Some(surprise), Some(certain)) = (expected.surprise.get(b), expected.certain.get(b)) else {
-                    continue;
-                };
-                let own = if uncertain > 0.0 { uncertain * self.variance_of_params(b) } else { 0.0 };
-                all += 1.0;
-                squares += f64::from(surprise * surprise) / (f64::from(*certain) + own);
-            }
-            squares <= TOGETHER * all
-        };
+        let mut counts = Mask::NONE;
+        self.alive(frame).for_each(|(b, _)| counts.put(b, expected.within.has(b)));
+        let most = TOGETHER * f64::from(counts.count());
         // the uncertainty of the params is only worked out for frames that need it
-        sum(0.0) || sum(1.0 + UNDERWEIGHT)
+        self.squares(expected, &counts, 0.0) <= most || self.squares(expected, &counts, 1.0 + UNDERWEIGHT) <= most
+    }
+
+    /// Sum of the squares of surprises over their variances, each by itself, with a multiple of what the uncertainty of the params
+    /// adds to these.
+    fn squares(&self, expected: &Expected<B, W>, counts: &Mask<W>, uncertain: f64) -> f64 {
+        let each = expected.surprise.iter().zip(&expected.certain).enumerate().filter(|(b, _)| counts.has(*b));
+        let square = |(b, (surprise, certain)): (usize, (&f32, &f32))| {
+            let own = if uncertain > 0.0 { uncertain * self.variance_of_params(b) } else { 0.0 };
+            f64::from(surprise * surprise) / (f64::from(*certain) + own)
+        };
+        each.map(square).sum()
+    }
+
+    /// Normalised innovation squared of the readings used, each by itself, before they are learnt. Without the uncertainty of the
+    /// params, unless the frame would surprise.
+    pub(super) fn surprise(&self, judged: &Judged<B, C, F, W>) -> f32 {
+        let used = &judged.screened.accepted;
+        let certain = self.squares(&judged.expected, used, 0.0) as f32;
+        if !is_surprising(certain, used.count()) {
+            return certain;
+        }
+        self.squares(&judged.expected, used, 1.0) as f32
     }
 
     /// Variance that the params' uncertainty gives a prediction [m^2].

@@ -35,15 +35,9 @@ impl<const C: usize, const T: usize> Gain<C, T> {
             return;
         }
         matrix.invert();
-        self.inverse = Triangle::ZERO;
-        // A^-1 = X^T X for the inverse X of the factor
-        for row in matrix.rows() {
-            let mut single = [0.0; C];
-            single.iter_mut().zip(row).for_each(|(to, x)| *to = *x as f32);
-            for (to, x) in self.inverse.rows_mut().zip(single) {
-                add(to, x, &single);
-            }
-        }
+        matrix.square();
+        let each = self.inverse.entries_mut().iter_mut().zip(matrix.entries_mut());
+        each.for_each(|(to, from)| *to = *from as f32);
     }
 
     /// The kicks `-A^-1 pull` [rad], within the room that each corrector has, and scaled so that none moves faster than its rate; the

@@ -4,7 +4,7 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::Estimate;
+use crate::estimator::Judged;
 
 /// Why a frame moves no corrector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -59,6 +59,17 @@ const DISAGREES: f32 = 3.0;
 /// One in so many monitors must be of use.
 const BLIND: usize = 2;
 
+/// True if so many readings are further from the prediction, by their squares over their variances, than chance explains.
+pub fn is_surprising(nis: f32, readings: u32) -> bool {
+    nis > most(readings)
+}
+
+/// NIS of so many readings beyond which a frame surprises.
+fn most(readings: u32) -> f32 {
+    let expected = readings as f32;
+    expected + SURPRISING * libm::sqrtf(2.0 * expected)
+}
+
 /// The running mean of NIS over readings, less 1.
 #[derive(Debug, Clone, Copy)]
 pub struct Watch(f32);
@@ -68,28 +79,26 @@ impl Watch {
     pub const BLANK: Self = Self(0.0);
 
     /// Judge a frame.
-    pub fn judge<const B: usize, const N: usize, const W: usize>(
+    pub fn judge<const B: usize, const C: usize, const F: usize, const W: usize>(
         &mut self,
         is_stale: bool,
         is_ready: bool,
-        estimate: &Estimate<B, N, W>,
+        judged: &Judged<B, C, F, W>,
         monitors: usize,
     ) -> Option<Hold> {
-        let used = estimate.accepted.count() + estimate.tune_innovation.iter().flatten().count() as u32;
-        let expected = used as f32;
-        if !estimate.remarks.put_aside && used > 0 {
+        let (used, nis) = (judged.screened.accepted.count(), judged.nis);
+        if !judged.remarks.put_aside && used > 0 {
             // a single frame of any size moves the mean no further than a surprising one
-            let most = 1.0 + SURPRISING * libm::sqrtf(2.0 / expected);
-            self.0 += SHARE * ((estimate.nis / expected).min(most) - 1.0 - self.0);
+            let expected = used as f32;
+            self.0 += SHARE * (nis.min(most(used)) / expected - 1.0 - self.0);
         }
-        let surprise = estimate.nis - expected;
         let reasons = [
             (is_stale, Hold::Stale),
-            (estimate.remarks.put_aside, Hold::PutAside),
-            (estimate.remarks.unsolved || !estimate.nis.is_finite(), Hold::Unsolved),
-            (surprise > SURPRISING * libm::sqrtf(2.0 * expected), Hold::Surprising),
+            (judged.remarks.put_aside, Hold::PutAside),
+            (judged.remarks.unsolved || !nis.is_finite(), Hold::Unsolved),
+            (is_surprising(nis, used), Hold::Surprising),
             (1.0 + self.0 > DISAGREES, Hold::Mismatch),
-            (BLIND * (estimate.accepted.count() as usize) < monitors, Hold::Blind),
+            (BLIND * (used as usize) < monitors, Hold::Blind),
             (!is_ready, Hold::Unprepared),
         ];
         reasons.into_iter().find(|(holds, _)| *holds).map(|(_, hold)| hold)

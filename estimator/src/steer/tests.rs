@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::estimate::{Health, Remarks};
+use crate::estimator::{Expected, Screened};
 use crate::mask::Mask;
 use crate::sizes::{Layout, Sizes};
 use crate::surrogate::{Prediction, Surrogate, Tables, Unstable};
@@ -10,7 +11,6 @@ use crate::wire::{MagnetCurrents, Parcel, ParcelError, RfCode};
 const B: usize = 4;
 const C: usize = 4;
 type State = Steer<B, C, 3, 1, 6, 1>;
-type Cycle = Frame<B, C, 1, 1>;
 
 /// `R(theta) = at + theta uncertain`, one param; the orbit off momentum is `dispersion`.
 #[derive(Debug, Clone)]
@@ -139,7 +139,7 @@ struct Machine {
     cycle_time_us: u32,
     /// Over the reference.
     momentum: f32,
-    estimate: Estimate<B, 1, 1>,
+    judged: Judged<B, C, 1, 1>,
     /// Slices of work for the feedback between two frames.
     slices: u8,
 }
@@ -158,7 +158,7 @@ impl Machine {
             time_us: 0,
             cycle_time_us: 0,
             momentum: 1.0,
-            estimate: estimate(health),
+            judged: judged(health),
             slices: TURN,
         };
         assert_eq!(machine.cycle().hold, Some(Hold::Stale));
@@ -175,21 +175,12 @@ impl Machine {
     /// A frame of the orbit as it is; the setpoints it makes are not taken over yet.
     fn frame(&mut self) -> Steered {
         self.time_us += 100_000;
-        let frame = Cycle {
-            epoch: 0,
-            sequence: 0,
-            time_us: self.time_us,
-            cycle_time_us: self.cycle_time_us,
-            corrector: self.current,
-            magnets: MagnetCurrents { dipole: CurrentCode::default(), supply: [CurrentCode::default()] },
-            rf_offset: RfCode::default(),
-            reading: self.orbit().map(|x| PositionCode::nearest(x.into()).unwrap()),
-            tune: [None; 2],
-            intensity: None,
-            valid: Mask::from_words(&[15]),
-        };
+        let reading = self.orbit().map(|x| PositionCode::nearest(x.into()).unwrap());
+        let frame = &mut self.judged.frame;
+        (frame.time_us, frame.cycle_time_us, frame.corrector) = (self.time_us, self.cycle_time_us, self.current);
+        frame.reading = reading;
         let response = Response { surrogate: &self.table, at: &(), kick_per_ampere: &KICK, momentum: self.momentum };
-        let steered = self.state.steer(&self.feedback, &response, &frame, &self.estimate);
+        let steered = self.state.steer(&self.feedback, &response, &self.judged);
         for _ in 0..self.slices {
             self.state.prepare(&self.feedback, &response, |_| [self.variance]);
         }
@@ -214,30 +205,25 @@ impl Machine {
     }
 }
 
-fn estimate(health: Health) -> Estimate<B, 1, 1> {
-    Estimate {
+fn judged(health: Health) -> Judged<B, C, 1, 1> {
+    let frame = Frame {
+        epoch: 0,
         sequence: 0,
         time_us: 0,
-        frames: 1,
-        rejected_frames: 0,
-        mean: [1.0],
-        sigma: [0.01],
-        map_params: [0.0],
-        centre: [0.0],
-        params_sigma: [0.01],
-        clipped: Mask::NONE,
-        nis: 4.0,
-        accepted: Mask::from_words(&[15]),
-        rejected: Mask::NONE,
-        confirmed: Mask::NONE,
-        restarted: Mask::NONE,
-        tune_innovation: [None; 2],
-        setting: None,
-        log_evidence: 0.0,
-        linearised: false,
-        remarks: Remarks::default(),
-        health: [health; B],
-    }
+        cycle_time_us: 0,
+        corrector: [CurrentCode::default(); C],
+        magnets: MagnetCurrents { dipole: CurrentCode::default(), supply: [CurrentCode::default()] },
+        rf_offset: RfCode::default(),
+        reading: [PositionCode::default(); B],
+        tune: [None; 2],
+        intensity: None,
+        valid: Mask::from_words(&[15]),
+    };
+    let drive = Drive { kick: [0.0; C], strength: [0.0], rf_offset: 0.0 };
+    let screened = Screened { accepted: Mask::from_words(&[15]), ..Screened::default() };
+    let expected = Expected { surprise: [0.0; B], certain: [0.0; B], within: Mask::NONE };
+    let (remarks, health) = (Remarks::default(), [health; B]);
+    Judged { frame, nis: 4.0, linearised: false, remarks, health, drive, expected, cell: None, screened }
 }
 
 /// Where kicks have several ways, a step that costs something: 1 % of what an orbit costs.
@@ -300,9 +286,9 @@ fn a_moved_orbit_is_the_mean_of_its_frames() {
     let mut machine = Machine::new(diagonal(), Feedback { walk: 1e-3 * SLOW, ..free() }, 0.0);
     machine.cycles(20);
     machine.disturbance = [1e-3; B];
-    machine.estimate.remarks.baselines_moved = true;
+    machine.judged.remarks.baselines_moved = true;
     machine.cycles(1);
-    machine.estimate.remarks.baselines_moved = false;
+    machine.judged.remarks.baselines_moved = false;
     assert!(machine.orbit().iter().all(|x| x.abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
     // a second one that is off counts half, too little to move faster
     machine.disturbance = [1.05e-3; B];
@@ -388,21 +374,21 @@ fn each_reason_holds() {
         (|m| m.time_us += 2_000_000, Hold::Stale),
         (|m| m.time_us -= 150_000, Hold::Stale),
         (|m| m.cycle_time_us += 20_000, Hold::Stale),
-        (|m| m.estimate.remarks.put_aside = true, Hold::PutAside),
-        (|m| m.estimate.remarks.unsolved = true, Hold::Unsolved),
-        (|m| m.estimate.nis = 30.0, Hold::Surprising),
-        (|m| m.estimate.accepted = Mask::from_words(&[1]), Hold::Blind),
+        (|m| m.judged.remarks.put_aside = true, Hold::PutAside),
+        (|m| m.judged.remarks.unsolved = true, Hold::Unsolved),
+        (|m| m.judged.nis = 30.0, Hold::Surprising),
+        (|m| m.judged.screened.accepted = Mask::from_words(&[1]), Hold::Blind),
     ];
     for (change, hold) in reasons {
         let mut machine = Machine::new(diagonal(), free(), 0.0);
         machine.cycles(1);
         machine.disturbance = [1e-3; B];
-        let good = machine.estimate.clone();
+        let good = machine.judged.clone();
         change(&mut machine);
         assert_eq!(machine.cycle().hold, Some(hold));
         assert_eq!(machine.amperes(), [0.0; C], "{hold:?}");
         // and it goes on
-        machine.estimate = good;
+        machine.judged = good;
         assert_eq!(machine.cycle().hold, None, "{hold:?}");
         machine.cycles(1);
         assert!(machine.orbit().iter().all(|x| x.abs() < 4.0 * ROUNDING), "{hold:?}: {:?}", machine.orbit());
@@ -412,10 +398,10 @@ fn each_reason_holds() {
 #[test]
 fn a_lasting_mismatch_holds_until_it_is_over() {
     let mut machine = Machine::new(diagonal(), free(), 0.0);
-    machine.estimate.nis = 14.0; // 3.5 times what four readings make
+    machine.judged.nis = 14.0; // 3.5 times what four readings make
     let holds: std::vec::Vec<_> = (0..300).map(|_| machine.cycle().hold).collect();
     assert_eq!((holds[0], holds[60], holds[150]), (None, None, Some(Hold::Mismatch)));
-    machine.estimate.nis = 4.0;
+    machine.judged.nis = 4.0;
     assert!((0..100).map(|_| machine.cycle().hold).any(|hold| hold.is_none()));
 }
 
@@ -426,7 +412,7 @@ fn doubt_is_probed_within_the_limits_and_leaves_nothing_behind() {
     machine.cycles(3);
     let before = machine.amperes();
     assert!(before[0] == -6.0 && before[2] == 6.0, "{before:?}");
-    machine.estimate.remarks.put_aside = true;
+    machine.judged.remarks.put_aside = true;
     let mut patterns = [[0.0; C]; 20];
     for pattern in &mut patterns {
         machine.cycles(1);
@@ -437,8 +423,8 @@ fn doubt_is_probed_within_the_limits_and_leaves_nothing_behind() {
     // each corrector is moved both ways, and no two alike
     let moved = |c: usize| patterns.iter().filter(|pattern| pattern[c] > before[c]).count();
     assert!((0..C).all(|c| (4..=16).contains(&moved(c))), "{patterns:?}");
-    machine.estimate.remarks.put_aside = false;
-    (machine.estimate.accepted, machine.estimate.nis) = (Mask::NONE, 0.0);
+    machine.judged.remarks.put_aside = false;
+    (machine.judged.screened.accepted, machine.judged.nis) = (Mask::NONE, 0.0);
     machine.cycles(1);
     assert_eq!(machine.amperes(), before);
 }
@@ -520,10 +506,10 @@ fn a_monitor_that_does_not_report_keeps_its_orbit() {
     let mut machine = Machine::new(diagonal(), Feedback { walk: SLOW, ..free() }, 0.0);
     machine.cycles(60);
     machine.disturbance = [5e-5; B];
-    machine.estimate.accepted = Mask::from_words(&[14]);
+    machine.judged.screened.accepted = Mask::from_words(&[14]);
     machine.cycles(20);
     assert!((machine.orbit()[0] - 5e-5).abs() < 4.0 * ROUNDING, "{:?}", machine.orbit());
-    machine.estimate.accepted = Mask::from_words(&[15]);
+    machine.judged.screened.accepted = Mask::from_words(&[15]);
     machine.cycles(1);
     // 0.27 noise^2 and 20 frames' walks of 0.1 of it, with that of this frame
     let known = SLOW_GAIN + 20.0 * 0.1 + 0.1;

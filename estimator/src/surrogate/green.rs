@@ -18,7 +18,7 @@
 //! Source: the resolvent (Dyson) form of the perturbed Green's function, by successive rank-one updates (J. Sherman
 //! and W. J. Morrison, Ann. Math. Stat. 21 (1950) 124); S. Y. Lee, Accelerator Physics, ch. 2, for G.
 
-use super::quantised::{Column, dot_codes};
+use super::quantised::{Column, dot_codes, dot_four_codes};
 use super::{Block, LowRank, Prediction, Steerable, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
 use crate::linear::{add, add_four, add_four_twice, dot};
@@ -660,7 +660,13 @@ impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinear
 
     /// Add readings for kicks of nodes.
     fn read_nodes(&self, kick: &[f32; Q], reading: &mut [f32]) {
-        reading.iter_mut().zip(&self.seen).for_each(|(reading, seen)| *reading += seen.dot(kick));
+        let ((seen, last_seen), (reading, last)) = (self.seen.as_chunks::<4>(), reading.as_chunks_mut::<4>());
+        for (reading, seen) in reading.iter_mut().zip(seen) {
+            let sums = dot_four_codes(seen.each_ref().map(|seen| seen.codes.as_slice()), kick);
+            let each = reading.iter_mut().zip(seen.iter().zip(sums));
+            each.for_each(|(reading, (seen, sum))| *reading += seen.scale * sum);
+        }
+        last.iter_mut().zip(last_seen).for_each(|(reading, seen)| *reading += seen.dot(kick));
     }
 }
 

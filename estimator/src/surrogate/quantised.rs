@@ -63,6 +63,24 @@ pub fn dot_codes(codes: &[i16], values: &[f32]) -> f32 {
     codes.iter().zip(values).map(|(code, value)| f32::from(*code) * value).sum()
 }
 
+/// [`dot_codes`] of four at a time: four sums that do not wait for one another. All have as many codes as there are values.
+#[inline(never)]
+pub fn dot_four_codes(codes: [&[i16]; 4], values: &[f32]) -> [f32; 4] {
+    let n = values.len();
+    let [first, second, third, fourth] = codes.map(|codes| codes.get(..n));
+    let (Some(first), Some(second), Some(third), Some(fourth)) = (first, second, third, fourth) else {
+        return [0.0; 4];
+    };
+    let mut sums = [-0.0; 4];
+    for i in 0..n {
+        sums[0] += f32::from(first[i]) * values[i];
+        sums[1] += f32::from(second[i]) * values[i];
+        sums[2] += f32::from(third[i]) * values[i];
+        sums[3] += f32::from(fourth[i]) * values[i];
+    }
+    sums
+}
+
 /// `to += factor` times codes.
 #[inline(never)]
 pub fn add_codes(to: &mut [f32], factor: f32, codes: &[i16]) {

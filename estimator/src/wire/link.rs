@@ -108,7 +108,7 @@ pub struct Short<U> {
     pub remarks: Remarks,
     /// An operator should look, see [`crate::Core::needs_attention`].
     pub attention: bool,
-    /// Normalised innovation squared of the readings used.
+    /// Normalised innovation squared of the readings used; with a correction, each of them by itself (`Judged::nis`).
     pub nis: f32,
     /// What the correctors are to do, while the device steers.
     pub correction: Option<Correction<U>>,

@@ -109,19 +109,12 @@ struct ImperfectionResult {
 
 impl From<&Imperfection> for ImperfectionResult {
     fn from(one: &Imperfection) -> Self {
-        let Imperfection { name, kind, at, measure, measured, unit, ordinary } = *one;
+        let Imperfection { kind, at, measure, measured, unit, .. } = *one;
         let [mean, scatter] = match measure {
             Measure::Mean => [measured.value, 0.0],
             Measure::Scatter => [0.0, measured.value],
         };
-        let said = match measure {
-            Measure::Mean => measured.signed(unit.factor),
-            Measure::Scatter => measured.size(unit.factor),
-        };
-        let what = if at == "all" { name.to_owned() } else { format!("{name}, {at}") };
-        let shown =
-            [what, said, format!("{}", unit.rounded(ordinary)), if one.is_large() { "large" } else { "" }.to_owned()];
-        let row = one.is_seen().then_some(shown);
+        let row = one.is_seen().then(|| one.row());
         Self { kind, at, mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
     }
 }

@@ -37,7 +37,7 @@ impl Source for Replay<'_> {
         let Some(row) = self.recording.rows.get(self.next) else { return Ok(Next::End) };
         self.next += 1;
         let mut bytes = stream::wire(self.recording, row)?;
-        self.times.preparing(|| self.core.prepare());
+        self.times.preparing(|| self.core.slice());
         self.clock.wait();
         let estimate = self.times.of(|| self.core.ingest(&mut bytes));
         let estimate = estimate.map_err(|error| format!("frame {}: {error}", row.sequence))?;

@@ -96,7 +96,7 @@ where
 {
     fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate, IngestError> {
         let estimate = self.core.ingest(&self.tables, &self.setup, bytes)?;
-        Ok(E::estimate(&self.tables, &estimate))
+        Ok(<E as Room>::estimate(&self.tables, &estimate))
     }
 
     fn prepare(&mut self) -> Prepared {

@@ -4,9 +4,9 @@ use core::error::Error;
 use core::fmt;
 use std::os::unix::net::UnixStream;
 
-use estimator::booster::{CORRECTORS, Estimate, Estimator, Feedback};
+use estimator::Each;
+use estimator::booster::{self, Estimate, Estimator, Feedback};
 use estimator::wire::link::{Form, Short, Status};
-use estimator::{CurrentCode, Each, Steered};
 use host_bridge::source::link::{Heard, Link, LinkError};
 use inference::stream;
 use training::rooms::large::{self, Setpoints};
@@ -18,9 +18,9 @@ use crate::sil::bits;
 
 /// Steps whose instructions are counted, by the words of the table and the function in the image.
 pub const REGIONS: [(&str, &str); 5] = [
-    ("frame to setpoints", "ingest_and_steer"),
-    ("estimate", "Estimator::update"),
+    ("frame to setpoints", "judge_and_steer"),
     ("steer", "Steer::steer"),
+    ("learn", "Estimator::learn"),
     ("gains of a plane", "Steer::prepare"),
     ("reply", "Reply::encode"),
 ];
@@ -92,7 +92,10 @@ impl<'e> Chip<'e> {
             self.link.form(Form::Short)?;
             self.link.steer(Some(on_wire(feedback)))?;
         }
-        self.link.feedback(sequence, wire).map(|short| Said::Short(Box::new(short)))
+        let short = self.link.feedback(sequence, wire)?;
+        // answered once the frame is learnt: the next one does not come before that
+        self.link.form(Form::Short)?;
+        Ok(Said::Short(Box::new(short)))
     }
 
     /// How the device is.
@@ -109,12 +112,11 @@ impl<'e> Chip<'e> {
         said: &Said,
         core: &Estimator,
         estimate: &Estimate,
-        steered: Option<Steered>,
-        setpoints: &[CurrentCode; CORRECTORS],
+        short: Option<&Short<booster::Setpoints>>,
     ) {
         let is_same = match said {
             Said::Full(heard) => is_same(heard, core, estimate),
-            Said::Short(short) => says(short, estimate, steered, setpoints),
+            Said::Short(said) => short.is_some_and(|short| says(said, short)),
         };
         self.different += usize::from(!is_same);
     }
@@ -128,18 +130,13 @@ fn is_same(heard: &Heard, core: &Estimator, estimate: &Estimate) -> bool {
         && places.all(|(i, j)| core.covariance(i, j).to_bits() == heard.covariance(i, j).to_bits())
 }
 
-/// True if a short reply says what the core in process does, bit for bit.
-fn says(
-    short: &Short<Setpoints>,
-    estimate: &Estimate,
-    steered: Option<Steered>,
-    setpoints: &[CurrentCode; CORRECTORS],
-) -> bool {
-    let Some(correction) = &short.correction else { return false };
-    short.nis.to_bits() == estimate.nis.to_bits()
-        && short.remarks == estimate.remarks
-        && Some(correction.steered) == steered
-        && correction.setpoints.as_slice() == setpoints
+/// True if two short replies say the same, bit for bit.
+fn says(said: &Short<Setpoints>, own: &Short<booster::Setpoints>) -> bool {
+    let (Some(correction), Some(expected)) = (&said.correction, &own.correction) else { return false };
+    (said.sequence, said.nis.to_bits()) == (own.sequence, own.nis.to_bits())
+        && (said.remarks, said.attention) == (own.remarks, own.attention)
+        && (correction.steered, correction.prepared) == (expected.steered, expected.prepared)
+        && correction.setpoints.as_slice() == expected.setpoints.as_slice()
 }
 
 /// As a host sends it, which talks to devices of any size.
