@@ -164,10 +164,12 @@ impl Data {
         drives.orbit = orbit;
         let shared = |b: usize| campaign.following(b).insert_column(0, BASELINE);
         let noise = noise_of(campaign, &design, &drives)?;
+        let mut screened = screened.clone();
+        noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);
         let mut data = Self {
             ring: ring.clone(),
             units: Units::of(&campaign.prior),
-            screened: screened.clone(),
+            screened,
             supplies: supplies.clone(),
             readings: recorded.clone(),
             shared: (0..recorded.ncols()).map(shared).collect(),

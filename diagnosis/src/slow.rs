@@ -43,7 +43,7 @@ const STEPS: [f64; 5] = [0.0, 0.25, 0.7, 2.0, 8.0];
 /// Passes over noise scale and memory.
 const PASSES: usize = 2;
 /// Widths of the prior at which the range of what is not needed is integrated.
-const RANGE: usize = 24;
+const RANGE: usize = 12;
 
 /// Coordinates: share, time and walk (in units of the mean noise) of all monitors.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -69,6 +69,8 @@ struct Learner<'r> {
     /// `ln` likelihood of white noise, and of the best of its own kind over that.
     white: Vec<f64>,
     own: Vec<f64>,
+    /// Starts for the common ones, with their `ln` likelihood over that of white noise.
+    starts: Vec<(Common, f64)>,
 }
 
 impl Slow {
@@ -117,23 +119,21 @@ impl Slow {
 
 impl<'r> Learner<'r> {
     fn of(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
-        let likelihood = |b: usize, common: Common| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
+        let of = |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
+        let white: Vec<f64> = (0..repeats.len()).map(|b| of(Common::NONE, b)).collect();
         let frames = frames as f64;
-        let grid = grid(frames);
-        let white: Vec<f64> = (0..repeats.len()).map(|b| likelihood(b, Common::NONE)).collect();
-        let best = |b: usize| grid.iter().map(|common| likelihood(b, *common) - white[b]).fold(0.0, f64::max);
-        let own = (0..repeats.len()).map(best).collect();
-        Self { repeats, relative, frames, white, own }
+        let over_white = |common: Common| (0..repeats.len()).map(|b| of(common, b) - white[b]).collect();
+        let tried: Vec<(Common, Vec<f64>)> = grid(frames).into_iter().map(|one| (one, over_white(one))).collect();
+        let best = |b: usize| tried.iter().map(|(_, logs)| logs[b]).fold(0.0, f64::max);
+        let own: Vec<f64> = (0..repeats.len()).map(best).collect();
+        let starts = tried.iter().map(|(one, logs)| (*one, together(logs, &own))).collect();
+        Self { repeats, relative, frames, white, own, starts }
     }
 
     /// `ln` likelihood over that of white noise, each monitor's own kind allowed for.
     fn likelihood(&self, common: Common) -> f64 {
-        let one = |b: usize| {
-            let log = self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
-            let own = self.own[b].max(log);
-            own + ((1.0 - OWN) * (log - own).exp() + OWN).ln()
-        };
-        (0..self.repeats.len()).map(one).sum()
+        let one = |b: usize| self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
+        together(&(0..self.repeats.len()).map(one).collect::<Vec<_>>(), &self.own)
     }
 
     /// `ln` prior density of the logarithms of what is free.
@@ -152,12 +152,11 @@ impl<'r> Learner<'r> {
     /// The most likely model, `mean` being the mean noise [m].
     fn learn(&self, mean: f64) -> Slow {
         let nothing = self.likelihood(Common::NONE);
-        let grid: Vec<(Common, f64)> = grid(self.frames).into_iter().map(|one| (one, self.likelihood(one))).collect();
         let models = [(true, false), (false, true), (true, true)].map(|(slow, walk)| Free { slow, walk });
         let mut best: Option<(Free, Peak)> = None;
         for free in models {
             let posterior = |(one, log): &(Common, f64)| log + self.log_prior(*one, free);
-            let of_model = grid.iter().filter(|(one, _)| one.is_of(free));
+            let of_model = self.starts.iter().filter(|(one, _)| one.is_of(free));
             let Some((start, _)) = of_model.max_by(|a, b| posterior(a).total_cmp(&posterior(b))) else { continue };
             let density = |x: &DVector<f64>| {
                 let common = Common::at(x, free);
@@ -237,6 +236,15 @@ impl Common {
         let walk = if free.walk { peak.sigma(peak.at.len() - 1) } else { 0.0 };
         (Self::at(&peak.at, free), [slow[0], slow[1], walk])
     }
+}
+
+/// Sum over the monitors of `ln` likelihood, where each may have noise of its own kind, of which `own` is the best.
+fn together(logs: &[f64], own: &[f64]) -> f64 {
+    let one = |(log, own): (&f64, &f64)| {
+        let best = own.max(*log);
+        best + ((1.0 - OWN) * (log - best).exp() + OWN * (own - best).exp()).ln()
+    };
+    logs.iter().zip(own).map(one).sum()
 }
 
 /// Width of the prior of the walk, in units of the noise: over the campaign a monitor wanders by as much as it is noisy.

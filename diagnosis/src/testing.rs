@@ -30,6 +30,9 @@ pub fn readings(recording: &Recording) -> DMatrix<f64> {
     DMatrix::from_fn(rows.len(), rows[0].reading.len(), |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
 }
 
+/// Neighbours that share a crate.
+pub const CRATE: core::ops::Range<usize> = 8..13;
+
 /// Noise that is not white and alone, added to that of the hardware.
 pub struct Coloured {
     /// Noise of a reading [m].
@@ -40,30 +43,34 @@ pub struct Coloured {
     pub walk: f64,
     /// Rms jitter of the momentum [1].
     pub momentum: f64,
-    /// Share that five neighbours in the order of reading have in common.
+    /// Share that five neighbours in the order of reading have in common, see [`CRATE`].
     pub crate_share: f64,
-    /// Dispersion at the read monitors [m].
+    /// The vars of the machine, and its dispersion at the read monitors [m].
+    pub vars: Vec<f64>,
     pub dispersion: DVector<f64>,
     pub seed: u64,
 }
 
 impl Coloured {
-    /// As the header states it.
+    /// As the header states it, on a machine of random vars.
     pub fn white(ring: &Ring, recording: &Recording, seed: u64) -> Self {
-        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 }).unwrap();
+        let vars = inference::simulate::vars(ring, true, seed).unwrap();
+        let made = recording.powered(ring).with_vars(&vars);
+        let optics = Optics::of(&made, Hold::Momentum { delta: 0.0 }).unwrap();
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         let noise = recording.header.noise[0];
-        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, dispersion, seed }
+        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, vars, dispersion, seed }
     }
 
-    /// A campaign with this noise, of random vars, with the faulty monitors of the shipped recordings.
+    /// A campaign with this noise, with the faulty monitors of the shipped recordings.
     pub fn campaign(&self, ring: &Ring, recording: &Recording, effects: &[Effect]) -> Recording {
         let mut hardware = Hardware::shipped(ring, recording);
-        let white = (1.0 - self.slow.0 - self.crate_share).sqrt() * self.noise / recording.header.noise[0];
-        hardware.noise.iter_mut().for_each(|noise| *noise *= white);
-        let vars = inference::simulate::vars(ring, true, self.seed).unwrap();
+        for (b, noise) in hardware.noise.iter_mut().enumerate() {
+            let shared = if CRATE.contains(&b) { self.crate_share } else { 0.0 };
+            *noise *= (1.0 - self.slow.0 - shared).sqrt() * self.noise / recording.header.noise[b];
+        }
         let beyond: &[&dyn Beyond] = &[self];
-        let truth = Truth { vars: &vars, effects, beyond };
+        let truth = Truth { vars: &self.vars, effects, beyond };
         inference::simulate::campaign(recording, ring, &truth, &hardware, self.seed).unwrap()
     }
 }
@@ -83,10 +90,8 @@ impl Beyond for Coloured {
         }
         for mut row in readings.row_iter_mut() {
             row += self.dispersion.transpose() * (self.momentum * normal());
-            for of_crate in 0..row.len().div_ceil(5) {
-                let common = self.noise * self.crate_share.sqrt() * normal();
-                row.iter_mut().skip(5 * of_crate).take(5).for_each(|reading| *reading += common);
-            }
+            let common = self.noise * self.crate_share.sqrt() * normal();
+            CRATE.for_each(|b| row[b] += common);
         }
     }
 }
