@@ -38,18 +38,15 @@ impl Vars {
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
 
-    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]).
+    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]); the means stay those without it.
     ///
     /// # Errors
     /// [`FitError`].
     pub fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let unseen = best.hypothesis.unseen();
-        let (wide, narrow) = (Self::of(&Fitted::of(data, &unseen, &best.guess(data, &unseen))?), Self::of(best));
-        Ok(Self {
-            mean: self.mean + wide.mean - narrow.mean,
-            covariance: self.covariance + wide.covariance - narrow.covariance,
-        })
+        let wide = Fitted::of(data, &unseen, &best.guess(data, &unseen))?;
+        Ok(Self { covariance: self.covariance + wide.covariance() - best.covariance(), ..self })
     }
 
     fn over(competition: &Competition) -> Self {

@@ -11,7 +11,7 @@ use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::{Diagnosis, Finding, page};
 use inference::Recording;
 use serde::Serialize;
-use twin::{Machine, Measured, Rf, Ring};
+use twin::{Measured, Ring};
 
 use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
 use crate::cli::Diagnose;
@@ -309,12 +309,9 @@ impl FindingResult {
     }
 }
 
-/// Tunes of the machine that was found, at the recording's mean supply currents; none if it is unstable.
+/// Tunes of the machine that was found, what is ordinary included, at the recording's mean supply currents; none if it is unstable.
 fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
-    let data = &diagnosis.found.data;
-    let strengths = data.ring.strengths(diagnosis.vars_after.mean.as_slice(), &data.supplies);
-    let ring = data.ring.with_strengths(&strengths);
-    let machine = Machine::new(ring, Rf::FixedMomentum, &diagnosis.effects()).ok()?;
+    let (machine, _) = diagnosis.found.best.machine(&diagnosis.found.data).ok()?;
     let tunes = machine.response().ok()?.tunes;
     Some(Tunes { x: tunes.x, y: tunes.y })
 }
