@@ -208,11 +208,14 @@ impl Data {
         self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
     }
 
-    /// Terms of the exact orbits of a machine above first order in kicks and RF offset, rows frames, the same for all repeats [m].
+    /// What the exact orbits of a machine have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first
+    /// order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
     fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
-        let tracked = Tracked::of(machine.clone(), self.drives.nominal_kick)?;
+        let mut displaced = machine.clone();
+        self.baseline.displace(displaced.ring_mut())?;
         let settings = Settings::of(&self.drives);
-        let drives = settings.means(&self.drives);
+        let drives = Drives { orbit: displaced.orbit()?, ..settings.means(&self.drives) };
+        let tracked = Tracked::of(displaced, self.drives.nominal_kick)?;
         let cycle = |kick: Vec<f64>, rf_offset: f64| {
             let strength = vec![0.0; self.ring.quadrupoles.len()];
             tracked.readings(&Cycle { kick, strength, rf_offset, time: 0.0 })

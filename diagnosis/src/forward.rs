@@ -145,3 +145,33 @@ fn explore() {
         }
     }
 }
+
+#[test]
+fn folders() {
+    let ring = Ring::booster();
+    let Ok(all) = std::env::var("FOLDERS") else { return };
+    for folder in all.split_whitespace() {
+        let started = std::time::Instant::now();
+        let Ok(recording) = Recording::read(std::path::Path::new(folder), &ring) else {
+            println!("{folder}: unreadable");
+            continue;
+        };
+        match crate::Diagnosis::of(&ring, &recording, |_| ()) {
+            Ok(made) => {
+                let truth = crate::score::Truth::read(std::path::Path::new(folder), &ring).ok();
+                let nees = truth.as_ref().map(|t| t.nees(&ring.var_names(), &made.vars_after));
+                let pulls = truth.map(|t| t.pulls(&made));
+                println!(
+                    "{folder}: {} {} {pulls:?} nees {nees:?} {:.1} s",
+                    made.verdict.word(),
+                    made.sentence,
+                    started.elapsed().as_secs_f64()
+                );
+                for f in &made.findings {
+                    println!("     {} {:?} P {:.3}", f.label(), f.amplitude, f.probability);
+                }
+            }
+            Err(error) => println!("{folder}: ERROR {error}"),
+        }
+    }
+}
