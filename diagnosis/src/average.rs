@@ -8,7 +8,10 @@ use nalgebra::{DMatrix, DVector};
 
 use super::alternatives::{Cause, Competition, DECISIVE};
 use super::discrepancy::Discrepancy;
+use super::error::FitError;
 use super::fit::Fitted;
+#[cfg(doc)]
+use super::hypothesis::Hypothesis;
 use super::search::Found;
 
 /// `ln` of the vars.
@@ -33,6 +36,20 @@ impl Vars {
         };
         let least = found.competitions.iter().min_by(|a, b| certainty(a).total_cmp(&certainty(b)));
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
+    }
+
+    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]).
+    ///
+    /// # Errors
+    /// [`FitError`].
+    pub fn widened(self, found: &Found) -> Result<Self, FitError> {
+        let (data, best) = (&found.data, &found.best);
+        let unseen = best.hypothesis.unseen();
+        let (wide, narrow) = (Self::of(&Fitted::of(data, &unseen, &best.guess(data, &unseen))?), Self::of(best));
+        Ok(Self {
+            mean: self.mean + wide.mean - narrow.mean,
+            covariance: self.covariance + wide.covariance - narrow.covariance,
+        })
     }
 
     fn over(competition: &Competition) -> Self {

@@ -7,16 +7,27 @@
 //! `S = sigma^2 (1 + U U^T)`, and with the thin decomposition `U = Q D V^T`,
 //! `S^(-1/2) = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T)/sigma`.
 //!
+//! The noise itself is as learnt from the repeats ([`super::noise`]). Where it remembers the frames before, the numbers of a monitor are
+//! replaced by its innovations before the common terms are taken out ([`super::memory`]); where monitors have noise in common within a frame,
+//! the frame is whitened before all that ([`super::modes`]). The covariance is thereby defined as the product of the two: what
+//! monitors have in common has the same memory as their own noise.
+//!
 //! For whitened data every fit is plain least squares. The tune meter adds four numbers: the mean of each tune and
 //! its change from start to end.
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, RowVector2, Vector2};
-use twin::{Cycle, Drives, Effect, EffectError, Machine, OrbitError, Rf, Ring, Signature, Signatures, Tracked, Tunes};
+use nalgebra::{DMatrix, DVector, DVectorView, RowVector2, Vector2};
+use twin::{
+    Cycle, Drives, Effect, EffectError, Hold, Machine, Optics, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
+    Tunes,
+};
 
 use super::baseline::Baseline;
 use super::error::FitError;
 use super::evidence::Units;
+use super::memory::{Filter, Memory};
+use super::modes::Mixing;
+use super::noise::{Noise, Source};
 use super::settings::Settings;
 use super::wiring::Miswired;
 use inference::campaign::chi_square;
@@ -47,7 +58,12 @@ pub struct Data {
     fluctuation: DMatrix<f64>,
     /// Noise of a reading of each monitor by the recording's header [B] [m].
     pub expected_noise: Vec<f64>,
+    /// The noise as learnt.
+    pub noise: Noise,
     channels: Vec<Channel>,
+    mixing: Mixing,
+    /// A constant taken off each monitor's readings before those of a frame are mixed, about their mean; 0 where none are [B] [m].
+    centre: DVector<f64>,
     /// Tunes at the mean supply currents, rows frames; NaN where they do not count.
     tunes: DMatrix<f64>,
     recorded_tunes: DMatrix<f64>,
@@ -65,6 +81,8 @@ pub struct Data {
 struct Channel {
     frames: Vec<usize>,
     sigma: f64,
+    /// Where the noise remembers.
+    filter: Option<Filter>,
     /// `Q` [frames][factors].
     basis: DMatrix<f64>,
     /// `1 - (1 + D^2)^(-1/2)` of each.
@@ -145,6 +163,7 @@ impl Data {
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
         let shared = |b: usize| campaign.following(b).insert_column(0, BASELINE);
+        let noise = noise_of(campaign, &design, &drives)?;
         let mut data = Self {
             ring: ring.clone(),
             units: Units::of(&campaign.prior),
@@ -156,7 +175,10 @@ impl Data {
             recorded: recorded.clone(),
             fluctuation: campaign.fluctuation.clone(),
             expected_noise: recording.header.noise.clone(),
+            centre: DVector::zeros(recorded.ncols()),
+            noise,
             channels: Vec::new(),
+            mixing: Mixing::default(),
             meter: [None, None],
             tunes: recorded_tunes.clone(),
             recorded_tunes,
@@ -164,7 +186,7 @@ impl Data {
             drift: 0.0,
             drives,
         };
-        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, 0.0)).collect();
+        data.prepare();
         data.check(recording)?;
         data.linearise_about(&design)?;
         Ok(data)
@@ -205,7 +227,7 @@ impl Data {
                 self.screened.accepted[(frame, b)] = false;
             }
         }
-        self.channels = (0..self.readings.ncols()).map(|b| self.channel(b, self.drift)).collect();
+        self.prepare();
     }
 
     /// What the exact orbits of a machine have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first
@@ -248,14 +270,14 @@ impl Data {
     pub fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
         data.drift = amplitude;
-        data.channels = (0..self.readings.ncols()).map(|b| self.channel(b, amplitude)).collect();
+        data.prepare();
         data
     }
 
     /// A hypothetical campaign with other drives; its readings are ignored.
     pub fn driven_by(&self, drives: &Drives) -> Self {
         let mut data = Self { drives: drives.clone(), ..self.clone() };
-        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data.prepare();
         data
     }
 
@@ -267,19 +289,32 @@ impl Data {
             data.tunes.row_mut(frame).fill(f64::NAN);
         }
         data.meter = data.meters();
-        data.channels = (0..data.readings.ncols()).map(|b| data.channel(b, data.drift)).collect();
+        data.prepare();
         data
     }
 
-    fn channel(&self, b: usize, drift: f64) -> Channel {
+    /// Prepare the whitening of the readings that count.
+    fn prepare(&mut self) {
+        self.channels = (0..self.readings.ncols()).map(|b| self.channel(b)).collect();
+        self.mixing = Mixing::of(&self.noise.modes, self.readings.nrows(), |frame, b| self.counts(frame, b));
+        if !self.mixing.is_none() {
+            let mean = |b: usize| {
+                let frames = self.frames(b);
+                frames.iter().map(|&frame| self.readings[(frame, b)]).sum::<f64>() / frames.len().max(1) as f64
+            };
+            self.centre = DVector::from_fn(self.readings.ncols(), |b, _| mean(b));
+        }
+    }
+
+    fn channel(&self, b: usize) -> Channel {
         let frames: Vec<usize> = (0..self.readings.nrows()).filter(|&frame| self.counts(frame, b)).collect();
-        let shared = self.shared_of(b, &frames, drift);
-        Channel::of(frames, f64::from(self.screened.health[b].weighted_as), shared)
+        let shared = self.shared(b, &frames);
+        Channel::of(frames, self.noise.own[b], self.noise.memory(b), shared)
     }
 
     /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
-    fn shared_of(&self, b: usize, frames: &[usize], drift: f64) -> DMatrix<f64> {
-        let plane = usize::from(b >= self.ring.horizontal_monitors());
+    pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
+        let (plane, drift) = (usize::from(b >= self.ring.horizontal_monitors()), self.drift);
         let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();
@@ -330,7 +365,7 @@ impl Data {
 
     /// `ln` of the determinant of the covariance.
     pub fn log_det(&self) -> f64 {
-        self.channels.iter().map(|c| c.log_det).sum()
+        self.channels.iter().map(|c| c.log_det).sum::<f64>() + self.mixing.log_det()
     }
 
     /// Whitened residuals: readings and tunes less those predicted.
@@ -339,7 +374,7 @@ impl Data {
             let predicted = Vector2::new([tunes.x, tunes.y][plane], tune_drift[plane]);
             self.meter[plane].as_ref().map_or(Vector2::zeros(), |meter| meter.miss(predicted))
         });
-        self.whiten(|b, frame| self.readings[(frame, b)] - predicted[(frame, b)], miss)
+        self.whiten(|b, frame| self.readings[(frame, b)] - self.centre[b] - predicted[(frame, b)], miss)
     }
 
     /// Readings [m] and tunes [1] as columns, less those predicted, for a tune modulo 1.
@@ -364,13 +399,29 @@ impl Data {
     }
 
     fn whiten(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
+        if self.mixing.is_none() {
+            return self.stack(|b, frame| value(b, frame) / self.channels[b].sigma, tunes);
+        }
+        let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
+        for (b, channel) in self.channels.iter().enumerate() {
+            channel.frames.iter().for_each(|&frame| values[(frame, b)] = value(b, frame) / channel.sigma);
+        }
+        self.mixing.apply(&mut values);
+        self.stack(|b, frame| values[(frame, b)], tunes)
+    }
+
+    /// All numbers, monitor by monitor, whitened in time, then those of the tunes.
+    fn stack(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
         let mut all = DVector::zeros(self.size());
         let mut at = 0;
         for (b, channel) in self.channels.iter().enumerate() {
             let n = channel.frames.len();
             let mut part = all.rows_mut(at, n);
             for (to, &frame) in part.iter_mut().zip(&channel.frames) {
-                *to = value(b, frame) / channel.sigma;
+                *to = value(b, frame);
+            }
+            if let Some(filter) = &channel.filter {
+                filter.whiten(part.iter_mut());
             }
             let common = channel.basis.tr_mul(&part).component_mul(&channel.shrink);
             part.gemv(-1.0, &channel.basis, &common, 1.0);
@@ -381,6 +432,29 @@ impl Data {
             at += 2;
         }
         all
+    }
+
+    /// Whitened numbers, one set a column, with the noise in common taken out once more: the product of what only one monitor would read
+    /// with them is then that with all that it would leave in the others.
+    pub fn taken_back(&self, whitened: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut back = whitened.clone();
+        if self.mixing.is_none() {
+            return back;
+        }
+        let starts: Vec<usize> = (0..self.channels.len()).map(|b| self.start(b)).collect();
+        let places = || {
+            let of = |(b, channel): (usize, &Channel)| {
+                channel.frames.iter().enumerate().map(move |(i, &frame)| (i, frame, b)).collect::<Vec<_>>()
+            };
+            self.channels.iter().enumerate().flat_map(of)
+        };
+        for mut column in back.column_iter_mut() {
+            let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
+            places().for_each(|(i, frame, b)| values[(frame, b)] = column[starts[b] + i]);
+            self.mixing.apply(&mut values);
+            places().for_each(|(i, frame, b)| column[starts[b] + i] = values[(frame, b)]);
+        }
+        back
     }
 
     /// Frame and monitor of each whitened number; none for those of the tune meter.
@@ -394,33 +468,82 @@ impl Data {
         self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
     }
 
-    /// Chi-square of a monitor's readings by its expected noise and its degrees of freedom, about all that they have in common. `residual`
-    /// has a row for every frame.
-    pub fn chi_square(&self, b: usize, residual: &DVector<f64>) -> (f64, f64) {
-        let frames = self.frames(b);
-        let mut terms = self.shared(b, frames).transpose();
-        terms.row_mut(0).fill(1.0);
-        chi_square(&residual.select_rows(frames), &terms, 1, self.expected_noise[b])
+    /// Sum of squares of measured less predicted readings over the noise as learnt, about all that a monitor's readings have in common, and
+    /// its degrees of freedom; of the monitors in state ok. `miss`: rows frames, columns monitors.
+    pub fn chi_square(&self, miss: &DMatrix<f64>) -> (f64, f64) {
+        let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
+        for (b, channel) in self.channels.iter().enumerate() {
+            let value = |frame: usize| (miss[(frame, b)] - self.centre[b]) / channel.sigma;
+            channel.frames.iter().for_each(|&frame| values[(frame, b)] = value(frame));
+        }
+        self.mixing.apply(&mut values);
+        let is_ok = |b: &usize| self.health()[*b].state == MonitorState::Ok;
+        let mut sums = (0.0, 0.0);
+        for b in self.active_monitors().into_iter().filter(is_ok) {
+            let channel = &self.channels[b];
+            let mut terms = self.shared(b, &channel.frames) / channel.sigma;
+            terms.column_mut(0).fill(1.0);
+            let mut residual = values.select_rows(&channel.frames).columns(b, 1).into_owned();
+            if let Some(filter) = &channel.filter {
+                filter.whiten_columns(&mut terms);
+                filter.whiten_columns(&mut residual);
+            }
+            let (chi2, freedom) = chi_square(&residual.column(0).into_owned(), &terms.transpose(), 1, 1.0);
+            sums = (sums.0 + chi2, sums.1 + freedom);
+        }
+        sums
     }
 
     /// Whiten columns over all frames as readings of one monitor.
     pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let channel = &self.channels[b];
         let mut part = columns.select_rows(&channel.frames) / channel.sigma;
+        if let Some(filter) = &channel.filter {
+            filter.whiten_columns(&mut part);
+        }
         let mut common = channel.basis.transpose() * &part;
         common.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
         part -= &channel.basis * common;
         part
     }
 
-    /// `E^T S^-1 E` of a monitor's readings for groups of frames, of which `group` names that of each frame: `diag(alone) - common common^T`,
-    /// the latter of their common terms. Returns both, [groups] and [groups][factors].
+    /// What a monitor's readings tell beside those of the others in the same frames, as a share of what they tell alone, on average.
+    pub fn own_share(&self, b: usize) -> f64 {
+        let frames = self.frames(b);
+        if self.mixing.is_none() || frames.is_empty() {
+            return 1.0;
+        }
+        frames.iter().map(|&frame| self.mixing.own(frame, b)).sum::<f64>() / frames.len() as f64
+    }
+
+    /// What a pattern over some monitors [m] has to be multiplied by, monitor by monitor, with [`Data::own_share`]: itself with what it leaves
+    /// in each by the noise in common.
+    pub fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
+        if self.mixing.is_none() {
+            return pattern.clone();
+        }
+        let mixing = Mixing::of(&self.noise.modes, 1, |_, b| monitors.contains(&b));
+        let mut values = DMatrix::zeros(1, pattern.len());
+        monitors.iter().for_each(|&b| values[(0, b)] = pattern[b] / self.channels[b].sigma);
+        mixing.apply(&mut values);
+        mixing.apply(&mut values);
+        DVector::from_fn(pattern.len(), |b, _| values[(0, b)] * self.channels[b].sigma / mixing.own(0, b))
+    }
+
+    /// Readings that step with time, whitened: rows frames, columns monitors.
+    pub fn stepping(&self, readings: &DMatrix<f64>, step: &DVectorView<f64>) -> DVector<f64> {
+        self.whiten(|b, frame| readings[(frame, b)] * step[frame], [Vector2::zeros(); 2])
+    }
+
+    /// `E^T S^-1 E` of a monitor's readings for groups of frames, of which `group` names that of each frame, as if the noise were white:
+    /// `diag(alone) - common common^T`, the latter of their common terms. Returns both, [groups] and [groups][factors].
     pub fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
         let channel = &self.channels[b];
-        let taken = channel.shrink.map(|shrink| (shrink * (2.0 - shrink)).sqrt() / channel.sigma).transpose();
+        let share = self.own_share(b);
+        let taken = channel.shrink.map(|shrink| (share * shrink * (2.0 - shrink)).sqrt() / channel.sigma).transpose();
         let (mut alone, mut common) = (DVector::zeros(groups), DMatrix::zeros(groups, taken.len()));
         for (row, &frame) in channel.basis.row_iter().zip(&channel.frames) {
-            alone[group[frame]] += channel.sigma.powi(-2);
+            alone[group[frame]] += share * channel.sigma.powi(-2);
             let mut common = common.row_mut(group[frame]);
             common += row.component_mul(&taken);
         }
@@ -437,19 +560,14 @@ impl Data {
         &self.channels[b].frames
     }
 
-    /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
-    pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
-        self.shared_of(b, frames, self.drift)
-    }
-
     /// Noise of a reading by the recording's header, mean over the monitors [m].
     pub fn mean_noise(&self) -> f64 {
         self.expected_noise.iter().sum::<f64>() / self.expected_noise.len().max(1) as f64
     }
 
-    /// Noise of one reading of a monitor [m].
-    pub fn noise(&self, b: usize) -> f64 {
-        self.channels[b].sigma
+    /// Noise of one reading of a monitor that is its own [m], what it remembers, and the variance of a whole reading over that of its own.
+    pub fn noise_of(&self, b: usize) -> (f64, Memory, f64) {
+        (self.noise.own[b], self.noise.memory(b), self.noise.modes.growth(b))
     }
 
     /// Frames in which a tune counts.
@@ -470,17 +588,36 @@ impl Data {
 }
 
 impl Channel {
-    fn of(frames: Vec<usize>, sigma: f64, shared: DMatrix<f64>) -> Self {
-        let log_sigma = 2.0 * frames.len() as f64 * sigma.ln();
-        if frames.is_empty() {
-            return Self { frames, sigma, basis: DMatrix::zeros(0, 0), shrink: DVector::zeros(0), log_det: 0.0 };
-        }
-        let svd = (shared / sigma).svd(true, false);
+    fn of(frames: Vec<usize>, sigma: f64, memory: Memory, shared: DMatrix<f64>) -> Self {
+        let Some(&first) = frames.first() else {
+            let (basis, shrink) = (DMatrix::zeros(0, 0), DVector::zeros(0));
+            return Self { frames, sigma, filter: None, basis, shrink, log_det: 0.0 };
+        };
+        let filter = (!memory.is_none()).then(|| Filter::of(memory, first, &frames));
+        let mut shared = shared / sigma;
+        filter.iter().for_each(|filter| filter.whiten_columns(&mut shared));
+        let svd = shared.svd(true, false);
         let basis = svd.u.expect("asked for");
         let grown = svd.singular_values.map(|d| 1.0 + d * d);
-        let log_det = log_sigma + grown.iter().map(|g| g.ln()).sum::<f64>();
-        Self { frames, sigma, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
+        let log_det = 2.0 * frames.len() as f64 * sigma.ln() + grown.iter().map(|g| g.ln()).sum::<f64>();
+        let log_det = log_det + filter.as_ref().map_or(0.0, Filter::log_det);
+        Self { frames, sigma, filter, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
     }
+}
+
+/// The noise, learnt from the readings about the machine that the screening ends with, or about the design where that keeps no beam.
+fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<Noise, DataError> {
+    let ring = &campaign.ring;
+    let found = ring.with_strengths(&ring.strengths(campaign.params.as_slice(), &campaign.supplies));
+    let found = Machine::new(found, Rf::FixedMomentum, &[]).ok();
+    let of = |machine: &Machine| -> Result<(DMatrix<f64>, DVector<f64>), OrbitError> {
+        let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
+        Ok((machine.readings(drives)?.0, optics.dispersion_of(&optics.read_monitors())))
+    };
+    let known = found.as_ref().and_then(|machine| of(machine).ok());
+    let (predicted, dispersion) = known.map_or_else(|| of(design), Ok)?;
+    let residual = &campaign.readings - predicted;
+    Ok(Noise::learn(&Source { campaign, residual: &residual, dispersion: &dispersion }))
 }
 
 fn drives_of(campaign: &Campaign) -> Drives {

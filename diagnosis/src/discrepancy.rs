@@ -9,6 +9,10 @@
 //! averaged over omega from well below the noise to millimetres. It assumes nothing of the physics; the determinant corrects for the
 //! number of free amplitudes.
 //!
+//! Sums are taken monitor by monitor. Where monitors have noise in common within a frame, a pattern that only one of them reads leaves
+//! something in the others when the frame is whitened; it is counted as if their readings and memory were the same, and what the
+//! free amplitudes of different monitors then share is left out (see the tests for how much that is).
+//!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
 use estimator::MonitorState;
@@ -67,10 +71,21 @@ struct Sums {
 }
 
 /// The Gram matrix of a monitor's amplitudes for settings. No frame has two, so that it is diagonal but for the common terms of the
-/// readings: `diag(alone) - common common^T`.
+/// readings, `diag(alone) - common common^T`, and for what their noise remembers.
 struct Apart {
     alone: DVector<f64>,
     common: DMatrix<f64>,
+    /// The matrix itself, of few settings of noise that remembers; of many such settings the memory is left out.
+    whole: Option<DMatrix<f64>>,
+}
+
+/// Settings up to which their matrix is taken as it is.
+const FEW: usize = 64;
+
+/// Residuals and derivatives of a fit, as the sums of one monitor's numbers need them.
+struct Seen {
+    residual: DVector<f64>,
+    jacobian: DMatrix<f64>,
 }
 
 /// A fit, linearised at its best point.
@@ -87,10 +102,11 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     let linearised = Linearised { fitted };
     let settings = Settings::of(&data.drives);
     let monitors = data.readings.ncols();
-    let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &settings.indicator())).collect();
-    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings)).collect();
+    let seen = Seen::of(data, fitted);
+    let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
+    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings, &sums[b])).collect();
     let stretches = stretches(data);
-    let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, fitted, &stretches)).collect();
+    let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &stretches)).collect();
     // faulty monitors scatter by themselves
     let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
     let active: Vec<usize> = data.active_monitors().into_iter().filter(healthy).collect();
@@ -106,12 +122,12 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     for &b in &active {
         all.push(linearised.judge(Location::Monitor(b), &sums[b], active.len()));
         all.push(linearised.judge(Location::MonitorInTime(b), &steps[b], active.len()));
-        let gains = data.sums(b, fitted, &scaled(&stretches, &predicted.column(b)));
+        let gains = data.sums(b, &seen, &scaled(&stretches, &predicted.column(b)));
         all.push(linearised.judge(Location::GainInTime(b), &gains, active.len()));
         let orbit = signatures.around(b);
-        let elsewhere = data.sums(b, fitted, &independent(orbit.clone()));
+        let elsewhere = data.sums(b, &seen, &independent(orbit.clone()));
         all.push(linearised.judge(Location::MonitorElsewhere(b), &elsewhere, active.len()));
-        let curve = data.sums(b, fitted, &independent(powers(&orbit.column(0))));
+        let curve = data.sums(b, &seen, &independent(powers(&orbit.column(0))));
         all.push(linearised.judge(Location::MonitorCurve(b), &curve, active.len()));
     }
     let driven = data.driven_correctors();
@@ -121,13 +137,13 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
             active.iter().map(|&b| (sums[b].select(&of_corrector), apart[b].select(&of_corrector))).unzip();
         all.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
         let patterns = independent(signatures.beside(c));
-        let beside = patterned(&sums, &active, &settings.strength(c), &patterns);
+        let beside = patterned(data, &sums, &active, &settings.strength(c), &patterns);
         all.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
     for (quadrupole, plane, pattern) in patterns {
-        all.push(linearised.judge(Location::Ring(quadrupole, plane), &weighted(&sums, &active, &pattern), sites));
+        all.push(linearised.judge(Location::Ring(quadrupole, plane), &weighted(data, &sums, &active, &pattern), sites));
     }
     let of_quadrupoles = signatures.of_quadrupoles();
     for (q, signature) in of_quadrupoles.iter().enumerate() {
@@ -166,7 +182,16 @@ impl Linearised<'_> {
     /// `1 + omega^2 G = D - omega^2 C A^-1 C^T`, whose determinant is `det D det B/det A`, `B = A - omega^2 C^T D^-1 C`,
     ///
     /// and whose inverse `D^-1 + omega^2 D^-1 C B^-1 C^T D^-1`; `D`, `C^T D^-1 C` and the like are sums over the monitors.
+    ///
+    /// Where there are fewer amplitudes than unknowns of the fit, the one large matrix is the quicker way.
     fn judge_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
+        if each.iter().map(|sums| sums.pull.len()).sum::<usize>() < self.fitted.u.len() {
+            return self.judge(at, &Sums::stacked(each), sites);
+        }
+        self.taken_apart(at, each, apart, sites)
+    }
+
+    fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
         let taken = self.fitted.free.solve(&self.fitted.slope);
         let sides: Vec<DMatrix<f64>> =
             each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &taken))).collect();
@@ -236,7 +261,7 @@ impl Discrepancy {
 }
 
 /// `ln` Bayes factor of free amplitudes of one standard deviation, given their projected pull and Gram matrix.
-pub fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
+fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let variance = size * size;
     let mut grown = gram * variance;
     (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
@@ -302,11 +327,12 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
 }
 
 /// One amplitude for each setting, common to all monitors with a fixed pattern.
-fn weighted(sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
+fn weighted(data: &Data, sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
     let first = &sums[monitors[0]];
+    let all = data.accompanied(monitors, pattern);
     let mut sum = Sums::none(first.cross.nrows(), first.cross.ncols());
     for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
-        sum.gram += &sums[b].gram * (pattern[b] * pattern[b]);
+        sum.gram += &sums[b].gram * (pattern[b] * all[b]);
         sum.cross += &sums[b].cross * pattern[b];
         sum.pull += &sums[b].pull * pattern[b];
     }
@@ -314,11 +340,15 @@ fn weighted(sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
 }
 
 /// One amplitude for each pattern over the monitors (one a column), in proportion to `setting`.
-fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
+fn patterned(data: &Data, sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
     let mut sum = Sums::none(patterns.ncols(), sums[monitors[0]].cross.ncols());
+    let mut all = patterns.clone();
+    all.column_iter_mut()
+        .for_each(|mut pattern| pattern.copy_from(&data.accompanied(monitors, &pattern.clone_owned())));
     for &b in monitors {
         let seen = patterns.row(b).transpose();
-        sum.gram += &seen * seen.transpose() * setting.dot(&(&sums[b].gram * setting));
+        let both = (&seen * all.row(b) + all.row(b).transpose() * seen.transpose()) * 0.5;
+        sum.gram += both * setting.dot(&(&sums[b].gram * setting));
         sum.cross += &seen * setting.tr_mul(&sums[b].cross);
         sum.pull += &seen * setting.dot(&sums[b].pull);
     }
@@ -327,14 +357,14 @@ fn patterned(sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns
 
 impl Data {
     /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
-    fn sums(&self, b: usize, fitted: &Fitted, indicator: &DMatrix<f64>) -> Sums {
+    fn sums(&self, b: usize, seen: &Seen, indicator: &DMatrix<f64>) -> Sums {
         let whitened = self.whiten_columns(b, indicator);
         let (start, n) = (self.start(b), self.frames(b).len());
         let back = whitened.transpose();
         Sums {
-            gram: &back * &whitened,
-            cross: &back * fitted.jacobian.rows(start, n),
-            pull: back * fitted.residual.rows(start, n),
+            gram: &back * &whitened * self.own_share(b),
+            cross: &back * seen.jacobian.rows(start, n),
+            pull: back * seen.residual.rows(start, n),
         }
     }
 
@@ -365,17 +395,20 @@ impl Data {
         stretches: &DMatrix<f64>,
         monitors: &[usize],
     ) -> Sums {
-        let mut sum = Sums::none(stretches.ncols(), fitted.jacobian.ncols());
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
-        for &b in monitors {
-            let mut columns = stretches.clone();
-            columns.row_iter_mut().enumerate().for_each(|(i, mut row)| row *= signature.readings[(i, b)] / rms);
-            let sums = self.sums(b, fitted, &columns);
-            sum.gram += sums.gram;
-            sum.cross += sums.cross;
-            sum.pull += sums.pull;
-        }
-        sum
+        let mut readings = DMatrix::zeros(signature.readings.nrows(), signature.readings.ncols());
+        monitors.iter().for_each(|&b| readings.set_column(b, &(signature.readings.column(b) / rms)));
+        let columns: Vec<DVector<f64>> = stretches.column_iter().map(|step| self.stepping(&readings, &step)).collect();
+        let back = DMatrix::from_columns(&columns).transpose();
+        Sums { gram: &back * back.transpose(), cross: &back * &fitted.jacobian, pull: back * &fitted.residual }
+    }
+}
+
+impl Seen {
+    fn of(data: &Data, fitted: &Fitted) -> Self {
+        let residual = DMatrix::from_columns(core::slice::from_ref(&fitted.residual));
+        let residual = data.taken_back(&residual).column(0).into_owned();
+        Self { residual, jacobian: data.taken_back(&fitted.jacobian) }
     }
 }
 
@@ -383,6 +416,21 @@ impl Sums {
     fn none(numbers: usize, unknowns: usize) -> Self {
         let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
         Self { gram, cross, pull: DVector::zeros(numbers) }
+    }
+
+    /// Of several monitors, each with its own amplitudes.
+    fn stacked(each: &[Self]) -> Self {
+        let amplitudes = each.iter().map(|sums| sums.pull.len()).sum();
+        let mut all = Self::none(amplitudes, each.first().map_or(0, |sums| sums.cross.ncols()));
+        let mut at = 0;
+        for sums in each {
+            let n = sums.pull.len();
+            all.gram.view_mut((at, at), (n, n)).copy_from(&sums.gram);
+            all.cross.rows_mut(at, n).copy_from(&sums.cross);
+            all.pull.rows_mut(at, n).copy_from(&sums.pull);
+            at += n;
+        }
+        all
     }
 
     /// Of some of the groups.
@@ -401,19 +449,31 @@ impl Sums {
 }
 
 impl Apart {
-    fn of(data: &Data, b: usize, settings: &Settings) -> Self {
+    fn of(data: &Data, b: usize, settings: &Settings, sums: &Sums) -> Self {
         let (alone, common) = data.information(b, &settings.of_frame, settings.count());
-        Self { alone, common }
+        let remembers = !data.noise_of(b).1.is_none();
+        Self { alone, common, whole: remembers.then(|| sums.gram.clone()) }
     }
 
     /// Of some of the settings.
     fn select(&self, settings: &[usize]) -> Self {
-        Self { alone: self.alone.select_rows(settings), common: self.common.select_rows(settings) }
+        let whole = self.whole.as_ref().filter(|_| settings.len() <= FEW);
+        Self {
+            alone: self.alone.select_rows(settings),
+            common: self.common.select_rows(settings),
+            whole: whole.map(|gram| gram.select_rows(settings).select_columns(settings)),
+        }
     }
 
     /// `ln det D` and `sides^T D^-1 sides`, `D = 1 + variance (diag(alone) - common common^T)`: with `d` its diagonal and
     /// `R = 1 - variance common^T d^-1 common`, `det D = det d det R`, `D^-1 = d^-1 + variance d^-1 common R^-1 common^T d^-1`.
     fn grown(&self, variance: f64, sides: &DMatrix<f64>) -> Option<(f64, DMatrix<f64>)> {
+        if let Some(gram) = &self.whole {
+            let mut grown = gram * variance;
+            (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
+            let factor = grown.cholesky()?;
+            return Some((log_det_of(&factor), sides.tr_mul(&factor.solve(sides))));
+        }
         let diagonal = self.alone.map(|alone| 1.0 + variance * alone);
         let over = |columns: &DMatrix<f64>| {
             let mut over = columns.clone();
@@ -442,19 +502,16 @@ mod tests {
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
         let (linearised, settings) = (Linearised { fitted: &fitted }, Settings::of(&data.drives));
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
-        let each = monitors.map(|b| data.sums(b, &fitted, &settings.indicator()).select(&some));
-        let apart = monitors.map(|b| Apart::of(&data, b, &settings).select(&some));
-        let (n, unknowns) = (some.len(), fitted.u.len());
-        let mut all = Sums::none(n * each.len(), unknowns);
-        for (at, (sums, apart)) in each.iter().zip(&apart).enumerate() {
+        let seen = Seen::of(&data, &fitted);
+        let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
+        let each = sums.each_ref().map(|sums| sums.select(&some));
+        let apart = [0, 1, 2].map(|i| Apart::of(&data, monitors[i], &settings, &sums[i]).select(&some));
+        for (sums, apart) in each.iter().zip(&apart) {
             let gram = DMatrix::from_diagonal(&apart.alone) - &apart.common * apart.common.transpose();
             assert!((gram - &sums.gram).amax() < 1e-9 * sums.gram.amax(), "rounding");
-            all.gram.view_mut((n * at, n * at), (n, n)).copy_from(&sums.gram);
-            all.cross.rows_mut(n * at, n).copy_from(&sums.cross);
-            all.pull.rows_mut(n * at, n).copy_from(&sums.pull);
         }
-        let one = linearised.judge(Location::Corrector(0), &all, 1);
-        let other = linearised.judge_apart(Location::Corrector(0), &each, &apart, 1);
+        let one = linearised.judge(Location::Corrector(0), &Sums::stacked(&each), 1);
+        let other = linearised.taken_apart(Location::Corrector(0), &each, &apart, 1);
         assert_eq!(one.size, other.size);
         assert!((one.log_bayes / other.log_bayes - 1.0).abs() < 1e-9, "{} {}", one.log_bayes, other.log_bayes);
     }

@@ -5,18 +5,19 @@
 //! `cost = |r(u)|^2 + |u|^2`, `ln evidence = -cost/2 - ln det(1 + J^T J)/2` (Laplace),
 //!
 //! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::evidence`]). The normalisation of
-//! the data is included, since hypotheses with drifting baselines change their covariance.
+//! the data is included, since hypotheses with drifting baselines change their covariance. The ordinary imperfections, many and
+//! small, are taken to first order about the start of the fit.
 
-use core::ops::{Div, Sub};
+use core::ops::{Mul, Sub};
 
-use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, Machine, Signature, Signatures};
+use twin::{Drives, EffectError, Machine, Signature, Signatures, Tunes};
 
 use super::data::Data;
 use super::error::FitError;
 use super::evidence::{Units, Within};
-use super::hypothesis::{Hypothesis, Unknown};
+use super::hypothesis::{Hypothesis, Term, Unknown};
+use super::ordinary::Family;
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
@@ -62,6 +63,17 @@ struct Problem<'d> {
     data: &'d Data,
     hypothesis: &'d Hypothesis,
     unknowns: Vec<Unknown>,
+    ordinary: Ordinary,
+}
+
+/// The ordinary imperfections, the last unknowns of a fit, to first order about its start.
+struct Ordinary {
+    /// Their values at the start.
+    start: DVector<f64>,
+    /// Derivative `Z` of the whitened predictions with respect to each.
+    slopes: DMatrix<f64>,
+    /// `Z^T Z`.
+    gram: DMatrix<f64>,
 }
 
 /// A point of the fit.
@@ -105,13 +117,12 @@ impl Fitted {
     /// # Errors
     /// [`FitError`].
     pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
-        let problem = Problem::new(data, hypothesis);
-        let u = DVector::zeros(problem.size());
-        let residual = problem.residual(&u)?;
-        let jacobian = problem.jacobian(&u)?;
-        let cost = residual.norm_squared() + u.norm_squared();
-        let factor = normal(&jacobian).cholesky().ok_or(FitError::Degenerate)?;
-        Self::at(&problem, Point { u, residual, cost }, factor, jacobian)
+        let u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
+        let problem = Problem::new(data, hypothesis, &u)?;
+        let (cost, residual) = problem.evaluate(&u)?;
+        let (quadratic, slopes) = problem.linearise(&u, &residual)?;
+        let factor = quadratic.factor().ok_or(FitError::Degenerate)?;
+        Self::at(&problem, Point { u, residual, cost }, factor, slopes)
     }
 
     /// The data as this fit whitens them.
@@ -120,10 +131,11 @@ impl Fitted {
     }
 
     fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, FitError> {
-        let problem = Problem::new(data, hypothesis);
-        let start = guess.clone().resize_vertically(problem.size(), 0.0);
+        let size = data.units.len() + hypothesis.unknowns(data).len();
+        let start = guess.clone().resize_vertically(size, 0.0);
+        let problem = Problem::new(data, hypothesis, &start)?;
         let hopeful = |steps, cost| steps < TRIAL || cost <= HOPELESS * rival;
-        let found = minimise(&problem, &start, &data.units.bounds(problem.size()), &LIMITS, hopeful);
+        let found = minimise(&problem, &start, &data.units.bounds(size), &LIMITS, hopeful);
         let found = found.map_err(|error| match error {
             OptimiseError::Start(error) => FitError::Effect(error),
             OptimiseError::Degenerate => FitError::Degenerate,
@@ -133,19 +145,16 @@ impl Fitted {
         Self::at(&problem, here, factor, found.slopes)
     }
 
-    fn at(
-        problem: &Problem,
-        here: Point,
-        factor: Cholesky<f64, Dyn>,
-        jacobian: DMatrix<f64>,
-    ) -> Result<Self, FitError> {
+    fn at(problem: &Problem, here: Point, factor: Cholesky<f64, Dyn>, slopes: DMatrix<f64>) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.data.units.clone());
+        let jacobian = problem.ordinary.beside(slopes);
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
         let lower = factor.l();
         let within = Within::of(&lower * lower.transpose(), &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
-        let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside;
+        let of_widths: f64 = problem.hypothesis.ordinary.iter().map(Family::log_prior).sum();
+        let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside + of_widths;
         let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
         Ok(Self {
@@ -169,9 +178,9 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
     pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
-        let problem = Problem::new(self.data(data), &self.hypothesis);
+        let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
-        let slope = problem.jacobian(u)?.tr_mul(&residual) - u;
+        let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
         Ok((-0.5 * (residual.norm_squared() + u.norm_squared()), slope))
     }
 
@@ -203,6 +212,19 @@ impl Fitted {
         })
     }
 
+    /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
+    pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
+        let own = self.hypothesis.unknowns(data);
+        let value = |unknown: &Unknown| {
+            let same = |(_, one): &(usize, &Unknown)| one.is_of(&self.hypothesis) == unknown.is_of(other);
+            let (i, one) = own.iter().enumerate().find(same)?;
+            Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
+        };
+        let others = other.unknowns(data);
+        let all = self.u.iter().copied().take(self.params.len());
+        DVector::from_vec(all.chain(others.iter().map(|unknown| value(unknown).unwrap_or(0.0))).collect())
+    }
+
     /// The machine at the best point, and its drives.
     ///
     /// # Errors
@@ -216,31 +238,39 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn predicted(&self, data: &Data) -> Result<DMatrix<f64>, EffectError> {
-        self.predicted_at(data, &self.u)
+        Ok(self.predicted_at(data, &self.u)?.by_frame(&data.drives.time))
     }
 
-    fn predicted_at(&self, data: &Data, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
+    /// Whitened residuals of some data at the best point of this fit, which may be of others.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn residual_of(&self, data: &Data) -> Result<DVector<f64>, EffectError> {
+        let Signature { readings, tunes: [x, y], tune_drift } = self.predicted_at(data, &self.u)?;
+        Ok(data.residual(&readings, Tunes { x, y }, tune_drift))
+    }
+
+    fn predicted_at(&self, data: &Data, u: &DVector<f64>) -> Result<Signature, EffectError> {
         let vars = self.params.len();
         let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
         let (readings, tunes, tune_drift) = machine.readings(&drives)?;
-        Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift }.by_frame(&drives.time))
+        Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift })
     }
 
     /// Derivative of the predictions with respect to every u.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn slopes(&self, data: &Data) -> Result<Vec<DMatrix<f64>>, EffectError> {
+    pub fn slopes(&self, data: &Data) -> Result<Vec<Signature>, EffectError> {
         let vars = self.params.len();
         let (machine, drives) = self.machine(data)?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let by_frame = |signature: Signature, scale: f64| signature.by_frame(&drives.time) * scale;
         let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
-        let mut slopes: Vec<DMatrix<f64>> = of_vars.map(|(signature, sigma)| by_frame(signature, *sigma)).collect();
+        let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Member(term, width) => by_frame(signatures.of_effect(term.kind, term.site)?, *width),
+                Unknown::Ordinary(terms, width) => together(&signatures, terms)? * *width,
                 _ => {
                     let at = |step: f64| {
                         let mut u = self.u.clone();
@@ -254,20 +284,15 @@ impl Fitted {
         Ok(slopes)
     }
 
-    /// Sum of (residual/expected noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift),
-    /// per degree of freedom, as [`inference::BatchFit::chi2_per_dof`] counts it.
+    /// Sum of (residual/noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift), per
+    /// degree of freedom, as [`inference::BatchFit::chi2_per_dof`] counts it, but by the noise as learnt.
     ///
     /// # Errors
     /// [`EffectError`].
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
         let data = self.data(data);
-        let miss = data.miss(&self.predicted(data)?);
-        let (mut sum, mut degrees) = (0.0, -(self.params.len() as f64));
-        for b in data.active_monitors().into_iter().filter(|&b| data.health()[b].state == MonitorState::Ok) {
-            let (chi2, freedom) = data.chi_square(b, &miss.column(b).into_owned());
-            (sum, degrees) = (sum + chi2, degrees + freedom);
-        }
-        Ok(sum / degrees)
+        let (sum, degrees) = data.chi_square(&data.miss(&self.predicted(data)?));
+        Ok(sum / (degrees - self.params.len() as f64))
     }
 
     /// Covariance of `ln` of the vars.
@@ -277,54 +302,94 @@ impl Fitted {
 }
 
 impl<'d> Problem<'d> {
-    fn new(data: &'d Data, hypothesis: &'d Hypothesis) -> Self {
-        Self { data, hypothesis, unknowns: hypothesis.unknowns(data) }
+    /// About the ordinary imperfections of a start.
+    fn new(data: &'d Data, hypothesis: &'d Hypothesis, start: &DVector<f64>) -> Result<Self, EffectError> {
+        let unknowns = hypothesis.unknowns(data);
+        let others = unknowns.iter().filter(|unknown| !unknown.is_ordinary()).count();
+        let first = data.units.len() + others;
+        let (machine, drives) =
+            hypothesis.machine(data, &data.units.params(start), &start.as_slice()[data.units.len()..])?;
+        let ordinary =
+            Ordinary::about(data, &unknowns[others..], (&machine, &drives), start.rows_range(first..).into_owned())?;
+        Ok(Self { data, hypothesis, unknowns, ordinary })
     }
 
-    /// Number of unknowns, vars included.
-    fn size(&self) -> usize {
-        self.data.units.len() + self.unknowns.len()
-    }
-
-    fn machine(&self, u: &DVector<f64>) -> Result<(Machine, Drives), EffectError> {
-        let units = &self.data.units;
-        self.hypothesis.machine(self.data, &units.params(u), &u.as_slice()[units.len()..])
+    /// Number of unknowns that are no ordinary imperfections, the first.
+    fn others(&self) -> usize {
+        self.data.units.len() + self.unknowns.len() - self.ordinary.start.len()
     }
 
     /// Whitened residuals.
     fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
-        let (machine, drives) = self.machine(u)?;
+        let units = &self.data.units;
+        let mut held = u.clone();
+        held.rows_range_mut(self.others()..).copy_from(&self.ordinary.start);
+        let (machine, drives) =
+            self.hypothesis.machine(self.data, &units.params(u), &held.as_slice()[units.len()..])?;
         let (readings, tunes, tune_drift) = machine.readings(&drives)?;
-        Ok(self.data.residual(&readings, tunes, tune_drift))
+        let moved = u.rows_range(self.others()..) - &self.ordinary.start;
+        Ok(self.data.residual(&readings, tunes, tune_drift) - &self.ordinary.slopes * moved)
     }
 
-    /// Derivative of the predicted numbers with respect to u.
+    /// Derivative of the predicted numbers with respect to the others.
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
-        let (machine, drives) = self.machine(u)?;
+        let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let mut jacobian = DMatrix::zeros(data.size(), self.size());
+        let mut jacobian = DMatrix::zeros(data.size(), self.others());
         for (i, signature) in signatures.of_vars().iter().enumerate() {
             jacobian.set_column(i, &(data.signature(signature) * data.units.sigma[i]));
         }
-        for (i, unknown) in self.unknowns.iter().enumerate() {
-            let column = match unknown {
-                Unknown::Member(term, width) => data.signature(&signatures.of_effect(term.kind, term.site)?) * *width,
-                _ => {
-                    let at = |step: f64| {
-                        let mut u = u.clone();
-                        u[vars + i] += step;
-                        self.residual(&u)
-                    };
-                    // of the predictions, not of what they leave
-                    -difference(at)?
-                }
+        for i in vars..self.others() {
+            let at = |step: f64| {
+                let mut u = u.clone();
+                u[i] += step;
+                self.residual(&u)
             };
-            jacobian.set_column(vars + i, &column);
+            // of the predictions, not of what they leave
+            jacobian.set_column(i, &-difference(at)?);
         }
         Ok(jacobian)
     }
+}
+
+impl Ordinary {
+    fn about(
+        data: &Data,
+        unknowns: &[Unknown],
+        (machine, drives): (&Machine, &Drives),
+        start: DVector<f64>,
+    ) -> Result<Self, EffectError> {
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, drives)?;
+        let mut slopes = DMatrix::zeros(data.size(), unknowns.len());
+        for (mut column, unknown) in slopes.column_iter_mut().zip(unknowns) {
+            if let Unknown::Ordinary(terms, width) = unknown {
+                column.copy_from(&(data.signature(&together(&signatures, terms)?) * *width));
+            }
+        }
+        let gram = slopes.transpose() * &slopes;
+        Ok(Self { start, slopes, gram })
+    }
+
+    /// The derivatives of all unknowns, from those of the others.
+    fn beside(&self, others: DMatrix<f64>) -> DMatrix<f64> {
+        let first = others.ncols();
+        let mut all = others.insert_columns(first, self.slopes.ncols(), 0.0);
+        all.columns_range_mut(first..).copy_from(&self.slopes);
+        all
+    }
+}
+
+/// The sum of the signatures of some effects.
+fn together(signatures: &Signatures, terms: &[Term]) -> Result<Signature, EffectError> {
+    let mut of_each = terms.iter().map(|term| signatures.of_effect(term.kind, term.site));
+    let first = of_each.next().expect("a family has members")?;
+    of_each.try_fold(first, |mut sum, one| {
+        sum += one?;
+        Ok(sum)
+    })
 }
 
 impl Objective for Problem<'_> {
@@ -339,27 +404,35 @@ impl Objective for Problem<'_> {
         Ok((residual.norm_squared() + u.norm_squared(), residual))
     }
 
+    /// With `A` the derivatives of the others and `Z` those of the ordinary imperfections: `1 + (A Z)^T (A Z)` and `(A Z)^T r - u`.
     fn linearise(&self, u: &DVector<f64>, residual: &DVector<f64>) -> Result<(Quadratic, DMatrix<f64>), EffectError> {
-        let jacobian = self.jacobian(u)?;
-        Ok((Quadratic { matrix: normal(&jacobian), slope: jacobian.tr_mul(residual) - u }, jacobian))
+        let (slopes, k) = (self.jacobian(u)?, self.others());
+        let back = slopes.transpose();
+        let cross = &back * &self.ordinary.slopes;
+        let mut matrix = DMatrix::identity(u.len(), u.len());
+        let mut of_others = matrix.view_mut((0, 0), (k, k));
+        of_others += &back * &slopes;
+        matrix.view_range_mut(..k, k..).copy_from(&cross);
+        matrix.view_range_mut(k.., ..k).copy_from(&cross.transpose());
+        let mut of_ordinary = matrix.view_range_mut(k.., k..);
+        of_ordinary += &self.ordinary.gram;
+        let mut slope = -u;
+        let mut of_others = slope.rows_range_mut(..k);
+        of_others += slopes.tr_mul(residual);
+        let mut of_ordinary = slope.rows_range_mut(k..);
+        of_ordinary += self.ordinary.slopes.tr_mul(residual);
+        Ok((Quadratic { matrix, slope }, slopes))
     }
 }
 
 /// Derivative at 0. Next to a resonance one side has no stable machine, and the other one serves alone.
-fn difference<T: Sub<Output = T> + Div<f64, Output = T>>(
+fn difference<T: Sub<Output = T> + Mul<f64, Output = T>>(
     at: impl Fn(f64) -> Result<T, EffectError>,
 ) -> Result<T, EffectError> {
     match (at(DIFFERENCE), at(-DIFFERENCE)) {
-        (Ok(above), Ok(below)) => Ok((above - below) / (2.0 * DIFFERENCE)),
-        (Ok(above), Err(_)) => Ok((above - at(0.0)?) / DIFFERENCE),
-        (Err(_), Ok(below)) => Ok((at(0.0)? - below) / DIFFERENCE),
+        (Ok(above), Ok(below)) => Ok((above - below) * (2.0 * DIFFERENCE).recip()),
+        (Ok(above), Err(_)) => Ok((above - at(0.0)?) * DIFFERENCE.recip()),
+        (Err(_), Ok(below)) => Ok((at(0.0)? - below) * DIFFERENCE.recip()),
         (Err(error), Err(_)) => Err(error),
     }
-}
-
-/// `1 + J^T J`.
-fn normal(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
-    let mut matrix = jacobian.transpose() * jacobian;
-    (0..matrix.ncols()).for_each(|i| matrix[(i, i)] += 1.0);
-    matrix
 }

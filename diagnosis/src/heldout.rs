@@ -1,11 +1,15 @@
 //! Held-out frames: how well a hypothesis predicts frames that it was not fitted to.
 //!
 //! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
-//! hypothesis is fitted to the rest by the exact twin, and each left-out reading `z`, of a monitor or of the tune meter, has a
-//! normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
+//! hypothesis is fitted to the rest, by one Gauss-Newton step from its fit to all frames, and each left-out reading `z`, of a monitor or of
+//! the tune meter, has a normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
 //! like, `U`) as estimated from its kept readings with covariance `C`,
 //!
 //! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less its projection on the common terms.
+//!
+//! Where noise remembers the frames before, what the kept frames say of it in the left-out ones is taken off `z`, `u` and `d`, and `sigma^2` is
+//! the variance that is left ([`super::memory`]). What monitors have in common within a frame adds to that variance; that one
+//! left-out reading tells of another in the same frame is not counted.
 //!
 //! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
 //! standard error of its mean over readings: given the model they are independent, also within a frame, and an effect of one corrector
@@ -16,12 +20,14 @@
 use std::collections::BTreeMap;
 
 use estimator::MonitorState;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use twin::Signature;
 
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
+use super::memory::{Filter, Interpolation, Memory};
 use inference::campaign::Settings;
 use inference::campaign::TUNE_CALIBRATION;
 use inference::recording::Recording;
@@ -90,10 +96,10 @@ impl Score {
         let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
         let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
         let (mut squares, mut plain) = (0.0, 0usize);
+        let data = fitted.data(data);
+        let linear = Linear::of(data, fitted)?;
         for fold in folds {
-            let kept = data.without(fold);
-            let fit = Fitted::of(&kept, &fitted.hypothesis, &fitted.u)?;
-            for left in predict(data, fit.data(&kept), &fit, fold)? {
+            for left in linear.predict(data, fold)? {
                 let z = left.innovation / left.variance.sqrt();
                 score.log_density[(left.frame, left.column)] -=
                     0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
@@ -135,14 +141,46 @@ struct Left {
     variance: f64,
 }
 
-/// One column of a frame, a monitor or a tune: kept frames, left-out ones, noise, and the common terms of their readings, in standard
-/// deviations.
+/// One column of a frame, a monitor or a tune: kept frames, left-out ones, noise and what it remembers, and the common terms of their
+/// readings, in standard deviations.
 struct Column {
     index: usize,
     kept: Vec<usize>,
     out: Vec<usize>,
-    variance: f64,
+    sigma: f64,
+    memory: Memory,
     shared: [DMatrix<f64>; 2],
+}
+
+/// What its noise is to be expected to be in the left-out frames.
+struct Expectation {
+    sigma: f64,
+    known: Option<(Filter, Interpolation)>,
+    /// Variance of each left-out frame's noise about that, in units of `sigma`'s.
+    variances: Vec<f64>,
+}
+
+impl Expectation {
+    fn of(column: &Column) -> Self {
+        let Column { kept, out, sigma, memory, .. } = column;
+        let origin = kept.iter().chain(out).copied().min().unwrap_or(0);
+        let remembers = !memory.is_none();
+        let known =
+            remembers.then(|| (Filter::of(*memory, origin, kept), Interpolation::of(*memory, origin, kept, out)));
+        let variances = known.as_ref().map_or_else(|| vec![1.0; out.len()], |(_, at)| at.variances(*memory));
+        Self { sigma: *sigma, known, variances }
+    }
+
+    /// Rows of the kept and of the left-out frames, both in units of `sigma`: the first whitened, the others less what is to be
+    /// expected of them.
+    fn apart(&self, kept: DMatrix<f64>, out: DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
+        let (mut kept, mut out) = (kept / self.sigma, out / self.sigma);
+        if let Some((filter, interpolation)) = &self.known {
+            out -= interpolation.expected(&kept);
+            filter.whiten_columns(&mut kept);
+        }
+        (kept, out)
+    }
 }
 
 /// All of them of which readings are left out.
@@ -150,51 +188,103 @@ fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
     let monitor = |b: usize| {
         let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
         let shared = [kept.shared(b, kept.frames(b)), kept.shared(b, &out)];
-        Column { index: b, kept: kept.frames(b).to_vec(), out, variance: kept.noise(b).powi(2), shared }
+        let (own, memory, growth) = kept.noise_of(b);
+        Column { index: b, kept: kept.frames(b).to_vec(), out, sigma: own * growth.sqrt(), memory, shared }
     };
     let tune = |plane: usize| {
         let noise = kept.tune_noise(plane)?;
         let out: Vec<usize> = all.tune_frames(plane).into_iter().filter(|i| fold.contains(i)).collect();
         let kept = kept.tune_frames(plane);
         let shared = [kept.len(), out.len()].map(|n| DMatrix::from_element(n, 1, TUNE_CALIBRATION));
-        Some(Column { index: all.readings.ncols() + plane, kept, out, variance: noise * noise, shared })
+        Some(Column { index: all.readings.ncols() + plane, kept, out, sigma: noise, memory: Memory::NONE, shared })
     };
     let monitors = all.active_monitors().into_iter().map(monitor);
     monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
 }
 
-/// Predict the left-out readings by a fit to the kept ones.
-fn predict(all: &Data, kept: &Data, fit: &Fitted, fold: &Fold) -> Result<Vec<Left>, FitError> {
-    let (residual, slopes) = (all.miss(&fit.predicted(kept)?), fit.slopes(kept)?);
-    let mut left = Vec::new();
-    for column in columns(all, kept, fold) {
-        let at = column.index;
-        let [u_in, u_out] = &column.shared;
-        let mut normal = u_in.tr_mul(u_in) / column.variance;
-        (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
-        let Some(normal) = normal.cholesky() else { continue };
-        let rows = |frames: &[usize]| DMatrix::from_fn(frames.len(), slopes.len(), |i, p| slopes[p][(frames[i], at)]);
-        let of = |frames: &[usize]| DVector::from_iterator(frames.len(), frames.iter().map(|&i| residual[(i, at)]));
-        // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
-        let back = u_in.transpose() / column.variance;
-        let factors = normal.solve(&(&back * of(&column.kept)));
-        let innovation = of(&column.out) - u_out * factors;
-        let d = rows(&column.out) - u_out * normal.solve(&(back * rows(&column.kept)));
-        let unknown = normal.l().solve_lower_triangular(&u_out.transpose()).unwrap_or_else(|| u_out.transpose() * 0.0);
-        let params = fit.factor.l().solve_lower_triangular(&d.transpose()).unwrap_or_else(|| d.transpose() * 0.0);
-        for (i, &frame) in column.out.iter().enumerate() {
-            let variance = column.variance + unknown.column(i).norm_squared() + params.column(i).norm_squared();
-            left.push(Left { frame, column: at, innovation: innovation[i], variance });
-        }
+/// A fit to all frames, linearised.
+struct Linear<'f> {
+    fitted: &'f Fitted,
+    /// Derivatives of the predictions with respect to every u.
+    slopes: Vec<Signature>,
+    /// The same, columns monitors and tunes, rows frames.
+    by_frame: Vec<DMatrix<f64>>,
+    /// Readings and tunes less those predicted.
+    miss: DMatrix<f64>,
+}
+
+impl<'f> Linear<'f> {
+    fn of(data: &Data, fitted: &'f Fitted) -> Result<Self, FitError> {
+        let slopes = fitted.slopes(data)?;
+        let by_frame = slopes.iter().map(|slope| slope.clone().by_frame(&data.drives.time)).collect();
+        Ok(Self { fitted, miss: data.miss(&fitted.predicted(data)?), slopes, by_frame })
     }
-    Ok(left)
+
+    /// The step from the fit to all frames to that to the kept ones, and the factor of the latter's precision.
+    fn step(&self, kept: &Data) -> Result<(DVector<f64>, Cholesky<f64, Dyn>), FitError> {
+        let columns: Vec<DVector<f64>> = self.slopes.iter().map(|slope| kept.signature(slope)).collect();
+        let jacobian = DMatrix::from_columns(&columns);
+        let back = jacobian.transpose();
+        let normal = DMatrix::identity(columns.len(), columns.len()) + &back * jacobian;
+        let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
+        let slope = back * self.fitted.residual_of(kept)? - &self.fitted.u;
+        Ok((factor.solve(&slope), factor))
+    }
+
+    /// Predict the left-out readings by a fit to the kept ones.
+    fn predict(&self, all: &Data, fold: &Fold) -> Result<Vec<Left>, FitError> {
+        let kept = &all.without(fold);
+        let (step, factor) = self.step(kept)?;
+        let mut left = Vec::new();
+        for column in columns(all, kept, fold) {
+            let at = column.index;
+            let expectation = Expectation::of(&column);
+            let rows =
+                |frames: &[usize]| DMatrix::from_fn(frames.len(), step.len(), |i, p| self.by_frame[p][(frames[i], at)]);
+            let miss = |frames: &[usize]| DMatrix::from_fn(frames.len(), 1, |i, _| self.miss[(frames[i], at)]);
+            let Column { kept, out, shared: [u_in, u_out], .. } = &column;
+            let (u_in, u_out) = expectation.apart(u_in.clone(), u_out.clone());
+            let (slopes_in, slopes_out) = expectation.apart(rows(kept), rows(out));
+            let (known, left_out) = expectation.apart(miss(kept), miss(out));
+            let (known, left_out) = (known - &slopes_in * &step, left_out - &slopes_out * &step);
+            let mut normal = u_in.tr_mul(&u_in);
+            (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
+            let Some(normal) = normal.cholesky() else { continue };
+            // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
+            let innovation = left_out - &u_out * normal.solve(&u_in.tr_mul(&known));
+            let d = slopes_out - &u_out * normal.solve(&(u_in.transpose() * slopes_in));
+            let lower = |factor: &Cholesky<f64, Dyn>, rows: &DMatrix<f64>| {
+                factor.l_dirty().solve_lower_triangular(&rows.transpose()).unwrap_or_else(|| rows.transpose() * 0.0)
+            };
+            let (unknown, params) = (lower(&normal, &u_out), lower(&factor, &d));
+            for (i, &frame) in out.iter().enumerate() {
+                let noise = expectation.variances[i];
+                let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
+                let sigma = expectation.sigma;
+                left.push(Left {
+                    frame,
+                    column: at,
+                    innovation: innovation[i] * sigma,
+                    variance: variance * sigma * sigma,
+                });
+            }
+        }
+        Ok(left)
+    }
+}
+
+/// The same fit without its effects, what is ordinary being of the same size.
+pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
+    let without = Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() };
+    Fitted::of(data, &without, &fitted.guess(data, &without))
+        .or_else(|_| Fitted::of(data, &without, &DVector::zeros(fitted.params.len())))
 }
 
 /// The same fit without one of its terms.
 pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
     let vars = fitted.params.len();
     let without: Hypothesis = fitted.hypothesis.without(term);
-    let near = Fitted::of(data, &without, &fitted.u.rows(0, vars).into_owned());
+    let near = Fitted::of(data, &without, &fitted.guess(data, &without));
     // vars that are stable with the term may be unstable without it
     near.or_else(|_| Fitted::of(data, &without, &DVector::zeros(vars)))
 }

@@ -3,6 +3,7 @@
 use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Rf, Ring, Site};
 
 use super::data::Data;
+use super::ordinary::Family;
 
 /// One effect that a hypothesis holds, its amplitude unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -13,24 +14,13 @@ pub struct Term {
     pub site: Site,
 }
 
-/// Random errors of all members of a family of instruments or magnets, of ordinary size and therefore not a finding.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Scatter {
-    /// The property that scatters.
-    pub kind: EffectKind,
-    /// Name of the family and property.
-    pub name: &'static str,
-    /// Standard deviation, in the unit of the kind.
-    pub width: f64,
-}
-
 /// Some effects, any number of them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Hypothesis {
     /// Effects that count as findings.
     pub terms: Vec<Term>,
-    /// Ordinary scatter.
-    pub scatter: Vec<Scatter>,
+    /// Ordinary imperfections.
+    pub ordinary: Vec<Family>,
     /// Effects of known amplitude.
     pub given: Vec<Effect>,
 }
@@ -42,8 +32,42 @@ pub enum Unknown {
     Amplitude(usize, f64),
     /// The orbit at an element, in x or y [m].
     Orbit(usize, Plane, f64),
-    /// One member of a scatter.
-    Member(Term, f64),
+    /// One ordinary imperfection, of all effects that share it.
+    Ordinary(Vec<Term>, f64),
+}
+
+/// What an unknown is the amplitude of, whatever its width.
+#[derive(Debug, PartialEq)]
+pub enum Identity<'u> {
+    /// A term.
+    Amplitude(Term),
+    /// The orbit at an element.
+    Orbit(usize, Plane),
+    /// An ordinary imperfection.
+    Ordinary(&'u [Term]),
+}
+
+impl Unknown {
+    /// True for an ordinary imperfection.
+    pub fn is_ordinary(&self) -> bool {
+        matches!(self, Self::Ordinary(..))
+    }
+
+    /// Its prior standard deviation.
+    pub fn sigma(&self) -> f64 {
+        match self {
+            Self::Amplitude(_, sigma) | Self::Orbit(_, _, sigma) | Self::Ordinary(_, sigma) => *sigma,
+        }
+    }
+
+    /// What it is, as an unknown of a hypothesis.
+    pub fn is_of<'u>(&'u self, hypothesis: &Hypothesis) -> Identity<'u> {
+        match self {
+            Self::Amplitude(i, _) => Identity::Amplitude(hypothesis.terms[*i]),
+            Self::Orbit(element, plane, _) => Identity::Orbit(*element, *plane),
+            Self::Ordinary(terms, _) => Identity::Ordinary(terms),
+        }
+    }
 }
 
 impl Term {
@@ -79,6 +103,16 @@ impl From<Effect> for Term {
 }
 
 impl Hypothesis {
+    /// No effect, and everything ordinary.
+    pub fn plain() -> Self {
+        Self { ordinary: Family::all(), ..Self::default() }
+    }
+
+    /// The same with room for what a recording cannot show.
+    pub fn unseen(&self) -> Self {
+        Self { ordinary: self.ordinary.iter().map(Family::unseen).collect(), ..self.clone() }
+    }
+
     /// One more effect.
     pub fn with(&self, term: Term) -> Self {
         let mut more = self.clone();
@@ -103,17 +137,12 @@ impl Hypothesis {
                 });
             amplitude.into_iter().chain(orbit).collect::<Vec<_>>()
         };
-        let of_scatter = |scatter: &Scatter| {
-            let Scatter { kind, width, .. } = *scatter;
-            members(kind, data).into_iter().map(move |term| Unknown::Member(term, width)).collect::<Vec<_>>()
+        let of_family = |family: &Family| {
+            let width = family.width;
+            family.members(data).into_iter().map(move |terms| Unknown::Ordinary(terms, width))
         };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
-        terms.chain(self.scatter.iter().flat_map(of_scatter)).collect()
-    }
-
-    /// Number of unknowns that are members of a scatter; they stand last.
-    pub fn members(&self, data: &Data) -> usize {
-        self.scatter.iter().map(|scatter| members(scatter.kind, data).len()).sum()
+        terms.chain(self.ordinary.iter().flat_map(of_family)).collect()
     }
 
     /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations.
@@ -128,7 +157,7 @@ impl Hypothesis {
             match what {
                 Unknown::Amplitude(i, sigma) => effects[*i].amplitude = u * sigma,
                 Unknown::Orbit(element, plane, sigma) => drives.orbit[*element][plane.index()] += u * sigma,
-                Unknown::Member(term, sigma) => effects.push(term.effect(u * sigma)),
+                Unknown::Ordinary(terms, sigma) => effects.extend(terms.iter().map(|term| term.effect(u * sigma))),
             }
         }
         let ring = data.ring.with_strengths(&data.ring.strengths(params, &data.supplies));

@@ -18,14 +18,24 @@ pub mod experiment;
 pub mod fit;
 pub mod heldout;
 pub mod hypothesis;
+pub mod imperfection;
+mod jitter;
+mod laplace;
 pub mod location;
+mod memory;
+mod modes;
+pub mod noise;
+pub mod ordinary;
 pub mod page;
 pub mod place_scan;
+mod repeats;
 pub mod sample;
+mod scale;
 pub mod scan;
 pub mod score;
 pub mod search;
 pub mod settings;
+pub mod slow;
 pub mod validation;
 pub mod verdict;
 pub mod wiring;
@@ -41,6 +51,7 @@ use average::Vars;
 use data::{Data, DataError};
 use heldout::Score;
 use hypothesis::Term;
+use imperfection::Imperfection;
 use inference::Campaign;
 use inference::recording::Recording;
 use search::{Found, Search};
@@ -90,7 +101,8 @@ impl Diagnosis {
         let data = &found.data;
         progress("held-out frames");
         let folds = heldout::by_repeat(&campaign.settings);
-        let before = Score::of(data, &found.null, &folds)?;
+        let bare = if found.competitions.is_empty() { found.null.clone() } else { heldout::bare(data, &found.best)? };
+        let before = Score::of(data, &bare, &folds)?;
         let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
         let gains = verdict::gains(data, &found, &before, &after, &folds)?;
         let verdict = Verdict::of(&found, &gains);
@@ -101,7 +113,7 @@ impl Diagnosis {
         let folds = heldout::by_corrector(recording);
         let correctors = if whole && !folds.is_empty() {
             let scored = |fitted| Score::of(data, fitted, &folds).ok();
-            scored(&found.null).zip(scored(&found.best))
+            scored(&bare).zip(scored(&found.best))
         } else {
             None
         };
@@ -109,7 +121,7 @@ impl Diagnosis {
         // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let sentence = verdict::sentence(data, &found, verdict, &findings);
-        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found));
+        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
         Ok(Self {
             found,
             verdict,
@@ -129,6 +141,12 @@ impl Diagnosis {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
         best.hypothesis.terms.iter().enumerate().map(of).collect()
+    }
+
+    /// What was learnt of the machine besides.
+    pub fn imperfections(&self) -> Vec<Imperfection> {
+        let Found { data, best, .. } = &self.found;
+        ordinary::rows(data, best).into_iter().chain(data.noise.rows()).collect()
     }
 
     /// Gain of held-out log predictive density by all effects, and its standard error.

@@ -84,11 +84,6 @@ impl Projection {
         Ok(Self { residual, back, factor, slope })
     }
 
-    /// `d P r` of whitened signatures, one a column.
-    fn pulls(&self, columns: &DMatrix<f64>) -> DVector<f64> {
-        columns.tr_mul(&self.residual) - self.factor.solve(&(&self.back * columns)).tr_mul(&self.slope)
-    }
-
     /// `d_i P d_j` of whitened signatures, one a column.
     pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
@@ -216,23 +211,4 @@ fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
     let scale = term.kind.prior_scale().unwrap_or(1.0);
     let signature = signatures.of_effect(term.kind, term.site);
     signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
-}
-
-/// `ln` Bayes factor of all members of a family having amplitudes of one of some standard deviations, to first order.
-///
-/// # Errors
-/// [`FitError`].
-pub fn family(data: &Data, fitted: &Fitted, members: &[Term], widths: &[f64]) -> Result<Vec<f64>, FitError> {
-    let (machine, drives) = fitted.machine(data)?;
-    let machine = machine.on_orbit(&drives.orbit);
-    let signatures = Signatures::of(&machine, &drives)?;
-    let columns: Vec<DVector<f64>> = members
-        .iter()
-        .map(|term| Ok(data.signature(&signatures.of_effect(term.kind, term.site)?)))
-        .collect::<Result<_, FitError>>()?;
-    let columns = DMatrix::from_columns(&columns);
-    let projection = Projection::of(fitted);
-    let pulls = projection.pulls(&columns);
-    let gram = projection.gram(&columns);
-    Ok(widths.iter().map(|&width| super::discrepancy::marginal(&pulls, &gram, width)).collect())
 }

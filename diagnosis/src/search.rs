@@ -19,8 +19,9 @@ use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::{Hypothesis, Scatter, Term, members};
+use super::hypothesis::{Hypothesis, Term, Unknown};
 use super::location::SORTS;
+use super::ordinary;
 use super::scan::{Candidate, scan};
 use inference::bounded::softplus;
 
@@ -50,7 +51,7 @@ const CURVED: f64 = 4.0;
 pub struct Found {
     /// The recording, linearised about the machine that was found.
     pub data: Data,
-    /// The fit without any effect (ordinary scatter included).
+    /// The fit without any effect.
     pub null: Fitted,
     /// The fit with all effects found.
     pub best: Fitted,
@@ -132,19 +133,15 @@ impl Search {
         Ok(found)
     }
 
-    /// The fit of the vars alone, with the ordinary scatter of a family if there is any.
+    /// The fit of the vars and of what is ordinary.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
-        let zero = DVector::zeros(data.units.len());
-        let mut null = fit_linearised(&mut data, &Hypothesis::default(), &zero)?;
-        let mut next = self.one_more(&data, &null)?;
-        if let Ok(Some(scatter)) = scatter(&data, &null, &next) {
-            let mut scattered = data.clone();
-            if let Ok(fitted) = fit_linearised(&mut scattered, &Hypothesis { scatter, ..Hypothesis::default() }, &zero)
-            {
-                (data, null) = (scattered, fitted);
-                next = self.one_more(&data, &null)?;
-            }
-        }
+        let hypothesis = Hypothesis::plain();
+        let start = DVector::zeros(data.units.len());
+        let fitted = fit_linearised(&mut data, &hypothesis, &start)?;
+        let learnt = Hypothesis { ordinary: ordinary::learnt(&data, &fitted), ..hypothesis };
+        let guess = fitted.guess(&data, &learnt);
+        let null = if fitted.is_gross() { fitted } else { fit_linearised(&mut data, &learnt, &guess)? };
+        let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
     }
 
@@ -227,7 +224,7 @@ impl Search {
 
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
-        let rest = super::heldout::reduced(data, fitted, term)?;
+        let rest = relearnt(data, super::heldout::reduced(data, fitted, term)?);
         let present = Alternative::exact(data, &rest, fitted.clone(), term);
         self.competition(data, &rest, Some(present))
     }
@@ -262,6 +259,7 @@ impl Search {
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
+        relearn(data, fitted, &mut weights);
         for discrepancy in discrepancy::scan(data, fitted)? {
             let prior = (UNMODELLED * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
@@ -317,57 +315,46 @@ fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
 /// The exact fit with a candidate, abandoned where its cost stays far above the least of its rivals.
 fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alternative {
     let hypothesis = fitted.hypothesis.with(candidate.term);
-    let vars = fitted.params.len();
-    // the new unknowns of a term stand before those of scatter
-    let at = vars + fitted.hypothesis.unknowns(data).len() - fitted.hypothesis.members(data);
-    let new = hypothesis.unknowns(data).len() - fitted.hypothesis.unknowns(data).len();
-    let mut guess = fitted.u.clone().insert_rows(at, new, 0.0);
-    if new > 0 {
-        guess[at] = candidate.amplitude;
+    let mut guess = fitted.guess(data, &hypothesis);
+    let unknowns = hypothesis.unknowns(data);
+    let last = hypothesis.terms.len() - 1;
+    if let Some(at) = unknowns.iter().position(|unknown| matches!(unknown, Unknown::Amplitude(i, _) if *i == last)) {
+        guess[fitted.params.len() + at] = candidate.amplitude;
     }
     let mut guesses = vec![guess];
     if fitted.is_gross() {
-        guesses.push(DVector::zeros(vars));
+        guesses.push(DVector::zeros(fitted.params.len()));
     }
     let fits = guesses.iter().filter_map(|guess| Fitted::against(data, &hypothesis, guess, least).ok());
     // a candidate without a stable machine is excluded
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
     };
-    Alternative::exact(data, fitted, refitted, fitted.hypothesis.terms.len())
+    Alternative::exact(data, fitted, refitted, last)
 }
 
-/// A family of instruments or magnets that scatters, if that explains the data better than any single effect.
-fn scatter(data: &Data, fitted: &Fitted, next: &Competition) -> Result<Option<Vec<Scatter>>, FitError> {
-    let single = next.log_odds;
-    let mut best: Option<(Scatter, f64)> = None;
-    for &(kind, name, widths) in &FAMILIES {
-        let terms = members(kind, data);
-        let logs = super::scan::family(data, fitted, &terms, widths)?;
-        for (&width, log_bayes) in widths.iter().zip(logs) {
-            if best.as_ref().is_none_or(|(_, largest)| log_bayes > *largest) {
-                best = Some((Scatter { kind, name, width }, log_bayes));
-            }
-        }
+/// Refit the best of some weighted candidates with the ordinary widths that the recording shows beside each.
+fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
+    let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
+    let is_near = |(one, weight): &&mut (Alternative, f64)| *weight > best - BEHIND && one.log_gain > WORTH;
+    for (alternative, weight) in weights.iter_mut().filter(is_near) {
+        let place = |fitted: &Fitted| fitted.hypothesis.terms.iter().position(|term| Some(term) == alternative.term());
+        let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {
+            continue;
+        };
+        let again = Alternative::exact(data, without, relearnt(data, fitted), term);
+        *weight += again.log_gain - alternative.log_gain;
+        *alternative = again;
     }
-    let correction = ((FAMILIES.len() * WIDTHS) as f64).ln() + CLEARLY;
-    Ok(best
-        .filter(|(_, log_bayes)| *log_bayes > correction && *log_bayes - correction > single)
-        .map(|(one, _)| vec![one]))
 }
 
-/// Widths that are tried of each family.
-const WIDTHS: usize = 3;
-/// By how much scatter of a whole family has to describe the readings better than any single effect [nat]: where rolls imitate each
-/// other a family can imitate any one of them.
-const CLEARLY: f64 = 6.0;
-/// Families whose members all scatter a little, and the widths tried, in the unit of the kind.
-///
-/// Source: alignment and calibration tolerances, from good to poor (1 to 5 % of gain, 5 to 30 mrad; 1 to 5 mrad of a quadrupole).
-const FAMILIES: [(EffectKind, &str, &[f64]); 5] = [
-    (EffectKind::BpmGain, "BPM gains", &[0.01, 0.02, 0.04]),
-    (EffectKind::CorrectorGain, "corrector gains", &[0.01, 0.02, 0.04]),
-    (EffectKind::BpmRoll, "BPM rolls", &[0.01, 0.02, 0.04]),
-    (EffectKind::CorrectorRoll, "corrector rolls", &[0.01, 0.02, 0.04]),
-    (EffectKind::QuadRoll, "quadrupole rolls", &[0.001, 0.002, 0.004]),
-];
+/// The same fit with the ordinary widths that the recording then shows, if it is the better. What makes a fit poor is not ordinary.
+fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
+    if fitted.is_gross() {
+        return fitted;
+    }
+    let ordinary = ordinary::learnt(fitted.data(data), &fitted);
+    let hypothesis = Hypothesis { ordinary, ..fitted.hypothesis.clone() };
+    let again = Fitted::of(data, &hypothesis, &fitted.guess(data, &hypothesis));
+    again.ok().filter(|again| again.log_evidence > fitted.log_evidence).unwrap_or(fitted)
+}

@@ -3,9 +3,12 @@
 use std::path::Path;
 
 use inference::recording::Recording;
-use inference::simulate::Hardware;
-use nalgebra::DMatrix;
-use twin::Ring;
+use inference::simulate::{Beyond, Hardware, Truth};
+use nalgebra::{DMatrix, DVector};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use rand_distr::{Distribution, StandardNormal};
+use twin::{Cycle, Effect, Hold, Optics, Ring};
 
 /// A campaign of the repository, on the ring as designed.
 pub fn template() -> (Ring, Recording) {
@@ -25,4 +28,65 @@ pub fn ideal(ring: &Ring) -> Hardware {
 pub fn readings(recording: &Recording) -> DMatrix<f64> {
     let rows = &recording.rows;
     DMatrix::from_fn(rows.len(), rows[0].reading.len(), |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
+}
+
+/// Noise that is not white and alone, added to that of the hardware.
+pub struct Coloured {
+    /// Noise of a reading [m].
+    pub noise: f64,
+    /// Share of its variance that is slow, and correlation time [frames].
+    pub slow: (f64, f64),
+    /// Random walk [m per root frame].
+    pub walk: f64,
+    /// Rms jitter of the momentum [1].
+    pub momentum: f64,
+    /// Share that five neighbours in the order of reading have in common.
+    pub crate_share: f64,
+    /// Dispersion at the read monitors [m].
+    pub dispersion: DVector<f64>,
+    pub seed: u64,
+}
+
+impl Coloured {
+    /// As the header states it.
+    pub fn white(ring: &Ring, recording: &Recording, seed: u64) -> Self {
+        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 }).unwrap();
+        let dispersion = optics.dispersion_of(&optics.read_monitors());
+        let noise = recording.header.noise[0];
+        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, dispersion, seed }
+    }
+
+    /// A campaign with this noise, of random vars, with the faulty monitors of the shipped recordings.
+    pub fn campaign(&self, ring: &Ring, recording: &Recording, effects: &[Effect]) -> Recording {
+        let mut hardware = Hardware::shipped(ring, recording);
+        let white = (1.0 - self.slow.0 - self.crate_share).sqrt() * self.noise / recording.header.noise[0];
+        hardware.noise.iter_mut().for_each(|noise| *noise *= white);
+        let vars = inference::simulate::vars(ring, true, self.seed).unwrap();
+        let beyond: &[&dyn Beyond] = &[self];
+        let truth = Truth { vars: &vars, effects, beyond };
+        inference::simulate::campaign(recording, ring, &truth, &hardware, self.seed).unwrap()
+    }
+}
+
+impl Beyond for Coloured {
+    fn alter_readings(&self, _: &[Cycle], readings: &mut DMatrix<f64>) {
+        let mut random = StdRng::seed_from_u64(self.seed ^ 0x5eed);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
+        let decay = (-1.0 / self.slow.1).exp();
+        for mut column in readings.column_iter_mut() {
+            let (mut slow, mut walk) = (normal(), 0.0);
+            for reading in &mut column {
+                *reading += self.noise * self.slow.0.sqrt() * slow + self.walk * walk;
+                slow = decay * slow + (1.0 - decay * decay).sqrt() * normal();
+                walk += normal();
+            }
+        }
+        for mut row in readings.row_iter_mut() {
+            row += self.dispersion.transpose() * (self.momentum * normal());
+            for of_crate in 0..row.len().div_ceil(5) {
+                let common = self.noise * self.crate_share.sqrt() * normal();
+                row.iter_mut().skip(5 * of_crate).take(5).for_each(|reading| *reading += common);
+            }
+        }
+    }
 }

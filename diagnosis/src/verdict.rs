@@ -8,7 +8,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
 use super::heldout::{Fold, Score, VALIDATED};
-use super::hypothesis::{Scatter, Term};
+use super::hypothesis::Term;
 use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
 use super::search::Found;
@@ -192,10 +192,8 @@ pub fn gains(
     if found.competitions.len() == 1 {
         return Ok(vec![after.gain_over(before)]);
     }
-    found
-        .competitions
-        .iter()
-        .map(|competition| Ok(after.gain_over(&Score::of(data, &competition.without, folds)?)))
+    (0..found.competitions.len())
+        .map(|i| Ok(after.gain_over(&Score::of(data, &super::heldout::reduced(data, &found.best, i)?, folds)?)))
         .collect()
 }
 
@@ -256,16 +254,12 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
             format!("{named}{last}, which no effect of the library describes")
         }
     };
-    let scatter = found.null.hypothesis.scatter.first().map(|scatter| {
-        let Scatter { kind, name, width } = scatter;
-        format!("; all {name} scatter by {} {}, an ordinary size", width * kind.unit().factor, kind.unit().shown)
-    });
     let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
         .collect();
     let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
-    capitalised(&format!("{text}{}{faulty}", scatter.unwrap_or_default()))
+    capitalised(&format!("{text}{faulty}"))
 }
 
 /// The alternatives that share most of the probability.

@@ -7,6 +7,7 @@ use comfy_table::ColumnConstraint;
 use diagnosis::average::Vars;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
+use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::{Diagnosis, Finding, page};
 use inference::Recording;
 use serde::Serialize;
@@ -35,8 +36,8 @@ struct DiagnosisResult {
     next_measurement: Option<String>,
     /// Probability that nothing (more) is missing, that an effect of the library is, and that something else is.
     probabilities: Probabilities,
-    /// Ordinary scatter of families that the fits include.
-    scatter: Vec<ScatterResult>,
+    /// Ordinary imperfections of the machine.
+    imperfections: Vec<ImperfectionResult>,
 }
 
 #[derive(Debug, Serialize)]
@@ -92,9 +93,37 @@ struct Probabilities {
 }
 
 #[derive(Debug, Serialize)]
-struct ScatterResult {
+struct ImperfectionResult {
     kind: &'static str,
-    width: f64,
+    at: &'static str,
+    /// What the members have in common, in the unit.
+    mean: f64,
+    /// Rms of the members about it.
+    scatter: f64,
+    /// Standard deviation of whichever of the two is not 0.
+    sigma: f64,
+    unit: &'static str,
+    #[serde(skip)]
+    row: Option<[String; 4]>,
+}
+
+impl From<&Imperfection> for ImperfectionResult {
+    fn from(one: &Imperfection) -> Self {
+        let Imperfection { name, kind, at, measure, measured, unit, ordinary } = *one;
+        let [mean, scatter] = match measure {
+            Measure::Mean => [measured.value, 0.0],
+            Measure::Scatter => [0.0, measured.value],
+        };
+        let said = match measure {
+            Measure::Mean => measured.signed(unit.factor),
+            Measure::Scatter => measured.size(unit.factor),
+        };
+        let what = if at == "all" { name.to_owned() } else { format!("{name}, {at}") };
+        let shown =
+            [what, said, format!("{}", unit.rounded(ordinary)), if one.is_large() { "large" } else { "" }.to_owned()];
+        let row = one.is_seen().then_some(shown);
+        Self { kind, at, mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
+    }
 }
 
 impl From<DataError> for CommandError {
@@ -195,9 +224,7 @@ impl DiagnosisResult {
                 library: next.library(),
                 unknown: next.unknown(),
             },
-            scatter: (found.null.hypothesis.scatter.iter())
-                .map(|scatter| ScatterResult { kind: scatter.kind.word(), width: scatter.width })
-                .collect(),
+            imperfections: diagnosis.imperfections().iter().map(Into::into).collect(),
         })
     }
 }
@@ -235,7 +262,21 @@ impl fmt::Display for DiagnosisResult {
         if let Some(tunes) = &self.tunes {
             write!(f, "\ntunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
         }
+        self.write_imperfections(f)?;
         self.next_measurement.as_ref().map_or(Ok(()), |next| write!(f, "\n\n{}", fill(next)))
+    }
+}
+
+impl DiagnosisResult {
+    /// The ordinary imperfections that the recording shows.
+    fn write_imperfections(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut rows = self.imperfections.iter().filter_map(|one| one.row.as_ref()).peekable();
+        if rows.peek().is_none() {
+            return Ok(());
+        }
+        let mut table = table(["of the machine as it is", "size", "ordinary", ""]);
+        table.add_rows(rows);
+        write!(f, "\n\n{table}")
     }
 }
 

@@ -55,6 +55,28 @@ impl core::ops::AddAssign for Signature {
     }
 }
 
+impl core::ops::Sub for Signature {
+    type Output = Self;
+
+    fn sub(self, other: Self) -> Self {
+        let less = |one: [f64; 2], other: [f64; 2]| core::array::from_fn(|plane| one[plane] - other[plane]);
+        Self {
+            readings: self.readings - other.readings,
+            tunes: less(self.tunes, other.tunes),
+            tune_drift: less(self.tune_drift, other.tune_drift),
+        }
+    }
+}
+
+impl core::ops::Mul<f64> for Signature {
+    type Output = Self;
+
+    fn mul(self, factor: f64) -> Self {
+        let times = |pair: [f64; 2]| pair.map(|one| one * factor);
+        Self { readings: self.readings * factor, tunes: times(self.tunes), tune_drift: times(self.tune_drift) }
+    }
+}
+
 impl Signature {
     /// Readings and, as two more columns, the tunes of every frame.
     pub fn by_frame(self, time: &DVector<f64>) -> DMatrix<f64> {

@@ -1,0 +1,126 @@
+//! Noise that monitors have in common within a frame: the momentum's jitter, in the dispersion's pattern, and that of a crate of
+//! electronics, the same in neighbouring monitors.
+//!
+//! In units of the monitors' own noise a frame has the covariance `1 + F F^T`, a column of F for each mode, over the monitors whose
+//! readings count in that frame; with the thin decomposition `F = Q D V^T` it is whitened by the symmetric
+//! `M = 1 - Q (1 - (1 + D^2)^(-1/2)) Q^T`.
+
+use nalgebra::{DMatrix, DVector};
+
+/// The modes of all frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Modes {
+    /// F: rows monitors, in units of their own noise.
+    pub factors: DMatrix<f64>,
+}
+
+/// Their whitening, frame by frame.
+#[derive(Debug, Clone, Default)]
+pub struct Mixing {
+    frames: Vec<Mixed>,
+}
+
+/// That of one frame.
+#[derive(Debug, Clone)]
+struct Mixed {
+    /// `Q` [monitors][modes], 0 for a monitor whose reading does not count.
+    basis: DMatrix<f64>,
+    /// `1 - (1 + D^2)^(-1/2)` of each.
+    shrink: DVector<f64>,
+}
+
+impl Modes {
+    /// None, of so many monitors.
+    pub fn none(monitors: usize) -> Self {
+        Self { factors: DMatrix::zeros(monitors, 0) }
+    }
+
+    /// True if monitors have nothing in common.
+    pub fn is_none(&self) -> bool {
+        self.factors.is_empty()
+    }
+
+    /// Variance of a monitor's reading over that of its own noise.
+    pub fn growth(&self, b: usize) -> f64 {
+        1.0 + self.factors.row(b).norm_squared()
+    }
+}
+
+impl Mixing {
+    /// Over the readings that count, rows frames.
+    pub fn of(modes: &Modes, frames: usize, counts: impl Fn(usize, usize) -> bool) -> Self {
+        let of = |frame: usize| {
+            let mut factors = modes.factors.clone();
+            for (b, mut row) in factors.row_iter_mut().enumerate() {
+                if !counts(frame, b) {
+                    row.fill(0.0);
+                }
+            }
+            Mixed::of(factors)
+        };
+        Self { frames: if modes.is_none() { Vec::new() } else { (0..frames).map(of).collect() } }
+    }
+
+    /// True if monitors have nothing in common.
+    pub fn is_none(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Multiply each frame by M; rows frames, columns monitors, 0 for readings that do not count.
+    pub fn apply(&self, values: &mut DMatrix<f64>) {
+        for (i, Mixed { basis, shrink }) in self.frames.iter().enumerate() {
+            let common = (values.row(i) * basis).component_mul(&shrink.transpose());
+            let mut row = values.row_mut(i);
+            row -= common * basis.transpose();
+        }
+    }
+
+    /// Diagonal of `M^2` of a monitor in a frame: what its readings tell beside those of the others.
+    pub fn own(&self, frame: usize, b: usize) -> f64 {
+        let Some(Mixed { basis, shrink }) = self.frames.get(frame) else { return 1.0 };
+        1.0 - (0..shrink.len()).map(|k| basis[(b, k)].powi(2) * shrink[k] * (2.0 - shrink[k])).sum::<f64>()
+    }
+
+    /// `ln` of the determinant of the covariances.
+    pub fn log_det(&self) -> f64 {
+        let of = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
+        self.frames.iter().map(of).sum()
+    }
+}
+
+impl Mixed {
+    fn of(factors: DMatrix<f64>) -> Self {
+        let svd = factors.svd(true, false);
+        let shrink = svd.singular_values.map(|d| 1.0 - (1.0 + d * d).sqrt().recip());
+        Self { basis: svd.u.expect("asked for"), shrink }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_is_whitened_by_the_symmetric_root_of_its_covariance() {
+        let factors = DMatrix::from_row_slice(4, 2, &[0.5, 0.0, -0.7, 0.0, 0.3, 0.6, 0.9, 0.6]);
+        let counts = |frame: usize, b: usize| frame == 0 || b != 1;
+        let mixing = Mixing::of(&Modes { factors: factors.clone() }, 2, counts);
+        let mut log_det = 0.0;
+        for frame in 0..2 {
+            let kept = DMatrix::from_fn(4, 2, |b, k| if counts(frame, b) { factors[(b, k)] } else { 0.0 });
+            let covariance = DMatrix::identity(4, 4) + &kept * kept.transpose();
+            log_det += covariance.determinant().ln();
+            let mut root = DMatrix::zeros(4, 4);
+            for b in 0..4 {
+                let mut values = DMatrix::zeros(2, 4);
+                values[(frame, b)] = 1.0;
+                mixing.apply(&mut values);
+                root.set_column(b, &values.row(frame).transpose());
+            }
+            assert!((&root * &covariance * &root - DMatrix::identity(4, 4)).amax() < 1e-12, "rounding");
+            let square = &root * &root;
+            (0..4).for_each(|b| assert!((mixing.own(frame, b) - square[(b, b)]).abs() < 1e-12, "rounding"));
+        }
+        assert!((mixing.log_det() - log_det).abs() < 1e-12, "rounding");
+    }
+}

@@ -1,0 +1,338 @@
+//! The noise of a recording as it is: learnt from its repeats, with the header's noise as a prior.
+//!
+//! Of each monitor the scale of its noise; of all together what the noise remembers ([`super::slow`]), the jitter of the momentum and
+//! what crates of monitors have in common ([`super::jitter`]). Everything comes from differences between readings of the same setting
+//! ([`super::repeats`]), so that physics that the model lacks does not enter, with one exception: what changes with time alone, such as
+//! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size.
+//!
+//! Scales are root mean squares of the readings that count. Tails are those of the readings that the screening accepts: it drops
+//! what is far from its repeats. Weighting the rest by how far each lies from its repeats would gain up to a third of the information for
+//! tails of Student's t with four degrees of freedom, but their chi-square would no longer be their number, and two repeats cannot tell which
+//! is the outlier.
+
+use nalgebra::{DMatrix, DVector};
+use twin::{Measured, Unit};
+
+use super::imperfection::{Imperfection, Measure};
+use super::jitter::{CRATE, Crates, Differences};
+use super::memory::Memory;
+use super::modes::Modes;
+use super::repeats::{Repeats, Run};
+use super::scale::{ALIKE, QUOTED, Scales};
+use super::slow::{SHARE, Slow, steps};
+use inference::Campaign;
+
+/// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
+/// recording allows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Noise {
+    /// Scale of the noise of each monitor over the header's [B] [1]; 1 for a faulty one.
+    pub scale: Vec<f64>,
+    /// Scale that all have in common [1].
+    pub common_scale: Measured,
+    /// Scatter of the scales between monitors, relative [1].
+    pub scatter: Measured,
+    /// Slow noise and walk.
+    pub slow: Slow,
+    /// Rms jitter of the momentum from frame to frame [1].
+    pub momentum: Measured,
+    /// Share of the noise's variance that the monitors of a crate have in common [1].
+    pub crate_share: Measured,
+    /// The crates, where they were found, by index of the monitors.
+    pub crates: Vec<Vec<usize>>,
+    /// Kurtosis of the differences, 3 for normal noise [1].
+    pub kurtosis: Measured,
+    /// Noise of each monitor's readings that is its own [B] [m].
+    pub own: Vec<f64>,
+    /// Ordinary walk of a monitor: as far as it is noisy, over the campaign [m per root frame].
+    pub ordinary_walk: f64,
+    /// Ordinary jitter of the momentum: the orbit's is that of the noise where the dispersion is largest [1].
+    pub ordinary_momentum: f64,
+    /// Noise in common, in units of the monitors' own.
+    pub(super) modes: Modes,
+}
+
+/// What noise is learnt from.
+pub struct Source<'c> {
+    /// The recording.
+    pub campaign: &'c Campaign,
+    /// Readings less their prediction, rows frames, columns monitors [m].
+    pub residual: &'c DMatrix<f64>,
+    /// Dispersion at the read monitors, in the plane they read [m].
+    pub dispersion: &'c DVector<f64>,
+}
+
+/// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
+const FEWEST: f64 = 20.0;
+/// Kurtosis of normal noise.
+const NORMAL: f64 = 3.0;
+/// Least share of a reading's variance that is not the momentum's.
+const OWN: f64 = 0.05;
+
+/// A monitor in state ok with its repeats, and their noise [m].
+struct Learner {
+    b: usize,
+    repeats: Repeats,
+    sigma: f64,
+}
+
+impl Noise {
+    /// The noise as the screening weights it.
+    pub fn screened(campaign: &Campaign) -> Self {
+        let monitors = campaign.monitors();
+        let nothing = Measured { value: 0.0, sigma: 0.0 };
+        Self {
+            scale: vec![1.0; monitors],
+            common_scale: Measured { value: 1.0, sigma: 0.0 },
+            scatter: nothing,
+            slow: Slow::NONE,
+            momentum: nothing,
+            crate_share: nothing,
+            crates: Vec::new(),
+            kurtosis: Measured { value: NORMAL, sigma: 0.0 },
+            own: (0..monitors).map(|b| campaign.noise(b)).collect(),
+            ordinary_walk: 0.0,
+            ordinary_momentum: 0.0,
+            modes: Modes::none(monitors),
+        }
+    }
+
+    /// Learn.
+    pub fn learn(source: &Source) -> Self {
+        let campaign = source.campaign;
+        let mut learners = learners(source);
+        if learners.is_empty() {
+            return Self::screened(campaign);
+        }
+        let (repeats, sigma): (Vec<Repeats>, Vec<f64>) =
+            learners.iter().map(|one| (one.repeats.clone(), one.sigma)).unzip();
+        let slow = Slow::of(&repeats, &sigma, campaign.frames());
+        for one in &mut learners {
+            one.sigma = one.repeats.weigh(slow.memory(one.sigma)).sigma().unwrap_or(one.sigma);
+        }
+        let differences = differences(&learners, &slow, campaign.frames(), campaign.monitors());
+        let kurtosis = kurtosis(&differences);
+        // per momentum, in units of the noise of whole readings
+        let mut pattern = DVector::zeros(campaign.monitors());
+        learners.iter().for_each(|one| pattern[one.b] = source.dispersion[one.b] / one.sigma);
+        let differences = Differences(differences);
+        let ordinary_momentum = pattern.amax().max(f64::MIN_POSITIVE).recip();
+        let momentum = differences.momentum(&pattern, ordinary_momentum);
+        let jitter = &pattern * momentum.value;
+        let order: Vec<usize> = learners.iter().map(|one| one.b).collect();
+        let mut along = order.clone();
+        let places: Vec<usize> = campaign.ring.monitors_read().map(|monitor| monitor.element).collect();
+        along.sort_by_key(|&b| places[b]);
+        let (crates, crate_share) = differences.crates(&jitter, &[order, along]);
+        let mut measured = vec![None; campaign.monitors()];
+        for one in &learners {
+            let own = (1.0 - jitter[one.b].powi(2)).max(OWN).sqrt() * one.sigma;
+            let value = (own / campaign.recording.header.noise[one.b]).ln();
+            let count = one.repeats.weigh(Memory::NONE).count;
+            measured[one.b] = Some(Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() });
+        }
+        let Scales { common, scatter, each } = Scales::of(&measured);
+        let scale = common.value.exp();
+        Self {
+            common_scale: Measured { value: scale, sigma: scale * common.sigma },
+            scatter,
+            slow,
+            momentum,
+            crate_share,
+            crates: Vec::new(),
+            kurtosis,
+            ordinary_walk: steps(campaign.frames() as f64) * sigma.iter().sum::<f64>() / sigma.len() as f64,
+            ordinary_momentum,
+            ..Self::screened(campaign)
+        }
+        .with_scales(source, each)
+        .with_modes(source, crates)
+    }
+
+    /// Scales of all monitors that are known by their repeats; the screening's noise of the others stays.
+    fn with_scales(mut self, source: &Source, scale: Vec<f64>) -> Self {
+        let header = &source.campaign.recording.header.noise;
+        for (b, &scale) in scale.iter().enumerate().filter(|(b, _)| source.campaign.is_ok(*b)) {
+            // as the screening holds it, whose numbers have single precision
+            self.own[b] = f64::from(header[b] as f32) * scale;
+        }
+        Self { scale, ..self }
+    }
+
+    /// Noise in common; what a crate shares is no longer its monitors' own.
+    fn with_modes(mut self, source: &Source, crates: Option<Crates>) -> Self {
+        let mut columns = Vec::new();
+        if let Some(Crates { groups, share }) = crates {
+            for group in &groups {
+                let mut column = DVector::zeros(self.own.len());
+                for &b in group {
+                    self.own[b] *= (1.0 - share.value).sqrt();
+                    column[b] = (share.value / (1.0 - share.value)).sqrt();
+                }
+                columns.push(column);
+            }
+            self.crates = groups;
+        }
+        if self.momentum.value > 0.0 {
+            let pattern = DVector::from_fn(self.own.len(), |b, _| source.dispersion[b] / self.own[b]);
+            columns.push(pattern * self.momentum.value);
+        }
+        if !columns.is_empty() {
+            self.modes = Modes { factors: DMatrix::from_columns(&columns) };
+        }
+        self
+    }
+
+    /// What the noise of a monitor remembers.
+    pub(super) fn memory(&self, b: usize) -> Memory {
+        self.slow.memory(self.own[b])
+    }
+
+    /// True if everything is as the header says.
+    pub fn is_as_stated(&self) -> bool {
+        self.slow.is_none() && self.modes.is_none() && self.scale.iter().all(|scale| *scale == 1.0)
+    }
+
+    /// The rows of a table.
+    pub fn rows(&self) -> Vec<Imperfection> {
+        const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
+        let off = Measured { value: self.common_scale.value - 1.0, ..self.common_scale };
+        let row = |(name, kind), measured, unit, ordinary| Imperfection {
+            name,
+            kind,
+            at: "all",
+            measure: Measure::Scatter,
+            measured,
+            unit,
+            ordinary,
+        };
+        let mean = |what, measured, unit, ordinary| Imperfection {
+            measure: Measure::Mean,
+            ..row(what, measured, unit, ordinary)
+        };
+        vec![
+            mean(("noise over the header's, less 1", "noise"), off, Unit::PERCENT, QUOTED),
+            row(("noise of single monitors", "noise"), self.scatter, Unit::PERCENT, ALIKE),
+            mean(("slow share of the noise's variance", "slow_noise"), self.slow.share, Unit::PERCENT, SHARE),
+            row(("walk per root frame", "walk"), self.slow.walk, LENGTH, self.ordinary_walk),
+            row(
+                ("momentum from frame to frame", "momentum_jitter"),
+                self.momentum,
+                Unit::PER_MILLE,
+                self.ordinary_momentum,
+            ),
+            mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
+        ]
+    }
+}
+
+/// The monitors in state ok that have enough repeats.
+fn learners(source: &Source) -> Vec<Learner> {
+    let campaign = source.campaign;
+    let runs = Run::of(&campaign.settings.of_frame);
+    let of = |b: usize| {
+        let frames: Vec<usize> = (0..campaign.frames()).filter(|&frame| campaign.counts(frame, b)).collect();
+        let values: Vec<f64> = frames.iter().map(|&frame| source.residual[(frame, b)]).collect();
+        let repeats = Repeats::of(&frames, &values, &runs);
+        let sigma = repeats.of_neighbours().filter(|sigma| *sigma > 0.0)?;
+        let repeats = repeats.without(&campaign.following(b).select_rows(&frames), sigma);
+        (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, sigma })
+    };
+    (0..campaign.monitors()).filter(|&b| campaign.is_ok(b)).filter_map(of).collect()
+}
+
+/// Whitened differences, rows frames, columns monitors; not a number where there is none.
+fn differences(learners: &[Learner], slow: &Slow, frames: usize, monitors: usize) -> DMatrix<f64> {
+    let mut all = DMatrix::from_element(frames, monitors, f64::NAN);
+    for Learner { b, repeats, sigma } in learners {
+        for (frame, innovation, variance) in repeats.differences(slow.memory(*sigma)) {
+            all[(frame, *b)] = innovation / (sigma * variance.sqrt());
+        }
+    }
+    all
+}
+
+/// Of differences of variance 1, with its sampling error for normal noise.
+fn kurtosis(differences: &DMatrix<f64>) -> Measured {
+    let known: Vec<f64> = differences.iter().copied().filter(|z| !z.is_nan()).collect();
+    let n = known.len().max(1) as f64;
+    let moment = |power: i32| known.iter().map(|z| z.powi(power)).sum::<f64>() / n;
+    Measured { value: (moment(4) / moment(2).powi(2)).max(1.0 + 1.0 / n), sigma: (24.0 / n).sqrt() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Diagnosis;
+    use crate::data::Data;
+    use crate::testing::{Coloured, template};
+    use crate::verdict::Verdict;
+
+    /// What is learnt of a campaign, and what is true of it: scale, slow share, its time, walk, jitter, crate's share.
+    fn learnt(noise: &Noise, truth: &Coloured, header: f64) -> [(&'static str, Measured, f64); 6] {
+        let (share, time) = truth.slow;
+        let time = if share > 0.0 { time } else { 0.0 };
+        [
+            ("scale", noise.common_scale, truth.noise / header),
+            ("slow", noise.slow.share, share),
+            ("time", noise.slow.time, time),
+            ("walk", noise.slow.walk, truth.walk),
+            ("momentum", noise.momentum, truth.momentum),
+            ("crate", noise.crate_share, truth.crate_share),
+        ]
+    }
+
+    /// Noise of several kinds and sizes.
+    fn kinds(white: impl Fn() -> Coloured) -> [Coloured; 7] {
+        let sigma = white().noise;
+        [
+            Coloured { noise: 1.2 * sigma, ..white() },
+            Coloured { noise: 0.85 * sigma, ..white() },
+            Coloured { slow: (0.12, 12.0), ..white() },
+            Coloured { slow: (0.3, 4.0), ..white() },
+            Coloured { walk: 6e-6, ..white() },
+            Coloured { momentum: 3e-5, ..white() },
+            Coloured { crate_share: 0.15, ..white() },
+        ]
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn what_the_noise_is_like_is_learnt_within_three_errors() {
+        let (ring, recording) = template();
+        for seed in 0..2 {
+            for truth in kinds(|| Coloured::white(&ring, &recording, 100 + seed)) {
+                let made = truth.campaign(&ring, &recording, &[]);
+                let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+                for (name, found, truth) in learnt(&data.noise, &truth, recording.header.noise[0]) {
+                    println!("{seed} {name}: {:.3e} ± {:.1e}, true {truth:.3e}", found.value, found.sigma);
+                    assert!((found.value - truth).abs() <= 3.0 * found.sigma + 1e-12, "{name}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn nothing_is_learnt_where_the_noise_is_as_the_header_says() {
+        let (ring, recording) = template();
+        for seed in 0..4 {
+            let made = Coloured::white(&ring, &recording, 40 + seed).campaign(&ring, &recording, &[]);
+            let campaign = Campaign::of(&ring, &made).unwrap();
+            let data = Data::of(&campaign).unwrap();
+            assert!(data.noise.is_as_stated(), "{:?}", data.noise);
+            (0..campaign.monitors()).for_each(|b| assert_eq!(data.noise.own[b], campaign.noise(b), "monitor {b}"));
+        }
+    }
+
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn noise_of_any_kind_is_no_missing_physics() {
+        let (ring, recording) = template();
+        for truth in kinds(|| Coloured::white(&ring, &recording, 7)) {
+            let made = truth.campaign(&ring, &recording, &[]);
+            let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+            assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);
+        }
+    }
+}

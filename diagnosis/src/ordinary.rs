@@ -1,0 +1,256 @@
+//! The ordinary imperfections of a machine: what every real one has, and what is therefore part of the model before any missing
+//! physics is looked for.
+//!
+//! A family is one property of all instruments or magnets of a sort. Its members have unknown amplitudes `a`, normal about zero with
+//! the width `w` of the family; what they have in common is a family of one member. The width of a family of many is learnt
+//! from the recording: with `G` the Gram matrix of the members' whitened signatures and `g` their products with the readings, both less
+//! what vars and effects absorb,
+//!
+//! `ln L(w) = -ln det(1 + W G W)/2 + g W (1 + W G W)^-1 W g/2 - sum of (w/t)^2/2`, `W = diag(w)`,
+//!
+//! the last term a prior of the size of the tolerance `t`, largest where nothing is wrong. At its maximum
+//! `sum of (a/w)^2 = n - trace(1 + W G W)^-1 + (w/t)^2` in each family, which gives the next width from the last.
+//!
+//! Source: D. J. C. MacKay, Neural Comput. 4 (1992) 415, eq. 4.8; A. Gelman, Bayesian Anal. 1 (2006) 515, half-normal priors of widths.
+
+use nalgebra::{DMatrix, DVector};
+use twin::{EffectKind, Measured, Plane, Ring, Site};
+
+use super::data::Data;
+use super::fit::Fitted;
+use super::hypothesis::{Term, members};
+use super::imperfection::{Imperfection, Measure};
+
+/// Which members share an amplitude.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Grouping {
+    /// None.
+    Each,
+    /// All in a plane.
+    Plane(Plane),
+    /// All.
+    All,
+}
+
+/// One property of all instruments or magnets of a sort.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Family {
+    /// The property, as the head of a table's row.
+    pub name: &'static str,
+    /// What is wrong with a member.
+    pub kind: EffectKind,
+    /// Which members share an amplitude.
+    pub grouping: Grouping,
+    /// Standard deviation that is ordinary, in the unit of the kind.
+    pub tolerance: f64,
+    /// Standard deviation of the amplitudes, in the unit of the kind.
+    pub width: f64,
+}
+
+/// Share of its tolerance below which a family does not count.
+const NONE: f64 = 0.02;
+/// Steps of the widths at most, and the change, in tolerances, at which they have settled.
+const STEPS: usize = 30;
+const SETTLED: f64 = 0.01;
+
+/// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles; a common
+/// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
+/// 1 % of its aperture.
+const FAMILIES: [(&str, EffectKind, Grouping, f64); 13] = [
+    ("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
+    ("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
+    ("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
+    ("gains of correctors", EffectKind::CorrectorGain, Grouping::Each, 0.02),
+    ("gain of all horizontal correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::X), 0.03),
+    ("gain of all vertical correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::Y), 0.03),
+    ("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
+    ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
+    ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, 0.001),
+    ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
+    ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
+    ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
+    ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
+];
+
+impl Family {
+    /// All of them, as wide as their tolerances.
+    pub fn all() -> Vec<Self> {
+        let of = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
+            name,
+            kind,
+            grouping,
+            tolerance,
+            width: tolerance,
+        };
+        FAMILIES.iter().map(of).collect()
+    }
+
+    /// Its members, each the effects that share an amplitude.
+    pub fn members(&self, data: &Data) -> Vec<Vec<Term>> {
+        let all = members(self.kind, data).into_iter();
+        let some: Vec<Vec<Term>> = match self.grouping {
+            Grouping::Each => return all.map(|term| vec![term]).collect(),
+            Grouping::Plane(plane) => vec![all.filter(|term| plane_of(&data.ring, term.site) == Some(plane)).collect()],
+            Grouping::All => {
+                vec![all.filter(|term| whole_of(self.kind).is_none_or(|site| site == term.site)).collect()]
+            }
+        };
+        some.into_iter().filter(|terms| !terms.is_empty()).collect()
+    }
+
+    /// The same with room for what a recording cannot show: the vars near a straight absorb a gradient in it. One of the size of its kind's
+    /// prior counts as four standard deviations; the vars beside it, whose readings count too, are then off by less than three of theirs.
+    pub fn unseen(&self) -> Self {
+        match (self.kind, self.kind.prior_scale()) {
+            (EffectKind::StrayGradient, Some(scale)) => Self { width: scale / 4.0, ..*self },
+            _ => *self,
+        }
+    }
+
+    /// True if its width is learnt.
+    pub fn is_learnt(&self) -> bool {
+        self.grouping == Grouping::Each && self.kind != EffectKind::StrayGradient
+    }
+
+    /// The instruments or magnets that it holds: `x`, `y`, `H`, `V` or `all`.
+    pub fn place(&self) -> &'static str {
+        match (self.grouping, self.kind) {
+            (Grouping::Plane(Plane::X), EffectKind::CorrectorGain) => "H",
+            (Grouping::Plane(Plane::Y), EffectKind::CorrectorGain) => "V",
+            (Grouping::Plane(Plane::X), _) => "x",
+            (Grouping::Plane(Plane::Y), _) => "y",
+            (Grouping::Each | Grouping::All, _) => "all",
+        }
+    }
+
+    /// `ln` prior of its width, relative to that of none.
+    pub fn log_prior(&self) -> f64 {
+        if self.is_learnt() { -0.5 * (self.width / self.tolerance).powi(2) } else { 0.0 }
+    }
+}
+
+/// The site that stands for the whole ring, of a kind that has one beside single places.
+fn whole_of(kind: EffectKind) -> Option<Site> {
+    (kind == EffectKind::DipoleEdge).then_some(Site::Ring)
+}
+
+fn plane_of(ring: &Ring, site: Site) -> Option<Plane> {
+    match site {
+        Site::Monitor(at) => Some(ring.monitors[at].plane),
+        Site::Corrector(at) => Some(ring.correctors[at].plane),
+        _ => None,
+    }
+}
+
+/// The members of some families in a fit: `1 + W G W` without its `W`, and `g`, in units of their tolerances.
+struct Projected {
+    gram: DMatrix<f64>,
+    pull: DVector<f64>,
+    /// Family of each member.
+    family: Vec<usize>,
+}
+
+impl Projected {
+    /// From the normal matrix of a fit, of which the members are the last unknowns.
+    fn of(data: &Data, fitted: &Fitted) -> Option<Self> {
+        let families = &fitted.hypothesis.ordinary;
+        let sized = |(f, family): (usize, &Family)| {
+            let scale = family.tolerance / family.width;
+            core::iter::repeat_n((f, scale), family.members(data).len())
+        };
+        let (family, scale): (Vec<usize>, Vec<f64>) = families.iter().enumerate().flat_map(sized).unzip();
+        let (m, lower) = (family.len(), fitted.factor.l());
+        let k = fitted.u.len() - m;
+        let normal = &lower * lower.transpose();
+        let without = fitted.jacobian.columns(k, m) * fitted.u.rows(k, m) + &fitted.residual;
+        let mut slope = fitted.jacobian.tr_mul(&without);
+        let mut of_others = slope.rows_mut(0, k);
+        of_others -= fitted.u.rows(0, k);
+        let factor = normal.view((0, 0), (k, k)).into_owned().cholesky()?;
+        let cross = normal.view((0, k), (k, m)).into_owned();
+        let taken = factor.solve(&cross);
+        let mut gram = normal.view((k, k), (m, m)) - cross.transpose() * &taken;
+        (0..m).for_each(|i| gram[(i, i)] -= 1.0);
+        let mut pull = slope.rows(k, m) - taken.tr_mul(&slope.rows(0, k));
+        let scale = DVector::from_vec(scale);
+        pull.component_mul_assign(&scale);
+        gram.column_iter_mut()
+            .zip(scale.iter())
+            .for_each(|(mut column, s)| column.component_mul_assign(&(&scale * *s)));
+        Some(Self { gram, pull, family })
+    }
+
+    /// Posterior mean and variance of each member in units of its width, for the widths of the families in units of their tolerances.
+    fn posterior(&self, width: &[f64]) -> Option<(DVector<f64>, DVector<f64>)> {
+        let w = DVector::from_iterator(self.family.len(), self.family.iter().map(|&f| width[f]));
+        let mut matrix = self.gram.clone();
+        matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
+        (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
+        let factor = matrix.cholesky()?;
+        let mean = factor.solve(&self.pull.component_mul(&w));
+        Some((mean, factor.inverse().diagonal()))
+    }
+}
+
+/// The families of a fit with the widths that its recording shows; those that it shows none of are left out.
+pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
+    let mut families = fitted.hypothesis.ordinary.clone();
+    let Some(projected) = Projected::of(data, fitted) else { return families };
+    let mut width: Vec<f64> = families.iter().map(|family| family.width / family.tolerance).collect();
+    for _ in 0..STEPS {
+        let Some((mean, variance)) = projected.posterior(&width) else { break };
+        let mut moved = 0.0_f64;
+        for f in (0..families.len()).filter(|&f| families[f].is_learnt()) {
+            let of = |i: &usize| projected.family[*i] == f;
+            let (mut squares, mut known) = (0.0, 0.0);
+            (0..mean.len())
+                .filter(of)
+                .for_each(|i| (squares, known) = (squares + mean[i].powi(2), known + 1.0 - variance[i]));
+            let next = width[f] * (squares / (known + width[f].powi(2))).sqrt();
+            moved = moved.max((next - width[f]).abs());
+            width[f] = next;
+        }
+        if moved < SETTLED {
+            break;
+        }
+    }
+    families.iter_mut().zip(&width).for_each(|(family, width)| family.width = family.tolerance * width);
+    families.retain(|family| !family.is_learnt() || family.width > NONE * family.tolerance);
+    families
+}
+
+/// The sizes of the ordinary imperfections in a fit. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's
+/// prior variance that the recording leaves: `1 - c` is 1 for a member that is well known, 0 for one that it does not show.
+pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
+    let covariance = fitted.factor.inverse();
+    let families = &fitted.hypothesis.ordinary;
+    let members: usize = families.iter().map(|family| family.members(data).len()).sum();
+    let mut at = fitted.u.len() - members;
+    let mut rows = Vec::new();
+    for family in families {
+        let own = at..at + family.members(data).len();
+        at = own.end;
+        let width = family.width;
+        let (value, sigma) = match family.grouping {
+            _ if own.is_empty() => continue,
+            Grouping::Each if family.is_learnt() => {
+                let information: f64 = own.map(|i| 2.0 * (1.0 - covariance[(i, i)]).powi(2)).sum();
+                (width, width / information.sqrt())
+            }
+            Grouping::Each => continue,
+            Grouping::Plane(_) | Grouping::All => {
+                (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
+            }
+        };
+        rows.push(Imperfection {
+            name: family.name,
+            kind: family.kind.word(),
+            at: family.place(),
+            measure: if family.is_learnt() { Measure::Scatter } else { Measure::Mean },
+            measured: Measured { value, sigma },
+            unit: family.kind.unit(),
+            ordinary: family.tolerance,
+        });
+    }
+    rows
+}

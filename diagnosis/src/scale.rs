@@ -1,0 +1,126 @@
+//! How large the noise of each monitor is, over what the recording's header states.
+//!
+//! Each monitor's own measurement, from its repeats, has a known error. The logarithms of the true scales are normal about a common one,
+//! which the header knows to a prior width, with a scatter between monitors; both are taken over only where the evidence asks for them, so
+//! that monitors that agree with the header keep its noise exactly. A monitor far from all others has a scale of its own.
+//!
+//! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 5.4, the hierarchical normal model.
+
+use twin::Measured;
+
+/// Scales of the monitors.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scales {
+    /// `ln` of the common scale.
+    pub common: Measured,
+    /// Scatter of `ln` of the scales between monitors.
+    pub scatter: Measured,
+    /// Scale of each, 1 of one of which nothing is known.
+    pub each: Vec<f64>,
+}
+
+/// Width of the prior of the common scale: a noise is quoted to a quarter, since it depends on intensity and filling pattern.
+pub const QUOTED: f64 = 0.25;
+/// Width of the prior of the scatter: monitors of one make differ by a tenth.
+pub const ALIKE: f64 = 0.1;
+/// A monitor this many standard deviations from the others has a scale of its own.
+const FAR: f64 = 4.0;
+/// Scatters that are tried, over some 3 prior widths.
+const SCATTERS: usize = 60;
+
+impl Scales {
+    /// From each monitor's `ln` of its measured scale, where there is one.
+    pub fn of(measured: &[Option<Measured>]) -> Self {
+        let known: Vec<Measured> = measured.iter().copied().flatten().collect();
+        let (near, scatter) = Self::scatter_of(&known);
+        let common = common_of(&near, scatter.value);
+        let of = |one: &Option<Measured>| one.map_or(0.0, |one| shrunk(one, common.value, scatter.value));
+        Self { each: measured.iter().map(|one| of(one).exp()).collect(), common, scatter }
+    }
+
+    /// The monitors near the others, and the scatter of these.
+    fn scatter_of(known: &[Measured]) -> (Vec<Measured>, Measured) {
+        let mut near = known.to_vec();
+        // the furthest one goes first: it widens the scatter of the others
+        while let Some(at) = furthest(&near).filter(|&at| near.len() > 2 && !is_alike(&near, at)) {
+            near.remove(at);
+        }
+        let scatter = scatter_among(&near).unwrap_or(Measured { value: 0.0, sigma: ALIKE });
+        (near, scatter)
+    }
+}
+
+/// The scale that is furthest from the others, in standard deviations.
+fn furthest(all: &[Measured]) -> Option<usize> {
+    let centre = centre_of(all);
+    let off = |one: &Measured| (one.value - centre).abs() / one.sigma;
+    all.iter().enumerate().max_by(|a, b| off(a.1).total_cmp(&off(b.1))).map(|(i, _)| i)
+}
+
+/// True if one of some scales lies near the others, by the scatter of these alone.
+fn is_alike(all: &[Measured], at: usize) -> bool {
+    let mut others = all.to_vec();
+    let one = others.remove(at);
+    let scatter = scatter_among(&others).map_or(0.0, |scatter| scatter.value);
+    (one.value - centre_of(&others)).abs() < FAR * one.sigma.hypot(scatter)
+}
+
+/// The scatter of some scales, 0 with its root mean square where none is more likely; none without any scale.
+fn scatter_among(near: &[Measured]) -> Option<Measured> {
+    if near.is_empty() {
+        return None;
+    }
+    let log_density = |scatter: f64| {
+        let weights: Vec<f64> = near.iter().map(|one| one.sigma.hypot(scatter).powi(-2)).collect();
+        let total: f64 = weights.iter().sum();
+        let mean = near.iter().zip(&weights).map(|(one, weight)| one.value * weight).sum::<f64>() / total;
+        let square: f64 = near.iter().zip(&weights).map(|(one, weight)| (one.value - mean).powi(2) * weight).sum();
+        0.5 * (weights.iter().map(|weight| weight.ln()).sum::<f64>() - square - total.ln())
+    };
+    let step = 3.0 * ALIKE / SCATTERS as f64;
+    let none = log_density(0.0);
+    let weights: Vec<(f64, f64)> = (0..SCATTERS)
+        .map(|i| (i as f64 + 0.5) * step)
+        .map(|x| (x, (log_density(x) - none - 0.5 * (x / ALIKE).powi(2)).exp()))
+        .collect();
+    let sum: f64 = weights.iter().map(|(_, weight)| weight).sum();
+    let moment = |power: i32| weights.iter().map(|(x, weight)| x.powi(power) * weight).sum::<f64>() / sum;
+    let evidence = sum * step / ALIKE * core::f64::consts::FRAC_2_PI.sqrt();
+    let mean = moment(1);
+    Some(if evidence > 1.0 {
+        Measured { value: mean, sigma: (moment(2) - mean * mean).sqrt() }
+    } else {
+        Measured { value: 0.0, sigma: moment(2).sqrt() }
+    })
+}
+
+/// The common scale of some, 0 where none is more likely.
+fn common_of(near: &[Measured], scatter: f64) -> Measured {
+    let weights: Vec<f64> = near.iter().map(|one| one.sigma.hypot(scatter).powi(-2)).collect();
+    let total: f64 = weights.iter().sum();
+    if total == 0.0 {
+        return Measured { value: 0.0, sigma: QUOTED };
+    }
+    let mean = near.iter().zip(&weights).map(|(one, weight)| one.value * weight).sum::<f64>() / total;
+    let (variance, prior) = (1.0 / total, QUOTED * QUOTED);
+    let gain = 0.5 * (mean * mean / variance - mean * mean / (variance + prior) - ((variance + prior) / variance).ln());
+    let sigma = (prior * variance / (prior + variance)).sqrt();
+    let value = if gain > 0.0 { mean * prior / (prior + variance) } else { 0.0 };
+    Measured { value, sigma }
+}
+
+/// `ln` of the scale of one monitor.
+fn shrunk(one: Measured, common: f64, scatter: f64) -> f64 {
+    let off = one.value - common;
+    if off.abs() > FAR * one.sigma.hypot(scatter) {
+        return one.value;
+    }
+    common + off * scatter.powi(2) / (scatter.powi(2) + one.sigma.powi(2))
+}
+
+/// Their median.
+fn centre_of(all: &[Measured]) -> f64 {
+    let mut values: Vec<f64> = all.iter().map(|one| one.value).collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
