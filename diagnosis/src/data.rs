@@ -72,6 +72,8 @@ pub struct Data {
     pub believed: Vec<Effect>,
     /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
+    /// Momentum that the kicks of each frame make, as the RF offset that would make it [1].
+    off_momentum: DVector<f64>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
 }
@@ -183,6 +185,7 @@ impl Data {
             tunes: recorded_tunes.clone(),
             recorded_tunes,
             believed,
+            off_momentum: design.momentum_offsets(&drives)?,
             drift: 0.0,
             drives,
         };
@@ -274,9 +277,18 @@ impl Data {
         data
     }
 
+    /// The same recording where the momentum follows the kicks, given as the RF offset that would make it [1]: every baseline follows it, by
+    /// the dispersion of the unknown misalignments.
+    pub fn off_momentum(&self, offsets: DVector<f64>) -> Self {
+        let mut data = Self { off_momentum: offsets, ..self.clone() };
+        data.prepare();
+        data
+    }
+
     /// A hypothetical campaign with other drives; its readings are ignored.
     pub fn driven_by(&self, drives: &Drives) -> Self {
-        let mut data = Self { drives: drives.clone(), ..self.clone() };
+        let off_momentum = DVector::zeros(drives.rf_offset.len());
+        let mut data = Self { drives: drives.clone(), off_momentum, ..self.clone() };
         data.prepare();
         data
     }
@@ -315,7 +327,10 @@ impl Data {
     /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
         let (plane, drift) = (usize::from(b >= self.ring.horizontal_monitors()), self.drift);
-        let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
+        let rf = DVector::from_iterator(
+            frames.len(),
+            frames.iter().map(|&i| self.drives.rf_offset[i] + self.off_momentum[i]),
+        );
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);
