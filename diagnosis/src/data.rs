@@ -72,7 +72,8 @@ pub struct Data {
     pub believed: Vec<Effect>,
     /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
-    /// Momentum that the kicks of each frame make, as the RF offset that would make it [1].
+    /// Momentum that the kicks of each frame make where it is not held, as the RF offset that would make it [1]: every baseline follows it,
+    /// by the dispersion of the unknown misalignments.
     off_momentum: DVector<f64>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
@@ -185,7 +186,7 @@ impl Data {
             tunes: recorded_tunes.clone(),
             recorded_tunes,
             believed,
-            off_momentum: design.momentum_offsets(&drives)?,
+            off_momentum: DVector::zeros(driven.len()),
             drift: 0.0,
             drives,
         };
@@ -204,6 +205,11 @@ impl Data {
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let higher = self.higher_orders(machine)?;
+        let off_momentum = machine.momentum_offsets(&self.drives)?;
+        if off_momentum != self.off_momentum {
+            self.off_momentum = off_momentum;
+            self.prepare();
+        }
         let slopes = Signatures::of(&machine.on_orbit(&self.drives.orbit), &self.drives)?.of_quadrupoles();
         let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
@@ -273,14 +279,6 @@ impl Data {
     pub fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
         data.drift = amplitude;
-        data.prepare();
-        data
-    }
-
-    /// The same recording where the momentum follows the kicks, given as the RF offset that would make it [1]: every baseline follows it, by
-    /// the dispersion of the unknown misalignments.
-    pub fn off_momentum(&self, offsets: DVector<f64>) -> Self {
-        let mut data = Self { off_momentum: offsets, ..self.clone() };
         data.prepare();
         data
     }

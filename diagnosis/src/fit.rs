@@ -11,7 +11,7 @@
 use core::ops::{Mul, Sub};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures, Tunes};
+use twin::{Drives, EffectError, Machine, Signature, Signatures, Tunes};
 
 use super::data::Data;
 use super::error::FitError;
@@ -97,26 +97,19 @@ impl Fitted {
     /// # Errors
     /// [`FitError`].
     pub fn against(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, FitError> {
-        let fitted = Self::minimise(data, hypothesis, guess, rival)?;
-        let Some(moving) = fitted.moving(data)? else { return Ok(fitted) };
-        let fitted = Self::minimise(&moving, hypothesis, &fitted.u, rival)?;
-        Ok(Self { drifting: Some(Box::new(moving)), ..fitted })
-    }
-
-    /// The data whitened for what the effects do to the baselines, if anything: with all quadrupoles they drift by as much, and they
-    /// follow a momentum that the kicks change.
-    fn moving(&self, data: &Data) -> Result<Option<Data>, FitError> {
-        let Hypothesis { terms, given, .. } = &self.hypothesis;
-        let drifts = given.iter().find(|effect| effect.kind.moves_baselines()).map(|effect| effect.amplitude);
-        let fitted = || terms.iter().position(|term| term.kind.moves_baselines()).map(|i| self.amplitude(data, i).0);
-        let drifting = drifts.or_else(fitted).map(|amplitude| data.drifting(amplitude.abs()));
-        let mut kinds = terms.iter().map(|term| term.kind).chain(given.iter().map(|effect| effect.kind));
-        if !kinds.any(EffectKind::moves_momentum) {
-            return Ok(drifting);
+        if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind.moves_baselines()) {
+            let drifting = data.drifting(given.amplitude.abs());
+            let fitted = Self::minimise(&drifting, hypothesis, guess, rival)?;
+            return Ok(Self { drifting: Some(Box::new(drifting)), ..fitted });
         }
-        let (machine, drives) = self.machine(data)?;
-        let offsets = machine.momentum_offsets(&drives).map_err(EffectError::from)?;
-        Ok(Some(drifting.as_ref().unwrap_or(data).off_momentum(offsets)))
+        let fitted = Self::minimise(data, hypothesis, guess, rival)?;
+        let Some(term) = hypothesis.terms.iter().position(|term| term.kind.moves_baselines()) else {
+            return Ok(fitted);
+        };
+        // the drift of the baselines is as large as that of the quadrupoles
+        let drifting = data.drifting(fitted.amplitude(data, term).0.abs());
+        let fitted = Self::minimise(&drifting, hypothesis, &fitted.u, rival)?;
+        Ok(Self { drifting: Some(Box::new(drifting)), ..fitted })
     }
 
     /// The hypothesis at the prior's mean, linearised and not fitted.

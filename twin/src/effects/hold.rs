@@ -211,6 +211,9 @@ impl Machine {
     /// # Errors
     /// [`OrbitError`] if the machine is unstable.
     pub fn momentum_offsets(&self, drives: &Drives) -> Result<DVector<f64>, OrbitError> {
+        if self.hold.frequency_share == 0.0 && self.hold.radial_loop.is_none() {
+            return Ok(DVector::zeros(drives.kick.nrows()));
+        }
         let optics = Optics::of(&self.ring, Hold::Momentum { delta: self.hold.delta })?;
         let (observers, sources) = (optics.monitor_places(Plane::X), optics.correctors());
         let held = self.held_of(&self.ring, &optics)?.response(&optics, &observers, &sources);

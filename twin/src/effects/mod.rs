@@ -173,14 +173,6 @@ impl EffectKind {
         }
     }
 
-    /// True if the momentum follows the kicks, and with it the orbit without kicks.
-    pub fn moves_momentum(self) -> bool {
-        match self.class() {
-            Class::Hold(hold) => hold != HoldEffect::Momentum,
-            Class::Monitor(_) | Class::Corrector(_) | Class::Field(_) | Class::Drift(_) => false,
-        }
-    }
-
     /// The thin gradient that acts on the beam as it does, if any.
     pub fn thin(self) -> Option<Thin> {
         match self.class() {
