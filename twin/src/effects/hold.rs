@@ -110,9 +110,10 @@ impl Mechanism for HoldEffect {
         let (ring, hold) = (&machine.ring, &mut machine.hold);
         match (self, site) {
             (Self::Momentum, Site::Ring) => hold.delta += amplitude,
-            (Self::Frequency, Site::Ring) => hold.frequency_share = amplitude,
+            (Self::Frequency, Site::Ring) => hold.frequency_share += amplitude,
             (Self::RadialLoop, Site::MonitorPair(one, other)) if is_horizontal(ring, [one, other]) => {
-                hold.radial_loop = Some(([one, other], amplitude));
+                let held = hold.radial_loop.filter(|(pair, _)| *pair == [one, other]).map_or(0.0, |(_, share)| share);
+                hold.radial_loop = Some(([one, other], held + amplitude));
             }
             _ => return Err(self.misplaced(ring, site.name(ring))),
         }
