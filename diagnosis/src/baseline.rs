@@ -4,7 +4,7 @@
 //! the RF frequency, and this change is common to the readings of a monitor, as the baseline is.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Hold, Optics, OrbitError, Plane, Ring, Tunes};
+use twin::{Hold, Optics, OrbitError, Place, Plane, Ring, Tunes};
 
 use inference::Screened;
 
@@ -19,6 +19,8 @@ pub struct Baseline {
     pub spurious: [f64; 2],
     /// Standard deviation of the orbit at each element (x, y) [m].
     pub sigma: Vec<[f64; 2]>,
+    /// Mean reading of each monitor less the response to the kicks [m]; none for a monitor without readings.
+    read: Vec<Option<f64>>,
 }
 
 /// Standard deviation of a monitor's offset [m], typical of surveys of such monitors.
@@ -45,8 +47,25 @@ impl Baseline {
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
         let spurious = [0, 1].map(|plane| per_rms[plane] * rms[plane]);
-        let (orbit, sigma) = krige(ring, &baselines, rms)?;
-        Ok((orbit, Self { rms, sensitivity, spurious, sigma }))
+        let Kriged { orbit, sigma, .. } = Kriged::of(ring, &baselines, rms)?;
+        Ok((orbit, Self { rms, sensitivity, spurious, sigma, read: baselines }))
+    }
+
+    /// A ring with its quadrupoles displaced so that its orbit without kicks is the estimated one.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring has no orbit.
+    pub fn displace(&self, ring: &mut Ring) -> Result<(), OrbitError> {
+        let kicks = Kriged::of(ring, &self.read, self.rms)?.kicks;
+        for ((quadrupole, k1), [x, y]) in ring.quadrupoles.iter().zip(ring.gradients()).zip(kicks) {
+            let element = &mut ring.elements[quadrupole.element];
+            let strength = k1 * element.length;
+            if strength != 0.0 {
+                element.misalignment.dx += x / strength;
+                element.misalignment.dy -= y / strength;
+            }
+        }
+        Ok(())
     }
 }
 
@@ -79,38 +98,53 @@ fn rms(values: &[Option<f64>]) -> f64 {
     (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
 }
 
-/// Orbit (x, y) at every element, and its standard deviation [m].
-type Kriged = (Vec<[f64; 2]>, Vec<[f64; 2]>);
+/// The orbit that random kicks at all quadrupoles make, as the monitors' baselines tell it.
+struct Kriged {
+    /// Orbit (x, y) at every element [m].
+    orbit: Vec<[f64; 2]>,
+    /// Its standard deviation [m].
+    sigma: Vec<[f64; 2]>,
+    /// Mean kick of each quadrupole [M] [rad].
+    kicks: Vec<[f64; 2]>,
+}
 
-/// The orbit (x, y) at every element from the baselines of the monitors, whose offsets are unknown, and its standard
-/// deviation: random kicks at all quadrupoles, of the size that explains the baselines' rms.
-///
-/// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
-fn krige(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Kriged, OrbitError> {
-    let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    let (mut orbit, mut sigma) = (vec![[0.0; 2]; ring.elements.len()], vec![[0.0; 2]; ring.elements.len()]);
-    let monitors: Vec<_> = ring.monitors_read().collect();
-    for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
-        let direction = [[1.0, 0.0], [0.0, 1.0]][index];
-        let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(q.element, direction)).collect();
-        let read: Vec<usize> =
-            (0..monitors.len()).filter(|&b| monitors[b].plane == plane && baselines[b].is_some()).collect();
-        let seen: Vec<_> = read.iter().map(|&b| optics.observe(monitors[b].element, plane)).collect();
-        let everywhere: Vec<_> = (0..ring.elements.len()).map(|i| optics.observe(i, plane)).collect();
-        let (at, all) = (optics.response(&seen, &sources), optics.response(&everywhere, &sources));
-        let mean_square = at.norm_squared() / (read.len().max(1)) as f64;
-        let variance = if mean_square > 0.0 { rms[index].powi(2) / mean_square } else { 0.0 };
-        let noise = DMatrix::from_diagonal_element(read.len(), read.len(), OFFSET.powi(2));
-        let Some(factor) = (&at * at.transpose() * variance + noise).cholesky() else { continue };
-        let values = DVector::from_iterator(read.len(), read.iter().filter_map(|&b| baselines[b]));
-        let cross = &all * at.transpose() * variance;
-        let mean = &cross * factor.solve(&values);
-        for i in 0..ring.elements.len() {
-            let row = cross.row(i).transpose();
-            let left = all.row(i).norm_squared() * variance - row.dot(&factor.solve(&row));
-            orbit[i][index] = mean[i];
-            sigma[i][index] = left.max(0.0).sqrt();
+impl Kriged {
+    /// From the baselines of the monitors, whose offsets are unknown; the kicks are of the size that explains the baselines' rms.
+    ///
+    /// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
+    fn of(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Self, OrbitError> {
+        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+        let zero = |count: usize| vec![[0.0; 2]; count];
+        let mut kriged = Self {
+            orbit: zero(ring.elements.len()),
+            sigma: zero(ring.elements.len()),
+            kicks: zero(ring.quadrupoles.len()),
+        };
+        let monitors: Vec<_> = ring.monitors_read().collect();
+        for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
+            let direction = [[1.0, 0.0], [0.0, 1.0]][index];
+            let middle = |element: usize| Place { element, depth: 0.5 * ring.elements[element].length };
+            let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(middle(q.element), direction)).collect();
+            let read: Vec<usize> =
+                (0..monitors.len()).filter(|&b| monitors[b].plane == plane && baselines[b].is_some()).collect();
+            let seen: Vec<_> = read.iter().map(|&b| optics.observe(monitors[b].element, plane)).collect();
+            let everywhere: Vec<_> = (0..ring.elements.len()).map(|i| optics.observe(i, plane)).collect();
+            let (at, all) = (optics.response(&seen, &sources), optics.response(&everywhere, &sources));
+            let mean_square = at.norm_squared() / (read.len().max(1)) as f64;
+            let variance = if mean_square > 0.0 { rms[index].powi(2) / mean_square } else { 0.0 };
+            let noise = DMatrix::from_diagonal_element(read.len(), read.len(), OFFSET.powi(2));
+            let Some(factor) = (&at * at.transpose() * variance + noise).cholesky() else { continue };
+            let values = DVector::from_iterator(read.len(), read.iter().filter_map(|&b| baselines[b]));
+            let kicks = at.tr_mul(&factor.solve(&values)) * variance;
+            let (mean, cross) = (&all * &kicks, &all * at.transpose() * variance);
+            kriged.kicks.iter_mut().zip(kicks.iter()).for_each(|(to, kick)| to[index] = *kick);
+            for i in 0..ring.elements.len() {
+                let row = cross.row(i).transpose();
+                let left = all.row(i).norm_squared() * variance - row.dot(&factor.solve(&row));
+                kriged.orbit[i][index] = mean[i];
+                kriged.sigma[i][index] = left.max(0.0).sqrt();
+            }
         }
+        Ok(kriged)
     }
-    Ok((orbit, sigma))
 }

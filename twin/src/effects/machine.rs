@@ -9,7 +9,7 @@ use super::monitor::Reading;
 use super::{Effect, EffectError};
 use crate::lattice::{Plane, Ring};
 use crate::map::{X, Y};
-use crate::orbit::{Hold, OrbitError};
+use crate::orbit::{ClosedOrbit, Hold, OrbitError};
 use crate::response::Optics;
 use crate::site::Site;
 use crate::tune::Tunes;
@@ -79,6 +79,15 @@ impl Machine {
     /// The same, for a [`Mechanism`] that changes elements.
     pub fn ring_mut(&mut self) -> &mut Ring {
         &mut self.ring
+    }
+
+    /// The orbit (x, y) without kicks at the entrance of every element [m].
+    ///
+    /// # Errors
+    /// [`OrbitError`] if there is none.
+    pub fn orbit(&self) -> Result<Vec<[f64; 2]>, OrbitError> {
+        let orbit = ClosedOrbit::find(&self.ring, Hold::Momentum { delta: self.hold.delta })?;
+        Ok(orbit.at[..self.ring.elements.len()].iter().map(|at| [at[X], at[Y]]).collect())
     }
 
     /// Relative change of all gradients from mid-campaign to its end.
