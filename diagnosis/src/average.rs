@@ -38,15 +38,15 @@ impl Vars {
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
 
-    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]); the means stay those without it.
+    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]), to first order; the means stay
+    /// those without it.
     ///
     /// # Errors
-    /// [`FitError`].
+    /// [`FitError::Degenerate`].
     pub fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
-        let unseen = best.hypothesis.unseen();
-        let wide = Fitted::of(data, &unseen, &best.guess(data, &unseen))?;
-        Ok(Self { covariance: self.covariance + wide.covariance() - best.covariance(), ..self })
+        let wide = best.covariance_with(data, &best.hypothesis.unseen())?;
+        Ok(Self { covariance: self.covariance + wide - best.covariance(), ..self })
     }
 
     fn over(competition: &Competition) -> Self {

@@ -233,6 +233,11 @@ impl Fitted {
         self.hypothesis.machine(data, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
+    /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
+    pub fn is_stable(&self, data: &Data) -> bool {
+        self.machine(data).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
+    }
+
     /// Predictions at the best point, rows frames, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
@@ -293,6 +298,24 @@ impl Fitted {
         let data = self.data(data);
         let (sum, degrees) = data.chi_square(&data.miss(&self.predicted(data)?));
         Ok(sum / (degrees - self.params.len() as f64))
+    }
+
+    /// Covariance of `ln` of the vars, were the same unknowns as wide as those of another hypothesis: to first order.
+    ///
+    /// # Errors
+    /// [`FitError::Degenerate`].
+    pub fn covariance_with(&self, data: &Data, other: &Hypothesis) -> Result<DMatrix<f64>, FitError> {
+        let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
+        let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
+        let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
+        let (lower, n) = (self.factor.l(), self.u.len());
+        let mut matrix = &lower * lower.transpose() - DMatrix::identity(n, n);
+        matrix
+            .column_iter_mut()
+            .zip(wider.iter())
+            .for_each(|(mut column, w)| column.component_mul_assign(&(&wider * *w)));
+        let factor = (matrix + DMatrix::identity(n, n)).cholesky().ok_or(FitError::Degenerate)?;
+        Ok(self.units.covariance(&factor.inverse()))
     }
 
     /// Covariance of `ln` of the vars.

@@ -274,17 +274,28 @@ impl<'f> Linear<'f> {
 }
 
 /// The same fit without its effects, what is ordinary being of the same size.
+///
+/// # Errors
+/// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    let without = Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() };
-    Fitted::of(data, &without, &fitted.guess(data, &without))
-        .or_else(|_| Fitted::of(data, &without, &DVector::zeros(fitted.params.len())))
+    from_near_or_far(data, fitted, Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() })
 }
 
 /// The same fit without one of its terms.
+///
+/// # Errors
+/// [`FitError`].
 pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    let vars = fitted.params.len();
-    let without: Hypothesis = fitted.hypothesis.without(term);
-    let near = Fitted::of(data, &without, &fitted.guess(data, &without));
-    // vars that are stable with the term may be unstable without it
-    near.or_else(|_| Fitted::of(data, &without, &DVector::zeros(vars)))
+    from_near_or_far(data, fitted, fitted.hypothesis.without(term))
+}
+
+/// The fit of another hypothesis: vars that are stable with an effect may be unstable without it, and so may ordinary imperfections that grow
+/// in its place.
+fn from_near_or_far(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
+    let far = DVector::zeros(fitted.params.len());
+    let stable = |fitted: &Fitted| fitted.is_stable(data);
+    let near = Fitted::of(data, &other, &fitted.guess(data, &other)).ok().filter(stable);
+    let other_than_near = || Fitted::of(data, &other, &far).ok().filter(stable);
+    let bare = Hypothesis { ordinary: Vec::new(), ..other.clone() };
+    near.or_else(other_than_near).map_or_else(|| Fitted::of(data, &bare, &far), Ok)
 }

@@ -21,7 +21,7 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Term, Unknown};
 use super::location::SORTS;
-use super::ordinary;
+use super::ordinary::{self, Family};
 use super::scan::{Candidate, scan};
 use inference::bounded::softplus;
 
@@ -133,15 +133,16 @@ impl Search {
         Ok(found)
     }
 
-    /// The fit of the vars and of what is ordinary.
+    /// The fit of the vars and of what is ordinary. What makes a fit poor is not: ordinary imperfections, small by their nature, are then left out
+    /// until the effects are in the model that explain it.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
-        let plain = Hypothesis::plain();
-        let first = Fitted::of(&data, &plain, &DVector::zeros(data.units.len()))?;
-        // what makes a fit poor is not ordinary
-        let ordinary = if first.is_gross() { plain.ordinary.clone() } else { ordinary::learnt(&data, &first) };
+        let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
+        let first = Fitted::of(&data, &plain, &start)?;
+        let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
-        let null = fit_linearised(&mut data, &hypothesis, &guess)?;
+        let fitted = fit_linearised(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
+        let null = fitted.map_or_else(|| fit_linearised(&mut data, &Hypothesis::default(), &start), Ok)?;
         let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
     }
@@ -349,13 +350,19 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
     }
 }
 
-/// The same fit with the ordinary widths that the recording then shows, if it is the better. What makes a fit poor is not ordinary.
+/// The same fit with the ordinary widths that the recording then shows, if it is the better; a poor one stays as it is.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_gross() {
         return fitted;
     }
-    let ordinary = ordinary::learnt(fitted.data(data), &fitted);
-    let hypothesis = Hypothesis { ordinary, ..fitted.hypothesis.clone() };
-    let again = Fitted::of(data, &hypothesis, &fitted.guess(data, &hypothesis));
-    again.ok().filter(|again| again.log_evidence > fitted.log_evidence).unwrap_or(fitted)
+    let again = |ordinary: Vec<Family>, from: &Fitted| {
+        let hypothesis = Hypothesis { ordinary, ..from.hypothesis.clone() };
+        Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis))
+    };
+    let begun = match fitted.hypothesis.ordinary.is_empty() {
+        true => again(Family::all(), &fitted),
+        false => Ok(fitted.clone()),
+    };
+    let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
+    learnt.ok().filter(|learnt| learnt.log_evidence > fitted.log_evidence).unwrap_or(fitted)
 }

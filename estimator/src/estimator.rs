@@ -48,7 +48,8 @@ pub(crate) use screen::Screened;
 use sequence::Sequence;
 use times::Times;
 #[cfg(test)]
-use whole::Expected;
+#[cfg(test)]
+pub(crate) use whole::Expected;
 use whole::{Whole, WholeFrames};
 
 /// Priors that groups of params can have.
