@@ -48,7 +48,6 @@ pub(crate) use screen::Screened;
 use sequence::Sequence;
 use times::Times;
 #[cfg(test)]
-#[cfg(test)]
 pub(crate) use whole::Expected;
 use whole::{Whole, WholeFrames};
 
