@@ -349,7 +349,7 @@ impl<'r> Measured<'r> {
     }
 
     /// The design that a wiring is compared with.
-    fn design<'d>(designs: &'d [[DMatrix<f64>; 2]; 2], wiring: Option<(Columns, Fault)>) -> &'d DMatrix<f64> {
+    fn design(designs: &[[DMatrix<f64>; 2]; 2], wiring: Option<(Columns, Fault)>) -> &DMatrix<f64> {
         match wiring {
             Some((Columns::Readings(_), Fault::Exchanged)) => &designs[1][0],
             Some((Columns::Kicks(_), Fault::Exchanged)) => &designs[0][1],
