@@ -4,7 +4,7 @@
 //! the RF frequency, and this change is common to the readings of a monitor, as the baseline is.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Hold, Optics, OrbitError, Place, Plane, Ring, Tunes};
+use twin::{Hold, Machine, Monitor, Optics, OrbitError, Place, Plane, Ring, Tunes};
 
 use inference::Screened;
 
@@ -51,12 +51,19 @@ impl Baseline {
         Ok((orbit, Self { rms, sensitivity, spurious, sigma, read: baselines }))
     }
 
-    /// A ring with its quadrupoles displaced so that its orbit without kicks is the estimated one.
+    /// Displace a machine's quadrupoles so that its orbit without kicks is the estimated one; what it has by itself, off momentum, is not
+    /// theirs.
     ///
     /// # Errors
-    /// [`OrbitError`] if the ring has no orbit.
-    pub fn displace(&self, ring: &mut Ring) -> Result<(), OrbitError> {
-        let kicks = Kriged::of(ring, &self.read, self.rms)?.kicks;
+    /// [`OrbitError`] if the machine has no orbit.
+    pub fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
+        let own = machine.orbit()?;
+        let ring = machine.ring_mut();
+        let less = |(read, monitor): (&Option<f64>, Monitor)| {
+            read.map(|read| read - own[monitor.element][usize::from(monitor.plane == Plane::Y)])
+        };
+        let read: Vec<Option<f64>> = self.read.iter().zip(ring.monitors_read()).map(less).collect();
+        let kicks = Kriged::of(ring, &read, self.rms)?.kicks;
         for ((quadrupole, k1), [x, y]) in ring.quadrupoles.iter().zip(ring.gradients()).zip(kicks) {
             let element = &mut ring.elements[quadrupole.element];
             let strength = k1 * element.length;

@@ -245,7 +245,7 @@ impl Data {
     /// order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
     fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
         let mut displaced = machine.clone();
-        self.baseline.displace(displaced.ring_mut())?;
+        self.baseline.displace(&mut displaced)?;
         let settings = Settings::of(&self.drives);
         let drives = Drives { orbit: displaced.orbit()?, ..settings.means(&self.drives) };
         let tracked = Tracked::of(displaced, self.drives.nominal_kick)?;
