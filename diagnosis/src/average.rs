@@ -38,15 +38,14 @@ impl Vars {
         Self::over(least.filter(|competition| certainty(competition) < DECISIVE).unwrap_or(&found.next))
     }
 
-    /// The same with error bars that hold beside what the recording cannot show ([`Hypothesis::unseen`]), to first order; the means stay
-    /// those without it.
+    /// The same with room for what the recording cannot show ([`Hypothesis::unseen`]), to first order.
     ///
     /// # Errors
     /// [`FitError::Degenerate`].
     pub fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
-        let wide = best.covariance_with(data, &best.hypothesis.unseen())?;
-        Ok(Self { covariance: self.covariance + wide - best.covariance(), ..self })
+        let (step, wide) = best.widened(data, &best.hypothesis.unseen())?;
+        Ok(Self { mean: self.mean + step, covariance: self.covariance + wide - best.covariance() })
     }
 
     fn over(competition: &Competition) -> Self {

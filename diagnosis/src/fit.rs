@@ -300,22 +300,25 @@ impl Fitted {
         Ok(sum / (degrees - self.params.len() as f64))
     }
 
-    /// Covariance of `ln` of the vars, were the same unknowns as wide as those of another hypothesis: to first order.
+    /// Step of `ln` of the vars, and its covariance, were the same unknowns as wide as those of another hypothesis: to first order. With `D`
+    /// the ratios of the widths, `N = 1 + J^T J`: `N' = 1 + D (N - 1) D`, `u' = N'^-1 D (J^T r + (N - 1) u)`.
     ///
     /// # Errors
     /// [`FitError::Degenerate`].
-    pub fn covariance_with(&self, data: &Data, other: &Hypothesis) -> Result<DMatrix<f64>, FitError> {
+    pub fn widened(&self, data: &Data, other: &Hypothesis) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
         let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
-        let (lower, n) = (self.factor.l(), self.u.len());
-        let mut matrix = &lower * lower.transpose() - DMatrix::identity(n, n);
-        matrix
-            .column_iter_mut()
-            .zip(wider.iter())
-            .for_each(|(mut column, w)| column.component_mul_assign(&(&wider * *w)));
-        let factor = (matrix + DMatrix::identity(n, n)).cholesky().ok_or(FitError::Degenerate)?;
-        Ok(self.units.covariance(&factor.inverse()))
+        let (lower, identity) = (self.factor.l(), DMatrix::identity(self.u.len(), self.u.len()));
+        let mut matrix = &lower * lower.transpose() - &identity;
+        let pull = (self.jacobian.tr_mul(&self.residual) + &matrix * &self.u).component_mul(&wider);
+        let scaled = |column: &DVector<f64>, w: f64| column.component_mul(&wider) * w;
+        for (i, w) in wider.iter().enumerate() {
+            let column = scaled(&matrix.column(i).into_owned(), *w);
+            matrix.set_column(i, &column);
+        }
+        let factor = (matrix + identity).cholesky().ok_or(FitError::Degenerate)?;
+        Ok((self.units.step(&(factor.solve(&pull) - &self.u)), self.units.covariance(&factor.inverse())))
     }
 
     /// Covariance of `ln` of the vars.

@@ -350,7 +350,8 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
     }
 }
 
-/// The same fit with the ordinary widths that the recording then shows, if it is the better; a poor one stays as it is.
+/// The same fit with the ordinary widths that the recording then shows, if it is the better. A poor one stays as it is; one that was poor before
+/// gets the ordinary imperfections that it lacks.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_gross() {
         return fitted;
@@ -359,10 +360,8 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
         let hypothesis = Hypothesis { ordinary, ..from.hypothesis.clone() };
         Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis))
     };
-    let begun = match fitted.hypothesis.ordinary.is_empty() {
-        true => again(Family::all(), &fitted),
-        false => Ok(fitted.clone()),
-    };
+    let lacks_all = fitted.hypothesis.ordinary.is_empty();
+    let begun = if lacks_all { again(Family::all(), &fitted) } else { Ok(fitted.clone()) };
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
-    learnt.ok().filter(|learnt| learnt.log_evidence > fitted.log_evidence).unwrap_or(fitted)
+    learnt.ok().filter(|learnt| lacks_all || learnt.log_evidence > fitted.log_evidence).unwrap_or(fitted)
 }
