@@ -44,7 +44,7 @@ impl Vars {
     /// [`FitError::Degenerate`].
     pub fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
-        let (step, wide) = best.widened(data, &best.hypothesis.unseen())?;
+        let (step, wide) = best.widened(data, &best.hypothesis.unseen(data))?;
         Ok(Self { mean: self.mean + step, covariance: self.covariance + wide - best.covariance() })
     }
 

@@ -109,8 +109,8 @@ impl Hypothesis {
     }
 
     /// The same with room for what a recording cannot show.
-    pub fn unseen(&self) -> Self {
-        Self { ordinary: self.ordinary.iter().map(Family::unseen).collect(), ..self.clone() }
+    pub fn unseen(&self, data: &Data) -> Self {
+        Self { ordinary: self.ordinary.iter().map(|family| family.unseen(data)).collect(), ..self.clone() }
     }
 
     /// One more effect.

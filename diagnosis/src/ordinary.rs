@@ -98,11 +98,13 @@ impl Family {
         some.into_iter().filter(|terms| !terms.is_empty()).collect()
     }
 
-    /// The same with room for what a recording cannot show: the vars near a straight absorb a gradient in it. One of the size of its kind's
-    /// prior counts as three standard deviations, so that the vars beside it are off by less than three of theirs.
-    pub fn unseen(&self) -> Self {
+    /// The same with room for what a recording cannot show: the vars near a straight absorb a gradient in it. As wide as one gradient of its
+    /// kind's prior in any one of the `n` straights makes it, `scale/sqrt(n)`.
+    pub fn unseen(&self, data: &Data) -> Self {
         match (self.kind, self.kind.prior_scale()) {
-            (EffectKind::StrayGradient, Some(scale)) => Self { width: scale / 3.0, ..*self },
+            (EffectKind::StrayGradient, Some(scale)) => {
+                Self { width: scale / (self.members(data).len().max(1) as f64).sqrt(), ..*self }
+            }
             _ => *self,
         }
     }
