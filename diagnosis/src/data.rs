@@ -72,9 +72,6 @@ pub struct Data {
     pub believed: Vec<Effect>,
     /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
-    /// Momentum that the kicks of each frame make where it is not held, as the RF offset that would make it [1]: every baseline follows it,
-    /// by the dispersion of the unknown misalignments.
-    off_momentum: DVector<f64>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
 }
@@ -188,7 +185,6 @@ impl Data {
             tunes: recorded_tunes.clone(),
             recorded_tunes,
             believed,
-            off_momentum: DVector::zeros(driven.len()),
             drift: 0.0,
             drives,
         };
@@ -207,11 +203,6 @@ impl Data {
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let higher = self.higher_orders(machine)?;
-        let off_momentum = machine.momentum_offsets(&self.drives)?;
-        if off_momentum != self.off_momentum {
-            self.off_momentum = off_momentum;
-            self.prepare();
-        }
         let slopes = Signatures::of(&machine.on_orbit(&self.drives.orbit), &self.drives)?.of_quadrupoles();
         let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
         for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
@@ -287,8 +278,7 @@ impl Data {
 
     /// A hypothetical campaign with other drives; its readings are ignored.
     pub fn driven_by(&self, drives: &Drives) -> Self {
-        let off_momentum = DVector::zeros(drives.rf_offset.len());
-        let mut data = Self { drives: drives.clone(), off_momentum, ..self.clone() };
+        let mut data = Self { drives: drives.clone(), ..self.clone() };
         data.prepare();
         data
     }
@@ -327,10 +317,7 @@ impl Data {
     /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
     pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
         let (plane, drift) = (usize::from(b >= self.ring.horizontal_monitors()), self.drift);
-        let rf = DVector::from_iterator(
-            frames.len(),
-            frames.iter().map(|&i| self.drives.rf_offset[i] + self.off_momentum[i]),
-        );
+        let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
         let shared = self.shared[b].select_rows(frames);
         let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);

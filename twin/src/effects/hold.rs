@@ -8,9 +8,8 @@
 //!
 //! Exact orbits close at the momentum that follows in the same way; the derivative is a difference of two machines.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
-use super::drives::Drives;
 use super::mechanism::{Measured, Mechanism, Unit};
 use super::{EffectError, Machine};
 use crate::lattice::{Plane, Ring};
@@ -203,24 +202,6 @@ impl<'r> Held<'r> {
             Some((held, share)) => at_momentum * (1.0 - share) + of(held) * *share,
             None => at_momentum,
         }
-    }
-}
-
-impl Machine {
-    /// Momentum that the kicks of each frame make where the momentum is not held, as the RF offset that would make it [1].
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the machine is unstable.
-    pub fn momentum_offsets(&self, drives: &Drives) -> Result<DVector<f64>, OrbitError> {
-        if self.hold.frequency_share == 0.0 && self.hold.radial_loop.is_none() {
-            return Ok(DVector::zeros(drives.kick.nrows()));
-        }
-        let optics = Optics::of(&self.ring, Hold::Momentum { delta: self.hold.delta })?;
-        let (observers, sources) = (optics.monitor_places(Plane::X), optics.correctors());
-        let held = self.held_of(&self.ring, &optics)?.response(&optics, &observers, &sources);
-        let dispersion = optics.dispersion_of(&observers);
-        let momentum = (held - optics.response(&observers, &sources)).tr_mul(&dispersion) / dispersion.norm_squared();
-        Ok(self.kicks(drives) * momentum * -optics.slip_factor())
     }
 }
 
