@@ -241,7 +241,9 @@ impl Search {
         let odds = odds(fitted.hypothesis.terms.len());
         let scanned = scan(fitted.data(data), fitted, &self.terms)?;
         let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNMODELLED) * odds).ln();
-        let leaders = self.leaders(data, fitted, &scanned)?;
+        let outstanding = ordinary::outstanding(data, fitted);
+        let mut leaders = self.leaders(data, fitted, &scanned)?;
+        leaders.extend((0..scanned.len()).filter(|&i| outstanding.contains(&scanned[i].term)));
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
         let mut least = f64::INFINITY;
         for (i, candidate) in scanned.iter().enumerate() {
@@ -262,7 +264,7 @@ impl Search {
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
-        relearn(data, fitted, &mut weights);
+        relearn(data, fitted, &mut weights, &outstanding);
         for discrepancy in discrepancy::scan(data, fitted)? {
             let prior = (UNMODELLED * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
@@ -335,10 +337,14 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
     Alternative::exact(data, fitted, refitted, last)
 }
 
-/// Refit the best of some weighted candidates with the ordinary widths that the recording shows beside each.
-fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) {
+/// Refit the best of some weighted candidates, and those that stand out of their family, with the ordinary widths that the recording shows
+/// beside each.
+fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], outstanding: &[Term]) {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
-    let is_near = |(one, weight): &&mut (Alternative, f64)| *weight > best - BEHIND && one.log_gain > WORTH;
+    let is_near = |(one, weight): &&mut (Alternative, f64)| {
+        let stands_out = one.term().is_some_and(|term| outstanding.contains(term));
+        stands_out || (*weight > best - BEHIND && one.log_gain > WORTH)
+    };
     for (alternative, weight) in weights.iter_mut().filter(is_near) {
         let place = |fitted: &Fitted| fitted.hypothesis.terms.iter().position(|term| Some(term) == alternative.term());
         let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {

@@ -25,6 +25,9 @@ use inference::{Drive, Prior};
 const AS_STATED: f64 = 0.9;
 /// Probability of a wrong wiring above which a recording is refused.
 const REFUSED: f64 = 0.95;
+/// Least correlation of a response that is put right with the design's: 0.8 and more with vars that scatter, 0 where there is only noise,
+/// as in columns of correctors that were never set.
+const RESEMBLES: f64 = 0.5;
 /// Degrees of freedom of the scatter: known to a factor of two.
 const FREEDOM: f64 = 4.0;
 /// Relative error of a response that ordinary gains, rolls and what is held make beside the vars.
@@ -373,9 +376,9 @@ impl<'r> Measured<'r> {
         };
         let mut likely: Vec<Wiring> = wrong.iter().zip(&weights).map(of).collect();
         likely.sort_by(|one, other| other.probability.total_cmp(&one.probability));
-        likely.retain(|one| one.probability > 1.0 - REFUSED);
+        likely.retain(|one| one.probability > 1.0 - REFUSED && one.correlation[1] > RESEMBLES);
         let refused = (stated - largest).exp() / sum < 1.0 - REFUSED;
-        refused.then_some(Miswired(likely))
+        (refused && !likely.is_empty()).then_some(Miswired(likely))
     }
 
     /// `ln` likelihood of a wiring, that of the header if none, at the tunes that suit it best.

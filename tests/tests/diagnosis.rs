@@ -73,7 +73,8 @@ fn concealed_effects_are_found_and_only_those() {
 fn every_kind_is_found_when_it_is_strong() {
     let ring = Ring::booster();
     let data = whitened(&simulated(&[], 5));
-    let null = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(48)).unwrap();
+    // beside what is ordinary
+    let null = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
     let scanned = scan(&data, &null, &candidates(&data, Some(&loop_on))).unwrap();
     for &kind in EffectKind::ALL {
@@ -102,15 +103,23 @@ fn every_kind_is_found_when_it_is_strong() {
     }
 }
 
+/// Of six at most one is suspected, and nothing is named: with one false alarm in 33, two of six have a probability of 1 %.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn empty_campaigns_are_consistent() {
     let ring = Ring::booster();
+    let mut suspected = Vec::new();
     for seed in 21..27 {
         let diagnosis = Diagnosis::of(&ring, &simulated(&[], seed), |_| ()).unwrap();
-        assert_eq!(diagnosis.verdict, Verdict::Consistent, "seed {seed}: {}", diagnosis.sentence);
-        assert!(diagnosis.sentence.contains("median detection limits"), "{}", diagnosis.sentence);
+        match diagnosis.verdict {
+            Verdict::Consistent => {
+                assert!(diagnosis.sentence.contains("median detection limits"), "{}", diagnosis.sentence);
+            }
+            Verdict::Ambiguous => suspected.push(diagnosis.sentence),
+            _ => panic!("seed {seed}: {}", diagnosis.sentence),
+        }
     }
+    assert!(suspected.len() <= 1, "{suspected:?}");
 }
 
 /// All monitors off by 3 % at random, and all correctors: ordinary, no discovery, and of the size that it is.
