@@ -86,8 +86,8 @@ impl fmt::Display for Timing {
         if self.prepared_us_max == self.update_us_max {
             return Ok(()); // a device, which prepares unseen
         }
-        line(f, "\nwith a slice of preparation", [self.frame_us_p50, self.frame_us_p99, self.frame_us_max])?;
-        line(f, "\nwith all preparation", [self.prepared_us_p50, self.prepared_us_p99, self.prepared_us_max])
+        line(f, "\npreparing one slice", [self.frame_us_p50, self.frame_us_p99, self.frame_us_max])?;
+        line(f, "\npreparing all slices", [self.prepared_us_p50, self.prepared_us_p99, self.prepared_us_max])
     }
 }
 
