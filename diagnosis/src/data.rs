@@ -8,8 +8,8 @@
 //! `S^(-1/2) = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T)/sigma`.
 //!
 //! The noise itself is as learnt from the repeats ([`super::noise`]). Where it remembers the frames before, the numbers of a monitor are
-//! replaced by its innovations before the common terms are taken out ([`super::memory`]); where monitors have noise in common within a frame,
-//! the frame is whitened before all that ([`super::modes`]). The covariance is thereby defined as the product of the two: what
+//! replaced by its innovations before the common terms are taken out (`memory.rs`); where monitors have noise in common within a frame,
+//! the frame is whitened before all that (`modes.rs`). The covariance is thereby defined as the product of the two: what
 //! monitors have in common has the same memory as their own noise.
 //!
 //! For whitened data every fit is plain least squares. The tune meter adds four numbers: the mean of each tune and

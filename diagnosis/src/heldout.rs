@@ -8,7 +8,7 @@
 //! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less its projection on the common terms.
 //!
 //! Where noise remembers the frames before, what the kept frames say of it in the left-out ones is taken off `z`, `u` and `d`, and `sigma^2` is
-//! the variance that is left ([`super::memory`]). What monitors have in common within a frame adds to that variance; that one
+//! the variance that is left (`memory.rs`). What monitors have in common within a frame adds to that variance; that one
 //! left-out reading tells of another in the same frame is not counted.
 //!
 //! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the

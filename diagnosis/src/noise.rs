@@ -1,8 +1,8 @@
 //! The noise of a recording as it is: learnt from its repeats, with the header's noise as a prior.
 //!
 //! Of each monitor the scale of its noise; of all together what the noise remembers ([`super::slow`]), the jitter of the momentum and
-//! what crates of monitors have in common ([`super::jitter`]). Everything comes from differences between readings of the same setting
-//! ([`super::repeats`]), so that physics that the model lacks does not enter, with one exception: what changes with time alone, such as
+//! what crates of monitors have in common (`jitter.rs`). Everything comes from differences between readings of the same setting
+//! (`repeats.rs`), so that physics that the model lacks does not enter, with one exception: what changes with time alone, such as
 //! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size.
 //!
 //! Scales are root mean squares of the readings that count. Tails are those of the readings that the screening accepts: it drops

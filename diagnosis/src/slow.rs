@@ -1,6 +1,6 @@
 //! What the noise of all monitors remembers: the share of slow noise, its correlation time and a random walk, learnt from repeats.
 //!
-//! The likelihood is that of [`super::repeats`], summed over the monitors. Each of these has, with a small probability, noise of its own kind,
+//! The likelihood is that of `repeats.rs`, summed over the monitors. Each of these has, with a small probability, noise of its own kind,
 //! so that one monitor that wanders by itself says nothing of the others:
 //!
 //! `ln L = sum over monitors of ln((1 - OWN) L_b + OWN best L_b)`.
