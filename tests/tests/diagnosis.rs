@@ -143,7 +143,7 @@ fn scatter_of_a_family_is_ordinary() {
 
 /// Strong unmodelled physics is located and not named, and the vars are right beside it.
 #[test]
-#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+#[ignore = "one of the five strong cases takes more than 15 minutes beside ordinary imperfections: to be made quick first"]
 fn unmodelled_physics_is_not_named() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let hardware = Hardware::shipped(&ring, &template);
