@@ -6,6 +6,8 @@ use super::data::Data;
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
 use super::hypothesis::Term;
+use super::location::Location;
+use super::noise::Noise;
 use super::scan::Candidate;
 
 /// Probability at which a cause counts as decided.
@@ -56,6 +58,15 @@ pub struct Competition {
 }
 
 impl Cause {
+    /// True for the same effect at the same place, or the same unmodelled place.
+    pub fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Effect(one), Self::Effect(other)) => one == other,
+            (Self::Unmodelled(one), Self::Unmodelled(other)) => one.at == other.at,
+            _ => false,
+        }
+    }
+
     /// The effect of the library, if it is one.
     pub fn term(&self) -> Option<&Term> {
         match self {
@@ -104,6 +115,14 @@ impl Alternative {
         }
     }
 
+    /// What varies from frame to frame in the noise of a campaign and is not ordinary, if anything does.
+    pub(super) fn from_frame_to_frame(noise: &Noise, campaign: usize) -> Option<Self> {
+        let (one, probability) = noise.unordinary()?;
+        let (at, log_bayes, size) = (Location::FrameToFrame, one.log_bayes, one.rms.value);
+        let found = Self::unmodelled(Discrepancy { at, campaign, log_bayes, size, sites: 1, adapted: None });
+        Some(Self { probability, amplitude: (size, one.rms.sigma), ..found })
+    }
+
     /// The effect of the library, if it is one.
     pub fn term(&self) -> Option<&Term> {
         self.cause.term()
@@ -118,9 +137,19 @@ impl Alternative {
 /// Probability below which an alternative that was not refitted is not listed.
 const LISTED: f64 = 1e-4;
 
-impl Competition {
+/// Alternatives with their probabilities, and nothing as one of them.
+pub(super) struct Weighed {
+    /// Most likely first; those of negligible probability are left out.
+    pub alternatives: Vec<Alternative>,
+    /// Probability that none of them is needed.
+    pub nothing: f64,
+    /// `ln` posterior odds of any of them over none.
+    pub log_odds: f64,
+}
+
+impl Weighed {
     /// Normalise posterior weights (`ln`; that of no effect is 0).
-    pub(super) fn of(mut weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
+    pub fn of(mut weights: Vec<(Alternative, f64)>) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
         weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
         let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
@@ -133,8 +162,15 @@ impl Competition {
         };
         let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
         let alternatives = weights.into_iter().map(normalised).filter(listed).collect();
-        let log_odds = largest + something.ln();
-        Self { alternatives, nothing: nothing / sum, log_odds, scanned, without }
+        Self { alternatives, nothing: nothing / sum, log_odds: largest + something.ln() }
+    }
+}
+
+impl Competition {
+    /// Of posterior weights (`ln`; that of no effect is 0).
+    pub(super) fn of(weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
+        let Weighed { alternatives, nothing, log_odds } = Weighed::of(weights);
+        Self { alternatives, nothing, log_odds, scanned, without }
     }
 
     /// True if an effect is likely to be needed.

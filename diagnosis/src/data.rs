@@ -7,41 +7,51 @@
 //! `S = sigma^2 (1 + U U^T)`, and with the thin decomposition `U = Q D V^T`,
 //! `S^(-1/2) = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T)/sigma`.
 //!
-//! The noise itself is as learnt from the repeats ([`super::noise`]). Where it remembers the frames before, the numbers of a monitor are
-//! replaced by its innovations before the common terms are taken out (`memory.rs`); where monitors have noise in common within a frame,
-//! the frame is whitened before all that (`modes.rs`). The covariance is thereby defined as the product of the two: what
+//! What is whitened are not single frames but the means of consecutive frames of one setting ([`super::pools`]), each reading less
+//! what the supplies and the correctors' read-backs do to it within the pool. The noise itself is as learnt from the repeats ([`super::noise`]); the
+//! covariance of the means follows from what it remembers (`channel.rs`). Where monitors have noise in common within a frame,
+//! the pool is whitened before all that (`modes.rs`). The covariance is thereby defined as the product of the two: what
 //! monitors have in common has the same memory as their own noise.
 //!
-//! For whitened data every fit is plain least squares. The tune meter adds four numbers: the mean of each tune and
-//! its change from start to end.
+//! For whitened data every fit is plain least squares. A tune is read as a monitor is, with a calibration error that all its readings share.
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, DVectorView, RowVector2, Vector2};
+use nalgebra::{DMatrix, DVector, DVectorView, RowVector2};
 use twin::{
-    Cycle, Drives, Effect, EffectError, Hold, Machine, Optics, OrbitError, Rf, Ring, Signature, Signatures, Tracked,
-    Tunes,
+    Cycle, Drives, Effect, EffectError, Hold, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
+    Tracked,
 };
 
 use super::baseline::Baseline;
+use super::channel::Channel;
 use super::error::FitError;
 use super::evidence::Units;
+use super::frame_to_frame::Shape;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
+use super::pools::Pools;
 use super::settings::Settings;
 use super::wiring::Miswired;
-use inference::campaign::chi_square;
+use super::within::Within;
+use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
 pub struct Data {
+    /// Name of the recording.
+    pub name: String,
+    /// Further recordings of the same machine, each alone, which are fitted together with this one (`joint.rs`).
+    pub(super) others: Vec<Self>,
+    /// Momentum of the beam [GeV/c].
+    pub momentum: f64,
     /// The ring as designed.
     pub ring: Ring,
     /// The params in units of their priors.
     pub units: Units,
-    /// Kicks, RF offset and time of each frame, and the orbit without kicks.
+    /// Mean kicks, RF offset and time of each pool, and the orbit without kicks.
     pub drives: Drives,
     /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
@@ -49,25 +59,22 @@ pub struct Data {
     pub screened: Screened,
     /// `ln` of each supply's mean factor [F].
     pub supplies: Vec<f64>,
-    /// Readings at the mean supply currents, the orbit's terms above first order in kicks and RF offset subtracted, rows frames,
-    /// columns monitors [m].
+    /// Pooled readings at the mean supply currents, the orbit's terms above first order in kicks and RF offset subtracted, rows pools,
+    /// columns monitors [m], then the two tunes; 0 where none counts.
     pub readings: DMatrix<f64>,
-    /// Readings as recorded [m]; NaN for one that is missing.
-    recorded: DMatrix<f64>,
-    /// `ln` of each supply's factor off its mean, rows frames, columns supplies.
-    fluctuation: DMatrix<f64>,
+    /// The pools of the frames.
+    pub pools: Pools,
+    /// Frame by frame.
+    frames: Frames,
     /// Noise of a reading of each monitor by the recording's header [B] [m].
     pub expected_noise: Vec<f64>,
     /// The noise as learnt.
     pub noise: Noise,
+    /// Of each monitor, then of the two tunes.
     channels: Vec<Channel>,
     mixing: Mixing,
-    /// A constant taken off each monitor's readings before those of a frame are mixed, about their mean; 0 where none are [B] [m].
+    /// A constant taken off each monitor's readings before those of a pool are mixed, about their mean; 0 where none are [B] [m].
     centre: DVector<f64>,
-    /// Tunes at the mean supply currents, rows frames; NaN where they do not count.
-    tunes: DMatrix<f64>,
-    recorded_tunes: DMatrix<f64>,
-    meter: [Option<Meter>; 2],
     /// The constraint that the header states instead of a fixed momentum.
     pub believed: Vec<Effect>,
     /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
@@ -76,18 +83,18 @@ pub struct Data {
     drift: f64,
 }
 
-/// The readings of one monitor that count.
+/// A recording, frame by frame.
 #[derive(Debug, Clone)]
-struct Channel {
-    frames: Vec<usize>,
-    sigma: f64,
-    /// Where the noise remembers.
-    filter: Option<Filter>,
-    /// `Q` [frames][factors].
-    basis: DMatrix<f64>,
-    /// `1 - (1 + D^2)^(-1/2)` of each.
-    shrink: DVector<f64>,
-    log_det: f64,
+struct Frames {
+    drives: Drives,
+    /// As recorded, columns monitors [m] and the two tunes; NaN for what is missing.
+    recorded: DMatrix<f64>,
+    /// The same at the mean supply currents, at the drives of the pool and without the terms above first order.
+    readings: DMatrix<f64>,
+    /// `ln` of each supply's factor off its mean, columns supplies.
+    fluctuation: DMatrix<f64>,
+    /// Noise of one frame's tune, of a tune that was read.
+    tune_noise: [Option<f64>; 2],
 }
 
 /// Why a recording cannot be diagnosed.
@@ -116,6 +123,16 @@ pub enum DataError {
         recording: String,
         /// The times.
         found: String,
+    },
+    /// Recordings of two machines.
+    #[error("{first} and {other} are analysed together: expected the same {what} in both")]
+    Apart {
+        /// One of them.
+        first: String,
+        /// The other.
+        other: String,
+        /// What differs.
+        what: &'static str,
     },
     /// Columns that are not what the header says.
     #[error("{recording}: frames.csv: {wiring}")]
@@ -162,31 +179,39 @@ impl Data {
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
+        let pools = Pools::of(&campaign.settings.of_frame);
         let shared = |b: usize| campaign.following(b).insert_column(0, BASELINE);
         let noise = noise_of(campaign, &design, &drives)?;
         let mut screened = screened.clone();
         noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);
+        let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
+            name: recording.name.clone(),
+            others: Vec::new(),
+            momentum: ring.particle.momentum() * ramped.map_or(1.0, |at| at.momentum),
             ring: ring.clone(),
             units: Units::of(&campaign.prior),
             screened,
             supplies: supplies.clone(),
-            readings: recorded.clone(),
+            readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
-            recorded: recorded.clone(),
-            fluctuation: campaign.fluctuation.clone(),
             expected_noise: recording.header.noise.clone(),
-            centre: DVector::zeros(recorded.ncols()),
+            centre: DVector::zeros(recorded.ncols() + 2),
             noise,
             channels: Vec::new(),
             mixing: Mixing::default(),
-            meter: [None, None],
-            tunes: recorded_tunes.clone(),
-            recorded_tunes,
             believed,
             drift: 0.0,
-            drives,
+            drives: pools.drives(&drives),
+            pools,
+            frames: Frames {
+                drives,
+                recorded: beside(recorded, &recorded_tunes),
+                readings: beside(recorded, &recorded_tunes),
+                fluctuation: campaign.fluctuation.clone(),
+                tune_noise: [None; 2],
+            },
         };
         data.prepare();
         data.check(recording)?;
@@ -202,30 +227,34 @@ impl Data {
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
-        let higher = self.higher_orders(machine)?;
-        let slopes = Signatures::of(&machine.on_orbit(&self.drives.orbit), &self.drives)?.of_quadrupoles();
-        let (mut readings, mut tunes) = (&self.recorded - higher, self.recorded_tunes.clone());
-        for (slope, quadrupole) in slopes.iter().zip(&self.ring.quadrupoles) {
-            let Some(supply) = quadrupole.supply else { continue };
-            let off = self.fluctuation.column(supply);
-            for (b, mut column) in readings.column_iter_mut().enumerate() {
-                column -= off.component_mul(&slope.readings.column(b));
-            }
-            tunes -= off * RowVector2::from(slope.tunes);
-        }
-        let moved = self.whiten(|b, frame| readings[(frame, b)] - self.readings[(frame, b)], [Vector2::zeros(); 2]);
-        (self.readings, self.tunes) = (readings, tunes);
-        self.meter = self.meters();
-        Ok(moved.norm_squared())
+        let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
+        let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&self.drives)?.0);
+        let off_first_order = within + self.higher_orders(machine)?;
+        let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
+        let monitors = self.monitors();
+        let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);
+        let mut of_monitors = readings.columns_mut(0, monitors);
+        of_monitors -= off_first_order;
+        self.frames.readings = readings;
+        let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
+        self.prepare();
+        Ok(self
+            .whiten(|c, pool| if c < monitors { self.readings[(pool, c)] - before[(pool, c)] } else { 0.0 })
+            .norm_squared())
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
     /// there are any.
     pub fn trim(&mut self, residual: &DVector<f64>) -> bool {
         let places = self.places().into_iter().zip(residual.iter()).filter(|(_, r)| r.abs() > FAULTY);
-        let is_faulty = |(_, b): &(usize, usize)| self.health()[*b].state != MonitorState::Ok;
-        let dropped: Vec<(usize, usize)> = places.filter_map(|(place, _)| place).filter(is_faulty).collect();
-        dropped.iter().for_each(|&place| self.screened.accepted[place] = false);
+        let is_faulty =
+            |(_, c): &(usize, usize)| self.health().get(*c).is_some_and(|one| one.state != MonitorState::Ok);
+        let dropped: Vec<(usize, usize)> = places.map(|(place, _)| place).filter(is_faulty).collect();
+        for (frame, pool) in self.pools.of_frame.iter().enumerate() {
+            for &(_, b) in dropped.iter().filter(|(dropped, _)| dropped == pool) {
+                self.screened.accepted[(frame, b)] = false;
+            }
+        }
         if !dropped.is_empty() {
             self.prepare();
         }
@@ -235,10 +264,12 @@ impl Data {
     /// What the exact orbits of a machine have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first
     /// order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
     fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
+        // settings do not follow each other in time
+        let machine = &machine.without_memory();
         let mut displaced = machine.clone();
         self.baseline.displace(&mut displaced)?;
-        let settings = Settings::of(&self.drives);
-        let drives = Drives { orbit: displaced.orbit()?, ..settings.means(&self.drives) };
+        let settings = Settings::of(&self.frames.drives);
+        let drives = Drives { orbit: displaced.orbit()?, ..settings.means(&self.frames.drives) };
         let tracked = Tracked::of(displaced, self.drives.nominal_kick)?;
         let cycle = |kick: Vec<f64>, rf_offset: f64| {
             let strength = vec![0.0; self.ring.quadrupoles.len()];
@@ -256,16 +287,11 @@ impl Data {
     /// The same recording with a known signal taken out of its readings and tunes, rows frames.
     pub fn less(&self, readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> Self {
         let mut data = self.clone();
-        data.readings -= readings;
-        data.recorded -= readings;
-        data.tunes -= tunes;
-        data.recorded_tunes -= tunes;
-        data.meter = data.meters();
+        let signal = beside(readings, tunes);
+        data.frames.readings -= &signal;
+        data.frames.recorded -= signal;
+        data.prepare();
         data
-    }
-
-    fn meters(&self) -> [Option<Meter>; 2] {
-        [0, 1].map(|plane| Meter::of(self.tunes.column(plane).iter().zip(self.drives.time.iter())))
     }
 
     /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
@@ -273,52 +299,97 @@ impl Data {
         let mut data = self.clone();
         data.drift = amplitude;
         data.prepare();
+        data.others.iter_mut().for_each(|other| *other = other.drifting(amplitude));
         data
     }
 
-    /// A hypothetical campaign with other drives; its readings are ignored.
-    pub fn driven_by(&self, drives: &Drives) -> Self {
-        let mut data = Self { drives: drives.clone(), ..self.clone() };
-        data.prepare();
-        data
-    }
-
-    /// The same recording without some frames.
-    pub fn without(&self, frames: &[usize]) -> Self {
+    /// The same recording where monitors wander.
+    pub fn wandering(&self, walk: Measured) -> Self {
         let mut data = self.clone();
-        for &frame in frames {
-            data.screened.accepted.row_mut(frame).fill(false);
-            data.tunes.row_mut(frame).fill(f64::NAN);
-        }
-        data.meter = data.meters();
+        data.noise.slow.walk = walk;
+        data.prepare();
+        data.others.iter_mut().for_each(|other| *other = other.wandering(walk));
+        data
+    }
+
+    /// A hypothetical campaign with other drives, by itself; its readings are ignored.
+    pub fn driven_by(&self, drives: &Drives) -> Self {
+        let mut data = Self { drives: drives.clone(), others: Vec::new(), ..self.clone() };
         data.prepare();
         data
     }
 
-    /// Prepare the whitening of the readings that count.
+    /// Prepare the whitening of the readings that count, and pool them.
     fn prepare(&mut self) {
-        self.channels = (0..self.readings.ncols()).map(|b| self.channel(b)).collect();
-        self.mixing = Mixing::of(&self.noise.modes, self.readings.nrows(), |frame, b| self.counts(frame, b));
+        let (columns, monitors) = (self.monitors() + 2, self.monitors());
+        let time = &self.frames.drives.time;
+        self.frames.tune_noise = [0, 1].map(|plane| {
+            let tunes = self.frames.readings.column(monitors + plane);
+            Meter::of(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
+        });
+        self.readings = self.pools.means(&self.frames.readings, |frame, c| self.counts(frame, c));
+        let frames = self.pools.frames();
+        self.channels.clear();
+        for c in 0..columns {
+            let channel = self.channel(c, &frames);
+            self.channels.push(channel);
+        }
+        let count = self.pools.counts(monitors, |frame, b| self.counts(frame, b));
+        self.mixing = Mixing::of(&self.noise.modes, self.pools.count, |pool, b| count[(pool, b)] > 0.0);
         if !self.mixing.is_none() {
-            let mean = |b: usize| {
-                let frames = self.frames(b);
-                frames.iter().map(|&frame| self.readings[(frame, b)]).sum::<f64>() / frames.len().max(1) as f64
+            let mean = |c: usize| {
+                let rows = &self.channels[c].rows;
+                rows.iter().map(|&pool| self.readings[(pool, c)]).sum::<f64>() / rows.len().max(1) as f64
             };
-            self.centre = DVector::from_fn(self.readings.ncols(), |b, _| mean(b));
+            self.centre = DVector::from_fn(columns, |c, _| if c < monitors { mean(c) } else { 0.0 });
         }
     }
 
-    fn channel(&self, b: usize) -> Channel {
-        let frames: Vec<usize> = (0..self.readings.nrows()).filter(|&frame| self.counts(frame, b)).collect();
-        let shared = self.shared(b, &frames);
-        Channel::of(frames, self.noise.own[b], self.noise.memory(b), shared)
+    /// Prepare a channel, from the frames of each pool.
+    fn channel(&mut self, c: usize, frames: &[Vec<usize>]) -> Channel {
+        let counting = |of_pool: &Vec<usize>| -> Vec<usize> {
+            of_pool.iter().copied().filter(|&frame| self.counts(frame, c)).collect()
+        };
+        let all = frames.iter().map(counting).enumerate().filter(|(_, frames)| !frames.is_empty());
+        let (rows, frames): (Vec<usize>, Vec<Vec<usize>>) = all.unzip();
+        match c.checked_sub(self.monitors()) {
+            None => {
+                let common = self.common(c, &rows, &frames);
+                Channel::of(rows, &frames, self.noise.own[c], self.noise.memory(c), common)
+            }
+            Some(plane) => {
+                let common = DMatrix::from_element(rows.len(), 1, TUNE_CALIBRATION);
+                let noise = self.frames.tune_noise[plane].unwrap_or(TUNE_CALIBRATION);
+                Channel::of(rows, &frames, noise, Memory::NONE, common)
+            }
+        }
     }
 
-    /// Common terms of a monitor's readings in some frames, in standard deviations [frames][factors] [m].
-    pub fn shared(&self, b: usize, frames: &[usize]) -> DMatrix<f64> {
+    /// Common terms of a monitor's pooled readings, in standard deviations [rows][factors] [m], as far as the differences within pools do not
+    /// tell them; what these tell is taken off the readings. `frames` of each row.
+    fn common(&mut self, b: usize, rows: &[usize], frames: &[Vec<usize>]) -> DMatrix<f64> {
+        let (all, sigma) = (&self.shared[b], self.noise.own[b]);
+        let mean = |row: usize, k: usize| {
+            frames[row].iter().map(|&frame| all[(frame, k)]).sum::<f64>() / frames[row].len() as f64
+        };
+        let means = DMatrix::from_fn(rows.len(), all.ncols(), mean);
+        let each: Vec<(usize, usize)> =
+            frames.iter().enumerate().flat_map(|(row, frames)| frames.iter().map(move |&frame| (row, frame))).collect();
+        let readings =
+            each.iter().map(|&(row, frame)| self.frames.readings[(frame, b)] - self.readings[(rows[row], b)]);
+        let readings = DVector::from_iterator(each.len(), readings) / sigma;
+        let terms =
+            DMatrix::from_fn(each.len(), all.ncols(), |i, k| all[(each[i].1, k)] - means[(each[i].0, k)]) / sigma;
+        let within = Within::of(&readings, &terms);
+        let told = &means * within.mean;
+        rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
+        self.drifting_with(b, rows, &self.drives, means * within.root)
+    }
+
+    /// With those of the RF frequency and the drift, at some rows of the drives.
+    fn drifting_with(&self, b: usize, rows: &[usize], drives: &Drives, shared: DMatrix<f64>) -> DMatrix<f64> {
         let (plane, drift) = (usize::from(b >= self.ring.horizontal_monitors()), self.drift);
-        let rf = DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.rf_offset[i]));
-        let shared = self.shared[b].select_rows(frames);
+        let rf = DVector::from_iterator(rows.len(), rows.iter().map(|&i| drives.rf_offset[i]));
         let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);
         shared.set_column(at, &(rf * self.baseline.spurious[plane]));
@@ -328,7 +399,7 @@ impl Data {
         // to second order in time: near an integer tune the orbit grows faster than the gradients drift
         let time = |power: i32| {
             let relative = (drift * self.baseline.sensitivity[plane]).powi(power) * self.baseline.rms[plane];
-            DVector::from_iterator(frames.len(), frames.iter().map(|&i| self.drives.time[i].powi(power) * relative))
+            DVector::from_iterator(rows.len(), rows.iter().map(|&i| drives.time[i].powi(power) * relative))
         };
         let at = shared.ncols();
         let mut shared = shared.insert_columns(at, 2, 0.0);
@@ -344,8 +415,7 @@ impl Data {
             }
             Err(DataError::TooLittle { recording: recording.name.clone(), what, expected, found })
         };
-        let active = |channel: &&Channel| channel.frames.len() > channel.basis.ncols();
-        enough("monitors with enough readings that count", LEAST, self.channels.iter().filter(active).count())?;
+        enough("monitors with enough readings that count", LEAST, self.active_monitors().len())?;
         enough("correctors that were moved", LEAST, self.driven_correctors().len())
     }
 
@@ -357,83 +427,89 @@ impl Data {
 
     /// Monitors that have readings which count, by index.
     pub fn active_monitors(&self) -> Vec<usize> {
-        (0..self.channels.len()).filter(|&b| self.channels[b].frames.len() > self.channels[b].basis.ncols()).collect()
+        (0..self.monitors()).filter(|&b| self.channels[b].rows.len() > self.channels[b].factors()).collect()
+    }
+
+    /// Number of monitors that are read.
+    pub fn monitors(&self) -> usize {
+        self.shared.len()
     }
 
     /// Number of whitened numbers.
     pub fn size(&self) -> usize {
-        self.channels.iter().map(|c| c.frames.len()).sum::<usize>() + 4
+        self.channels.iter().map(|c| c.rows.len()).sum()
     }
 
     /// `ln` of the determinant of the covariance.
     pub fn log_det(&self) -> f64 {
-        self.channels.iter().map(|c| c.log_det).sum::<f64>() + self.mixing.log_det()
+        // the tune meter's noise is not compared
+        self.channels[..self.monitors()].iter().map(|c| c.log_det).sum::<f64>() + self.mixing.log_det()
     }
 
     /// Whitened residuals: readings and tunes less those predicted.
-    pub fn residual(&self, predicted: &DMatrix<f64>, tunes: Tunes, tune_drift: [f64; 2]) -> DVector<f64> {
-        let miss = [0, 1].map(|plane| {
-            let predicted = Vector2::new([tunes.x, tunes.y][plane], tune_drift[plane]);
-            self.meter[plane].as_ref().map_or(Vector2::zeros(), |meter| meter.miss(predicted))
-        });
-        self.whiten(|b, frame| self.readings[(frame, b)] - self.centre[b] - predicted[(frame, b)], miss)
+    pub fn residual(&self, predicted: &Signature) -> DVector<f64> {
+        self.whiten(|c, pool| {
+            self.nearest(c, self.readings[(pool, c)] - self.centre[c] - self.effect_on(predicted, c, pool))
+        })
     }
 
-    /// Readings [m] and tunes [1] as columns, less those predicted, for a tune modulo 1.
+    /// A difference of tunes up to an integer.
+    fn nearest(&self, c: usize, miss: f64) -> f64 {
+        if c < self.monitors() { miss } else { miss - miss.round() }
+    }
+
+    /// What a signature does to the reading of a monitor [m], or to a tune, in a pool.
+    fn effect_on(&self, signature: &Signature, c: usize, pool: usize) -> f64 {
+        match c.checked_sub(self.monitors()) {
+            None => signature.readings[(pool, c)],
+            Some(plane) => signature.tunes[plane] + signature.tune_drift[plane] * self.drives.time[pool],
+        }
+    }
+
+    /// Pooled readings [m] and tunes [1] as columns, less those predicted, for a tune modulo 1; not a number where none counts.
     pub fn miss(&self, predicted: &DMatrix<f64>) -> DMatrix<f64> {
-        let monitors = self.readings.ncols();
-        let mut miss = -predicted;
-        let mut part = miss.columns_mut(0, monitors);
-        part += &self.readings;
-        let mut part = miss.columns_mut(monitors, 2);
-        part += &self.tunes;
-        part.apply(|tune| *tune -= tune.round());
+        let mut miss = DMatrix::from_element(predicted.nrows(), predicted.ncols(), f64::NAN);
+        for (c, channel) in self.channels.iter().enumerate() {
+            for &pool in &channel.rows {
+                miss[(pool, c)] = self.nearest(c, self.readings[(pool, c)] - predicted[(pool, c)]);
+            }
+        }
         miss
     }
 
     /// A signature, whitened.
     pub fn signature(&self, signature: &Signature) -> DVector<f64> {
-        let tunes = [0, 1].map(|plane| {
-            let change = Vector2::new(signature.tunes[plane], signature.tune_drift[plane]);
-            self.meter[plane].as_ref().map_or(Vector2::zeros(), |meter| meter.whiten * change)
-        });
-        self.whiten(|b, frame| signature.readings[(frame, b)], tunes)
+        self.whiten(|c, pool| self.effect_on(signature, c, pool))
     }
 
-    fn whiten(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
+    /// Numbers of the channels, one for each pool, whitened: channel by channel.
+    fn whiten(&self, value: impl Fn(usize, usize) -> f64) -> DVector<f64> {
+        let mut all = DVector::zeros(self.size());
         if self.mixing.is_none() {
-            return self.stack(|b, frame| value(b, frame) / self.channels[b].sigma, tunes);
+            self.stack(&mut all, value);
+            return all;
         }
-        let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
-        for (b, channel) in self.channels.iter().enumerate() {
-            channel.frames.iter().for_each(|&frame| values[(frame, b)] = value(b, frame) / channel.sigma);
+        let monitors = self.monitors();
+        let mut values = DMatrix::zeros(self.pools.count, monitors);
+        for (b, channel) in self.channels[..monitors].iter().enumerate() {
+            channel.rows.iter().for_each(|&pool| values[(pool, b)] = value(b, pool) / channel.sigma);
         }
         self.mixing.apply(&mut values);
-        self.stack(|b, frame| values[(frame, b)], tunes)
+        let mixed = |c: usize, pool: usize| {
+            if c < monitors { values[(pool, c)] * self.channels[c].sigma } else { value(c, pool) }
+        };
+        self.stack(&mut all, mixed);
+        all
     }
 
-    /// All numbers, monitor by monitor, whitened in time, then those of the tunes.
-    fn stack(&self, value: impl Fn(usize, usize) -> f64, tunes: [Vector2<f64>; 2]) -> DVector<f64> {
-        let mut all = DVector::zeros(self.size());
+    fn stack(&self, all: &mut DVector<f64>, value: impl Fn(usize, usize) -> f64) {
         let mut at = 0;
-        for (b, channel) in self.channels.iter().enumerate() {
-            let n = channel.frames.len();
-            let mut part = all.rows_mut(at, n);
-            for (to, &frame) in part.iter_mut().zip(&channel.frames) {
-                *to = value(b, frame);
-            }
-            if let Some(filter) = &channel.filter {
-                filter.whiten(part.iter_mut());
-            }
-            let common = channel.basis.tr_mul(&part).component_mul(&channel.shrink);
-            part.gemv(-1.0, &channel.basis, &common, 1.0);
-            at += n;
+        for (c, channel) in self.channels.iter().enumerate() {
+            let mut part = all.rows_mut(at, channel.rows.len());
+            part.iter_mut().zip(&channel.rows).for_each(|(to, &pool)| *to = value(c, pool) / channel.sigma);
+            channel.whiten_column(&mut part);
+            at += channel.rows.len();
         }
-        for tune in tunes {
-            all.fixed_rows_mut::<2>(at).copy_from(&tune);
-            at += 2;
-        }
-        all
     }
 
     /// Whitened numbers, one set a column, with the noise in common taken out once more: the product of what only one monitor would read
@@ -443,15 +519,16 @@ impl Data {
         if self.mixing.is_none() {
             return back;
         }
-        let starts: Vec<usize> = (0..self.channels.len()).map(|b| self.start(b)).collect();
+        let monitors = self.monitors();
+        let starts: Vec<usize> = (0..monitors).map(|b| self.start(b)).collect();
         let places = || {
             let of = |(b, channel): (usize, &Channel)| {
-                channel.frames.iter().enumerate().map(move |(i, &frame)| (i, frame, b)).collect::<Vec<_>>()
+                channel.rows.iter().enumerate().map(move |(i, &pool)| (i, pool, b)).collect::<Vec<_>>()
             };
-            self.channels.iter().enumerate().flat_map(of)
+            self.channels[..monitors].iter().enumerate().flat_map(of)
         };
         for mut column in back.column_iter_mut() {
-            let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
+            let mut values = DMatrix::zeros(self.pools.count, monitors);
             places().for_each(|(i, frame, b)| values[(frame, b)] = column[starts[b] + i]);
             self.mixing.apply(&mut values);
             places().for_each(|(i, frame, b)| column[starts[b] + i] = values[(frame, b)]);
@@ -459,34 +536,57 @@ impl Data {
         back
     }
 
-    /// Frame and monitor of each whitened number; none for those of the tune meter.
-    pub fn places(&self) -> Vec<Option<(usize, usize)>> {
-        let of = |(b, channel): (usize, &Channel)| channel.frames.iter().map(|&i| Some((i, b))).collect::<Vec<_>>();
-        self.channels.iter().enumerate().flat_map(of).chain([None; 4]).collect()
+    /// Pool and channel (a monitor, or a tune after the last of them) of each whitened number.
+    pub fn places(&self) -> Vec<(usize, usize)> {
+        let of = |(c, channel): (usize, &Channel)| channel.rows.iter().map(|&pool| (pool, c)).collect::<Vec<_>>();
+        self.channels.iter().enumerate().flat_map(of).collect()
     }
 
-    /// First of a monitor's whitened numbers.
-    pub fn start(&self, b: usize) -> usize {
-        self.channels[..b].iter().map(|channel| channel.frames.len()).sum()
+    /// Noise of each whitened number [m], of a tune [1]: that of the mean of its pool.
+    pub fn noise_of_means(&self) -> Vec<f64> {
+        let of = |channel: &Channel| (channel.noise_of_means() * channel.sigma).iter().copied().collect::<Vec<_>>();
+        self.channels.iter().flat_map(of).collect()
     }
 
-    /// Sum of squares of measured less predicted readings over the noise as learnt, about all that a monitor's readings have in common, and
-    /// its degrees of freedom; of the monitors in state ok. `miss`: rows frames, columns monitors.
-    pub fn chi_square(&self, miss: &DMatrix<f64>) -> (f64, f64) {
-        let mut values = DMatrix::zeros(self.readings.nrows(), self.channels.len());
-        for (b, channel) in self.channels.iter().enumerate() {
-            let value = |frame: usize| (miss[(frame, b)] - self.centre[b]) / channel.sigma;
-            channel.frames.iter().for_each(|&frame| values[(frame, b)] = value(frame));
+    /// Readings of a tune in each pool that has some.
+    pub fn tune_pools(&self, plane: usize) -> Vec<(usize, f64)> {
+        let channel = &self.channels[self.monitors() + plane];
+        channel.rows.iter().copied().zip(channel.readings().iter().copied()).collect()
+    }
+
+    /// First of a channel's whitened numbers.
+    pub fn start(&self, c: usize) -> usize {
+        self.channels[..c].iter().map(|channel| channel.rows.len()).sum()
+    }
+
+    /// A monitor's readings, whitened, or after the last of them a tune's.
+    pub(super) fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// Sum of squares of measured less predicted readings, frame by frame, over the noise as learnt, about all that a monitor's readings have in
+    /// common, and its degrees of freedom; of the monitors in state ok. `predicted`: rows pools.
+    pub fn chi_square(&self, predicted: &DMatrix<f64>) -> (f64, f64) {
+        let (monitors, frames) = (self.monitors(), self.pools.of_frame.len());
+        let mut values = DMatrix::zeros(frames, monitors);
+        for (frame, &pool) in self.pools.of_frame.iter().enumerate() {
+            for b in (0..monitors).filter(|&b| self.counts(frame, b)) {
+                let miss = self.frames.readings[(frame, b)] - predicted[(pool, b)];
+                values[(frame, b)] = (miss - self.centre[b]) / self.channels[b].sigma;
+            }
         }
-        self.mixing.apply(&mut values);
+        Mixing::of(&self.noise.modes, frames, |frame, b| self.counts(frame, b)).apply(&mut values);
         let is_ok = |b: &usize| self.health()[*b].state == MonitorState::Ok;
         let mut sums = (0.0, 0.0);
         for b in self.active_monitors().into_iter().filter(is_ok) {
-            let channel = &self.channels[b];
-            let mut terms = self.shared(b, &channel.frames) / channel.sigma;
+            let rows: Vec<usize> = (0..frames).filter(|&frame| self.counts(frame, b)).collect();
+            let shared = self.shared[b].select_rows(&rows);
+            let mut terms = self.drifting_with(b, &rows, &self.frames.drives, shared) / self.channels[b].sigma;
             terms.column_mut(0).fill(1.0);
-            let mut residual = values.select_rows(&channel.frames).columns(b, 1).into_owned();
-            if let Some(filter) = &channel.filter {
+            let mut residual = values.select_rows(&rows).columns(b, 1).into_owned();
+            let memory = self.noise.memory(b);
+            if !memory.is_none() {
+                let filter = Filter::of(memory, rows[0], &rows);
                 filter.whiten_columns(&mut terms);
                 filter.whiten_columns(&mut residual);
             }
@@ -496,26 +596,19 @@ impl Data {
         sums
     }
 
-    /// Whiten columns over all frames as readings of one monitor.
-    pub fn whiten_columns(&self, b: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
-        let channel = &self.channels[b];
-        let mut part = columns.select_rows(&channel.frames) / channel.sigma;
-        if let Some(filter) = &channel.filter {
-            filter.whiten_columns(&mut part);
-        }
-        let mut common = channel.basis.transpose() * &part;
-        common.row_iter_mut().zip(channel.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
-        part -= &channel.basis * common;
-        part
+    /// Whiten columns over all pools as readings of one channel.
+    pub fn whiten_columns(&self, c: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        let channel = &self.channels[c];
+        channel.whiten(columns.select_rows(&channel.rows) / channel.sigma)
     }
 
     /// What a monitor's readings tell beside those of the others in the same frames, as a share of what they tell alone, on average.
     pub fn own_share(&self, b: usize) -> f64 {
-        let frames = self.frames(b);
-        if self.mixing.is_none() || frames.is_empty() {
+        let rows = &self.channels[b].rows;
+        if self.mixing.is_none() || rows.is_empty() || b >= self.monitors() {
             return 1.0;
         }
-        frames.iter().map(|&frame| self.mixing.own(frame, b)).sum::<f64>() / frames.len() as f64
+        rows.iter().map(|&pool| self.mixing.own(pool, b)).sum::<f64>() / rows.len() as f64
     }
 
     /// What a pattern over some monitors [m] has to be multiplied by, monitor by monitor, with [`Data::own_share`]: itself with what it leaves
@@ -532,34 +625,33 @@ impl Data {
         DVector::from_fn(pattern.len(), |b, _| values[(0, b)] * self.channels[b].sigma / mixing.own(0, b))
     }
 
-    /// Readings that step with time, whitened: rows frames, columns monitors.
+    /// Readings that step with time, whitened: rows pools, columns monitors.
     pub fn stepping(&self, readings: &DMatrix<f64>, step: &DVectorView<f64>) -> DVector<f64> {
-        self.whiten(|b, frame| readings[(frame, b)] * step[frame], [Vector2::zeros(); 2])
+        self.whiten(|c, pool| if c < self.monitors() { readings[(pool, c)] * step[pool] } else { 0.0 })
     }
 
-    /// `E^T S^-1 E` of a monitor's readings for groups of frames, of which `group` names that of each frame, as if the noise were white:
+    /// `E^T S^-1 E` of a monitor's readings for groups of pools, of which `group` names that of each pool, as if the noise were white:
     /// `diag(alone) - common common^T`, the latter of their common terms. Returns both, [groups] and [groups][factors].
     pub fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
         let channel = &self.channels[b];
-        let share = self.own_share(b);
-        let taken = channel.shrink.map(|shrink| (share * shrink * (2.0 - shrink)).sqrt() / channel.sigma).transpose();
-        let (mut alone, mut common) = (DVector::zeros(groups), DMatrix::zeros(groups, taken.len()));
-        for (row, &frame) in channel.basis.row_iter().zip(&channel.frames) {
-            alone[group[frame]] += share * channel.sigma.powi(-2);
-            let mut common = common.row_mut(group[frame]);
-            common += row.component_mul(&taken);
+        let (share, per) = (self.own_share(b), channel.sigma.powi(-2));
+        let taken = channel.taken() * (share.sqrt() / channel.sigma);
+        let (mut alone, mut common) = (DVector::zeros(groups), DMatrix::zeros(groups, taken.ncols()));
+        for ((row, readings), &pool) in taken.row_iter().zip(&channel.readings()).zip(&channel.rows) {
+            alone[group[pool]] += share * per * readings;
+            let mut common = common.row_mut(group[pool]);
+            common += row;
         }
         (alone, common)
     }
 
-    /// True if a reading counts.
-    pub fn counts(&self, frame: usize, b: usize) -> bool {
-        self.screened.accepted[(frame, b)] && !self.readings[(frame, b)].is_nan()
-    }
-
-    /// Frames in which a monitor's reading counts.
-    pub fn frames(&self, b: usize) -> &[usize] {
-        &self.channels[b].frames
+    /// True if a frame's reading of a monitor, or of a tune after the last of them, counts.
+    fn counts(&self, frame: usize, c: usize) -> bool {
+        let is_read = !self.frames.readings[(frame, c)].is_nan();
+        match c.checked_sub(self.monitors()) {
+            None => is_read && self.screened.accepted[(frame, c)],
+            Some(plane) => is_read && self.frames.tune_noise[plane].is_some(),
+        }
     }
 
     /// Noise of a reading by the recording's header, mean over the monitors [m].
@@ -567,20 +659,19 @@ impl Data {
         self.expected_noise.iter().sum::<f64>() / self.expected_noise.len().max(1) as f64
     }
 
-    /// Noise of one reading of a monitor that is its own [m], what it remembers, and the variance of a whole reading over that of its own.
-    pub fn noise_of(&self, b: usize) -> (f64, Memory, f64) {
-        (self.noise.own[b], self.noise.memory(b), self.noise.modes.growth(b))
+    /// True if a monitor's noise remembers the frames before.
+    pub fn remembers(&self, b: usize) -> bool {
+        !self.noise.memory(b).is_none()
     }
 
-    /// Frames in which a tune counts.
-    pub fn tune_frames(&self, plane: usize) -> Vec<usize> {
-        let counts = |&frame: &usize| self.meter[plane].is_some() && !self.tunes[(frame, plane)].is_nan();
-        (0..self.tunes.nrows()).filter(counts).collect()
+    /// `ln` of the determinant of what monitors have in common in some pools, in units of their own noise.
+    pub fn mixed_log_det(&self, pools: &[usize]) -> f64 {
+        pools.iter().map(|&pool| self.mixing.log_det_of(pool)).sum()
     }
 
     /// Noise of one reading of the tune meter [1], if there are enough readings.
     pub fn tune_noise(&self, plane: usize) -> Option<f64> {
-        self.meter[plane].as_ref().map(|meter| meter.noise)
+        self.frames.tune_noise[plane]
     }
 
     /// State of the monitors.
@@ -589,22 +680,12 @@ impl Data {
     }
 }
 
-impl Channel {
-    fn of(frames: Vec<usize>, sigma: f64, memory: Memory, shared: DMatrix<f64>) -> Self {
-        let Some(&first) = frames.first() else {
-            let (basis, shrink) = (DMatrix::zeros(0, 0), DVector::zeros(0));
-            return Self { frames, sigma, filter: None, basis, shrink, log_det: 0.0 };
-        };
-        let filter = (!memory.is_none()).then(|| Filter::of(memory, first, &frames));
-        let mut shared = shared / sigma;
-        filter.iter().for_each(|filter| filter.whiten_columns(&mut shared));
-        let svd = shared.svd(true, false);
-        let basis = svd.u.expect("asked for");
-        let grown = svd.singular_values.map(|d| 1.0 + d * d);
-        let log_det = 2.0 * frames.len() as f64 * sigma.ln() + grown.iter().map(|g| g.ln()).sum::<f64>();
-        let log_det = log_det + filter.as_ref().map_or(0.0, Filter::log_det);
-        Self { frames, sigma, filter, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
-    }
+/// Readings of monitors and, after them, tunes.
+fn beside(readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> DMatrix<f64> {
+    let monitors = readings.ncols();
+    let mut all = readings.clone().insert_columns(monitors, 2, 0.0);
+    all.columns_mut(monitors, 2).copy_from(tunes);
+    all
 }
 
 /// The noise, learnt from the readings about the machine that the screening ends with, or about the design where that keeps no beam.
@@ -612,17 +693,37 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<No
     let ring = &campaign.ring;
     let found = ring.with_strengths(&ring.strengths(campaign.params.as_slice(), &campaign.supplies));
     let found = Machine::new(found, Rf::FixedMomentum, &[]).ok();
-    let of = |machine: &Machine| -> Result<(DMatrix<f64>, DVector<f64>), OrbitError> {
+    let of = |machine: &Machine| -> Result<_, OrbitError> {
         let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
-        Ok((machine.readings(drives)?.0, optics.dispersion_of(&optics.read_monitors())))
+        let dispersion = optics.dispersion_of(&optics.read_monitors());
+        Ok((machine.readings(drives)?.0, dispersion, Shape::all(&optics, machine.ring())?))
     };
     let known = found.as_ref().and_then(|machine| of(machine).ok());
-    let (predicted, dispersion) = known.map_or_else(|| of(design), Ok)?;
+    let (predicted, dispersion, shapes) = known.map_or_else(|| of(design), Ok)?;
     let residual = &campaign.readings - predicted;
-    Ok(Noise::learn(&Source { campaign, residual: &residual, dispersion: &dispersion }))
+    Ok(Noise::learn(&Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes }))
 }
 
-fn drives_of(campaign: &Campaign) -> Drives {
+/// What the supplies' fluctuations off their means do to the kicked orbits and the tunes, to first order, rows frames, columns monitors [m] and
+/// the two tunes; `slopes`: by each quadrupole.
+pub(super) fn rippled(ring: &Ring, slopes: &[Signature], fluctuation: &DMatrix<f64>) -> DMatrix<f64> {
+    let monitors = ring.read_monitors.len();
+    let mut moved = DMatrix::zeros(fluctuation.nrows(), monitors + 2);
+    for (slope, quadrupole) in slopes.iter().zip(&ring.quadrupoles) {
+        let Some(supply) = quadrupole.supply else { continue };
+        let off = fluctuation.column(supply);
+        for (b, column) in slope.readings.column_iter().enumerate() {
+            let mut of_monitor = moved.column_mut(b);
+            of_monitor += off.component_mul(&column);
+        }
+        let mut of_tunes = moved.columns_mut(monitors, 2);
+        of_tunes += off * RowVector2::from(slope.tunes);
+    }
+    moved
+}
+
+/// What drove the beam, frame by frame, on a straight orbit.
+pub(super) fn drives_of(campaign: &Campaign) -> Drives {
     let driven = &campaign.drives;
     let rows: Vec<_> = driven.iter().map(|d| d.kick.transpose()).collect();
     Drives {

@@ -31,6 +31,8 @@ use super::settings::Settings;
 pub struct Discrepancy {
     /// The place.
     pub at: Location,
+    /// The recording that shows it.
+    pub campaign: usize,
     /// `ln` Bayes factor over the fit.
     pub log_bayes: f64,
     /// Most likely standard deviation of the amplitudes [m at the monitors].
@@ -100,10 +102,27 @@ struct Linearised<'f> {
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = fitted.data(data);
+    let mut all = Vec::new();
+    for campaign in 0..data.count() {
+        let of_one = scan_of(data, campaign, fitted)?;
+        // each recording has free amplitudes of its own
+        all.extend(of_one.into_iter().map(|one| Discrepancy { campaign, sites: one.sites * data.count(), ..one }));
+    }
+    Ok(all)
+}
+
+/// Every place in one of several recordings.
+fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
+    let data = all.campaign(campaign);
     let linearised = Linearised { fitted };
+    let rows = all.parts().swap_remove(campaign);
+    let own = Seen {
+        residual: fitted.residual.rows_range(rows.clone()).into_owned(),
+        jacobian: fitted.jacobian.rows_range(rows).into_owned(),
+    };
     let settings = Settings::of(&data.drives);
-    let monitors = data.readings.ncols();
-    let seen = Seen::of(data, fitted);
+    let monitors = data.monitors();
+    let seen = Seen::of(data, &own);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
     let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings, &sums[b])).collect();
     let stretches = stretches(data);
@@ -114,49 +133,51 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
     if active.is_empty() {
         return Ok(Vec::new());
     }
-    let (machine, drives) = fitted.machine(data)?;
-    let predicted = fitted.predicted(data)?;
-    let miss = data.miss(&predicted);
+    let (machine, drives) = fitted.machine_in(all, campaign)?;
+    let predicted = fitted.predicted_in(all, campaign)?;
     let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
-    let mut all = Vec::new();
+    let mut found = Vec::new();
     for &b in &active {
-        all.push(linearised.judge(Location::Monitor(b), &sums[b], active.len()));
-        all.push(linearised.judge(Location::MonitorInTime(b), &steps[b], active.len()));
+        found.push(linearised.judge(Location::Monitor(b), &sums[b], active.len()));
+        found.push(linearised.judge(Location::MonitorInTime(b), &steps[b], active.len()));
         let gains = data.sums(b, &seen, &scaled(&stretches, &predicted.column(b)));
-        all.push(linearised.judge(Location::GainInTime(b), &gains, active.len()));
+        found.push(linearised.judge(Location::GainInTime(b), &gains, active.len()));
         let orbit = signatures.around(b);
         let elsewhere = data.sums(b, &seen, &independent(orbit.clone()));
-        all.push(linearised.judge(Location::MonitorElsewhere(b), &elsewhere, active.len()));
+        found.push(linearised.judge(Location::MonitorElsewhere(b), &elsewhere, active.len()));
         let curve = data.sums(b, &seen, &independent(powers(&orbit.column(0))));
-        all.push(linearised.judge(Location::MonitorCurve(b), &curve, active.len()));
+        found.push(linearised.judge(Location::MonitorCurve(b), &curve, active.len()));
     }
     let driven = data.driven_correctors();
     for &c in &driven {
         let of_corrector = settings.of_corrector(c);
         let (of_each, apart): (Vec<Sums>, Vec<Apart>) =
             active.iter().map(|&b| (sums[b].select(&of_corrector), apart[b].select(&of_corrector))).unzip();
-        all.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
+        found.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
         let patterns = independent(signatures.beside(c));
         let beside = patterned(data, &sums, &active, &settings.strength(c), &patterns);
-        all.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
+        found.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;
     let sites = patterns.len();
     for (quadrupole, plane, pattern) in patterns {
-        all.push(linearised.judge(Location::Ring(quadrupole, plane), &weighted(data, &sums, &active, &pattern), sites));
+        found.push(linearised.judge(
+            Location::Ring(quadrupole, plane),
+            &weighted(data, &sums, &active, &pattern),
+            sites,
+        ));
     }
     let of_quadrupoles = signatures.of_quadrupoles();
     for (q, signature) in of_quadrupoles.iter().enumerate() {
-        let pattern = data.stepped(signature, fitted, &stretches, &active);
-        all.push(linearised.judge(Location::QuadrupoleInTime(q), &pattern, of_quadrupoles.len()));
+        let pattern = data.stepped(signature, &own, &stretches, &active);
+        found.push(linearised.judge(Location::QuadrupoleInTime(q), &pattern, of_quadrupoles.len()));
     }
-    let tunes: Vec<Sums> =
-        [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &miss, fitted, &stretches)).collect();
-    all.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
-    all.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
-    all.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
-    Ok(all)
+    let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
+    found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
+    found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
+    found.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
+    Ok(found)
 }
 
 fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {
@@ -257,7 +278,7 @@ impl Discrepancy {
             .enumerate()
             .fold((0, f64::NEG_INFINITY), |best, (i, &log)| if log > best.1 { (i, log) } else { best });
         let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
-        Self { at, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
+        Self { at, campaign: 0, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
     }
 }
 
@@ -275,7 +296,7 @@ fn log_det_of(factor: &Cholesky<f64, Dyn>) -> f64 {
     2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
 }
 
-/// Steps at the edges of the stretches of time: rows frames, columns edges.
+/// Steps at the edges of the stretches of time: rows pools, columns edges.
 fn stretches(data: &Data) -> DMatrix<f64> {
     let edge = |i: usize| -1.0 + 2.0 * (i + 1) as f64 / STRETCHES as f64;
     DMatrix::from_fn(data.readings.nrows(), STRETCHES - 1, |frame, i| {
@@ -357,10 +378,10 @@ fn patterned(data: &Data, sums: &[Sums], monitors: &[usize], setting: &DVector<f
 }
 
 impl Data {
-    /// Sums of a monitor's numbers over the columns of `indicator` (rows frames).
+    /// Sums of a monitor's numbers over the columns of `indicator` (rows pools).
     fn sums(&self, b: usize, seen: &Seen, indicator: &DMatrix<f64>) -> Sums {
         let whitened = self.whiten_columns(b, indicator);
-        let (start, n) = (self.start(b), self.frames(b).len());
+        let (start, n) = (self.start(b), whitened.nrows());
         let back = whitened.transpose();
         Sums {
             gram: &back * &whitened * self.own_share(b),
@@ -369,47 +390,29 @@ impl Data {
         }
     }
 
-    /// Sums of one tune's numbers over the columns of `indicator`, about its mean, in units that make its noise as large as
-    /// that of a monitor; none if the tune meter has too few readings.
-    fn tune_sums(&self, plane: usize, miss: &DMatrix<f64>, fitted: &Fitted, indicator: &DMatrix<f64>) -> Option<Sums> {
+    /// Sums of one tune's numbers over the columns of `indicator`, in units that make its noise as large as that of a monitor; none if the
+    /// tune meter has too few readings.
+    fn tune_sums(&self, plane: usize, seen: &Seen, indicator: &DMatrix<f64>) -> Option<Sums> {
         let noise = self.tune_noise(plane)?;
-        let miss = miss.column(self.readings.ncols() + plane);
-        let frames = self.tune_frames(plane);
-        let centred = |mut columns: DMatrix<f64>| {
-            columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
-            columns
-        };
-        let columns = centred(indicator.select_rows(&frames)) / self.mean_noise();
-        let miss = centred(DMatrix::from_fn(frames.len(), 1, |i, _| miss[frames[i]])) / noise;
-        Some(Sums {
-            gram: columns.tr_mul(&columns),
-            cross: DMatrix::zeros(columns.ncols(), fitted.jacobian.ncols()),
-            pull: columns.tr_mul(&miss).column(0).into_owned(),
-        })
+        Some(self.sums(self.monitors() + plane, seen, &(indicator * (noise / self.mean_noise()))))
     }
 
     /// A signature that sets in at each edge of time, scaled to an rms of 1 at the readings.
-    fn stepped(
-        &self,
-        signature: &twin::Signature,
-        fitted: &Fitted,
-        stretches: &DMatrix<f64>,
-        monitors: &[usize],
-    ) -> Sums {
+    fn stepped(&self, signature: &twin::Signature, own: &Seen, stretches: &DMatrix<f64>, monitors: &[usize]) -> Sums {
         let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
         let mut readings = DMatrix::zeros(signature.readings.nrows(), signature.readings.ncols());
         monitors.iter().for_each(|&b| readings.set_column(b, &(signature.readings.column(b) / rms)));
         let columns: Vec<DVector<f64>> = stretches.column_iter().map(|step| self.stepping(&readings, &step)).collect();
         let back = DMatrix::from_columns(&columns).transpose();
-        Sums { gram: &back * back.transpose(), cross: &back * &fitted.jacobian, pull: back * &fitted.residual }
+        Sums { gram: &back * back.transpose(), cross: &back * &own.jacobian, pull: back * &own.residual }
     }
 }
 
 impl Seen {
-    fn of(data: &Data, fitted: &Fitted) -> Self {
-        let residual = DMatrix::from_columns(core::slice::from_ref(&fitted.residual));
+    fn of(data: &Data, own: &Self) -> Self {
+        let residual = DMatrix::from_columns(core::slice::from_ref(&own.residual));
         let residual = data.taken_back(&residual).column(0).into_owned();
-        Self { residual, jacobian: data.taken_back(&fitted.jacobian) }
+        Self { residual, jacobian: data.taken_back(&own.jacobian) }
     }
 }
 
@@ -452,8 +455,7 @@ impl Sums {
 impl Apart {
     fn of(data: &Data, b: usize, settings: &Settings, sums: &Sums) -> Self {
         let (alone, common) = data.information(b, &settings.of_frame, settings.count());
-        let remembers = !data.noise_of(b).1.is_none();
-        Self { alone, common, whole: remembers.then(|| sums.gram.clone()) }
+        Self { alone, common, whole: data.remembers(b).then(|| sums.gram.clone()) }
     }
 
     /// Of some of the settings.
@@ -496,6 +498,10 @@ mod tests {
     use crate::hypothesis::Hypothesis;
     use crate::testing::{Coloured, template};
 
+    fn seen_of(data: &Data, fitted: &Fitted) -> Seen {
+        Seen::of(data, &Seen { residual: fitted.residual.clone(), jacobian: fitted.jacobian.clone() })
+    }
+
     #[test]
     fn the_evidence_taken_monitor_by_monitor_is_that_of_one_large_matrix() {
         let (ring, recording) = template();
@@ -503,7 +509,7 @@ mod tests {
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
         let (linearised, settings) = (Linearised { fitted: &fitted }, Settings::of(&data.drives));
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
-        let seen = Seen::of(&data, &fitted);
+        let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
         let each = sums.each_ref().map(|sums| sums.select(&some));
         let apart = [0, 1, 2].map(|i| Apart::of(&data, monitors[i], &settings, &sums[i]).select(&some));
@@ -527,9 +533,9 @@ mod tests {
         let data = Data::of(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
         assert!(data.noise.momentum.value > 0.0 && data.noise.crates.len() == 1 && !data.noise.slow.is_none());
         let fitted = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
-        let (linearised, seen) = (Linearised { fitted: &fitted }, Seen::of(&data, &fitted));
+        let (linearised, seen) = (Linearised { fitted: &fitted }, seen_of(&data, &fitted));
         let whole = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
-            let readings = DMatrix::from_fn(data.readings.nrows(), pattern.len(), |_, b| pattern[b]);
+            let readings = DMatrix::from_fn(data.pools.count, pattern.len(), |_, b| pattern[b]);
             let columns: Vec<DVector<f64>> = indicator.column_iter().map(|c| data.stepping(&readings, &c)).collect();
             let back = DMatrix::from_columns(&columns).transpose();
             Sums { gram: &back * back.transpose(), cross: &back * &fitted.jacobian, pull: back * &fitted.residual }
@@ -538,12 +544,12 @@ mod tests {
         let (monitors, mut largest) = (data.active_monitors(), 0.0_f64);
         let stretches = stretches(&data);
         for &b in &monitors {
-            let alone = DVector::from_fn(data.readings.ncols(), |i, _| f64::from(u8::from(i == b)));
+            let alone = DVector::from_fn(data.monitors(), |i, _| f64::from(u8::from(i == b)));
             let (near, exact) = (evidence(&data.sums(b, &seen, &stretches)), evidence(&whole(&alone, &stretches)));
             largest = largest.max((near - exact).abs());
         }
         let indicator = Settings::of(&data.drives).indicator();
-        let sums: Vec<Sums> = (0..data.readings.ncols()).map(|b| data.sums(b, &seen, &indicator)).collect();
+        let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
         let (machine, _) = fitted.machine(&data).unwrap();
         let mut of_patterns = 0.0_f64;
         for (_, _, pattern) in kicked(&machine).unwrap().into_iter().step_by(8) {

@@ -50,18 +50,24 @@ impl Menu {
     /// # Errors
     /// [`FitError`].
     pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
+        let of_recording = |campaign: usize| {
+            let (machine, drives) = fitted.machine_in(data, campaign)?;
+            let weight = data.momentum / data.campaign(campaign).momentum;
+            Derivatives::of(data.campaign(campaign), &machine, &drives, one.0, other, weight)
+        };
+        let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
         let (machine, drives) = fitted.machine(data)?;
-        let present = Derivatives::of(data, &machine, &drives, one.0, other, 1.0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
         for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is not proposed
             let Ok(new) = Derivatives::of(data, &machine, &drives, one.0, other, weight) else { continue };
-            proposals.push(Proposal { what, separation: separation(&[&present, &new], amplitude, free) });
+            let both: Vec<&Derivatives> = present.iter().chain([&new]).collect();
+            proposals.push(Proposal { what, separation: separation(&both, amplitude, free) });
         }
         proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
-        Ok(Self { present: separation(&[&present], amplitude, free), proposals })
+        Ok(Self { present: separation(&present.iter().collect::<Vec<_>>(), amplitude, free), proposals })
     }
 }
 

@@ -11,12 +11,12 @@
 use core::ops::{Mul, Sub};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::{Drives, EffectError, Machine, Signature, Signatures, Tunes};
+use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
 
 use super::data::Data;
 use super::error::FitError;
 use super::evidence::{Units, Within};
-use super::hypothesis::{Hypothesis, Term, Unknown};
+use super::hypothesis::{Hypothesis, Member, Term, Unknown};
 use super::ordinary::Family;
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
@@ -154,7 +154,7 @@ impl Fitted {
         let within = Within::of(&lower * lower.transpose(), &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let of_widths: f64 = problem.hypothesis.ordinary.iter().map(Family::log_prior).sum();
-        let log_evidence = -0.5 * (here.cost + log_det + data.log_det()) + log_inside + of_widths;
+        let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + of_widths;
         let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
         Ok(Self {
@@ -191,7 +191,7 @@ impl Fitted {
 
     /// `ln` posterior at the best point, up to a constant of the recording: the evidence without its determinant.
     pub fn log_posterior(&self, data: &Data) -> f64 {
-        -0.5 * (self.cost + self.data(data).log_det())
+        -0.5 * (self.cost + self.data(data).whole_log_det())
     }
 
     /// Amplitude and standard deviation of a term, the latter without the vars' range; (1, 0) for a switch, which has no amplitude.
@@ -230,20 +230,47 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn machine(&self, data: &Data) -> Result<(Machine, Drives), EffectError> {
-        self.hypothesis.machine(data, &self.params, &self.u.as_slice()[self.params.len()..])
+        self.machine_in(data, 0)
+    }
+
+    /// The same in one of several recordings.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+        self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
+    }
+
+    /// The machine in each recording.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn machines(&self, data: &Data) -> Result<Vec<Machine>, EffectError> {
+        (0..data.count()).map(|campaign| Ok(self.machine_in(data, campaign)?.0)).collect()
     }
 
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
     pub fn is_stable(&self, data: &Data) -> bool {
-        self.machine(data).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
+        let keeps = |campaign: usize| {
+            self.machine_in(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
+        };
+        (0..data.count()).all(keeps)
     }
 
-    /// Predictions at the best point, rows frames, columns monitors [m], then the two tunes [1].
+    /// Predictions at the best point, rows pools, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
     /// [`EffectError`].
     pub fn predicted(&self, data: &Data) -> Result<DMatrix<f64>, EffectError> {
-        Ok(self.predicted_at(data, &self.u)?.by_frame(&data.drives.time))
+        self.predicted_in(data, 0)
+    }
+
+    /// The same in one of several recordings.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
+        Ok(self.predicted_at(data, campaign, &self.u)?.by_frame(&data.campaign(campaign).drives.time))
     }
 
     /// Whitened residuals of some data at the best point of this fit, which may be of others.
@@ -251,18 +278,17 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn residual_of(&self, data: &Data) -> Result<DVector<f64>, EffectError> {
-        let Signature { readings, tunes: [x, y], tune_drift } = self.predicted_at(data, &self.u)?;
-        Ok(data.residual(&readings, Tunes { x, y }, tune_drift))
+        data.stacked(|campaign, own| Ok(own.residual(&self.predicted_at(data, campaign, &self.u)?)))
     }
 
-    fn predicted_at(&self, data: &Data, u: &DVector<f64>) -> Result<Signature, EffectError> {
+    fn predicted_at(&self, data: &Data, campaign: usize, u: &DVector<f64>) -> Result<Signature, EffectError> {
         let vars = self.params.len();
-        let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
-        let (readings, tunes, tune_drift) = machine.readings(&drives)?;
-        Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift })
+        let unknown = &u.as_slice()[vars..];
+        let (machine, drives) = self.hypothesis.machine_in(data, campaign, &data.units.params(u), unknown)?;
+        predicted(&machine, &drives)
     }
 
-    /// Derivative of the predictions with respect to every u.
+    /// Derivative of the predictions of the first recording with respect to every u.
     ///
     /// # Errors
     /// [`EffectError`].
@@ -275,12 +301,12 @@ impl Fitted {
         let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Ordinary(terms, width) => together(&signatures, terms)? * *width,
+                Unknown::Ordinary(member, width) => together(&signatures, member, |_| 1.0)? * *width,
                 _ => {
                     let at = |step: f64| {
                         let mut u = self.u.clone();
                         u[vars + i] += step;
-                        self.predicted_at(data, &u)
+                        self.predicted_at(data, 0, &u)
                     };
                     difference(at)?
                 }
@@ -296,7 +322,11 @@ impl Fitted {
     /// [`EffectError`].
     pub fn chi2_per_dof(&self, data: &Data) -> Result<f64, EffectError> {
         let data = self.data(data);
-        let (sum, degrees) = data.chi_square(&data.miss(&self.predicted(data)?));
+        let (mut sum, mut degrees) = (0.0, 0.0);
+        for (campaign, own) in data.campaigns().enumerate() {
+            let (chi2, freedom) = own.chi_square(&self.predicted_in(data, campaign)?);
+            (sum, degrees) = (sum + chi2, degrees + freedom);
+        }
         Ok(sum / (degrees - self.params.len() as f64))
     }
 
@@ -333,10 +363,9 @@ impl<'d> Problem<'d> {
         let unknowns = hypothesis.unknowns(data);
         let others = unknowns.iter().filter(|unknown| !unknown.is_ordinary()).count();
         let first = data.units.len() + others;
-        let (machine, drives) =
-            hypothesis.machine(data, &data.units.params(start), &start.as_slice()[data.units.len()..])?;
-        let ordinary =
-            Ordinary::about(data, &unknowns[others..], (&machine, &drives), start.rows_range(first..).into_owned())?;
+        let start_of_ordinary = start.rows_range(first..).into_owned();
+        let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
+        let ordinary = Ordinary::about(data, &unknowns[others..], machine, start_of_ordinary)?;
         Ok(Self { data, hypothesis, unknowns, ordinary })
     }
 
@@ -347,26 +376,25 @@ impl<'d> Problem<'d> {
 
     /// Whitened residuals.
     fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
-        let units = &self.data.units;
         let mut held = u.clone();
         held.rows_range_mut(self.others()..).copy_from(&self.ordinary.start);
-        let (machine, drives) =
-            self.hypothesis.machine(self.data, &units.params(u), &held.as_slice()[units.len()..])?;
-        let (readings, tunes, tune_drift) = machine.readings(&drives)?;
         let moved = u.rows_range(self.others()..) - &self.ordinary.start;
-        Ok(self.data.residual(&readings, tunes, tune_drift) - &self.ordinary.slopes * moved)
+        let left = self.data.stacked(|campaign, own| {
+            let (machine, drives) = machine_at(self.data, self.hypothesis, campaign, &held)?;
+            Ok::<_, EffectError>(own.residual(&predicted(&machine, &drives)?))
+        })?;
+        Ok(left - &self.ordinary.slopes * moved)
     }
 
     /// Derivative of the predicted numbers with respect to the others.
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
-        let (machine, drives) = self.hypothesis.machine(data, &data.units.params(u), &u.as_slice()[vars..])?;
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, &drives)?;
-        let mut jacobian = DMatrix::zeros(data.size(), self.others());
-        for (i, signature) in signatures.of_vars().iter().enumerate() {
-            jacobian.set_column(i, &(data.signature(signature) * data.units.sigma[i]));
-        }
+        let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
+            let (machine, drives) = machine_at(data, self.hypothesis, campaign, u)?;
+            let machine = machine.on_orbit(&drives.orbit);
+            let of_vars = Signatures::of(&machine, &drives)?.of_vars().into_iter().zip(&data.units.sigma);
+            Ok::<_, EffectError>(of_vars.map(|(signature, sigma)| own.signature(&signature) * *sigma).collect())
+        })?;
         for i in vars..self.others() {
             let at = |step: f64| {
                 let mut u = u.clone();
@@ -384,17 +412,22 @@ impl Ordinary {
     fn about(
         data: &Data,
         unknowns: &[Unknown],
-        (machine, drives): (&Machine, &Drives),
+        machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
         start: DVector<f64>,
     ) -> Result<Self, EffectError> {
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, drives)?;
-        let mut slopes = DMatrix::zeros(data.size(), unknowns.len());
-        for (mut column, unknown) in slopes.column_iter_mut().zip(unknowns) {
-            if let Unknown::Ordinary(terms, width) = unknown {
-                column.copy_from(&(data.signature(&together(&signatures, terms)?) * *width));
-            }
-        }
+        let slopes = data.stacked_columns(unknowns.len(), |campaign, own| {
+            let (machine, drives) = machine(campaign)?;
+            let machine = machine.on_orbit(&drives.orbit);
+            let signatures = Signatures::of(&machine, &drives)?;
+            let column = |unknown: &Unknown| match unknown {
+                Unknown::Ordinary(member, width) if member.is_in(campaign) => {
+                    let scale = |kind| data.scale(campaign, kind);
+                    Ok(own.signature(&together(&signatures, member, scale)?) * *width)
+                }
+                _ => Ok(DVector::zeros(own.size())),
+            };
+            unknowns.iter().map(column).collect::<Result<Vec<_>, EffectError>>()
+        })?;
         let gram = slopes.transpose() * &slopes;
         Ok(Self { start, slopes, gram })
     }
@@ -408,9 +441,32 @@ impl Ordinary {
     }
 }
 
-/// The sum of the signatures of some effects.
-fn together(signatures: &Signatures, terms: &[Term]) -> Result<Signature, EffectError> {
-    let mut of_each = terms.iter().map(|term| signatures.of_effect(term.kind, term.site));
+/// The machine of a recording at some unknowns, the vars first, and its drives.
+fn machine_at(
+    data: &Data,
+    hypothesis: &Hypothesis,
+    campaign: usize,
+    u: &DVector<f64>,
+) -> Result<(Machine, Drives), EffectError> {
+    hypothesis.machine_in(data, campaign, &data.units.params(u), &u.as_slice()[data.units.len()..])
+}
+
+/// What a machine predicts.
+fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
+    let (readings, tunes, tune_drift) = machine.readings(drives)?;
+    Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift })
+}
+
+/// The sum of the signatures of effects that share an amplitude, each by the scale of its kind.
+fn together(
+    signatures: &Signatures,
+    member: &Member,
+    scale: impl Fn(EffectKind) -> f64,
+) -> Result<Signature, EffectError> {
+    let signature = |term: &Term| -> Result<Signature, EffectError> {
+        Ok(signatures.of_effect(term.kind, term.site)? * scale(term.kind))
+    };
+    let mut of_each = member.terms.iter().map(signature);
     let first = of_each.next().expect("a family has members")?;
     of_each.try_fold(first, |mut sum, one| {
         sum += one?;

@@ -1,120 +1,102 @@
-//! Held-out frames: how well a hypothesis predicts frames that it was not fitted to.
+//! Held-out readings: how well a hypothesis predicts what it was not fitted to.
 //!
-//! Frames are left out in folds, a frame never split: one repeat of every setting, or all frames of some correctors. The
-//! hypothesis is fitted to the rest, by one Gauss-Newton step from its fit to all frames, and each left-out reading `z`, of a monitor or of
-//! the tune meter, has a normal density: the mean is the prediction `h` plus the common terms of that instrument (baseline, calibration and the
-//! like, `U`) as estimated from its kept readings with covariance `C`,
+//! Whole pools of frames are left out in blocks, all monitors and tunes of each: every pool in turn, which the other pools of its
+//! corrector and all others predict, or all pools of a corrector. With everything linear about the fit to all pools, `T` the whitening,
+//! `J` the derivative and `N = 1 + J^T J`, the precision of all readings, the unknowns being integrated out, is `K = T^T (1 - J N^-1 J^T) T`,
+//! and the density of a block F given all others is exactly that of
 //!
-//! `var = sigma^2 + u C u + d cov d`, `C = (1 + U^T U/sigma^2)^-1`, `d` the derivative of `h`, less its projection on the common terms.
+//! `e = K_FF^-1 (T^T r)_F`, the readings less those that the others predict, normal with the covariance `K_FF^-1`,
 //!
-//! Where noise remembers the frames before, what the kept frames say of it in the left-out ones is taken off `z`, `u` and `d`, and `sigma^2` is
-//! the variance that is left (`memory.rs`). What monitors have in common within a frame adds to that variance; that one
-//! left-out reading tells of another in the same frame is not counted.
+//! `r` being the whitened residuals of the fit: no fit needs to be repeated, and readings that share a momentum's jitter, a crate's noise or
+//! a baseline are predicted together. The density is split into those of single readings, each given those after it in the block.
 //!
 //! The sum of the log densities is the expected log predictive density (elpd); a difference of two hypotheses has the
-//! standard error of its mean over readings: given the model they are independent, also within a frame, and an effect of one corrector
-//! has few frames and many readings.
+//! standard error of its mean over these: given the model they are independent, also within a frame, and an effect of one corrector
+//! has few pools and many readings.
 //!
-//! Source: A. Vehtari, A. Gelman and J. Gabry, Stat. Comput. 27 (2017) 1413, eq. 4 and 23.
-
-use std::collections::BTreeMap;
+//! Source: A. Vehtari, A. Gelman and J. Gabry, Stat. Comput. 27 (2017) 1413, eq. 4 and 23; S. Sundararajan and S. S. Keerthi, Neural
+//! Comput. 13 (2001) 1103, eq. 10, what is left out of a Gaussian process.
 
 use estimator::MonitorState;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twin::Signature;
 
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Hypothesis;
-use super::memory::{Filter, Interpolation, Memory};
-use inference::campaign::Settings;
-use inference::campaign::TUNE_CALIBRATION;
-use inference::recording::Recording;
+use super::hypothesis::{Hypothesis, Term};
+use super::scan::{Projection, SignatureScore, signatures};
+use super::settings::Settings;
 
-/// Frames that are left out together.
-pub type Fold = Vec<usize>;
+/// Pools that are left out together, counted through all recordings.
+pub type Block = Vec<usize>;
 
-/// Number of standard errors by which the prediction of held-out frames has to improve.
+/// Number of standard errors by which the prediction of held-out readings has to improve.
 pub const VALIDATED: f64 = 2.0;
-/// Folds at most.
-const FOLDS: usize = 5;
 
-/// One repeat of every setting in each fold.
-pub fn by_repeat(settings: &Settings) -> Vec<Fold> {
-    let mut seen: BTreeMap<_, (usize, usize)> = BTreeMap::new();
-    let mut folds = vec![Fold::new(); FOLDS];
-    for (i, setting) in settings.of_frame.iter().enumerate() {
-        let known = seen.len();
-        // a frame of no setting is one without repeats
-        let (setting, repeat) = seen.entry(setting.ok_or(i)).or_insert((known, 0));
-        // settings begin in different folds, so that those without repeats are spread over all folds
-        folds[(*setting + *repeat) % FOLDS].push(i);
-        *repeat += 1;
-    }
-    folds.retain(|fold| !fold.is_empty());
-    folds
+/// Every pool by itself.
+pub fn by_pool(data: &Data) -> Vec<Block> {
+    (0..pools_of(data)).map(|pool| vec![pool]).collect()
 }
 
-/// All frames of every fifth corrector in each fold; frames in which several are set go with the first of them. None of a
-/// recording that names no correctors.
-pub fn by_corrector(recording: &Recording) -> Vec<Fold> {
-    let mut order: Vec<usize> = Vec::new();
-    let mut folds = vec![Fold::new(); FOLDS];
-    for (i, row) in recording.rows.iter().enumerate() {
-        let Some(&(corrector, _)) = row.correctors.first() else { continue };
-        let at = order.iter().position(|known| *known == corrector).unwrap_or_else(|| {
-            order.push(corrector);
-            order.len() - 1
-        });
-        folds[at % FOLDS].push(i);
+/// All pools in which a corrector is powered most, of each that is.
+pub fn by_corrector(data: &Data) -> Vec<Block> {
+    let mut blocks = vec![Block::new(); data.drives.kick.ncols()];
+    for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
+        let settings = Settings::of(&own.drives);
+        for pool in 0..own.pools.count {
+            if let Some((corrector, _)) = settings.kick(pool) {
+                blocks[corrector].push(pools.start + pool);
+            }
+        }
     }
-    folds.retain(|fold| !fold.is_empty());
-    folds
+    blocks.retain(|block| !block.is_empty());
+    blocks
+}
+
+/// Pools of all recordings.
+fn pools_of(data: &Data) -> usize {
+    data.campaigns().map(|own| own.pools.count).sum()
 }
 
 /// The held-out predictions of a hypothesis, scored.
 #[derive(Debug, Clone)]
 pub struct Score {
-    /// Log density of each reading, rows frames, columns monitors and the two tunes; 0 for one that does not count.
-    pub log_density: DMatrix<f64>,
-    /// Readings of monitors and of the tune meter.
-    pub readings: usize,
-    /// Rms of measured minus predicted, monitors in state ok [m].
+    /// Log density of each reading, block by block.
+    pub log_density: Vec<f64>,
+    /// Rms of measured minus predicted means of pools, monitors in state ok [m].
     pub rms: f64,
-    /// Fraction of readings within the central 68.3 % and 95.4 % of their density.
+    /// Fraction of readings within one and two standard deviations of their density.
     pub inside: [f64; 2],
 }
 
 impl Score {
-    /// Score a hypothesis that has been fitted to all frames.
+    /// Score a hypothesis that has been fitted to all pools.
     ///
     /// # Errors
-    /// [`FitError`].
-    pub fn of(data: &Data, fitted: &Fitted, folds: &[Fold]) -> Result<Self, FitError> {
-        let monitors = data.readings.ncols();
-        let log_density = DMatrix::zeros(data.readings.nrows(), monitors + 2);
-        let mut score = Self { log_density, readings: 0, rms: 0.0, inside: [0.0; 2] };
-        let (mut squares, mut plain) = (0.0, 0usize);
+    /// [`FitError::Degenerate`].
+    pub fn of(data: &Data, fitted: &Fitted, blocks: &[Block]) -> Result<Self, FitError> {
         let data = fitted.data(data);
-        let linear = Linear::of(data, fitted)?;
-        for fold in folds {
-            for left in linear.predict(data, fold)? {
-                let z = left.innovation / left.variance.sqrt();
-                score.log_density[(left.frame, left.column)] -=
-                    0.5 * (z * z + (core::f64::consts::TAU * left.variance).ln());
-                score.readings += 1;
-                score.inside[0] += f64::from(u8::from(z.abs() < 1.0));
-                score.inside[1] += f64::from(u8::from(z.abs() < 2.0));
-                if left.column < monitors && data.health()[left.column].state == MonitorState::Ok {
+        let precision = Precision::of(data, fitted);
+        let (mut log_density, mut inside) = (Vec::new(), [0.0; 2]);
+        let (mut squares, mut ok) = (0.0, 0usize);
+        for block in blocks {
+            for left in precision.left_out(block)? {
+                log_density.push(left.log_density);
+                inside[0] += f64::from(u8::from(left.pull.abs() < 1.0));
+                inside[1] += f64::from(u8::from(left.pull.abs() < 2.0));
+                if precision.channels[left.channel].is_ok {
                     squares += left.innovation.powi(2);
-                    plain += 1;
+                    ok += 1;
                 }
             }
         }
-        score.rms = (squares / plain.max(1) as f64).sqrt();
-        score.inside = score.inside.map(|n| n / score.readings.max(1) as f64);
-        Ok(score)
+        let n = log_density.len().max(1) as f64;
+        Ok(Self { log_density, rms: (squares / ok.max(1) as f64).sqrt(), inside: inside.map(|count| count / n) })
+    }
+
+    /// Readings of monitors and of the tune meter: means of pools.
+    pub fn readings(&self) -> usize {
+        self.log_density.len()
     }
 
     /// Expected log predictive density.
@@ -124,8 +106,7 @@ impl Score {
 
     /// Gain over another, and its standard error.
     pub fn gain_over(&self, other: &Self) -> (f64, f64) {
-        let pairs = self.log_density.iter().zip(&other.log_density);
-        let gains: Vec<f64> = pairs.filter(|(one, _)| **one != 0.0).map(|(one, other)| one - other).collect();
+        let gains: Vec<f64> = self.log_density.iter().zip(&other.log_density).map(|(one, other)| one - other).collect();
         let n = gains.len() as f64;
         let gain: f64 = gains.iter().sum();
         let spread: f64 = gains.iter().map(|g| (g - gain / n).powi(2)).sum();
@@ -134,143 +115,184 @@ impl Score {
 }
 
 /// One reading that was left out.
-struct Left {
-    frame: usize,
-    column: usize,
+struct LeftOut {
+    channel: usize,
+    log_density: f64,
+    /// Measured less predicted, and the same over its standard deviation given the readings after it.
     innovation: f64,
-    variance: f64,
+    pull: f64,
 }
 
-/// One column of a frame, a monitor or a tune: kept frames, left-out ones, noise and what it remembers, and the common terms of their
-/// readings, in standard deviations.
-struct Column {
-    index: usize,
-    kept: Vec<usize>,
-    out: Vec<usize>,
+/// The precision of all readings, in units of their noise.
+struct Precision<'d> {
+    data: &'d Data,
+    fitted: &'d Fitted,
+    channels: Vec<OfChannel>,
+}
+
+/// `T^T`, `T^T T`, `T^T J` and `T^T r` of one channel of a recording.
+struct OfChannel {
+    /// Pool of each row, counted through all recordings.
+    pools: Vec<usize>,
+    /// First of its rows among those of all.
+    start: usize,
     sigma: f64,
-    memory: Memory,
-    shared: [DMatrix<f64>; 2],
+    /// True of a monitor in state ok.
+    is_ok: bool,
+    back: DMatrix<f64>,
+    gram: DMatrix<f64>,
+    cross: DMatrix<f64>,
+    pull: DVector<f64>,
 }
 
-/// What its noise is to be expected to be in the left-out frames.
-struct Expectation {
-    sigma: f64,
-    known: Option<(Filter, Interpolation)>,
-    /// Variance of each left-out frame's noise about that, in units of `sigma`'s.
-    variances: Vec<f64>,
-}
-
-impl Expectation {
-    fn of(column: &Column) -> Self {
-        let Column { kept, out, sigma, memory, .. } = column;
-        let origin = kept.iter().chain(out).copied().min().unwrap_or(0);
-        let remembers = !memory.is_none();
-        let known =
-            remembers.then(|| (Filter::of(*memory, origin, kept), Interpolation::of(*memory, origin, kept, out)));
-        let variances = known.as_ref().map_or_else(|| vec![1.0; out.len()], |(_, at)| at.variances(*memory));
-        Self { sigma: *sigma, known, variances }
-    }
-
-    /// Rows of the kept and of the left-out frames, both in units of `sigma`: the first whitened, the others less what is to be
-    /// expected of them.
-    fn apart(&self, kept: DMatrix<f64>, out: DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
-        let (mut kept, mut out) = (kept / self.sigma, out / self.sigma);
-        if let Some((filter, interpolation)) = &self.known {
-            out -= interpolation.expected(&kept);
-            filter.whiten_columns(&mut kept);
-        }
-        (kept, out)
-    }
-}
-
-/// All of them of which readings are left out.
-fn columns(all: &Data, kept: &Data, fold: &Fold) -> Vec<Column> {
-    let monitor = |b: usize| {
-        let out: Vec<usize> = fold.iter().copied().filter(|&i| all.counts(i, b)).collect();
-        let shared = [kept.shared(b, kept.frames(b)), kept.shared(b, &out)];
-        let (own, memory, growth) = kept.noise_of(b);
-        Column { index: b, kept: kept.frames(b).to_vec(), out, sigma: own * growth.sqrt(), memory, shared }
-    };
-    let tune = |plane: usize| {
-        let noise = kept.tune_noise(plane)?;
-        let out: Vec<usize> = all.tune_frames(plane).into_iter().filter(|i| fold.contains(i)).collect();
-        let kept = kept.tune_frames(plane);
-        let shared = [kept.len(), out.len()].map(|n| DMatrix::from_element(n, 1, TUNE_CALIBRATION));
-        Some(Column { index: all.readings.ncols() + plane, kept, out, sigma: noise, memory: Memory::NONE, shared })
-    };
-    let monitors = all.active_monitors().into_iter().map(monitor);
-    monitors.chain([0, 1].into_iter().filter_map(tune)).filter(|column| !column.out.is_empty()).collect()
-}
-
-/// A fit to all frames, linearised.
-struct Linear<'f> {
-    fitted: &'f Fitted,
-    /// Derivatives of the predictions with respect to every u.
-    slopes: Vec<Signature>,
-    /// The same, columns monitors and tunes, rows frames.
-    by_frame: Vec<DMatrix<f64>>,
-    /// Readings and tunes less those predicted.
-    miss: DMatrix<f64>,
-}
-
-impl<'f> Linear<'f> {
-    fn of(data: &Data, fitted: &'f Fitted) -> Result<Self, FitError> {
-        let slopes = fitted.slopes(data)?;
-        let by_frame = slopes.iter().map(|slope| slope.clone().by_frame(&data.drives.time)).collect();
-        Ok(Self { fitted, miss: data.miss(&fitted.predicted(data)?), slopes, by_frame })
-    }
-
-    /// The step from the fit to all frames to that to the kept ones, and the factor of the latter's precision.
-    fn step(&self, kept: &Data) -> Result<(DVector<f64>, Cholesky<f64, Dyn>), FitError> {
-        let columns: Vec<DVector<f64>> = self.slopes.iter().map(|slope| kept.signature(slope)).collect();
-        let jacobian = DMatrix::from_columns(&columns);
-        let back = jacobian.transpose();
-        let normal = DMatrix::identity(columns.len(), columns.len()) + &back * jacobian;
-        let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
-        let slope = back * self.fitted.residual_of(kept)? - &self.fitted.u;
-        Ok((factor.solve(&slope), factor))
-    }
-
-    /// Predict the left-out readings by a fit to the kept ones.
-    fn predict(&self, all: &Data, fold: &Fold) -> Result<Vec<Left>, FitError> {
-        let kept = &all.without(fold);
-        let (step, factor) = self.step(kept)?;
-        let mut left = Vec::new();
-        for column in columns(all, kept, fold) {
-            let at = column.index;
-            let expectation = Expectation::of(&column);
-            let rows =
-                |frames: &[usize]| DMatrix::from_fn(frames.len(), step.len(), |i, p| self.by_frame[p][(frames[i], at)]);
-            let miss = |frames: &[usize]| DMatrix::from_fn(frames.len(), 1, |i, _| self.miss[(frames[i], at)]);
-            let Column { kept, out, shared: [u_in, u_out], .. } = &column;
-            let (u_in, u_out) = expectation.apart(u_in.clone(), u_out.clone());
-            let (slopes_in, slopes_out) = expectation.apart(rows(kept), rows(out));
-            let (known, left_out) = expectation.apart(miss(kept), miss(out));
-            let (known, left_out) = (known - &slopes_in * &step, left_out - &slopes_out * &step);
-            let mut normal = u_in.tr_mul(&u_in);
-            (0..normal.ncols()).for_each(|i| normal[(i, i)] += 1.0);
-            let Some(normal) = normal.cholesky() else { continue };
-            // the factors of the common terms, fitted to the kept readings: of the residual and of each derivative
-            let innovation = left_out - &u_out * normal.solve(&u_in.tr_mul(&known));
-            let d = slopes_out - &u_out * normal.solve(&(u_in.transpose() * slopes_in));
-            let lower = |factor: &Cholesky<f64, Dyn>, rows: &DMatrix<f64>| {
-                factor.l_dirty().solve_lower_triangular(&rows.transpose()).unwrap_or_else(|| rows.transpose() * 0.0)
-            };
-            let (unknown, params) = (lower(&normal, &u_out), lower(&factor, &d));
-            for (i, &frame) in out.iter().enumerate() {
-                let noise = expectation.variances[i];
-                let variance = noise + unknown.column(i).norm_squared() + params.column(i).norm_squared();
-                let sigma = expectation.sigma;
-                left.push(Left {
-                    frame,
-                    column: at,
-                    innovation: innovation[i] * sigma,
-                    variance: variance * sigma * sigma,
+impl<'d> Precision<'d> {
+    fn of(data: &'d Data, fitted: &'d Fitted) -> Self {
+        let mut start = 0;
+        let mut channels = Vec::new();
+        for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
+            for (c, channel) in own.channels().iter().enumerate() {
+                let n = channel.rows.len();
+                let back = channel.whiten(DMatrix::identity(n, n)).transpose();
+                let (jacobian, residual) = (fitted.jacobian.rows(start, n), fitted.residual.rows(start, n));
+                channels.push(OfChannel {
+                    pools: channel.rows.iter().map(|pool| pools.start + pool).collect(),
+                    start,
+                    sigma: channel.sigma,
+                    is_ok: own.health().get(c).is_some_and(|one| one.state == MonitorState::Ok),
+                    gram: &back * back.transpose(),
+                    cross: &back * jacobian,
+                    pull: &back * residual,
+                    back,
                 });
+                start += n;
             }
         }
-        Ok(left)
+        Self { channels, data, fitted }
     }
+
+    /// The readings of a block: channel, and row in the channel.
+    fn readings(&self, block: &Block) -> Vec<(usize, usize)> {
+        let rows = |(c, channel): (usize, &OfChannel)| {
+            let of_pool = |pool: &usize| channel.pools.binary_search(pool).ok().map(|row| (c, row));
+            block.iter().filter_map(of_pool).collect::<Vec<_>>()
+        };
+        self.channels.iter().enumerate().flat_map(rows).collect()
+    }
+
+    /// Factor of `K_FF` of some readings, and `(T^T r)_F`.
+    fn of_readings(&self, readings: &[(usize, usize)]) -> Result<(Cholesky<f64, Dyn>, DVector<f64>), FitError> {
+        let n = readings.len();
+        let mut cross = DMatrix::zeros(self.fitted.u.len(), n);
+        for (mut column, &(c, row)) in cross.column_iter_mut().zip(readings) {
+            column.tr_copy_from(&self.channels[c].cross.row(row));
+        }
+        let taken = self.fitted.factor.l_dirty().solve_lower_triangular(&cross).ok_or(FitError::Degenerate)?;
+        let mut precision = -taken.tr_mul(&taken);
+        for (i, &(c, row)) in readings.iter().enumerate() {
+            for (j, &(_, other)) in readings.iter().enumerate().filter(|(_, (of, _))| *of == c) {
+                precision[(i, j)] += self.channels[c].gram[(row, other)];
+            }
+        }
+        let pull = DVector::from_iterator(n, readings.iter().map(|&(c, row)| self.channels[c].pull[row]));
+        Ok((precision.cholesky().ok_or(FitError::Degenerate)?, pull))
+    }
+
+    /// Whitened signatures, one a column, less what the fit absorbs of them, as they stand beside `T^T r`.
+    fn back(&self, signatures: &DMatrix<f64>) -> DMatrix<f64> {
+        let taken = self.fitted.factor.solve(&self.fitted.jacobian.tr_mul(signatures));
+        let mut back = signatures - &self.fitted.jacobian * taken;
+        for channel in &self.channels {
+            let (start, n) = (channel.start, channel.pools.len());
+            let part = &channel.back * back.rows(start, n);
+            back.rows_mut(start, n).copy_from(&part);
+        }
+        back
+    }
+
+    /// What a block's readings say of some signatures beside what all readings say: of each the part of its pull `d P r` and of its power
+    /// `d P d` that goes with the block. `back` as from [`Precision::back`].
+    fn shares(&self, back: &DMatrix<f64>, block: &Block) -> Result<Vec<SignatureScore>, FitError> {
+        let readings = self.readings(block);
+        let (factor, pull) = self.of_readings(&readings)?;
+        let rows: Vec<usize> = readings.iter().map(|&(c, row)| self.channels[c].start + row).collect();
+        let solved = |columns: &DMatrix<f64>| factor.l_dirty().solve_lower_triangular(columns);
+        let signatures = solved(&back.select_rows(&rows)).ok_or(FitError::Degenerate)?;
+        let pull = factor.l_dirty().solve_lower_triangular(&pull).ok_or(FitError::Degenerate)?;
+        let share =
+            |one: nalgebra::DVectorView<f64>| SignatureScore { pull: one.dot(&pull), power: one.norm_squared() };
+        Ok(signatures.column_iter().map(share).collect())
+    }
+
+    /// `ln` of the determinant of what monitors have in common in a block's pools.
+    fn mixed_log_det(&self, block: &Block) -> f64 {
+        let of_each = self.data.campaigns().zip(self.data.pools_of_each()).map(|(own, pools)| {
+            let inside: Vec<usize> = block.iter().filter_map(|pool| pool.checked_sub(pools.start)).collect();
+            let inside: Vec<usize> = inside.into_iter().filter(|pool| *pool < own.pools.count).collect();
+            own.mixed_log_det(&inside)
+        });
+        of_each.sum()
+    }
+
+    fn left_out(&self, block: &Block) -> Result<Vec<LeftOut>, FitError> {
+        let readings = self.readings(block);
+        let n = readings.len();
+        let (factor, pull) = self.of_readings(&readings)?;
+        let innovation = factor.solve(&pull);
+        let pulls = factor.l_dirty().solve_lower_triangular(&pull).ok_or(FitError::Degenerate)?;
+        let mixed = self.mixed_log_det(block) / n.max(1) as f64;
+        let one = |(i, &(channel, _)): (usize, &(usize, usize))| {
+            let sigma = self.channels[channel].sigma;
+            let scale = factor.l_dirty()[(i, i)] / sigma;
+            let log_density = scale.ln() - 0.5 * (pulls[i].powi(2) + core::f64::consts::TAU.ln() + mixed);
+            LeftOut { channel, log_density, innovation: innovation[i] * sigma, pull: pulls[i] }
+        };
+        Ok(readings.iter().enumerate().map(one).collect())
+    }
+}
+
+/// Folds of pools from which the choice of an effect is left out.
+const FOLDS: usize = 5;
+
+/// Gain of held-out log density where not only the amplitude but kind and place too are chosen without the held-out pools: each of five
+/// folds is predicted by all of some terms and by none of them, each with the weight that the other folds give it, to first order about a
+/// fit without any. What was chosen by chance has less than nothing.
+/// `penalty`: of each term the `ln` Bayes factor that pays for the search.
+///
+/// With the score `B = (d P r)^2/(1 + d P d)/2 - ln(1 + d P d)/2` of a term by all pools and `B_kept` by those outside the fold, the fold's density given
+/// the others is larger by `exp(B - B_kept)` with the term than without; the mixture gains
+///
+/// `ln(1 + sum of exp(B - penalty)) - ln(1 + sum of exp(B_kept - penalty))`.
+///
+/// # Errors
+/// [`FitError`].
+pub fn gain_of_choice(data: &Data, without: &Fitted, terms: &[Term], penalty: &[f64]) -> Result<f64, FitError> {
+    let columns = signatures(data, without, terms)?;
+    let data = without.data(data);
+    let precision = Precision::of(data, without);
+    let back = precision.back(&columns);
+    let all = Projection::of(without).score(columns).scores;
+    // ln of the weight of any term over that of none
+    let odds = |scores: &mut dyn Iterator<Item = SignatureScore>| {
+        let weights = scores
+            .zip(terms)
+            .zip(penalty)
+            .map(|((score, term), penalty)| score.log_bayes(term.kind.is_switch()) - penalty);
+        let weights: Vec<f64> = weights.chain([0.0]).collect();
+        let largest = weights.iter().copied().fold(0.0, f64::max);
+        largest + weights.iter().map(|weight| (weight - largest).exp()).sum::<f64>().ln()
+    };
+    let by_all = odds(&mut all.iter().copied());
+    let mut gain = 0.0;
+    for fold in 0..FOLDS {
+        let block: Block = (fold..pools_of(data)).step_by(FOLDS).collect();
+        let shares = precision.shares(&back, &block)?;
+        let kept = |(all, share): (&SignatureScore, &SignatureScore)| SignatureScore {
+            pull: all.pull - share.pull,
+            power: (all.power - share.power).max(0.0),
+        };
+        gain += by_all - odds(&mut all.iter().zip(&shares).map(kept));
+    }
+    Ok(gain)
 }
 
 /// The same fit without its effects, what is ordinary being of the same size.

@@ -30,10 +30,26 @@ pub struct Hypothesis {
 pub enum Unknown {
     /// The amplitude of a term.
     Amplitude(usize, f64),
-    /// The orbit at an element, in x or y [m].
-    Orbit(usize, Plane, f64),
-    /// One ordinary imperfection, of all effects that share it.
-    Ordinary(Vec<Term>, f64),
+    /// The orbit of a recording at an element, in x or y [m].
+    Orbit(usize, usize, Plane, f64),
+    /// One ordinary imperfection.
+    Ordinary(Member, f64),
+}
+
+/// Effects that share an amplitude.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Member {
+    /// The effects.
+    pub terms: Vec<Term>,
+    /// The recording in which they have it; none if they have it in all.
+    pub campaign: Option<usize>,
+}
+
+impl Member {
+    /// True if it acts in a recording.
+    pub fn is_in(&self, campaign: usize) -> bool {
+        self.campaign.is_none_or(|own| own == campaign)
+    }
 }
 
 /// What an unknown is the amplitude of, whatever its width.
@@ -41,10 +57,10 @@ pub enum Unknown {
 pub enum Identity<'u> {
     /// A term.
     Amplitude(Term),
-    /// The orbit at an element.
-    Orbit(usize, Plane),
+    /// The orbit of a recording at an element.
+    Orbit(usize, usize, Plane),
     /// An ordinary imperfection.
-    Ordinary(&'u [Term]),
+    Ordinary(&'u Member),
 }
 
 impl Unknown {
@@ -56,7 +72,7 @@ impl Unknown {
     /// Its prior standard deviation.
     pub fn sigma(&self) -> f64 {
         match self {
-            Self::Amplitude(_, sigma) | Self::Orbit(_, _, sigma) | Self::Ordinary(_, sigma) => *sigma,
+            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Ordinary(_, sigma) => *sigma,
         }
     }
 
@@ -64,8 +80,8 @@ impl Unknown {
     pub fn is_of<'u>(&'u self, hypothesis: &Hypothesis) -> Identity<'u> {
         match self {
             Self::Amplitude(i, _) => Identity::Amplitude(hypothesis.terms[*i]),
-            Self::Orbit(element, plane, _) => Identity::Orbit(*element, *plane),
-            Self::Ordinary(terms, _) => Identity::Ordinary(terms),
+            Self::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
+            Self::Ordinary(member, _) => Identity::Ordinary(member),
         }
     }
 }
@@ -131,15 +147,17 @@ impl Hypothesis {
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {
             let amplitude = term.kind.prior_scale().map(|scale| Unknown::Amplitude(i, scale));
-            let orbit =
-                term.kind.orbit(&data.ring, term.site).into_iter().map(|(element, plane)| {
-                    Unknown::Orbit(element, plane, data.baseline.sigma[element][plane.index()])
-                });
+            let seen = term.kind.orbit(&data.ring, term.site);
+            let orbit = data.campaigns().enumerate().flat_map(|(campaign, own)| {
+                seen.iter().map(move |&(element, plane)| {
+                    Unknown::Orbit(campaign, element, plane, own.baseline.sigma[element][plane.index()])
+                })
+            });
             amplitude.into_iter().chain(orbit).collect::<Vec<_>>()
         };
         let of_family = |family: &Family| {
             let width = family.width;
-            family.members(data).into_iter().map(move |terms| Unknown::Ordinary(terms, width))
+            family.members(data).into_iter().map(move |member| Unknown::Ordinary(member, width))
         };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
         terms.chain(self.ordinary.iter().flat_map(of_family)).collect()
@@ -150,17 +168,38 @@ impl Hypothesis {
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
     pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
+        self.machine_in(data, 0, params, unknown)
+    }
+
+    /// The same in one of several recordings.
+    ///
+    /// # Errors
+    /// [`EffectError`] if an effect is not defined at its place.
+    pub fn machine_in(
+        &self,
+        data: &Data,
+        campaign: usize,
+        params: &[f64],
+        unknown: &[f64],
+    ) -> Result<(Machine, Drives), EffectError> {
+        let own = data.campaign(campaign);
+        let scaled = |term: &Term, amplitude: f64| term.effect(amplitude * data.scale(campaign, term.kind));
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
-        effects.extend(self.given.iter().chain(&data.believed));
-        let mut drives = data.drives.clone();
+        effects.extend(self.given.iter().chain(&own.believed));
+        let mut drives = own.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
-                Unknown::Amplitude(i, sigma) => effects[*i].amplitude = u * sigma,
-                Unknown::Orbit(element, plane, sigma) => drives.orbit[*element][plane.index()] += u * sigma,
-                Unknown::Ordinary(terms, sigma) => effects.extend(terms.iter().map(|term| term.effect(u * sigma))),
+                Unknown::Amplitude(i, sigma) => effects[*i] = scaled(&self.terms[*i], u * sigma),
+                Unknown::Orbit(of, element, plane, sigma) if *of == campaign => {
+                    drives.orbit[*element][plane.index()] += u * sigma;
+                }
+                Unknown::Ordinary(member, sigma) if member.is_in(campaign) => {
+                    effects.extend(member.terms.iter().map(|term| scaled(term, u * sigma)));
+                }
+                Unknown::Orbit(..) | Unknown::Ordinary(..) => {}
             }
         }
-        let ring = data.ring.with_strengths(&data.ring.strengths(params, &data.supplies));
+        let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
         Ok((Machine::new(ring, Rf::FixedMomentum, &effects)?, drives))
     }
 
@@ -171,10 +210,11 @@ impl Hypothesis {
     }
 }
 
-/// The members of a family that affect the data.
+/// The members of a family that affect the data, those of any recording.
 pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
-    let driven = data.driven_correctors();
-    let active: Vec<usize> = data.active_monitors().into_iter().map(|b| data.ring.read_monitors[b]).collect();
+    let driven: Vec<usize> = data.campaigns().flat_map(Data::driven_correctors).collect();
+    let active = data.campaigns().flat_map(Data::active_monitors);
+    let active: Vec<usize> = active.map(|b| data.ring.read_monitors[b]).collect();
     let tells = |site: &Site| match site {
         Site::Monitor(at) => active.contains(at),
         Site::MonitorPair(one, other) => active.contains(one) && active.contains(other),

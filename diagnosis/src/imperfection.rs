@@ -26,7 +26,7 @@ pub struct Imperfection {
     pub measured: Measured,
     /// Unit.
     pub unit: Unit,
-    /// Size up to which it is ordinary.
+    /// Size up to which it is ordinary, 0 where none is.
     pub ordinary: f64,
 }
 
@@ -53,7 +53,8 @@ impl Imperfection {
             Measure::Scatter => format!("{} {} rms", measured.size(unit.factor), unit.shown),
         };
         let remark = if self.is_large() { "large" } else { "" };
-        [what, size, unit.rounded(ordinary), remark.to_owned()]
+        let ordinary = if ordinary == 0.0 { "none".to_owned() } else { unit.rounded(ordinary) };
+        [what, size, ordinary, remark.to_owned()]
     }
 }
 

@@ -11,6 +11,7 @@
 use nalgebra::{DMatrix, DVector};
 use twin::Measured;
 
+use super::half_normal::HalfNormal;
 use super::laplace::Peak;
 
 /// Whitened differences, rows frames, columns monitors; not a number where there is none.
@@ -32,25 +33,25 @@ const SIZES: core::ops::RangeInclusive<usize> = 2..=8;
 /// Crates at most.
 const MOST: usize = 12;
 /// Part of the noise that is always a monitor's own.
-const OWN: f64 = 0.05;
+const OWN: f64 = 0.01;
 /// Steps of a search through sizes, each a factor; over some 3 prior widths.
 const SEARCH: usize = 12;
 const FACTOR: f64 = 1.6;
-/// Points at which the range of what is not needed is integrated, over 3 prior widths.
+/// Points at which the range of what is not needed is integrated.
 const RANGE: usize = 24;
 
 impl Differences {
     /// `ln` likelihood of common modes, one a column [monitors][modes], over that of none.
-    fn log_likelihood(&self, modes: &DMatrix<f64>) -> f64 {
+    pub fn log_likelihood(&self, modes: &DMatrix<f64>) -> f64 {
         let own: Vec<f64> = modes.row_iter().map(|row| (1.0 - row.norm_squared()).max(OWN)).collect();
         self.0.row_iter().map(|frame| of_frame(frame.iter().copied(), &own, modes)).sum()
     }
 
-    /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior.
-    pub fn momentum(&self, pattern: &DVector<f64>, width: f64) -> Measured {
-        let modes = |jitter: f64| DMatrix::from_columns(&[pattern * jitter]);
-        let found = learnt(|jitter| self.log_likelihood(&modes(jitter)), width, 0.0);
-        self.sampled(found, 0.5)
+    /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior, beside known modes.
+    pub fn momentum(&self, pattern: &DVector<f64>, width: f64, known: &DMatrix<f64>) -> Measured {
+        let without = self.log_likelihood(known);
+        let with = |jitter: f64| self.log_likelihood(&beside(known, &(pattern * jitter))) - without;
+        self.sampled(learnt(with, width, 0.0), 0.5)
     }
 
     /// With the error of a sample of the frames: readings are in units of their rms in these, that of the mode included. `power`: 1/2 of an
@@ -61,28 +62,22 @@ impl Differences {
         Measured { sigma: found.sigma.hypot(sample), ..found }
     }
 
-    /// Crates, beside the momentum's jitter (its mode), and what the recording allows of one more, whose neighbours are in one of some
-    /// `orders`.
-    pub fn crates(&self, jitter: &DVector<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
-        let correlation = self.correlation(jitter);
+    /// Crates, beside known modes, and what the recording allows of one more, whose neighbours are in one of some `orders`.
+    pub fn crates(&self, others: &DMatrix<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
+        let correlation = self.correlation(others);
         let strength = |group: &&[usize]| strength(&correlation, group);
-        let mut groups: Vec<&[usize]> =
-            SIZES.flat_map(|size| orders.iter().flat_map(move |o| o.windows(size))).collect();
+        let mut groups = groups(orders);
         let correction = (groups.len().max(1) as f64).ln();
         let mut crates: Vec<Crate> = Vec::new();
         loop {
             let Some(group) = groups.iter().copied().max_by(|a, b| strength(a).total_cmp(&strength(b))) else {
                 return (crates, Measured { value: 0.0, sigma: CRATE });
             };
-            let known = modes(jitter, &crates);
+            let known = with_crates(others, &crates);
             let without = self.log_likelihood(&known);
-            let with = |share: f64| {
-                let mut modes = known.clone().insert_column(known.ncols(), 0.0);
-                modes.set_column(known.ncols(), &crate_mode(jitter.len(), group, share));
-                modes
-            };
+            let with = |share: f64| beside(&known, &crate_mode(others.nrows(), group, share));
             let share = learnt(|share| self.log_likelihood(&with(share)) - without, CRATE, correction);
-            let share = self.sampled(share, 1.0);
+            let share = self.sampled(Measured { value: share.value.min(1.0 - OWN), ..share }, 1.0);
             if share.value == 0.0 || crates.len() == MOST {
                 return (crates, share);
             }
@@ -91,16 +86,17 @@ impl Differences {
         }
     }
 
-    /// Mean products of pairs of monitors in units of their errors without correlation, the jitter's part taken out.
-    fn correlation(&self, jitter: &DVector<f64>) -> DMatrix<f64> {
+    /// Mean products of pairs of monitors in units of their errors without correlation, the part of known modes taken out.
+    pub fn correlation(&self, known: &DMatrix<f64>) -> DMatrix<f64> {
         let monitors = self.0.ncols();
+        let common = known * known.transpose();
         let mut sums = DMatrix::zeros(monitors, monitors);
         for b in 0..monitors {
             for other in 0..b {
                 let pairs = self.0.column(b).component_mul(&self.0.column(other));
                 let known = pairs.iter().filter(|product| !product.is_nan());
                 let (sum, count) = known.fold((0.0, 0.0), |(sum, count), product| (sum + product, count + 1.0));
-                let off = if count > 0.0 { (sum - count * jitter[b] * jitter[other]) / f64::sqrt(count) } else { 0.0 };
+                let off = if count > 0.0 { (sum - count * common[(b, other)]) / f64::sqrt(count) } else { 0.0 };
                 sums[(b, other)] = off;
                 sums[(other, b)] = off;
             }
@@ -122,15 +118,7 @@ fn learnt(log_likelihood: impl Fn(f64) -> f64, width: f64, correction: f64) -> M
         let value = peak.at[0].exp();
         return Measured { value, sigma: value * peak.sigma(0) };
     }
-    let point = |i: usize| (i as f64 + 0.5) * 3.0 / RANGE as f64;
-    let weights: Vec<(f64, f64)> = (0..RANGE)
-        .map(|i| (point(i) * width, (log_likelihood(point(i) * width) - 0.5 * point(i).powi(2)).exp()))
-        .collect();
-    let density = core::f64::consts::FRAC_2_PI.sqrt() * 3.0 / RANGE as f64;
-    let none = correction.exp() / density;
-    let sum: f64 = weights.iter().map(|(_, weight)| weight).sum();
-    let square: f64 = weights.iter().map(|(size, weight)| size * size * weight).sum();
-    Measured { value: 0.0, sigma: (square / (sum + none)).sqrt() }
+    Measured { value: 0.0, sigma: HalfNormal::of(log_likelihood, width, RANGE).range(correction) }
 }
 
 /// `ln` density of one frame over that of independent differences: with `S = diag(own) + G G^T`,
@@ -152,11 +140,22 @@ fn of_frame(differences: impl Iterator<Item = f64>, own: &[f64], modes: &DMatrix
     log + 0.5 * pull.dot(&factor.solve(&pull)) - log_det
 }
 
-/// The jitter's mode, and one for each crate.
-fn modes(jitter: &DVector<f64>, crates: &[Crate]) -> DMatrix<f64> {
-    let of_crate = |one: &Crate| crate_mode(jitter.len(), &one.monitors, one.share.value);
-    let columns: Vec<DVector<f64>> = core::iter::once(jitter.clone()).chain(crates.iter().map(of_crate)).collect();
-    DMatrix::from_columns(&columns)
+/// Groups of neighbours that may share a crate, in some orders.
+pub fn groups(orders: &[Vec<usize>]) -> Vec<&[usize]> {
+    SIZES.flat_map(|size| orders.iter().flat_map(move |order| order.windows(size))).collect()
+}
+
+/// Modes, and one more.
+pub fn beside(modes: &DMatrix<f64>, one: &DVector<f64>) -> DMatrix<f64> {
+    let mut all = modes.clone().insert_column(modes.ncols(), 0.0);
+    all.set_column(modes.ncols(), one);
+    all
+}
+
+/// Modes, and one for each crate.
+pub fn with_crates(modes: &DMatrix<f64>, crates: &[Crate]) -> DMatrix<f64> {
+    let of_crate = |one: &Crate| crate_mode(modes.nrows(), &one.monitors, one.share.value);
+    crates.iter().fold(modes.clone(), |modes, one| beside(&modes, &of_crate(one)))
 }
 
 /// The mode of a crate: the root of its share in each of its monitors.

@@ -1,7 +1,8 @@
 //! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
 //! better.
 //!
-//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]); the recording is
+//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]); what passes within a
+//! setting is found by the differences of its frames and taken out ([`transients`]); the recording is
 //! whitened ([`data`]), fitted by the exact twin without any
 //! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]), and so is an unmodelled discrepancy
 //! ([`discrepancy`]); the leading candidates are refitted and compete ([`search`]); what is found has to predict frames that it was
@@ -10,24 +11,33 @@
 pub mod alternatives;
 pub mod average;
 pub mod baseline;
+pub mod chance;
+mod channel;
 pub mod data;
 pub mod discrepancy;
 pub mod error;
 pub mod evidence;
 pub mod experiment;
+mod factors;
 pub mod fit;
+pub mod frame_to_frame;
+mod half_normal;
 pub mod heldout;
 pub mod hypothesis;
 pub mod imperfection;
 mod jitter;
+pub mod joint;
 mod laplace;
+pub mod limits;
 pub mod location;
 mod memory;
 mod modes;
 pub mod noise;
 pub mod ordinary;
 pub mod page;
+pub mod period;
 pub mod place_scan;
+pub mod pools;
 mod repeats;
 pub mod sample;
 mod scale;
@@ -36,9 +46,11 @@ pub mod score;
 pub mod search;
 pub mod settings;
 pub mod slow;
+pub mod transients;
 pub mod validation;
 pub mod verdict;
 pub mod wiring;
+mod within;
 
 #[cfg(test)]
 mod forward;
@@ -52,9 +64,9 @@ use data::{Data, DataError};
 use heldout::Score;
 use hypothesis::Term;
 use imperfection::Imperfection;
-use inference::Campaign;
-use inference::recording::Recording;
+use inference::recording::{Recording, at_energy};
 use search::{Found, Search};
+use transients::{Transient, Transients};
 pub use verdict::{Finding, Verdict};
 use wiring::Miswired;
 
@@ -63,6 +75,8 @@ use wiring::Miswired;
 pub struct Diagnosis {
     /// All that was found, with its fits.
     pub found: Found,
+    /// What passes within settings, which is not in the data of `found`.
+    pub transients: Vec<Transient>,
     /// The verdict.
     pub verdict: Verdict,
     /// The verdict as a sentence.
@@ -88,31 +102,55 @@ impl Diagnosis {
     ///
     /// # Errors
     /// [`DataError`].
-    pub fn of(ring: &Ring, recording: &Recording, mut progress: impl FnMut(&str)) -> Result<Self, DataError> {
+    pub fn of(ring: &Ring, recording: &Recording, progress: impl FnMut(&str)) -> Result<Self, DataError> {
+        Self::jointly(ring, recording, &[], progress)
+    }
+
+    /// Diagnose several recordings of one machine together, at other tunes, energies or times in the cycle ([`joint`]).
+    ///
+    /// # Errors
+    /// [`DataError`].
+    pub fn jointly(
+        ring: &Ring,
+        first: &Recording,
+        others: &[Recording],
+        mut progress: impl FnMut(&str),
+    ) -> Result<Self, DataError> {
+        let recordings: Vec<&Recording> = core::iter::once(first).chain(others).collect();
         progress("reading");
-        if let Some(wiring) = Miswired::of(ring, recording)? {
-            return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
+        for recording in &recordings {
+            if let Some(wiring) = Miswired::of(&at_energy(ring, recording.header.kinetic_energy), recording)? {
+                return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
+            }
         }
-        let campaign = Campaign::of(ring, recording)?;
-        let data = Data::of(&campaign)?;
-        let candidates = scan::candidates(&data, recording.header.radial_loop_monitors.as_ref());
+        progress("what passes within settings");
+        let (mut transients, mut joined) = (Vec::new(), Vec::new());
+        for (index, recording) in recordings.iter().enumerate() {
+            let ring = at_energy(ring, recording.header.kinetic_energy);
+            let Transients { found, campaign } = Transients::of(&ring, recording)?;
+            transients::join(&mut transients, found, index);
+            joined.push(Data::of(&campaign)?);
+        }
+        let data = joined.remove(0).joined_with(joined)?;
+        let candidates = scan::candidates(&data, first.header.radial_loop_monitors.as_ref());
         progress("searching");
-        let found = Search::new(candidates).run(data)?;
+        let found = Search::new(candidates.clone()).run(data)?;
         let data = &found.data;
         progress("held-out frames");
-        let folds = heldout::by_repeat(&campaign.settings);
+        let blocks = heldout::by_pool(data);
         let bare = if found.competitions.is_empty() { found.null.clone() } else { heldout::bare(data, &found.best)? };
-        let before = Score::of(data, &bare, &folds)?;
-        let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &folds)? };
-        let gains = verdict::gains(data, &found, &before, &after, &folds)?;
-        let verdict = Verdict::of(&found, &gains);
-        let findings = verdict::findings(data, &found, &gains, verdict)?;
+        let before = Score::of(data, &bare, &blocks)?;
+        let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &blocks)? };
+        let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
+        let of_means = Verdict::of(&found, &tests);
+        let verdict = of_means.beside(&transients).with_noise(data);
+        let findings = verdict::findings(data, &found, &transients, &tests, of_means)?;
         progress("held-out correctors");
         let whole =
             !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
-        let folds = heldout::by_corrector(recording);
-        let correctors = if whole && !folds.is_empty() {
-            let scored = |fitted| Score::of(data, fitted, &folds).ok();
+        let blocks = heldout::by_corrector(data);
+        let correctors = if whole && !blocks.is_empty() {
+            let scored = |fitted| Score::of(data, fitted, &blocks).ok();
             scored(&bare).zip(scored(&found.best))
         } else {
             None
@@ -124,6 +162,7 @@ impl Diagnosis {
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
         Ok(Self {
             found,
+            transients,
             verdict,
             sentence,
             findings,
@@ -140,7 +179,11 @@ impl Diagnosis {
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
-        best.hypothesis.terms.iter().enumerate().map(of).collect()
+        let passing = self.transients.iter().filter_map(|one| {
+            let leading = &one.alternatives[0];
+            Some(leading.term()?.effect(leading.amplitude.0))
+        });
+        passing.chain(best.hypothesis.terms.iter().enumerate().map(of)).collect()
     }
 
     /// What was learnt of the machine besides.
@@ -161,18 +204,22 @@ mod tests {
 
     use super::*;
 
-    /// A recording of format 2 need not name the correctors that were set: held-out settings are those of the read-backs, and no
-    /// corrector is held out.
+    /// A recording of format 2 need not name the correctors that were set: held-out settings and correctors are those of the read-backs.
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn without_names_of_correctors_none_is_held_out() {
+    fn correctors_are_held_out_without_their_names() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
         let ring = Ring::read(&folder.join("ring.json")).unwrap();
         let mut recording = Recording::read(&folder.join("gain"), &ring).unwrap();
         let named = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
         recording.rows.iter_mut().for_each(|row| row.correctors.clear());
         let unnamed = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
-        assert!(named.correctors.is_some() && unnamed.correctors.is_none());
-        assert!(named.gain().0 > 10.0 && (unnamed.gain().0 / named.gain().0 - 1.0).abs() < 1e-6);
+        let of_correctors = |diagnosis: &Diagnosis| {
+            let (before, after) = diagnosis.correctors.as_ref().unwrap();
+            after.gain_over(before).0
+        };
+        assert_eq!(of_correctors(&unnamed), of_correctors(&named));
+        assert!(named.gain().0 > 10.0);
+        assert_eq!(unnamed.gain(), named.gain());
     }
 }

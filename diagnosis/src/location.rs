@@ -31,9 +31,18 @@ pub enum Location {
     Tunes,
     /// All monitors, one amplitude a setting each.
     Everywhere,
+    /// All monitors, in the first frames of settings, a share of the former orbit; it competes with what else passes within them.
+    FirstFrames {
+        /// First frame of a stretch of the campaign.
+        from: usize,
+        /// Its last frame.
+        to: usize,
+    },
+    /// A pattern that all monitors share, from frame to frame: of the noise, so that it competes with none of the others.
+    FrameToFrame,
 }
 
-/// Number of sorts of location, equally likely a priori.
+/// Number of sorts of location that compete with each other, equally likely a priori.
 pub const SORTS: usize = 12;
 
 impl Location {
@@ -51,6 +60,8 @@ impl Location {
             Self::Time => "time".into(),
             Self::Tunes => "tunes".into(),
             Self::Everywhere => "everywhere".into(),
+            Self::FirstFrames { from, to } => format!("frames {from} to {to}"),
+            Self::FrameToFrame => "frame to frame".into(),
         }
     }
 
@@ -71,6 +82,8 @@ impl Location {
             Self::Time => "all monitors, in time".into(),
             Self::Tunes => "tunes, in time".into(),
             Self::Everywhere => "all monitors".into(),
+            Self::FirstFrames { .. } => format!("first frames of settings, {name}"),
+            Self::FrameToFrame => "all monitors, from frame to frame".into(),
         }
     }
 
@@ -93,6 +106,13 @@ impl Location {
             Self::Everywhere => {
                 "the readings of all monitors scatter more between settings than between repeats".into()
             }
+            Self::FirstFrames { .. } => {
+                format!(
+                    "the first frames of settings keep a share of the former orbit ({name}), as if all correctors settled slowly or \
+                     readings were averaged over cycles"
+                )
+            }
+            Self::FrameToFrame => data.noise.frame_to_frame.as_ref().map_or(name, |one| one.phrase(&data.ring)),
         }
     }
 
@@ -107,7 +127,8 @@ impl Location {
             | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
             Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q].element,
-            Self::Time | Self::Tunes | Self::Everywhere => return None,
+            Self::FrameToFrame => data.noise.frame_to_frame.as_ref()?.element(ring)?,
+            Self::Time | Self::Tunes | Self::Everywhere | Self::FirstFrames { .. } => return None,
         };
         Some(ring.elements[at].s)
     }

@@ -39,11 +39,6 @@ impl Modes {
     pub fn is_none(&self) -> bool {
         self.factors.is_empty()
     }
-
-    /// Variance of a monitor's reading over that of its own noise.
-    pub fn growth(&self, b: usize) -> f64 {
-        1.0 + self.factors.row(b).norm_squared()
-    }
 }
 
 impl Mixing {
@@ -83,8 +78,13 @@ impl Mixing {
 
     /// `ln` of the determinant of the covariances.
     pub fn log_det(&self) -> f64 {
+        (0..self.frames.len()).map(|frame| self.log_det_of(frame)).sum()
+    }
+
+    /// The same of one frame.
+    pub fn log_det_of(&self, frame: usize) -> f64 {
         let of = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
-        self.frames.iter().map(of).sum()
+        self.frames.get(frame).map_or(0.0, of)
     }
 }
 

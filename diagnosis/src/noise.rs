@@ -1,7 +1,7 @@
 //! The noise of a recording as it is: learnt from its repeats, with the header's noise as a prior.
 //!
 //! Of each monitor the scale of its noise; of all together what the noise remembers ([`super::slow`]), the jitter of the momentum and
-//! what crates of monitors have in common (`jitter.rs`). Everything comes from differences between readings of the same setting
+//! what crates of monitors have in common (`jitter.rs`), and any other pattern that they share ([`super::frame_to_frame`]). Everything comes from differences between readings of the same setting
 //! (`repeats.rs`), so that physics that the model lacks does not enter, with one exception: what changes with time alone, such as
 //! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size.
 //!
@@ -14,13 +14,18 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
+use super::alternatives::SUSPICIOUS;
+use super::frame_to_frame::{self, Found, FrameToFrame, Known, Like, Shape};
 use super::imperfection::{Imperfection, Measure};
-use super::jitter::{CRATE, Crate, Differences};
+use super::jitter::{CRATE, Crate, Differences, beside, groups, with_crates};
 use super::memory::Memory;
 use super::modes::Modes;
+use super::period::Period;
 use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
+use super::search::correction_of_sort;
 use super::slow::{SHARE, Slow, steps};
+use super::verdict::UNMODELLED;
 use inference::Campaign;
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
@@ -41,7 +46,9 @@ pub struct Noise {
     pub crate_share: Measured,
     /// The crates, where any were found.
     pub crates: Vec<Crate>,
-    /// Monitors that the screening calls noisy only for the momentum's jitter, by index.
+    /// What else moves all monitors from frame to frame, or a momentum that does so beyond what is ordinary.
+    pub frame_to_frame: Option<FrameToFrame>,
+    /// Monitors that the screening calls noisy only for what moves all of them, by index.
     pub sound: Vec<usize>,
     /// Kurtosis of the differences, 3 for normal noise [1].
     pub kurtosis: Measured,
@@ -63,22 +70,67 @@ pub struct Source<'c> {
     pub residual: &'c DMatrix<f64>,
     /// Dispersion at the read monitors, in the plane they read [m].
     pub dispersion: &'c DVector<f64>,
+    /// Patterns that are looked for.
+    pub shapes: &'c [Shape],
 }
 
 /// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
 const FEWEST: f64 = 20.0;
 /// Ratio to the common noise above which the screening calls a monitor noisy.
 const NOISY: f64 = 1.5;
+/// Noisy monitors from which on it is likely that something moves all of them.
+const MANY: usize = 3;
 /// Kurtosis of normal noise.
 const NORMAL: f64 = 3.0;
 /// Least share of a reading's variance that is not the momentum's.
-const OWN: f64 = 0.05;
+const OWN: f64 = 0.01;
 
-/// A monitor in state ok with its repeats, and their noise [m].
+/// A monitor in state ok with its repeats, those of one run alone, and their noise [m].
 struct Learner {
     b: usize,
     repeats: Repeats,
+    near: Repeats,
     sigma: f64,
+}
+
+/// Noise in common: the momentum's jitter, in the units of what it is learnt from, and crates.
+struct Shared {
+    momentum: Measured,
+    jitter: DVector<f64>,
+    crates: Vec<Crate>,
+    one_more: Measured,
+}
+
+impl Shared {
+    /// Beside known patterns; `per_momentum`: the momentum's.
+    fn of(differences: &Differences, known: &DMatrix<f64>, per_momentum: &DVector<f64>, orders: &[Vec<usize>]) -> Self {
+        let momentum = differences.momentum(per_momentum, ordinary(per_momentum), known);
+        let jitter = per_momentum * momentum.value;
+        let (crates, one_more) = differences.crates(&beside(known, &jitter), orders);
+        Self { momentum, jitter, crates, one_more }
+    }
+
+    /// Nothing, the jitter, and this with the crates: what a free pattern is looked for beside. Each number that is learnt costs half of the
+    /// `ln` of the number of frames, a crate the choice of its monitors too.
+    fn known(&self, frames: usize, orders: &[Vec<usize>]) -> Vec<Known> {
+        let none = DMatrix::zeros(self.jitter.len(), 0);
+        let (each, choice) = (0.5 * (frames as f64).ln(), (groups(orders).len() as f64).ln());
+        let mut all = vec![Known { modes: none.clone(), cost: 0.0 }];
+        let jitter = if self.momentum.value > 0.0 { beside(&none, &self.jitter) } else { none };
+        if self.momentum.value > 0.0 {
+            all.push(Known { modes: jitter.clone(), cost: each });
+        }
+        if !self.crates.is_empty() {
+            let cost = each * jitter.ncols() as f64 + self.crates.len() as f64 * (each + choice);
+            all.push(Known { modes: with_crates(&jitter, &self.crates), cost });
+        }
+        all
+    }
+}
+
+/// Ordinary jitter of the momentum, from its pattern over the noise.
+fn ordinary(per_momentum: &DVector<f64>) -> f64 {
+    per_momentum.amax().max(f64::MIN_POSITIVE).recip()
 }
 
 impl Noise {
@@ -94,6 +146,7 @@ impl Noise {
             momentum: nothing,
             crate_share: nothing,
             crates: Vec::new(),
+            frame_to_frame: None,
             sound: Vec::new(),
             kurtosis: Measured { value: NORMAL, sigma: 0.0 },
             own: (0..monitors).map(|b| campaign.noise(b)).collect(),
@@ -103,10 +156,30 @@ impl Noise {
         }
     }
 
+    /// With the common scale as the screening weights the monitors, their median: where it calls all of them noisy nothing else is known.
+    fn at_weights(self, campaign: &Campaign) -> Self {
+        let header = &campaign.recording.header.noise;
+        let mut scales: Vec<f64> = self.own.iter().zip(header).map(|(own, header)| own / header).collect();
+        scales.sort_by(f64::total_cmp);
+        let value = scales.get(scales.len() / 2).copied().unwrap_or(1.0);
+        Self { common_scale: Measured { value, sigma: 0.0 }, ..self }
+    }
+
     /// Learn.
     pub fn learn(source: &Source) -> Self {
         let first = Self::learn_from(source, &[]);
-        let sound: Vec<usize> = (0..source.campaign.monitors()).filter(|&b| first.is_sound(source, b)).collect();
+        let noisy = |b: &usize| source.campaign.screened.health[*b].state == MonitorState::Noisy;
+        let noisy: Vec<usize> = (0..source.campaign.monitors()).filter(noisy).collect();
+        let moves = |one: &Self| one.frame_to_frame.as_ref().is_some_and(|one| one.patterns.ncols() > 0);
+        // where many are called noisy, what moves all of them is seen by these alone
+        let all = (moves(&first) || noisy.len() >= MANY).then(|| Self::learn_from(source, &noisy));
+        let all = all.filter(|all| moves(all) || all.momentum.value > 0.0);
+        let header = &source.campaign.recording.header.noise;
+        let is_sound = |b: &usize| match &all {
+            Some(all) => all.own[*b] < NOISY * all.common_scale.value * header[*b],
+            None => first.is_sound(source, *b),
+        };
+        let sound: Vec<usize> = noisy.into_iter().filter(is_sound).collect();
         if sound.is_empty() { first } else { Self::learn_from(source, &sound) }
     }
 
@@ -115,7 +188,7 @@ impl Noise {
         let campaign = source.campaign;
         let mut learners = learners(source, sound);
         if learners.is_empty() {
-            return Self::screened(campaign);
+            return Self::screened(campaign).at_weights(campaign);
         }
         let (repeats, sigma): (Vec<Repeats>, Vec<f64>) =
             learners.iter().map(|one| (one.repeats.clone(), one.sigma)).unzip();
@@ -123,18 +196,29 @@ impl Noise {
         for one in &mut learners {
             one.sigma = one.repeats.weigh(slow.memory(one.sigma)).sigma().unwrap_or(one.sigma);
         }
-        let differences = differences(&learners, &slow, campaign.frames(), campaign.monitors());
-        let kurtosis = kurtosis(&differences);
+        let of = |repeats: fn(&Learner) -> &Repeats| {
+            Differences(differences(&learners, repeats, &slow, (campaign.frames(), campaign.monitors())))
+        };
+        let (differences, near) = (of(|one| &one.repeats), of(|one| &one.near));
+        let kurtosis = kurtosis(&differences.0);
         // per momentum, in units of the noise of whole readings
         let mut pattern = DVector::zeros(campaign.monitors());
         learners.iter().for_each(|one| pattern[one.b] = source.dispersion[one.b] / one.sigma);
-        let differences = Differences(differences);
-        let ordinary_momentum = pattern.amax().max(f64::MIN_POSITIVE).recip();
-        let momentum = differences.momentum(&pattern, ordinary_momentum);
-        let jitter = &pattern * momentum.value;
-        let (crates, one_more) = differences.crates(&jitter, &orders(campaign, &learners));
+        let orders = orders(campaign, &learners);
+        let none = DMatrix::zeros(campaign.monitors(), 0);
+        let mut shared = Shared::of(&differences, &none, &pattern, &orders);
+        let mut noises = vec![None; campaign.monitors()];
+        learners.iter().for_each(|one| noises[one.b] = Some(one.sigma));
+        let known = shared.known(campaign.frames(), &orders);
+        let found = Found::of(&near, &known, source.shapes, &noises);
+        let found = found.filter(|found| found.log_bayes > correction_of_sort());
+        let patterns = found.as_ref().map_or(none, |found| found.patterns.clone());
+        if found.is_some() {
+            shared = Shared::of(&differences, &patterns, &pattern, &orders);
+        }
+        let Shared { momentum, jitter, crates, one_more } = shared;
         let measured = |one: &Learner| {
-            let own = (1.0 - jitter[one.b].powi(2)).max(OWN);
+            let own = (1.0 - jitter[one.b].powi(2) - patterns.row(one.b).norm_squared()).max(OWN);
             let count = one.repeats.weigh(Memory::NONE).count;
             let value = (own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
             Measured { value, sigma: ((kurtosis.value - 1.0) / (4.0 * count)).sqrt() / own }
@@ -153,10 +237,71 @@ impl Noise {
             sound: sound.to_vec(),
             kurtosis,
             ordinary_walk: steps(campaign.frames() as f64) * sigma.iter().sum::<f64>() / sigma.len() as f64,
-            ordinary_momentum,
             ..Self::screened(campaign)
         };
-        noise.with_scales(source, each).with_modes(source, crates)
+        let mut noise = noise.with_scales(source, each);
+        let mut own = DVector::zeros(campaign.monitors());
+        learners.iter().for_each(|one| own[one.b] = source.dispersion[one.b] / noise.own[one.b]);
+        noise.ordinary_momentum = ordinary(&own);
+        noise.frame_to_frame = noise.varying(source, found, &noises);
+        noise.with_modes(source, crates)
+    }
+
+    /// What moves all monitors from frame to frame: a pattern that was found, in units of their noise in `noises`, or an unordinary momentum.
+    fn varying(&self, source: &Source, found: Option<Found>, noises: &[Option<f64>]) -> Option<FrameToFrame> {
+        let campaign = source.campaign;
+        let mut patterns = found.as_ref().map_or(DMatrix::zeros(noises.len(), 0), |found| found.patterns.clone());
+        patterns.row_iter_mut().zip(noises).for_each(|(mut row, noise)| row *= noise.unwrap_or(0.0));
+        let of_momentum = DMatrix::from_columns(&[source.dispersion * self.momentum.value]);
+        let moving = if found.is_some() { &patterns } else { &of_momentum };
+        let like = found.as_ref().map_or(Like::Momentum, |found| found.like);
+        let own: Vec<Option<f64>> = noises.iter().zip(&self.own).map(|(noise, own)| noise.map(|_| *own)).collect();
+        let known: Vec<usize> = (0..own.len()).filter(|&b| own[b].is_some()).collect();
+        let square = known.iter().map(|&b| moving.row(b).norm_squared()).sum::<f64>() / known.len() as f64;
+        if square == 0.0 {
+            return None;
+        }
+        let runs = runs(&campaign.settings.of_frame);
+        let mut residual = source.residual.clone();
+        for (frame, mut row) in residual.row_iter_mut().enumerate() {
+            let missing = (0..own.len()).filter(|&b| !campaign.counts(frame, b));
+            missing.for_each(|b| row[b] = f64::NAN);
+        }
+        let period = Period::of(&frame_to_frame::amplitudes(moving, &residual, &own, &runs), &runs);
+        let of_period = period.map_or(f64::NEG_INFINITY, |one| frame_to_frame::beyond_chance(one.log_chance));
+        let log_bayes = match (like, &found) {
+            (Like::Momentum, _) | (_, None) => {
+                // the momentum's size over its ordinary one is that of the orbit over the noise, where that is largest
+                let size =
+                    known.iter().map(|&b| moving.row(b).norm() / own[b].unwrap_or(f64::INFINITY)).fold(0.0, f64::max);
+                frame_to_frame::beyond_ordinary(size).max(of_period)
+            }
+            (_, Some(found)) => {
+                let ripple = known.iter().map(|&b| campaign.following(b).norm_squared()).sum::<f64>();
+                let ordinary = (ripple / (known.len() * campaign.frames()) as f64).sqrt();
+                let size = square.sqrt() / ordinary.max(f64::MIN_POSITIVE);
+                found.log_bayes.min(frame_to_frame::beyond_ordinary(size)).max(of_period)
+            }
+        };
+        let frames = (0..campaign.frames()).filter(|&frame| known.iter().any(|&b| campaign.counts(frame, b))).count();
+        let value = square.sqrt();
+        let rms = Measured { value, sigma: value / (2.0 * frames.max(1) as f64).sqrt() };
+        Some(FrameToFrame { patterns, like, rms, log_bayes, period })
+    }
+
+    /// What varies from frame to frame and is not ordinary, with its probability.
+    pub fn unordinary(&self) -> Option<(&FrameToFrame, f64)> {
+        let one = self.frame_to_frame.as_ref()?;
+        let odds = one.log_bayes - correction_of_sort();
+        let probability = 1.0 / (1.0 + (-odds).exp());
+        (probability > SUSPICIOUS).then_some((one, probability))
+    }
+
+    /// What the sentence says of noise that is far from the header's.
+    pub fn remark(&self) -> Option<String> {
+        let scale = self.common_scale.value;
+        let far = frame_to_frame::beyond_ordinary(scale.ln().abs() / QUOTED) > correction_of_sort();
+        far.then(|| format!("the noise is {scale:.1} times the header's"))
     }
 
     /// True for a monitor that is noisy only because its reading has the momentum's jitter too.
@@ -201,6 +346,11 @@ impl Noise {
             let pattern = DVector::from_fn(self.own.len(), |b, _| source.dispersion[b] / self.own[b]);
             columns.push(pattern * self.momentum.value);
         }
+        if let Some(one) = &self.frame_to_frame {
+            let over =
+                |column: nalgebra::DVectorView<f64>| DVector::from_fn(self.own.len(), |b, _| column[b] / self.own[b]);
+            columns.extend(one.patterns.column_iter().map(over));
+        }
         if !columns.is_empty() {
             self.modes = Modes { factors: DMatrix::from_columns(&columns) };
         }
@@ -234,7 +384,9 @@ impl Noise {
             measure: Measure::Mean,
             ..row(what, measured, unit, ordinary)
         };
-        vec![
+        let varying = self.frame_to_frame.iter().filter(|one| one.patterns.ncols() > 0);
+        let varying = varying.map(|one| row((one.name(), "frame_to_frame"), one.rms, UNMODELLED, 0.0));
+        let mut rows = vec![
             mean(("noise over the header's, less 1", "noise"), off, Unit::PERCENT, QUOTED),
             row(("noise of single monitors", "noise"), self.scatter, Unit::PERCENT, ALIKE),
             mean(("slow share of the noise's variance", "slow_noise"), self.slow.share, Unit::PERCENT, SHARE),
@@ -246,7 +398,9 @@ impl Noise {
                 self.ordinary_momentum,
             ),
             mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
-        ]
+        ];
+        rows.extend(varying);
+        rows
     }
 }
 
@@ -262,28 +416,47 @@ fn orders(campaign: &Campaign, learners: &[Learner]) -> [Vec<usize>; 2] {
 /// The monitors in state ok, and some others, that have enough repeats.
 fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let campaign = source.campaign;
-    let runs = Run::of(&campaign.settings.of_frame);
+    let settings = &campaign.settings.of_frame;
+    let apart: Vec<Option<usize>> = runs(settings).into_iter().map(Some).collect();
+    let (runs, apart) = (Run::of(settings), Run::of(&apart));
     let of = |b: usize| {
         let frames: Vec<usize> = (0..campaign.frames()).filter(|&frame| campaign.counts(frame, b)).collect();
         let values: Vec<f64> = frames.iter().map(|&frame| source.residual[(frame, b)]).collect();
         let repeats = Repeats::of(&frames, &values, &runs);
         let sigma = repeats.of_neighbours().filter(|sigma| *sigma > 0.0)?;
-        let repeats = repeats.without(&campaign.following(b).select_rows(&frames), sigma);
-        (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, sigma })
+        let following = campaign.following(b).select_rows(&frames);
+        let near = Repeats::of(&frames, &values, &apart).without(&following, sigma);
+        let repeats = repeats.without(&following, sigma);
+        (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, near, sigma })
     };
     let counts = |b: &usize| campaign.is_ok(*b) || sound.contains(b);
     (0..campaign.monitors()).filter(counts).filter_map(of).collect()
 }
 
 /// Whitened differences, rows frames, columns monitors; not a number where there is none.
-fn differences(learners: &[Learner], slow: &Slow, frames: usize, monitors: usize) -> DMatrix<f64> {
+fn differences(
+    learners: &[Learner],
+    repeats: fn(&Learner) -> &Repeats,
+    slow: &Slow,
+    (frames, monitors): (usize, usize),
+) -> DMatrix<f64> {
     let mut all = DMatrix::from_element(frames, monitors, f64::NAN);
-    for Learner { b, repeats, sigma } in learners {
-        for (frame, innovation, variance) in repeats.differences(slow.memory(*sigma)) {
-            all[(frame, *b)] = innovation / (sigma * variance.sqrt());
+    for one in learners {
+        for (frame, innovation, variance) in repeats(one).differences(slow.memory(one.sigma)) {
+            all[(frame, one.b)] = innovation / (one.sigma * variance.sqrt());
         }
     }
     all
+}
+
+/// The run of consecutive frames of one setting that each frame is in.
+fn runs(settings: &[Option<usize>]) -> Vec<usize> {
+    let mut run = 0;
+    let of = |i: usize| {
+        run += usize::from(i > 0 && (settings[i].is_none() || settings[i] != settings[i - 1]));
+        run
+    };
+    (0..settings.len()).map(of).collect()
 }
 
 /// Of differences of variance 1, with its sampling error for normal noise.

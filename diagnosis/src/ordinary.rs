@@ -18,7 +18,7 @@ use twin::{EffectKind, Measured, Plane, Ring, Site};
 
 use super::data::Data;
 use super::fit::Fitted;
-use super::hypothesis::{Term, Unknown, members};
+use super::hypothesis::{Member, Term, Unknown, members};
 use super::imperfection::{Imperfection, Measure};
 
 /// Which members share an amplitude.
@@ -57,8 +57,8 @@ const SETTLED: f64 = 0.01;
 
 /// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles; a common
 /// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
-/// 1 % of its aperture.
-const FAMILIES: [(&str, EffectKind, Grouping, f64); 13] = [
+/// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
+const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
     ("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
     ("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
     ("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
@@ -67,9 +67,11 @@ const FAMILIES: [(&str, EffectKind, Grouping, f64); 13] = [
     ("gain of all vertical correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::Y), 0.03),
     ("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
     ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
+    ("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
     ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, 0.001),
     ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
     ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
+    ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
     ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
     ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
 ];
@@ -87,8 +89,24 @@ impl Family {
         FAMILIES.iter().map(of).collect()
     }
 
-    /// Its members, each the effects that share an amplitude.
-    pub fn members(&self, data: &Data) -> Vec<Vec<Term>> {
+    /// Its members; of a family that belongs to a moment in the cycle those of each recording.
+    pub fn members(&self, data: &Data) -> Vec<Member> {
+        let terms = self.terms(data).into_iter();
+        let of_each = |terms: Vec<Term>| {
+            let campaigns: Vec<Option<usize>> =
+                if self.is_of_a_moment() { (0..data.count()).map(Some).collect() } else { vec![None] };
+            campaigns.into_iter().map(move |campaign| Member { terms: terms.clone(), campaign })
+        };
+        terms.flat_map(of_each).collect()
+    }
+
+    /// True for what may differ between two times in the cycle: the momentum, and fields of eddy currents.
+    fn is_of_a_moment(&self) -> bool {
+        matches!(self.kind, EffectKind::MomentumOffset | EffectKind::DipoleSextupole)
+    }
+
+    /// Its effects, those that share an amplitude together.
+    fn terms(&self, data: &Data) -> Vec<Vec<Term>> {
         let all = members(self.kind, data).into_iter();
         let some: Vec<Vec<Term>> = match self.grouping {
             Grouping::Each => return all.map(|term| vec![term]).collect(),
@@ -234,7 +252,7 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let members: Vec<(Term, f64)> = (unknowns.iter())
         .zip(fitted.u.iter().skip(fitted.params.len()))
         .filter_map(|(unknown, u)| match unknown {
-            Unknown::Ordinary(terms, _) if terms.len() == 1 => Some((terms[0], u.abs())),
+            Unknown::Ordinary(member, _) if member.terms.len() == 1 => Some((member.terms[0], u.abs())),
             _ => None,
         })
         .collect();
@@ -245,7 +263,7 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most).collect()
 }
 
-/// The sizes of the ordinary imperfections in a fit. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's
+/// The sizes of the ordinary imperfections in a fit, of several recordings those of the first where each has its own. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's
 /// prior variance that the recording leaves: `1 - c` is 1 for a member that is well known, 0 for one that it does not show.
 pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
     let covariance = fitted.factor.inverse();
@@ -308,9 +326,12 @@ mod tests {
         let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
         assert_eq!(of("gains of monitors").len(), 33);
         let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
-        assert_eq!(together.map(|members| members.iter().map(Vec::len).collect::<Vec<_>>()), [vec![15], vec![18]]);
+        assert_eq!(
+            together.map(|members| members.iter().map(|one| one.terms.len()).collect::<Vec<_>>()),
+            [vec![15], vec![18]]
+        );
         assert_eq!(of("gradient in all dipoles").len(), 1);
-        assert_eq!(of("edge angle of all dipoles")[0].len(), 1);
+        assert_eq!(of("edge angle of all dipoles")[0].terms.len(), 1);
     }
 
     /// The exact machine of the first fit, which starts at none, is 4.1 standard deviations of all readings together (root of the sum of

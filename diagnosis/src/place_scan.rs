@@ -4,9 +4,9 @@
 //! With a prior uniform in `s`, the posterior of the place is `exp(ln Bayes factor)` times the length of the segment. It
 //! assumes one gradient at one place in a model that is otherwise correct, and is of first order about the fit.
 
-use nalgebra::{DMatrix, DVector};
-use twin::Place;
-use twin::{Signatures, Thin};
+use core::convert::Infallible;
+
+use twin::{Drives, Machine, Place, Signatures, Thin};
 
 use super::data::Data;
 use super::error::FitError;
@@ -62,15 +62,25 @@ impl PlaceScan {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
         let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
-        let (machine, drives) = fitted.machine(data)?;
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, &drives)?;
+        let on_orbit = |campaign: usize| {
+            let (machine, drives) = fitted.machine_in(data, campaign)?;
+            Ok::<_, FitError>((machine.on_orbit(&drives.orbit), drives))
+        };
+        let machines: Vec<(Machine, Drives)> = (0..data.count()).map(on_orbit).collect::<Result<_, _>>()?;
+        let of_each = machines.iter().map(|(machine, drives)| Signatures::of(machine, drives));
+        let signatures: Vec<Signatures> = of_each.collect::<Result<_, _>>()?;
         let scale = kind.kind().prior_scale().unwrap_or(1.0);
+        // a gradient of the magnets, where that is what the scan replaces
+        let of_kind = left_out.map_or_else(|| kind.kind(), |term| fitted.hypothesis.terms[term].kind);
         let judge = |segments: Vec<Segment>| -> Self {
-            let column = |segment: &Segment| data.signature(&signatures.of_thin(segment.place, kind)) * scale;
             let of_batch = |batch: &[Segment]| {
-                let columns: Vec<DVector<f64>> = batch.iter().map(column).collect();
-                projection.score(DMatrix::from_columns(&columns)).scores
+                let columns = data.stacked_columns(batch.len(), |campaign, own| {
+                    let scale = scale * data.scale(campaign, of_kind);
+                    let of = |at: &Segment| own.signature(&signatures[campaign].of_thin(at.place, kind)) * scale;
+                    Ok::<_, Infallible>(batch.iter().map(of).collect())
+                });
+                let Ok(columns) = columns;
+                projection.score(columns).scores
             };
             let scores: Vec<SignatureScore> = segments.chunks(BATCH).flat_map(of_batch).collect();
             let judged = scores.into_iter().map(SignatureScore::of_amplitude);
@@ -174,6 +184,8 @@ fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Segmen
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::DVector;
+
     use super::*;
     use crate::hypothesis::Hypothesis;
     use crate::testing::template;

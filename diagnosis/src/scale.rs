@@ -8,6 +8,8 @@
 
 use twin::Measured;
 
+use super::half_normal::HalfNormal;
+
 /// Scales of the monitors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scales {
@@ -25,7 +27,7 @@ pub const QUOTED: f64 = 0.25;
 pub const ALIKE: f64 = 0.1;
 /// A monitor this many standard deviations from the others has a scale of its own.
 const FAR: f64 = 4.0;
-/// Scatters that are tried, over some 3 prior widths.
+/// Scatters that are tried.
 const SCATTERS: usize = 60;
 
 impl Scales {
@@ -77,21 +79,10 @@ fn scatter_among(near: &[Measured]) -> Option<Measured> {
         let square: f64 = near.iter().zip(&weights).map(|(one, weight)| (one.value - mean).powi(2) * weight).sum();
         0.5 * (weights.iter().map(|weight| weight.ln()).sum::<f64>() - square - total.ln())
     };
-    let step = 3.0 * ALIKE / SCATTERS as f64;
-    let none = log_density(0.0);
-    let weights: Vec<(f64, f64)> = (0..SCATTERS)
-        .map(|i| (i as f64 + 0.5) * step)
-        .map(|x| (x, (log_density(x) - none - 0.5 * (x / ALIKE).powi(2)).exp()))
-        .collect();
-    let sum: f64 = weights.iter().map(|(_, weight)| weight).sum();
-    let moment = |power: i32| weights.iter().map(|(x, weight)| x.powi(power) * weight).sum::<f64>() / sum;
-    let evidence = sum * step / ALIKE * core::f64::consts::FRAC_2_PI.sqrt();
-    let mean = moment(1);
-    Some(if evidence > 1.0 {
-        Measured { value: mean, sigma: (moment(2) - mean * mean).sqrt() }
-    } else {
-        Measured { value: 0.0, sigma: moment(2).sqrt() }
-    })
+    let posterior = HalfNormal::of(log_density, ALIKE, SCATTERS);
+    let needed = posterior.log_evidence > log_density(0.0);
+    let of_grid = || Measured { value: posterior.mean, sigma: posterior.sigma() };
+    Some(if needed { of_grid() } else { Measured { value: 0.0, sigma: posterior.square.sqrt() } })
 }
 
 /// The common scale of some, 0 where none is more likely.
@@ -123,4 +114,22 @@ fn centre_of(all: &[Measured]) -> f64 {
     let mut values: Vec<f64> = all.iter().map(|one| one.value).collect();
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_far_apart_stay_numbers() {
+        // an orbit that drifts makes the noise of monitors as different as their beta functions, to far beyond their errors
+        let measured: Vec<Option<Measured>> =
+            (0..30).map(|b| Some(Measured { value: f64::from(b % 7), sigma: 0.02 })).collect();
+        let scales = Scales::of(&measured);
+        assert!(scales.scatter.value.is_finite() && scales.common.sigma.is_finite());
+        for (scale, measured) in scales.each.iter().zip(measured.iter().flatten()) {
+            // the scatter among them is a hundred times each error, so that none is shrunk by more than a hundredth of its error
+            assert!((scale.ln() - measured.value).abs() < 0.2 * measured.sigma, "{scale}");
+        }
+    }
 }

@@ -110,14 +110,20 @@ impl SignatureScore {
         (pull / (1.0 + power), 0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p())
     }
 
+    /// The latter, of an effect with or without an amplitude.
+    pub fn log_bayes(self, is_switch: bool) -> f64 {
+        if is_switch { self.of_switch().1 } else { self.of_amplitude().1 }
+    }
+
     /// The same for an effect without an amplitude.
     pub fn of_switch(self) -> (f64, f64) {
         (1.0, self.pull - 0.5 * self.power)
     }
 }
 
-/// All candidates that affect the data.
+/// All candidates that affect the means of settings; what passes within them was taken out before.
 pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
+    let lasting = EffectKind::ALL.iter().filter(|kind| !kind.is_transient());
     let of_kind = |&kind: &EffectKind| members(kind, data);
     let held = |pair: &[String; 2]| Term::at(EffectKind::RadialLoop, &pair.join(","), &data.ring).ok();
     let is_read = |term: &Term| match term.site {
@@ -125,8 +131,24 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
         _ => false,
     };
     let radial = radial_loop.and_then(held).filter(is_read);
-    let is_believed = |term: &Term| data.believed.iter().any(|effect| effect.kind == term.kind);
-    EffectKind::ALL.iter().flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
+    let is_believed =
+        |term: &Term| data.campaigns().any(|own| own.believed.iter().any(|effect| effect.kind == term.kind));
+    lasting.flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
+}
+
+/// Whitened signatures of some terms about a fit, one a column, per prior standard deviation.
+///
+/// # Errors
+/// [`FitError`].
+pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatrix<f64>, FitError> {
+    let data = fitted.data(data);
+    data.stacked_columns(terms.len(), |campaign, own| {
+        let (machine, drives) = fitted.machine_in(data, campaign)?;
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, &drives)?;
+        let column = |term: &Term| whitened(own, &signatures, term) * data.scale(campaign, term.kind);
+        Ok(terms.iter().map(column).collect())
+    })
 }
 
 /// Scan them.
@@ -134,21 +156,12 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
 /// # Errors
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
-    let (machine, drives) = fitted.machine(data)?;
-    let machine = machine.on_orbit(&drives.orbit);
-    let signatures = Signatures::of(&machine, &drives)?;
-    let projection = Projection::of(fitted);
-    let mut all = Vec::with_capacity(terms.len());
-    for batch in terms.chunks(BATCH) {
-        let columns: Vec<DVector<f64>> = batch.iter().map(|term| whitened(data, &signatures, term)).collect();
-        let scored = projection.score(DMatrix::from_columns(&columns));
-        for (i, (term, score)) in batch.iter().zip(&scored.scores).enumerate() {
-            let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
-            let adapting = -scored.taken.column(i);
-            all.push(Candidate { term: *term, amplitude, log_bayes, power: score.power, adapting });
-        }
-    }
-    Ok(all)
+    let scored = Projection::of(fitted).score(signatures(data, fitted, terms)?);
+    let candidate = |(i, (term, score)): (usize, (&Term, &SignatureScore))| {
+        let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
+        Candidate { term: *term, amplitude, log_bayes, power: score.power, adapting: -scored.taken.column(i) }
+    };
+    Ok(terms.iter().zip(&scored.scores).enumerate().map(candidate).collect())
 }
 
 /// A cause and its rival: norms of what a fit cannot absorb of both, per prior standard deviation.
@@ -190,13 +203,8 @@ pub fn separations(
     (term, amplitude): (&Term, f64),
     others: &[&Term],
 ) -> Result<Vec<f64>, FitError> {
-    let (machine, drives) = fitted.machine(data)?;
-    let machine = machine.on_orbit(&drives.orbit);
-    let signatures = Signatures::of(&machine, &drives)?;
-    let data = fitted.data(data);
-    let columns: Vec<DVector<f64>> =
-        core::iter::once(&term).chain(others).map(|term| whitened(data, &signatures, term)).collect();
-    let gram = Projection::of(fitted).gram(&DMatrix::from_columns(&columns));
+    let all: Vec<Term> = core::iter::once(term).chain(others.iter().copied()).copied().collect();
+    let gram = Projection::of(fitted).gram(&signatures(data, fitted, &all)?);
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let of = |(i, other): (usize, &&Term)| {
         let free = [term, other].map(|term| !term.kind.is_switch());

@@ -12,24 +12,25 @@
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::EffectKind;
+use twin::{EffectKind, Measured};
 
-use super::alternatives::{Alternative, Competition};
+use super::alternatives::{Alternative, Cause, Competition};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::error::FitError;
 use super::fit::Fitted;
+use super::half_normal::HalfNormal;
 use super::hypothesis::{Hypothesis, Term, Unknown};
-use super::location::SORTS;
+use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
 use super::scan::{Candidate, scan};
 use inference::bounded::softplus;
 
 /// Prior odds of one (more) effect.
-const ODDS: f64 = 1.0;
+pub(super) const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Prior probability of physics that the library does not hold.
-const UNMODELLED: f64 = 0.15;
+pub(super) const UNMODELLED: f64 = 0.15;
 /// Rounds over all competitions, and the gain of `ln` posterior that calls for another round.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
@@ -42,6 +43,8 @@ const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order suffices.
 const WORTH: f64 = 3.0;
 
+/// Walks that are tried.
+const WALKS: usize = 12;
 /// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
 const PASSES: usize = 4;
 const CURVED: f64 = 4.0;
@@ -91,6 +94,11 @@ pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
     -(UNMODELLED * ODDS / (SORTS * discrepancy.sites) as f64).ln()
 }
 
+/// The same for one sort of it that has no sites.
+pub fn correction_of_sort() -> f64 {
+    -(UNMODELLED * ODDS / SORTS as f64).ln()
+}
+
 /// The candidates of a recording, with their prior.
 pub struct Search {
     terms: Vec<Term>,
@@ -111,6 +119,9 @@ impl Search {
     /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let mut found = self.without_effects(data)?;
+        if let Some(wandering) = wandering(&found)? {
+            found = self.without_effects(wandering)?;
+        }
         // one effect can make another unnecessary, so that there may be more steps than effects
         for _ in 0..2 * MOST {
             if found.competitions.len() >= MOST || !found.next.is_suspicious() {
@@ -137,12 +148,13 @@ impl Search {
     /// until the effects are in the model that explain it.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
-        let first = Fitted::of(&data, &plain, &start)?;
+        let first = first_of(&data, &plain)?;
         let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
         let fitted = fit_linearised(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
         let null = fitted.map_or_else(|| fit_linearised(&mut data, &Hypothesis::default(), &start), Ok)?;
+        let null = settled(&data, null);
         let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
     }
@@ -154,7 +166,7 @@ impl Search {
         let (mut best, mut competitions) = self.settle(&data, leader, &found.next)?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine; the fit without
         // effects is then linearised about a wrong machine, an error small against an effect of this size
-        if data.linearise_about(&best.machine(&data)?.0).is_ok_and(|moved| moved > CURVED) {
+        if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = fit_linearised(&mut data, &best.hypothesis, &best.u)?;
             null = Fitted::of(&data, &null.hypothesis, &null.u)?;
             competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
@@ -298,15 +310,70 @@ impl Search {
     }
 }
 
+/// The first fit of a hypothesis with all that is ordinary. Where it is poor the ordinary imperfections may be so large that about none of them
+/// they are not of first order, such as a gradient in all dipoles that moves the tunes: it is then begun anew where it ended, or where the
+/// vars alone come to rest, which absorb most of that.
+fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
+    let start = DVector::zeros(data.units.len());
+    let first = Fitted::of(data, plain, &start)?;
+    if !first.is_gross() {
+        return Ok(first);
+    }
+    let of_vars = Fitted::of(data, &Hypothesis::default(), &start).ok();
+    let begun = [of_vars.map(|fitted| fitted.guess(data, plain)), first.is_stable(data).then(|| first.u.clone())];
+    let mut fits: Vec<Fitted> = Vec::new();
+    for mut guess in begun.into_iter().flatten() {
+        for _ in 0..PASSES {
+            let Ok(fitted) = Fitted::of(data, plain, &guess) else { break };
+            guess = fitted.u.clone();
+            fits.push(fitted);
+        }
+    }
+    let best = fits.into_iter().filter(|fitted| fitted.is_stable(data)).min_by(|a, b| a.cost.total_cmp(&b.cost));
+    Ok(best.filter(|best| best.cost < first.cost).unwrap_or(first))
+}
+
+/// A fit whose ordinary widths no longer grow in evidence: what is left to gain would be given to the first effect that is tried.
+fn settled(data: &Data, mut fitted: Fitted) -> Fitted {
+    for _ in 0..PASSES {
+        let before = fitted.log_evidence;
+        fitted = relearnt(data, fitted);
+        if fitted.log_evidence < before + BETTER {
+            break;
+        }
+    }
+    fitted
+}
+
+/// The recording with monitors that wander, where that is more likely than any other cause. A walk too small to be seen in repeats shows in what a
+/// fit leaves, since it then has all settings to compare.
+fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
+    let Found { data, null, next, .. } = found;
+    let Some(leader) = next.alternatives.first() else { return Ok(None) };
+    let is_of_time = matches!(&leader.cause, Cause::Unmodelled(one) if one.at == Location::Time);
+    if !is_of_time || !next.is_suspicious() || data.noise.slow.walk.value > 0.0 {
+        return Ok(None);
+    }
+    let exactly = |value: f64| data.wandering(Measured { value, sigma: 0.0 });
+    let log_likelihood = |walk: f64| {
+        Fitted::of(&exactly(walk), &null.hypothesis, &null.u).map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
+    };
+    let posterior = HalfNormal::of(log_likelihood, data.noise.ordinary_walk, WALKS);
+    let gain = posterior.log_evidence - null.log_evidence;
+    let of_leader = (leader.probability / next.nothing.max(f64::MIN_POSITIVE)).ln();
+    let walk = Measured { value: posterior.mean, sigma: posterior.sigma() };
+    Ok((gain > of_leader).then(|| data.wandering(walk)))
+}
+
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    if !fitted.is_gross() && data.trim(&fitted.residual) {
+    if !fitted.is_gross() && data.trim_each(&fitted.residual) {
         fitted = Fitted::of(data, hypothesis, &fitted.u)?;
     }
     for _ in 0..PASSES {
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = data.linearise_about(&fitted.machine(data)?.0) else { break };
+        let Ok(moved) = data.linearise_each(&fitted.machines(data)?) else { break };
         let Ok(again) = Fitted::of(data, hypothesis, &fitted.u) else { break };
         fitted = again;
         if moved < CURVED {

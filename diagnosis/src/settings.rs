@@ -13,6 +13,9 @@ pub struct Settings {
     powered: Vec<Vec<(usize, i64)>>,
 }
 
+/// RF offsets this close belong to the same setting.
+const SAME_OFFSET: f64 = 1e-8;
+
 impl Settings {
     /// Group the frames.
     pub fn of(drives: &Drives) -> Self {
@@ -21,7 +24,8 @@ impl Settings {
             let fifths = drives.kick.row(frame).map(|kick| (5.0 * kick / drives.nominal_kick).round() as i64);
             let kicks: Vec<(usize, i64)> =
                 fifths.iter().copied().enumerate().filter(|(_, fifths)| *fifths != 0).collect();
-            *known.entry((kicks.clone(), drives.rf_offset[frame].to_bits())).or_insert_with(|| {
+            let rf = (drives.rf_offset[frame] / SAME_OFFSET).round() as i64;
+            *known.entry((kicks.clone(), rf)).or_insert_with(|| {
                 powered.push(kicks);
                 powered.len() - 1
             })

@@ -11,6 +11,7 @@
 use nalgebra::DVector;
 use twin::Measured;
 
+use super::half_normal::HalfNormal;
 use super::laplace::Peak;
 use super::memory::Memory;
 use super::repeats::Repeats;
@@ -42,7 +43,7 @@ const SHARES: [f64; 4] = [0.0, 0.2, 0.6, 2.0];
 const STEPS: [f64; 5] = [0.0, 0.25, 0.7, 2.0, 8.0];
 /// Passes over noise scale and memory.
 const PASSES: usize = 2;
-/// Widths of the prior at which the range of what is not needed is integrated.
+/// Points at which the range of what is not needed is integrated.
 const RANGE: usize = 12;
 
 /// Coordinates: share, time and walk (in units of the mean noise) of all monitors.
@@ -188,16 +189,7 @@ impl<'r> Learner<'r> {
 
     /// Root mean square, by its posterior, of what is not needed.
     fn range(&self, common: &dyn Fn(f64) -> Common, width: f64) -> f64 {
-        let points: Vec<(f64, f64)> = (0..RANGE)
-            .map(|i| {
-                let x = (i as f64 + 0.5) * 3.0 / RANGE as f64;
-                (x * width, self.likelihood(common((x * width).min(MOST))) - 0.5 * x * x)
-            })
-            .collect();
-        let largest = points.iter().map(|(_, log)| *log).fold(f64::NEG_INFINITY, f64::max);
-        let weight = |log: f64| (log - largest).exp();
-        let sum: f64 = points.iter().map(|(_, log)| weight(*log)).sum();
-        (points.iter().map(|(x, log)| x * x * weight(*log)).sum::<f64>() / sum).sqrt()
+        HalfNormal::of(|size| self.likelihood(common(size.min(MOST))), width, RANGE).square.sqrt()
     }
 
     fn bounds(&self, free: Free) -> Vec<[f64; 2]> {

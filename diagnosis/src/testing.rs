@@ -45,6 +45,8 @@ pub struct Coloured {
     pub momentum: f64,
     /// Share that five neighbours in the order of reading have in common, see [`CRATE`].
     pub crate_share: f64,
+    /// What all monitors read besides, rows frames, columns monitors [m]; empty for nothing.
+    pub common: DMatrix<f64>,
     /// The vars of the machine, and its dispersion at the read monitors [m].
     pub vars: Vec<f64>,
     pub dispersion: DVector<f64>,
@@ -59,7 +61,8 @@ impl Coloured {
         let optics = Optics::of(&made, Hold::Momentum { delta: 0.0 }).unwrap();
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         let noise = recording.header.noise[0];
-        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, vars, dispersion, seed }
+        let common = DMatrix::zeros(0, 0);
+        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, common, vars, dispersion, seed }
     }
 
     /// A campaign with this noise, with the faulty monitors of the shipped recordings.
@@ -79,6 +82,9 @@ impl Beyond for Coloured {
     fn alter_readings(&self, _: &[Cycle], readings: &mut DMatrix<f64>) {
         let mut random = StdRng::seed_from_u64(self.seed ^ 0x5eed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
+        if !self.common.is_empty() {
+            *readings += &self.common;
+        }
         let decay = (-1.0 / self.slow.1).exp();
         for mut column in readings.column_iter_mut() {
             let (mut slow, mut walk) = (normal(), 0.0);

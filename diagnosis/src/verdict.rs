@@ -4,14 +4,17 @@ use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
+use super::chance;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
-use super::heldout::{Fold, Score, VALIDATED};
+use super::heldout::{Block, Score, VALIDATED, gain_of_choice, reduced};
 use super::hypothesis::Term;
+use super::limits::Limits;
 use super::place_scan::{Interval, PlaceScan};
 use super::scan::separations;
-use super::search::Found;
+use super::search::{Found, corrections};
+use super::transients::Transient;
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -28,7 +31,7 @@ pub enum Verdict {
 }
 
 /// Unit of an unmodelled discrepancy [m], shown in mm.
-const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
+pub(super) const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 /// Alternatives that the sentence names.
@@ -47,8 +50,29 @@ impl Verdict {
         }
     }
 
-    /// From the competition of each effect, and its held-out gain.
-    pub fn of(found: &Found, gains: &[(f64, f64)]) -> Self {
+    /// The same with what passes within settings.
+    #[must_use]
+    pub fn beside(self, transients: &[Transient]) -> Self {
+        let decided = |one: &Transient| {
+            one.alternatives[0].probability >= DECISIVE && one.tested.is_some_and(|tested| tested.is_passed())
+        };
+        match self {
+            _ if transients.is_empty() => self,
+            Self::Unexplained => self,
+            _ if transients.iter().any(|one| !one.alternatives[0].is_of_library()) => Self::Unexplained,
+            Self::Consistent | Self::Identified if transients.iter().all(decided) => Self::Identified,
+            _ => Self::Ambiguous,
+        }
+    }
+
+    /// The same beside noise that is not ordinary.
+    #[must_use]
+    pub fn with_noise(self, data: &Data) -> Self {
+        if data.campaigns().any(|one| one.noise.unordinary().is_some()) { Self::Unexplained } else { self }
+    }
+
+    /// From the competition of each effect, and how it stood its tests.
+    pub fn of(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
         if next.unknown() > SUSPICIOUS {
             return Self::Unexplained;
@@ -64,13 +88,56 @@ impl Verdict {
             let is_it = |a: &&Alternative| a.term() == Some(term);
             competition.alternatives.iter().find(is_it).is_some_and(|a| a.probability >= DECISIVE)
         };
-        let validated = gains.iter().all(|(gain, error)| *gain > VALIDATED * error);
+        let validated = tests.iter().all(Tested::is_passed);
         let whole = !next.is_suspicious();
         if found.competitions.iter().zip(&found.best.hypothesis.terms).all(decided) && validated && whole {
             Self::Identified
         } else {
             Self::Ambiguous
         }
+    }
+}
+
+/// How an effect predicts what it was not chosen by, and how often chance would find as much.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tested {
+    /// Gain of held-out log predictive density with the amplitude fitted to the rest, and its standard error.
+    pub gain: (f64, f64),
+    /// The same where kind and place are chosen by the rest too; none beside a fit that is poor without the effect, about which nothing is of
+    /// first order.
+    pub of_choice: Option<f64>,
+    /// Probability of as good a candidate were nothing there.
+    pub chance: Option<f64>,
+}
+
+impl Tested {
+    /// True if held-out readings are predicted better by more than the standard errors asked for, by the choice too.
+    pub fn is_passed(&self) -> bool {
+        let (gain, error) = self.gain;
+        gain > VALIDATED * error && self.of_choice.is_none_or(|gain| gain > 0.0)
+    }
+}
+
+/// The integrated gradient of a field that does not grow with the magnets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fixed {
+    /// Kinetic energy at which the amplitude over the rigidity is given, that of the first recording [GeV].
+    pub kinetic_energy: f64,
+    /// The gradient [T].
+    pub gradient: Measured,
+}
+
+impl Fixed {
+    fn of(data: &Data, alternative: &Alternative) -> Option<Self> {
+        let is_fixed = data.is_joint() && alternative.term()?.kind.is_stray();
+        let (value, sigma) = alternative.amplitude;
+        let gradient = Measured { value: value * data.rigidity(), sigma: sigma * data.rigidity() };
+        is_fixed.then(|| Self { kinetic_energy: data.kinetic_energy(), gradient })
+    }
+
+    /// To follow the amplitude.
+    fn phrase(self) -> String {
+        format!(" at {:.3} GeV, {} T at all energies", self.kinetic_energy, self.gradient.signed(1.0))
     }
 }
 
@@ -87,14 +154,16 @@ pub struct Finding {
     pub interval: Vec<Interval>,
     /// Amplitude and its standard deviation, in the unit of the cause.
     pub amplitude: (f64, f64),
+    /// Of a field that is not a magnet of the ring, in several recordings: the same in tesla.
+    pub fixed: Option<Fixed>,
     /// As a clause of the sentence.
     pub phrase: String,
     /// `ln` evidence over the fit without it.
     pub log_evidence_gain: f64,
     /// Posterior probability among its alternatives.
     pub probability: f64,
-    /// Gain of held-out log predictive density, and its standard error; none if it is not in the model.
-    pub heldout: Option<(f64, f64)>,
+    /// Its tests; none if it is not in the model.
+    pub tested: Option<Tested>,
     /// True for an alternative that a recording like this one is not expected to separate from the finding.
     pub inseparable: bool,
     /// Its alternatives, most likely first.
@@ -111,9 +180,17 @@ impl Finding {
                 term.position(ring),
                 term.kind.phrase(ring, term.site, Measured { value: amplitude, sigma }),
             ),
-            Cause::Unmodelled(one) => (one.at.label(data), one.at.position(data), one.at.phrase(data)),
+            Cause::Unmodelled(one) => {
+                let own = data.campaign(one.campaign);
+                let phrase = one.at.phrase(own);
+                let phrase = if data.is_joint() { format!("in {} {phrase}", own.name) } else { phrase };
+                (one.at.label(own), one.at.position(own), phrase)
+            }
         };
+        let fixed = Fixed::of(data, alternative);
+        let phrase = fixed.map_or_else(|| phrase.clone(), |fixed| phrase.clone() + &fixed.phrase());
         Self {
+            fixed,
             cause: alternative.cause.clone(),
             at,
             s,
@@ -122,9 +199,20 @@ impl Finding {
             phrase,
             log_evidence_gain: alternative.log_gain,
             probability: alternative.probability,
-            heldout: None,
+            tested: None,
             inseparable: false,
             alternatives: Vec::new(),
+        }
+    }
+
+    /// What passes within settings.
+    fn of_transient(data: &Data, transient: &Transient) -> Self {
+        let listed = |one: &&Alternative| one.probability > LISTED;
+        let others = transient.alternatives[1..].iter().filter(listed);
+        Self {
+            tested: transient.tested,
+            alternatives: others.map(|one| Self::of(data, one)).collect(),
+            ..Self::of(data, &transient.alternatives[0])
         }
     }
 
@@ -169,7 +257,7 @@ impl Finding {
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
     pub fn is_validated(&self) -> bool {
-        self.heldout.is_some_and(|(gain, error)| gain > VALIDATED * error)
+        self.tested.is_some_and(|tested| tested.is_passed())
     }
 
     /// Probability of this cause together with all that the recording cannot separate from it.
@@ -178,33 +266,50 @@ impl Finding {
     }
 }
 
-/// Held-out gain of each effect: all effects against all but this one.
+/// Tests of each effect: all effects against all but this one, and the candidates against that.
 ///
 /// # Errors
 /// [`FitError`].
-pub fn gains(
+pub fn tests(
     data: &Data,
     found: &Found,
+    candidates: &[Term],
     before: &Score,
     after: &Score,
-    folds: &[Fold],
-) -> Result<Vec<(f64, f64)>, FitError> {
-    if found.competitions.len() == 1 {
-        return Ok(vec![after.gain_over(before)]);
-    }
-    (0..found.competitions.len())
-        .map(|i| Ok(after.gain_over(&Score::of(data, &super::heldout::reduced(data, &found.best, i)?, folds)?)))
-        .collect()
+    blocks: &[Block],
+) -> Result<Vec<Tested>, FitError> {
+    let penalty = corrections(candidates);
+    let test = |i: usize| -> Result<Tested, FitError> {
+        // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
+        let without = &reduced(data, &found.best, i)?;
+        let rival = if found.competitions.len() == 1 { before } else { &Score::of(data, without, blocks)? };
+        let gain = after.gain_over(rival);
+        if without.is_gross() {
+            return Ok(Tested { gain, of_choice: None, chance: None });
+        }
+        let of_choice = Some(gain_of_choice(data, without, candidates, &penalty)?);
+        Ok(Tested { gain, of_choice, chance: Some(chance::of_search(data, without, candidates, &penalty)?) })
+    };
+    (0..found.competitions.len()).map(test).collect()
 }
 
-/// One finding for each effect, strongest first; then the most likely cause that is not in the model.
+/// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of
+/// settings.
 ///
 /// # Errors
 /// [`FitError`].
-pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdict) -> Result<Vec<Finding>, FitError> {
-    let mut all: Vec<Finding> = Vec::new();
-    for (index, ((competition, term), &gain)) in
-        found.competitions.iter().zip(&found.best.hypothesis.terms).zip(gains).enumerate()
+pub fn findings(
+    data: &Data,
+    found: &Found,
+    transients: &[Transient],
+    tests: &[Tested],
+    of_means: Verdict,
+) -> Result<Vec<Finding>, FitError> {
+    let (named, unmodelled): (Vec<Finding>, Vec<Finding>) =
+        transients.iter().map(|one| Finding::of_transient(data, one)).partition(|one| one.term().is_some());
+    let mut all = named;
+    for (index, ((competition, term), &tested)) in
+        found.competitions.iter().zip(&found.best.hypothesis.terms).zip(tests).enumerate()
     {
         let is_it = |a: &Alternative| a.term() == Some(term);
         let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
@@ -214,18 +319,22 @@ pub fn findings(data: &Data, found: &Found, gains: &[(f64, f64)], verdict: Verdi
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
-        all.push(Finding { heldout: Some(gain), interval, ..Finding::of_competition(data, competition, first)? });
+        all.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
-    let open = match verdict {
+    let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
-        Verdict::Ambiguous if all.is_empty() || found.next.is_suspicious() => {
+        Verdict::Ambiguous if found.competitions.is_empty() || found.next.is_suspicious() => {
             (!found.next.alternatives.is_empty()).then_some(0)
         }
         _ => None,
     };
     if let Some(first) = open {
         all.push(Finding::of_competition(data, &found.next, first)?);
+    }
+    all.extend(unmodelled);
+    for (index, campaign) in data.campaigns().enumerate() {
+        all.extend(Alternative::from_frame_to_frame(&campaign.noise, index).map(|one| Finding::of(data, &one)));
     }
     Ok(all)
 }
@@ -239,8 +348,8 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         Verdict::Identified => {
             let gain: Vec<String> = findings
                 .iter()
-                .filter_map(|f| f.heldout)
-                .map(|(gain, error)| format!("{gain:.0} ± {error:.0}"))
+                .filter_map(|f| f.tested)
+                .map(|Tested { gain: (gain, error), .. }| format!("{gain:.0} ± {error:.0}"))
                 .collect();
             format!("{}; held-out frames gain {} nat", phrases("; "), gain.join(" and "))
         }
@@ -254,12 +363,17 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
             format!("{named}{last}, which no effect of the library describes")
         }
     };
-    let faulty: Vec<String> = (data.health().iter().zip(data.ring.monitor_names()))
+    let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
         .collect();
     let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
-    capitalised(&format!("{text}{faulty}"))
+    let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
+    let together = match data.is_joint() {
+        true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
+        false => String::new(),
+    };
+    capitalised(&format!("{text}{noise}{faulty}{together}"))
 }
 
 /// The alternatives that share most of the probability.
@@ -280,22 +394,19 @@ fn ambiguous(findings: &[Finding]) -> String {
     format!("physics may be missing: {}", parts.join("; and "))
 }
 
-/// Median detection limits: the amplitudes that give a `ln` Bayes factor of 12 at half of the places.
+/// Median detection limits of some kinds.
 fn power(found: &Found) -> String {
-    const SEEN: f64 = 12.0;
     let shown = [EffectKind::BpmGain, EffectKind::CorrectorGain, EffectKind::QuadRoll, EffectKind::StrayGradient];
     let of_kind = |kind: EffectKind| {
-        let mut powers: Vec<f64> = found.next.scanned.iter().filter(|c| c.term.kind == kind).map(|c| c.power).collect();
-        powers.sort_by(f64::total_cmp);
-        let median = powers.get(powers.len() / 2).copied()?;
-        let amplitude = kind.prior_scale()? * (2.0 * SEEN / median.max(f64::MIN_POSITIVE)).sqrt();
-        Some(format!("{kind} {}", kind.unit().rounded(amplitude)))
+        let limits = Limits::of(kind, &found.next.scanned)?;
+        Some(format!("{kind} {}", kind.unit().rounded(limits.median)))
     };
     let list: Vec<String> = shown.into_iter().filter_map(of_kind).collect();
     format!("median detection limits: {}", list.join(", "))
 }
 
-fn capitalised(text: &str) -> String {
+/// A clause as the beginning of a sentence.
+pub(super) fn capitalised(text: &str) -> String {
     let mut characters = text.chars();
     characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
 }

@@ -268,8 +268,9 @@ pub struct Study {
 /// `orbitcal diagnose`.
 #[derive(Debug, Args)]
 pub struct Diagnose {
-    /// Folder with header.toml and frames.csv
-    pub recording: PathBuf,
+    /// Folders with header.toml and frames.csv; several of one machine are analysed together
+    #[arg(required = true, value_name = "RECORDING")]
+    pub recordings: Vec<PathBuf>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,

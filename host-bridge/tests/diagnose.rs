@@ -82,7 +82,15 @@ fn a_model_of_nothing_is_not_written() {
 
 /// Rewrites the rows of a recording into a folder.
 fn altered(folder: &Path, change: impl Fn(usize, Vec<String>, &[String]) -> Option<Vec<String>>) -> String {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed/open-02");
+    altered_from("open-02", folder, change)
+}
+
+fn altered_from(
+    name: &str,
+    folder: &Path,
+    change: impl Fn(usize, Vec<String>, &[String]) -> Option<Vec<String>>,
+) -> String {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed").join(name);
     fs::copy(source.join("header.toml"), folder.join("header.toml")).unwrap();
     let text = fs::read_to_string(source.join("frames.csv")).unwrap();
     let mut lines = text.lines();
@@ -142,6 +150,45 @@ fn what_is_no_recording_is_refused() {
         let run = orbitcal(arguments);
         assert_eq!(run.status.code(), Some(2), "{arguments:?}");
         assert_eq!(String::from_utf8_lossy(&run.stderr).lines().count(), 1, "{arguments:?}");
+    }
+}
+
+/// Two halves of a campaign, each with correctors of its own, are two campaigns of one machine.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn two_recordings_are_analysed_together() {
+    let folders = [0, 1].map(|_| tempfile::tempdir().unwrap());
+    let frames = fs::read_to_string("../recordings/concealed/open-04/frames.csv").unwrap().lines().count() - 1;
+    let half = |which: usize| {
+        let of_half = move |i: usize, row: Vec<String>, _: &[String]| (2 * i / frames == which).then_some(row);
+        altered_from("open-04", folders[which].path(), of_half)
+    };
+    let halves = [half(0), half(1)];
+    let report = folders[0].path().join("report.html");
+    let arguments =
+        ["diagnose", &halves[0], &halves[1], "--json", "-", "--quiet", "--report", report.to_str().unwrap()];
+    let run = orbitcal(&arguments);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let result: Value = serde_json::from_slice(&run.stdout).unwrap();
+    assert_eq!(result["verdict"], "identified", "{result:#}");
+    assert_eq!((&result["findings"][0]["kind"], &result["findings"][0]["at"]), (&"quad_roll".into(), &"F2".into()));
+    assert_eq!(result["recordings"].as_array().map(Vec::len), Some(2));
+    let said = result["sentence"].as_str().unwrap();
+    assert!(said.contains("2 recordings analysed together"), "{said}");
+    assert!(fs::read_to_string(report).unwrap().contains("Pictures of readings"));
+}
+
+#[test]
+fn recordings_that_do_not_fit_together_are_refused() {
+    let cases = [
+        ("recordings/paper-vars", "recordings/../recordings/paper-vars", "given twice"),
+        ("recordings/paper-vars", "recordings/ten-cells/gain", "of another machine"),
+    ];
+    for (one, other, expected) in cases {
+        let run = orbitcal(&["diagnose", one, other]);
+        let error = String::from_utf8_lossy(&run.stderr).into_owned();
+        assert_eq!(run.status.code(), Some(2), "{error}");
+        assert!(error.lines().count() == 1 && error.contains(expected), "{error}");
     }
 }
 

@@ -2,6 +2,8 @@
 
 use core::ops::Range;
 
+use super::strip::Strip;
+
 /// Title, axis labels with their units, and what is drawn behind the data.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Axes {
@@ -15,6 +17,8 @@ pub struct Axes {
     pub x_names: Vec<String>,
     /// The line that perfect data would follow.
     pub reference: Option<Reference>,
+    /// The magnets and instruments below, where the horizontal axis is the path length [m].
+    pub strip: Option<Strip>,
 }
 
 /// A line to compare the data with, dashed in grey.
@@ -42,6 +46,12 @@ impl Axes {
     #[must_use]
     pub fn compared(self, reference: Reference) -> Axes {
         Axes { reference: Some(reference), ..self }
+    }
+
+    /// The same along the beam.
+    #[must_use]
+    pub fn along(self, strip: Strip) -> Axes {
+        Axes { strip: Some(strip), ..self }
     }
 
     /// The level to keep in sight, if there is one.

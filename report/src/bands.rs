@@ -1,15 +1,15 @@
 //! Intervals of named quantities: a marker, the inner interval thick, the outer one thin, groups side by side.
 
 use super::axes::{Axes, aired, slots, span};
-use super::canvas::{Drawn, WIDTH, draw};
+use super::canvas::{Drawn, draw};
 use super::figure::Figure;
 use super::legend::{Legend, Sample};
 use super::numbers::{csv, number};
 use super::pen::Pen;
 use super::plot::{LEFT, Place, Plot, RIGHT, below};
 
-/// Names that fit beside each other with several groups; more of them take further rows of panels.
-const NAMES_A_ROW: usize = 24;
+/// Space for a name with several groups [px], 24 to a row of a page; more of them take further rows of panels.
+const NAME: f64 = 33.8;
 /// Height of one row's axes [px].
 const HEIGHT: f64 = 260.0;
 /// Space between two rows [px].
@@ -33,7 +33,7 @@ pub struct Band {
 }
 
 impl Figure {
-    /// Intervals over the names of the horizontal axis, at most 24 names in a row of panels with a common scale.
+    /// Intervals over the names of the horizontal axis, at most 24 names (9 on a phone) in a row of panels with a common scale.
     ///
     /// # Panics
     /// When a group has not one entry for each name.
@@ -42,30 +42,31 @@ impl Figure {
             let lengths = [group.centre.len(), group.inner.len(), group.outer.len()];
             assert_eq!(lengths, [axes.x_names.len(); 3], "one entry of {} for each name", group.label);
         }
-        Figure { svg: panels(axes, groups), csv: numbers(axes, groups) }
+        Figure::drawn(numbers(axes, groups), |width| panels(axes, groups, width))
     }
 }
 
-fn panels(axes: &Axes, groups: &[Band]) -> String {
-    let legend = Legend::new(groups.iter().map(|group| (group.label.as_str(), Sample::Bands)));
-    let per_row = names_a_row(axes.x_names.len());
+fn panels(axes: &Axes, groups: &[Band], width: f64) -> String {
+    let legend = Legend::new(groups.iter().map(|group| (group.label.as_str(), Sample::Bands)), width);
+    let per_row = names_a_row(axes.x_names.len(), width);
     let rows: Vec<&[String]> = axes.x_names.chunks(per_row).collect();
     let (first, row_height) = (legend.bottom(), HEIGHT + below(&axes.x_names) + GAP);
-    draw(&axes.title, first + rows.len() as f64 * row_height - GAP, |sheet| {
+    draw(&axes.title, (width, first + rows.len() as f64 * row_height - GAP), |sheet| {
         legend.draw(sheet)?;
         rows.iter().enumerate().try_for_each(|(row, names)| {
             let top = first + row as f64 * row_height;
-            let place = Place { left: LEFT, top, right: WIDTH - RIGHT, bottom: top + HEIGHT };
+            let place = Place { left: LEFT, top, right: width - RIGHT, bottom: top + HEIGHT };
             let plot = Plot::new(sheet, place, slots(names.len()), aired(scale(axes, groups)));
             plot.surround(&axes.clone().named(names))?;
-            panel(&plot, row * per_row, names.len(), groups)
+            panel(&plot, row * per_row, (names.len(), place.right - place.left), groups)
         })
     })
 }
 
 /// Rows as few as possible, and equally long.
-fn names_a_row(names: usize) -> usize {
-    names.div_ceil(names.div_ceil(NAMES_A_ROW).max(1)).max(1)
+fn names_a_row(names: usize, width: f64) -> usize {
+    let most = ((width - LEFT - RIGHT) / NAME) as usize;
+    names.div_ceil(names.div_ceil(most).max(1)).max(1)
 }
 
 /// Range of everything that is drawn.
@@ -75,9 +76,9 @@ fn scale(axes: &Axes, groups: &[Band]) -> core::ops::Range<f64> {
     span(groups.iter().flat_map(|group| group.centre.iter().copied()).chain(bounds).chain(axes.level()))
 }
 
-/// The intervals of `count` names from number `first` on.
-fn panel(plot: &Plot, first: usize, count: usize, groups: &[Band]) -> Drawn {
-    let slot = (WIDTH - LEFT - RIGHT) / count as f64;
+/// The intervals of `count` names from number `first` on, in axes of a width [px].
+fn panel(plot: &Plot, first: usize, (count, width): (usize, f64), groups: &[Band]) -> Drawn {
+    let slot = width / count as f64;
     let apart = (SPREAD / groups.len() as f64).min(APART / slot);
     groups.iter().enumerate().try_for_each(|(index, group)| {
         let offset = apart * (index as f64 - (groups.len() as f64 - 1.0) / 2.0);
@@ -109,6 +110,7 @@ fn numbers(axes: &Axes, groups: &[Band]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::canvas::WIDTH;
     use super::*;
 
     fn group(label: &str, names: usize) -> Band {
@@ -139,6 +141,6 @@ mod tests {
     fn more_names_than_fit_take_another_row() {
         assert_eq!(figure(24).svg.matches("magnet").count(), 1);
         assert_eq!(figure(25).svg.matches("magnet").count(), 2);
-        assert_eq!([24, 25, 48, 60].map(names_a_row), [24, 13, 24, 20]);
+        assert_eq!([24, 25, 48, 60].map(|names| names_a_row(names, WIDTH)), [24, 13, 24, 20]);
     }
 }

@@ -35,7 +35,7 @@ impl Figure {
     /// When the matrix is not square with one row for each name.
     pub fn heat_map(title: &str, value: &str, names: &[String], matrix: &DMatrix<f64>) -> Figure {
         assert_eq!(matrix.shape(), (names.len(), names.len()), "one row and one column for each name");
-        Figure { svg: map(title, value, names, matrix), csv: numbers(names, matrix) }
+        Figure { svg: map(title, value, names, matrix), narrow: None, csv: numbers(names, matrix) }
     }
 }
 
@@ -45,7 +45,7 @@ fn map(title: &str, value: &str, names: &[String], matrix: &DMatrix<f64>) -> Str
     let margin = names.iter().map(|name| text_width(name, TICK)).fold(0.0, f64::max) + 14.0;
     let left = (WIDTH - side - AWAY - BAR - 60.0 + margin) / 2.0;
     let place = Place { left, top: TITLE + 6.0, right: left + side, bottom: TITLE + 6.0 + side };
-    draw(title, place.bottom + margin, |sheet| {
+    draw(title, (WIDTH, place.bottom + margin), |sheet| {
         let plot = Plot::new(sheet, place, slots(names.len()), slots(names.len()));
         cells(&plot, matrix, 1.0)?;
         outline(sheet, place)?;

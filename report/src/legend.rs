@@ -2,7 +2,7 @@
 
 use plotters::style::text_anchor::HPos;
 
-use super::canvas::{Drawn, Sheet, TICK, TITLE, WIDTH, plain, px, text_width, write};
+use super::canvas::{Drawn, Sheet, TICK, TITLE, plain, px, text_width, write};
 use super::pen::{Pen, Spot};
 use super::series::Mark;
 
@@ -32,12 +32,12 @@ struct Entry<'l> {
 pub struct Legend<'l>(Vec<Entry<'l>>);
 
 impl<'l> Legend<'l> {
-    /// Rows filled from the left, a new one where the next label would not fit.
-    pub fn new(entries: impl IntoIterator<Item = (&'l str, Sample)>) -> Legend<'l> {
+    /// Rows filled from the left, a new one where the next label would not fit the width of the sheet [px].
+    pub fn new(entries: impl IntoIterator<Item = (&'l str, Sample)>, sheet: f64) -> Legend<'l> {
         let (mut left, mut row) = (LEFT, 0);
         let place = |(label, sample)| {
             let width = SAMPLE + text_width(label, TICK) + GAP;
-            if left > LEFT && left + width > WIDTH {
+            if left > LEFT && left + width > sheet {
                 (left, row) = (LEFT, row + 1);
             }
             left += width;
@@ -87,12 +87,13 @@ fn sample(sheet: &Sheet, pen: Pen, sample: Sample, (left, height): (f64, f64)) -
 
 #[cfg(test)]
 mod tests {
+    use super::super::canvas::WIDTH;
     use super::*;
 
     #[test]
     fn long_legends_take_more_rows() {
         let label = "a label of some forty characters in all";
-        let bottom = |count| Legend::new([(label, Sample::Bands)].repeat(count)).bottom();
+        let bottom = |count| Legend::new([(label, Sample::Bands)].repeat(count), WIDTH).bottom();
         assert_eq!(bottom(2), bottom(1));
         assert_eq!(bottom(5), bottom(1) + 2.0 * ROW);
     }

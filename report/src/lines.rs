@@ -3,11 +3,11 @@
 use core::ops::Range;
 
 use super::axes::{Axes, aired};
-use super::canvas::{WIDTH, draw};
+use super::canvas::draw;
 use super::figure::Figure;
 use super::legend::{Legend, Sample};
 use super::numbers;
-use super::plot::{LEFT, Place, Plot, RIGHT, below, x_range};
+use super::plot::{BELOW, LEFT, Place, Plot, RIGHT, below, x_range};
 use super::series::{Series, draw_all, spans};
 
 /// Height of the plot [px].
@@ -17,7 +17,7 @@ impl Figure {
     /// Lines and points on common axes, each as its [`Series`] says.
     pub fn lines(axes: &Axes, series: &[Series]) -> Figure {
         let [x, y] = spans(series.iter(), axes).map(aired);
-        Figure { svg: chart(axes, series, x, y), csv: numbers::of_series(axes, series) }
+        Figure::drawn(numbers::of_series(axes, series), |width| chart(axes, series, [&x, &y], width))
     }
 
     /// Probability densities: curves on a common ground at zero, with a pale area below each.
@@ -25,7 +25,8 @@ impl Figure {
         let grounded: Vec<_> = curves.iter().cloned().map(on_ground).collect();
         let [x, y] = spans(grounded.iter(), axes);
         let top = aired(y.clone()).end;
-        Figure { svg: chart(axes, &grounded, x, y.start..top), csv: numbers::of_series(axes, curves) }
+        let y = y.start..top;
+        Figure::drawn(numbers::of_series(axes, curves), |width| chart(axes, &grounded, [&x, &y], width))
     }
 }
 
@@ -34,15 +35,17 @@ fn on_ground(curve: Series) -> Series {
     curve.within(band)
 }
 
-fn chart(axes: &Axes, series: &[Series], x: Range<f64>, y: Range<f64>) -> String {
-    let legend =
-        Legend::new(series.iter().map(|one| (one.label.as_str(), Sample::Series(one.mark, one.band.is_some()))));
+fn chart(axes: &Axes, series: &[Series], [x, y]: [&Range<f64>; 2], width: f64) -> String {
+    let samples = series.iter().map(|one| (one.label.as_str(), Sample::Series(one.mark, one.band.is_some())));
+    let legend = Legend::new(samples, width);
     let (top, bottom) = (legend.bottom(), legend.bottom() + HEIGHT);
-    let place = Place { left: LEFT, top, right: WIDTH - RIGHT, bottom };
-    draw(&axes.title, bottom + below(&axes.x_names), |sheet| {
+    let place = Place { left: LEFT, top, right: width - RIGHT, bottom };
+    let strip = axes.strip.as_ref().map_or(0.0, |strip| strip.height(width));
+    draw(&axes.title, (width, bottom + below(&axes.x_names) + strip), |sheet| {
         legend.draw(sheet)?;
-        let plot = Plot::new(sheet, place, x_range(&axes.x_names, x), y);
+        let plot = Plot::new(sheet, place, x_range(&axes.x_names, x.clone()), y.clone());
         plot.surround(axes)?;
+        axes.strip.as_ref().map_or(Ok(()), |strip| strip.draw(&plot, bottom + BELOW, width))?;
         draw_all(&plot, series)
     })
 }

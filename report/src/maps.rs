@@ -5,7 +5,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
 use super::axes::{Axes, slots};
-use super::canvas::{Drawn, LABEL, TICK, TITLE, WIDTH, bold, draw, px, text_width, upwards, write};
+use super::canvas::{Drawn, LABEL, NARROW, TICK, TITLE, bold, draw, px, text_width, upwards, write};
 use super::figure::Figure;
 use super::heat_map::{AWAY, BAR, cells, colour_bar, outline, row_names};
 use super::numbers::{csv, number};
@@ -28,7 +28,7 @@ pub struct Map {
 }
 
 impl Figure {
-    /// Maps beside each other: `axes` names the columns and labels both sides, `rows` names the rows from the top; colours run
+    /// Maps beside each other, on a phone below each other: `axes` names the columns and labels both sides, `rows` names the rows from the top; colours run
     /// from `-limit` to `limit` and end there. Where the first letter of a name changes, a line divides the map.
     ///
     /// # Panics
@@ -37,22 +37,24 @@ impl Figure {
         for map in maps {
             assert_eq!(map.values.shape(), (rows.len(), axes.x_names.len()), "one row and one column for each name");
         }
-        Figure { svg: sheet_of(axes, value, limit, rows, maps), csv: numbers(axes, rows, maps) }
+        Figure::drawn(numbers(axes, rows, maps), |width| sheet_of(axes, (value, limit), rows, maps, width))
     }
 }
 
-fn sheet_of(axes: &Axes, value: &str, limit: f64, rows: &[String], maps: &[Map]) -> String {
+fn sheet_of(axes: &Axes, (value, limit): (&str, f64), rows: &[String], maps: &[Map], sheet: f64) -> String {
     let widest = |names: &[String]| names.iter().map(|name| text_width(name, TICK)).fold(0.0, f64::max) + 14.0;
-    let (names, count) = (&axes.x_names, maps.len().max(1) as f64);
+    let (names, count) = (&axes.x_names, maps.len().max(1));
+    let beside = if sheet > NARROW { count } else { 1 };
     let first = 22.0 + widest(rows);
-    let room = (WIDTH - first - AWAY - BAR - 62.0 - (count - 1.0) * GAP) / count;
-    let width = room.min(CELL * names.len() as f64);
-    let (top, height) = (TITLE + NAME, ROW * rows.len() as f64);
+    let room = (sheet - first - AWAY - BAR - 62.0 - (beside - 1) as f64 * GAP) / beside as f64;
+    let (width, height) = (room.min(CELL * names.len() as f64), ROW * rows.len() as f64);
+    let each = NAME + height + widest(names) + 22.0;
     let place = |index: usize| {
-        let left = first + index as f64 * (width + GAP);
+        let left = first + (index % beside) as f64 * (width + GAP);
+        let top = TITLE + NAME + (index / beside) as f64 * each;
         Place { left, top, right: left + width, bottom: top + height }
     };
-    draw(&axes.title, top + height + widest(names) + 22.0, |sheet| {
+    draw(&axes.title, (sheet, TITLE + count.div_ceil(beside) as f64 * each), |sheet| {
         for (index, map) in maps.iter().enumerate() {
             let place = place(index);
             let plot = Plot::new(sheet, place, slots(names.len()), slots(rows.len()));
@@ -61,11 +63,13 @@ fn sheet_of(axes: &Axes, value: &str, limit: f64, rows: &[String], maps: &[Map])
             outline(sheet, place)?;
             plot.x_names(names)?;
             plot.x_label(&axes.x_label, widest(names) + 8.0)?;
-            write(sheet, &map.name, ((place.left + place.right) / 2.0, top - 9.0), &bold(TICK, HPos::Center))?;
+            write(sheet, &map.name, ((place.left + place.right) / 2.0, place.top - 9.0), &bold(TICK, HPos::Center))?;
         }
-        row_names(sheet, place(0), rows)?;
-        write(sheet, &axes.y_label, (10.0, top + height / 2.0), &upwards(LABEL, HPos::Center))?;
-        let last = place(maps.len().max(1) - 1);
+        for place in (0..count).step_by(beside).map(place) {
+            row_names(sheet, place, rows)?;
+            write(sheet, &axes.y_label, (10.0, place.top + height / 2.0), &upwards(LABEL, HPos::Center))?;
+        }
+        let last = place(beside - 1);
         let bar = Place { left: last.right + AWAY, right: last.right + AWAY + BAR, ..last };
         colour_bar(sheet, bar, value, limit)
     })

@@ -138,7 +138,13 @@ fn numbered_figure(number: usize, caption: &str, figure: &Figure) -> Markup {
     let data = format!("data:text/csv;base64,{}", BASE64_STANDARD.encode(&figure.csv));
     html! {
         figure id=(format!("figure-{number}")) {
-            (PreEscaped(&figure.svg))
+            @match &figure.narrow {
+                Some(narrow) => {
+                    div.wide { (PreEscaped(&figure.svg)) }
+                    div.narrow aria-hidden="true" { (PreEscaped(narrow)) }
+                }
+                None => div.scroll { (PreEscaped(&figure.svg)) }
+            }
             figcaption {
                 (head("Figure", number)) (caption) " "
                 a.numbers href=(data) download=(format!("figure-{number}.csv")) { "numbers (CSV)" }
@@ -150,12 +156,16 @@ fn numbered_figure(number: usize, caption: &str, figure: &Figure) -> Markup {
 impl Table {
     fn render(&self, number: usize) -> Markup {
         html! {
-            table id=(format!("table-{number}")) {
-                caption { (head("Table", number)) (self.caption) }
-                thead { tr { @for (column, cell) in self.header.iter().enumerate() { th.number[self.counts(column)] { (cell) } } } }
-                tbody {
-                    @for row in &self.rows {
-                        tr { @for cell in row { td.number[is_number(cell)] { (cell) } } }
+            div.table id=(format!("table-{number}")) {
+                p.caption id=(format!("table-{number}-caption")) { (head("Table", number)) (self.caption) }
+                div.scroll {
+                    table aria-labelledby=(format!("table-{number}-caption")) {
+                        thead { tr { @for (column, cell) in self.header.iter().enumerate() { th.number[self.counts(column)] { (cell) } } } }
+                        tbody {
+                            @for row in &self.rows {
+                                tr { @for cell in row { td.number[is_number(cell)] { (cell) } } }
+                            }
+                        }
                     }
                 }
             }
@@ -236,6 +246,15 @@ mod tests {
         let csv = BASE64_STANDARD.decode(data[0]).expect("a link that was just encoded");
         assert_eq!(data.len(), 4);
         assert_eq!(csv, page().sections[0].figures[0].1.csv.as_bytes());
+    }
+
+    #[test]
+    fn a_phone_has_drawings_and_tables_of_its_own_width() {
+        let html = page().render();
+        assert_eq!(html.matches("<div class=\"narrow\"").count(), 4);
+        assert_eq!(html.matches("<div class=\"scroll\"><table").count(), 4);
+        let css = include_str!("page.css");
+        assert!(css.contains("@media screen and (max-width: 700px)") && css.contains("@media print"));
     }
 
     #[test]

@@ -94,8 +94,8 @@ mod tests {
     fn drawn(index: usize) -> [String; 2] {
         let pen = Pen::nth(index);
         [
-            canvas::draw("", 50.0, |sheet| pen.line(sheet, &[(0, 0), (900, 0)])),
-            canvas::draw("", 50.0, |sheet| pen.mark(sheet, (0, 0))),
+            canvas::draw("", (90.0, 50.0), |sheet| pen.line(sheet, &[(0, 0), (900, 0)])),
+            canvas::draw("", (90.0, 50.0), |sheet| pen.mark(sheet, (0, 0))),
         ]
     }
 

@@ -18,6 +18,9 @@ pub const RIGHT: f64 = 20.0;
 /// Space below for numbers and a label [px].
 pub const BELOW: f64 = 46.0;
 
+/// Space for a number below the axes [px].
+pub const NUMBER: f64 = 80.0;
+
 const FRAME: RGBColor = BLACK;
 const GRID: RGBColor = RGBColor(225, 225, 225);
 const STRIPE: RGBColor = RGBColor(244, 244, 244);
@@ -41,7 +44,8 @@ pub struct Plot<'s, 'a> {
     /// The sheet drawn on.
     pub sheet: &'s Sheet<'a>,
     place: Place,
-    x: Range<f64>,
+    /// Range of the horizontal axis.
+    pub x: Range<f64>,
     y: Range<f64>,
     coordinates: Cartesian2d<RangedCoordf64, RangedCoordf64>,
 }
@@ -57,6 +61,11 @@ impl<'s, 'a> Plot<'s, 'a> {
     /// Where a point lies.
     pub fn spot(&self, x: f64, y: f64) -> Spot {
         self.coordinates.translate(&(x, y))
+    }
+
+    /// The upper and the lower edge, in drawing units.
+    pub fn heights(&self) -> [i32; 2] {
+        [px(self.place.top), px(self.place.bottom)]
     }
 
     /// The frame: an edge on the left and one below.
@@ -152,7 +161,7 @@ impl<'s, 'a> Plot<'s, 'a> {
         self.y_numbers(7, TICK)?;
         self.y_label(&axes.y_label)?;
         if axes.x_names.is_empty() {
-            self.x_numbers(10, TICK)?;
+            self.x_numbers(((self.place.right - self.place.left) / NUMBER) as usize, TICK)?;
         } else {
             self.x_names(&axes.x_names)?;
         }

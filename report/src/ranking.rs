@@ -4,12 +4,12 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
 use super::axes::{Axes, aired, slots, span};
-use super::canvas::{Drawn, TICK, WIDTH, draw, plain, px, text_width, write};
+use super::canvas::{Drawn, TICK, draw, plain, px, text_width, write};
 use super::figure::Figure;
 use super::legend::{Legend, Sample};
 use super::numbers::{csv, number};
 use super::pen::Pen;
-use super::plot::{BELOW, Place, Plot, RIGHT};
+use super::plot::{BELOW, NUMBER, Place, Plot, RIGHT};
 use super::series::Mark;
 
 /// Height of a bar's row, and share of it that the bar fills [px].
@@ -38,20 +38,21 @@ impl Figure {
             let group = groups.get(entry.group).copied().unwrap_or_default();
             [entry.label.clone(), group.into(), number(entry.value), entry.threshold.map_or(String::new(), number)]
         });
-        Figure { svg: chart(axes, groups, entries), csv: csv(["name", "group", "value", "threshold"], rows) }
+        let csv = csv(["name", "group", "value", "threshold"], rows);
+        Figure::drawn(csv, |width| chart(axes, groups, entries, width))
     }
 }
 
-fn chart(axes: &Axes, groups: &[&str], entries: &[Ranked]) -> String {
+fn chart(axes: &Axes, groups: &[&str], entries: &[Ranked], width: f64) -> String {
     let samples = groups.iter().map(|group| (*group, Sample::Series(Mark::Points, false)));
-    let legend = Legend::new(samples);
+    let legend = Legend::new(samples, width);
     let left = entries.iter().map(|entry| text_width(&entry.label, TICK)).fold(0.0, f64::max) + 20.0;
     let top = legend.bottom() + if axes.y_label.is_empty() { 0.0 } else { 20.0 };
-    let place = Place { left, top, right: WIDTH - RIGHT - FIGURES, bottom: top + ROW * entries.len().max(1) as f64 };
+    let place = Place { left, top, right: width - RIGHT - FIGURES, bottom: top + ROW * entries.len().max(1) as f64 };
     let values = entries.iter().flat_map(|entry| [Some(entry.value), entry.threshold]).flatten();
     let range = span(values.chain([0.0]));
     let range = if range.start < 0.0 { aired(range) } else { range.start..aired(range).end };
-    draw(&axes.title, place.bottom + BELOW, |sheet| {
+    draw(&axes.title, (width, place.bottom + BELOW), |sheet| {
         legend.draw(sheet)?;
         let plot = Plot::new(sheet, place, range, slots(entries.len()));
         if !axes.y_label.is_empty() {
@@ -60,22 +61,23 @@ fn chart(axes: &Axes, groups: &[&str], entries: &[Ranked]) -> String {
             write(sheet, &axes.y_label, (40.0, at), &plain(TICK, HPos::Left))?;
         }
         plot.frame()?;
-        plot.x_numbers(9, TICK)?;
+        plot.x_numbers(((place.right - place.left) / NUMBER).max(2.0) as usize, TICK)?;
         plot.x_label(&axes.x_label, BELOW - 10.0)?;
         entries.iter().enumerate().try_for_each(|(index, entry)| {
             let row = entries.len() as f64 - 1.0 - index as f64;
-            bar(&plot, left, row, entry)
+            bar(&plot, (left, width), row, entry)
         })
     })
 }
 
-fn bar(plot: &Plot, left: f64, row: f64, entry: &Ranked) -> Drawn {
+/// A bar whose name ends left of the axes, its value in figures at the edge of the sheet.
+fn bar(plot: &Plot, (left, width): (f64, f64), row: f64, entry: &Ranked) -> Drawn {
     let (pen, from, to) = (Pen::nth(entry.group), plot.spot(0.0, row), plot.spot(entry.value, row));
     plot.sheet.draw_text(&entry.label, &plain(TICK, HPos::Right), (px(left - 8.0), from.1))?;
     pen.pale_bar(plot.sheet, [from, to], BAR)?;
     pen.mark(plot.sheet, to)?;
     let figures = format!("{:.1}", entry.value).replace('-', "\u{2212}");
-    plot.sheet.draw_text(&figures, &plain(TICK, HPos::Right), (px(WIDTH - 8.0), from.1))?;
+    plot.sheet.draw_text(&figures, &plain(TICK, HPos::Right), (px(width - 8.0), from.1))?;
     entry.threshold.map_or(Ok(()), |threshold| tick(plot, plot.spot(threshold, row)))
 }
 

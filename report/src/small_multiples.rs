@@ -35,19 +35,20 @@ impl Figure {
             let row = |[label, x, y, low, high]: [String; 5]| [panel.name.clone(), label, x, y, low, high];
             panel.series.iter().flat_map(|series| numbers::rows(axes, series)).map(row)
         });
-        Figure { svg: grid(axes, panels), csv: csv(["panel", "series", "x", "y", "low", "high"], rows) }
+        let csv = csv(["panel", "series", "x", "y", "low", "high"], rows);
+        Figure { svg: grid(axes, panels), narrow: None, csv }
     }
 }
 
 fn grid(axes: &Axes, panels: &[Panel]) -> String {
     let fullest =
         panels.iter().map(|panel| panel.series.as_slice()).max_by_key(|series| series.len()).unwrap_or_default();
-    let legend =
-        Legend::new(fullest.iter().map(|one| (one.label.as_str(), Sample::Series(one.mark, one.band.is_some()))));
+    let samples = fullest.iter().map(|one| (one.label.as_str(), Sample::Series(one.mark, one.band.is_some())));
+    let legend = Legend::new(samples, WIDTH);
     let [x, y] = spans(panels.iter().flat_map(|panel| &panel.series), axes).map(aired);
     let top = legend.bottom();
     let bottom = top + panels.len().div_ceil(COLUMNS) as f64 * HEIGHT;
-    draw(&axes.title, bottom + BELOW - 6.0, |sheet| {
+    draw(&axes.title, (WIDTH, bottom + BELOW - 6.0), |sheet| {
         legend.draw(sheet)?;
         write(sheet, &axes.y_label, (12.0, (top + bottom) / 2.0), &upwards(LABEL, HPos::Center))?;
         write(sheet, &axes.x_label, ((LEFT + WIDTH - GAP) / 2.0, bottom + BELOW - 18.0), &plain(LABEL, HPos::Center))?;

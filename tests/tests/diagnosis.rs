@@ -77,7 +77,7 @@ fn every_kind_is_found_when_it_is_strong() {
     let null = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
     let scanned = scan(&data, &null, &candidates(&data, Some(&loop_on))).unwrap();
-    for &kind in EffectKind::ALL {
+    for &kind in EffectKind::ALL.iter().filter(|kind| !kind.is_transient()) {
         let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == kind);
         let seen = of_kind.max_by(|a, b| a.power.total_cmp(&b.power)).unwrap();
         // a gain of 40 nat, if the prior allows it and the beam is kept
@@ -100,6 +100,33 @@ fn every_kind_is_found_when_it_is_strong() {
         let gradient = matches!(kind, EffectKind::StrayGradient | EffectKind::DipoleGradient | EffectKind::DipoleEdge);
         let found = found || (gradient && diagnosis.verdict != Verdict::Consistent);
         assert!(found || expected < 20.0, "{effect:?}, expected gain {expected:.1}: {}", diagnosis.sentence);
+    }
+}
+
+/// Kinds that resemble each other, each of a size that the campaign shows well: what leaks, stays or comes late, and the plain faults that it might
+/// be taken for.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn leaks_and_memories_are_named_and_so_are_plain_faults() {
+    let ring = Ring::booster();
+    for (seed, text) in [
+        (11, "bpm_crosstalk@x_D2=0.06"),
+        (32, "corrector_crosstalk@H_E6=-0.08"),
+        (17, "corrector_hysteresis@H_E4=-0.03"),
+        (14, "bpm_timing@x_E6=0.15"),
+        (15, "corrector_settling@H_C4=0.12"),
+        (61, "bpm_gain@x_D2=-0.13"),
+        (62, "bpm_swap@x_E4,x_E6"),
+        (63, "corrector_gain@H_E6=0.12"),
+        (64, "bpm_roll@y_C5=0.09"),
+    ] {
+        let effect = Effect::parse(text, &ring).unwrap();
+        let diagnosis = Diagnosis::of(&ring, &simulated(&[effect], seed), |_| ()).unwrap();
+        assert_eq!(diagnosis.verdict, Verdict::Identified, "{text}: {}", diagnosis.sentence);
+        let named: Vec<_> = diagnosis.findings.iter().map(diagnosis::Finding::term).collect();
+        assert_eq!(named, [Some(&effect.into())], "{text}: {}", diagnosis.sentence);
+        let (amplitude, sigma) = diagnosis.findings[0].amplitude;
+        assert!((amplitude - effect.amplitude).abs() <= 3.0 * sigma, "{text}: {}", diagnosis.sentence);
     }
 }
 
@@ -141,30 +168,41 @@ fn scatter_of_a_family_is_ordinary() {
     }
 }
 
+/// Every corrector keeps 1 % of its last kick; eddy currents in all dipoles: ordinary, and of the size that they are.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn what_all_correctors_or_all_dipoles_have_is_ordinary() {
+    let ring = Ring::booster();
+    for (kind, amplitude) in [(EffectKind::CorrectorHysteresis, -0.01), (EffectKind::DipoleSextupole, 0.2)] {
+        let of = |site| Effect { kind, site, amplitude };
+        let effects: Vec<Effect> = kind.sites(&ring).into_iter().map(of).collect();
+        let diagnosis = Diagnosis::of(&ring, &simulated(&effects, 9), |_| ()).unwrap();
+        assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);
+        let rows = diagnosis.imperfections();
+        let Measured { value, sigma } = rows.iter().find(|row| row.kind == kind.word()).unwrap().measured;
+        assert!((value - amplitude).abs() < 3.0 * sigma, "{kind}: {value} +- {sigma}");
+    }
+}
+
 /// Strong unmodelled physics is located and not named, and the vars are right beside it.
 #[test]
-#[ignore = "one of the five strong cases takes more than 15 minutes beside ordinary imperfections: to be made quick first"]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn unmodelled_physics_is_not_named() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let hardware = Hardware::shipped(&ring, &template);
     let vars = simulate::vars(&ring, true, 3).unwrap();
-    use UnmodelledKind::{Crosstalk, Leak, OrbitDrift, QuadJump, Saturation};
-    for kind in [QuadJump, OrbitDrift, Leak, Crosstalk, Saturation] {
-        // crosstalk between monitors that see the orbit nearly alike is a gain (the next one after D2 does not), and a limit matters
-        // only where the orbit is large
-        let seen = |one: &Unmodelled| match kind {
-            Crosstalk => one.site.name(&ring) == "x_D2",
-            Saturation => one.site.name(&ring) == "x_F2",
-            _ => true,
-        };
-        let mut unmodelled = (3..500).map(|seed| Unmodelled::of(kind, &ring, &template, seed)).find(seen).unwrap();
+    use UnmodelledKind::{OrbitDrift, QuadJump, Saturation};
+    for kind in [QuadJump, OrbitDrift, Saturation] {
+        // a limit matters only where the orbit is large
+        let seen = |one: &Unmodelled| kind != Saturation || one.site.name(&ring) == "x_F2";
+        let mut unmodelled = (3..500).map(|seed| Unmodelled::of(kind, &ring, seed)).find(seen).unwrap();
         unmodelled.size = kind.sizes()[1];
         let truth = simulate::Truth { vars: &vars, effects: &[], beyond: &[&unmodelled] };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 3).unwrap();
         let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
         let open = matches!(diagnosis.verdict, Verdict::Unexplained | Verdict::Ambiguous);
         assert!(open, "{kind:?}: {} {}", diagnosis.verdict.word(), diagnosis.sentence);
-        if matches!(kind, Leak | Crosstalk | Saturation) {
+        if kind == Saturation {
             let at = &diagnosis.findings.last().unwrap().at;
             assert_eq!(*at, unmodelled.site.name(&ring), "{kind:?}: {}", diagnosis.sentence);
             let key = ring.var_names().into_iter().zip(vars.iter().copied()).collect();
@@ -182,7 +220,7 @@ fn cases_are_fixed_by_their_number() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
     let data = whitened(&template);
     let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
-    let draw = |index| Case::draw(&ring, &template, &terms, Class::Pair, index, 1);
+    let draw = |index| Case::draw(&ring, &terms, Class::Pair, index, 1);
     assert_eq!(draw(7).effects, draw(7).effects);
     assert_eq!(draw(7).vars, draw(7).vars);
     assert_ne!(draw(7).seed, draw(8).seed);

@@ -22,8 +22,8 @@ pub struct Extended {
     pub tables: Tables,
     /// Effects that they carry.
     pub carried: Vec<Effect>,
-    /// Effects that no response shows, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `quad_drift`
-    /// and `sextupole_error`.
+    /// Effects that no response shows, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `corrector_hysteresis`,
+    /// `corrector_settling`, `bpm_timing`, `quad_drift`, `sextupole_error` and `dipole_sextupole`.
     pub left_out: Vec<Effect>,
     /// Rms remainder over monitors and correctors at the vars given [m/rad]; more terms would reduce it.
     pub missing: f64,
@@ -78,11 +78,18 @@ impl Form {
             | EffectKind::CorrectorRoll
             | EffectKind::QuadRoll
             | EffectKind::StraySkewGradient
+            | EffectKind::BpmCrosstalk
+            | EffectKind::CorrectorCrosstalk
             | EffectKind::FixedRfFrequency
             | EffectKind::RadialLoop => Self::Term,
-            EffectKind::BpmCubic | EffectKind::CorrectorEven | EffectKind::QuadDrift | EffectKind::SextupoleError => {
-                Self::None
-            }
+            EffectKind::BpmCubic
+            | EffectKind::CorrectorEven
+            | EffectKind::CorrectorHysteresis
+            | EffectKind::CorrectorSettling
+            | EffectKind::BpmTiming
+            | EffectKind::QuadDrift
+            | EffectKind::SextupoleError
+            | EffectKind::DipoleSextupole => Self::None,
         }
     }
 }
@@ -218,7 +225,7 @@ mod tests {
         }
     }
 
-    /// Measured: 2.6 to 3.3 % of the block when the vars move by a campaign's error bars, independently. At 0.2 mrad that is
+    /// Measured: 1.8 % (crosstalk of a monitor) to 3.7 % (of a corrector) of the block when the vars move by a campaign's error bars, independently. At 0.2 mrad that is
     /// 0.8 um for a rolled quadrupole and 6 um for a radial loop, beside 150 um of noise.
     #[test]
     fn terms_are_exact_at_the_vars_given_and_near_there_to_a_thirtieth() {
@@ -229,6 +236,8 @@ mod tests {
             ("fixed_rf_frequency", 1),
             ("radial_loop@x_D8,x_E6", 1),
             ("bpm_roll@x_E4=0.06", 1),
+            ("bpm_crosstalk@x_E4=0.1", 1),
+            ("corrector_crosstalk@V_D3=0.1", 1),
             ("corrector_roll@V_D3=0.06", 1),
         ] {
             let effects = effects(&[word]);
@@ -238,7 +247,7 @@ mod tests {
             assert!(kicks < 0.7e-3 && rf < 1.5e-3, "{word}: {kicks:.5} {rf:.5}");
             let [kicks, _] = error(&effects, &at, &moved);
             let share = kicks / block(&extended.tables);
-            assert!((0.02..0.035).contains(&share), "{word}: {share:.4}");
+            assert!((0.015..0.04).contains(&share), "{word}: {share:.4}");
         }
     }
 

@@ -262,12 +262,12 @@ impl Bend {
         turn(z, self.e2);
     }
 
-    /// Sector body; a gradient is integrated in slices, its curvature correction `h x` (6e-4 at 8 mm) left out.
+    /// Sector body; gradient and sextupole are integrated in slices, their curvature correction `h x` (6e-4 at 8 mm) left out.
     fn body<T: Scalar>(&self, z: &mut Phase<T>, length: f64) {
-        if self.k1 == 0.0 {
+        if self.k1 == 0.0 && self.k2 == 0.0 {
             self.sector(z, length);
         } else {
-            integrate(z, length, |z, l| self.sector(z, l), |z, l| thin(z, self.k1 * l, 0.0, 0.0));
+            integrate(z, length, |z, l| self.sector(z, l), |z, l| thin(z, self.k1 * l, 0.0, self.k2 * l));
         }
     }
 
@@ -367,7 +367,7 @@ mod tests {
     }
 
     fn bend(k1: f64, e: f64) -> Element {
-        element(Kind::Bend(Bend { curvature: 0.1, k1, e1: e, e2: e, fringe: 0.0 }), 0.9)
+        element(Kind::Bend(Bend { curvature: 0.1, k1, k2: 0.0, e1: e, e2: e, fringe: 0.0 }), 0.9)
     }
 
     #[test]
@@ -397,7 +397,7 @@ mod tests {
     /// Closed form for a thin edge: S. Y. Lee, Accelerator Physics, eq. 2.41.
     #[test]
     fn edge_focuses_as_its_tangent() {
-        let b = Bend { curvature: 0.1, k1: 0.0, e1: 0.2, e2: 0.0, fringe: 0.0 };
+        let b = Bend { curvature: 0.1, k1: 0.0, k2: 0.0, e1: 0.2, e2: 0.0, fringe: 0.0 };
         let m = linearised(&mut Phase::<f64>::zeros(), |z| b.enter(z));
         let power = 0.1 * 0.2_f64.tan();
         assert!((m[(PX, X)] - power).abs() < 1e-14 && (m[(PY, Y)] + power).abs() < 1e-14);

@@ -9,7 +9,7 @@
 //!
 //! Source: D. A. Edwards and L. C. Teng, IEEE Trans. Nucl. Sci. 20 (1973) 885, eq. 12-14.
 
-use core::f64::consts::TAU;
+use core::f64::consts::{PI, TAU};
 
 use nalgebra::{Matrix4, Matrix6};
 
@@ -52,6 +52,13 @@ impl Modes {
         };
         let fractions = [fraction('x', mean + split, X)?, fraction('y', mean - split, Y)?];
         Ok(Self { turn: m, split, difference, fractions })
+    }
+
+    /// Least distance of the two tunes, were they brought together: `sqrt(|det(m + n^+)|)/(pi |sin mu_x + sin mu_y|)`.
+    pub fn closest_approach(&self) -> f64 {
+        let [a, b, c, d] = coupling(&self.turn);
+        let [x, y] = self.fractions.map(|fraction| (TAU * fraction).sin());
+        (a * d - b * c).abs().sqrt() / (PI * (x + y).abs())
     }
 
     /// Derivative of each tune with respect to the entries of the 4x4 matrix: `dQ = -d(cos mu)/(2 pi sin mu)`.

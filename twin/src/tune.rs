@@ -26,6 +26,17 @@ impl Optics<'_> {
         Ok(Tunes { x: self.count_turns(x, Plane::X), y: self.count_turns(y, Plane::Y) })
     }
 
+    /// Closest approach of the tunes that the coupling leaves, `|C-|`, from the one-turn matrix at the present tunes; for one thin skew
+    /// gradient `K1sL sqrt(beta_x beta_y)/(2 pi)`.
+    ///
+    /// Source: G. Guignard, CERN 76-06 (1976); the form by the matrix is that of MAD-X's `DQMIN`.
+    ///
+    /// # Errors
+    /// As [`Optics::tunes`].
+    pub fn closest_tune_approach(&self) -> Result<f64, OrbitError> {
+        Ok(Modes::of(self.orbit.one_turn())?.closest_approach())
+    }
+
     /// The tune that has this fractional part, nearest to the projected phase advance.
     fn count_turns(&self, fraction: f64, plane: Plane) -> f64 {
         let phase = self.phase_advances(plane).last().copied().unwrap_or(0.0) / TAU;
@@ -126,6 +137,20 @@ mod tests {
         let slope = optics.tune_slope(&optics.thin_gradient(slot.into()));
         slope.into_iter().zip(beta).for_each(|(s, b)| assert!((s * 2.0 * core::f64::consts::TAU - b).abs() < 1e-9));
         assert!(optics.tune_slope(&optics.thin_skew_gradient(slot.into())).iter().all(|s| s.abs() < 1e-12));
+    }
+
+    /// The prefactor of the matrix form at tunes apart, `sqrt(s_x s_y)/(s_x + s_y)`, `s` the sines of both phases, is 0.4984 here instead of 1/2.
+    #[test]
+    fn a_thin_skew_gradient_keeps_the_tunes_apart() {
+        let mut ring = Ring::booster();
+        let at = ring.element("SLOT_F6").unwrap();
+        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        let beta = [Plane::X, Plane::Y].map(|plane| optics.beta(at, plane));
+        assert!(optics.closest_tune_approach().unwrap() < 1e-9);
+        let known = 0.004 * (beta[0] * beta[1]).sqrt() / TAU;
+        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.004, k2l: 0.0 };
+        let ours = Optics::of(&ring, ON_MOMENTUM).unwrap().closest_tune_approach().unwrap();
+        assert!((ours / known - 1.0).abs() < 0.005, "{ours} {known}");
     }
 
     #[test]

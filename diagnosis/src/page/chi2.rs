@@ -46,12 +46,14 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
             true => ("log10 of chi-square", 0.0, series.into_iter().map(log).collect()),
             false => ("chi-square", 1.0, series),
         };
-        let axes = Axes::new(title, label, &format!("{scale} per reading [1]"));
+        let last = &series[series.len() - 1];
+        let worst = (0..names.len()).filter(|&i| !last.y[i].is_nan()).max_by(|&i, &j| last.y[i].total_cmp(&last.y[j]));
+        let title = worst.map_or(title.to_owned(), |i| format!("{title}: largest at {}", names[i]));
+        let axes = Axes::new(&title, label, &format!("{scale} per reading [1]"));
         Figure::lines(&axes.named(&names).compared(Reference::Level(one)), &series)
     };
     let kicked = residuals[0].all.iter().filter(|one| one.kick.is_some()).count() as f64;
-    // half of the readings are in-plane
-    let scatter = |members: usize| (2.0 * 2.0 * members as f64 / kicked.max(1.0)).sqrt();
+    let scatter = |members: usize| (2.0 * members as f64 / kicked.max(1.0)).sqrt();
     Section {
         heading: "Structure of the residuals".into(),
         text: vec![format!(
@@ -65,34 +67,28 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
         figures: vec![
             (
                 "By monitor. A faulty monitor stands out in its own column; a fault of the ring raises many.".into(),
-                figure("Chi-square by monitor", "monitor", &monitors, &monitor_names, by_monitor),
+                figure("Chi-square per reading by monitor", "monitor", &monitors, &monitor_names, by_monitor),
             ),
             (
                 "By corrector. A faulty corrector stands out in its own column; a fault of the ring raises many."
                     .into(),
-                figure("Chi-square by corrector", "corrector", &correctors, &corrector_names, by_corrector),
+                figure("Chi-square per reading by corrector", "corrector", &correctors, &corrector_names, by_corrector),
             ),
         ],
         tables: vec![groups(residuals)],
     }
 }
 
-/// In-plane and cross-plane, before and after, for each of some monitors or correctors.
+/// Before and after, for each of some monitors or correctors.
 fn by(residuals: &[Residuals], members: &[usize], of: impl Fn(&Residual) -> Option<usize>) -> Vec<Series> {
-    let mut series = Vec::new();
-    let count = 2.0 * residuals.len() as f64;
-    for (plane, in_plane) in [("in-plane", true), ("cross-plane", false)] {
-        for one in residuals {
-            let label = if residuals.len() == 1 { plane.to_owned() } else { format!("{plane}, {}", one.name) };
-            let mine =
-                |r: &&Residual, member: usize| of(r) == Some(member) && r.kick.is_some() && r.in_plane == in_plane;
-            let value = |&member: &usize| Chi2::of(one.all.iter().filter(|r| mine(r, member))).per_reading();
-            let shift = APART * (series.len() as f64 - 0.5 * (count - 1.0));
-            let x = (0..members.len()).map(|i| i as f64 + shift).collect();
-            series.push(Series::points(&label, x, members.iter().map(value).collect()));
-        }
-    }
-    series
+    let series = |(i, one): (usize, &Residuals)| {
+        let mine = |r: &&Residual, member: usize| of(r) == Some(member) && r.kick.is_some();
+        let value = |&member: &usize| Chi2::of(one.all.iter().filter(|r| mine(r, member))).per_reading();
+        let shift = APART * (i as f64 - 0.5 * (residuals.len() as f64 - 1.0));
+        let x = (0..members.len()).map(|i| i as f64 + shift).collect();
+        Series::points(one.name, x, members.iter().map(value).collect())
+    };
+    residuals.iter().enumerate().map(series).collect()
 }
 
 /// On a logarithmic axis.
@@ -152,6 +148,8 @@ mod tests {
     #[test]
     fn planes_are_told_apart_and_the_kick_counted() {
         let one = |in_plane, sign: f64, value| Residual {
+            pool: 0,
+            noise: 1.0,
             monitor: 3,
             kick: (sign != 0.0).then_some((5, sign)),
             in_plane,
@@ -160,7 +158,10 @@ mod tests {
         };
         let all = vec![one(true, 1.0, 2.0), one(true, -1.0, 1.0), one(false, 1.0, 3.0), one(false, 0.0, 7.0)];
         let series = by(&[Residuals { name: "before", all }], &[3, 4], |residual| Some(residual.monitor));
-        assert_eq!([series[0].y[0], series[1].y[0]], [2.5, 9.0]);
+        assert!((series[0].y[0] - 14.0 / 3.0).abs() < 1e-12, "without a kick a reading is of no corrector");
         assert!(series[0].y[1].is_nan(), "a monitor without readings has no marker");
+        let row =
+            &groups(&[Residuals { name: "before", all: vec![one(true, 1.0, 2.0), one(false, 1.0, 3.0)] }]).rows[1];
+        assert_eq!([&row[1], &row[4], &row[6]], ["2", "4.000", "9.000"], "{row:?}");
     }
 }

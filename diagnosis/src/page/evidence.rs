@@ -36,8 +36,12 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let mut all: Vec<Ranked> = library.chain(unmodelled).collect();
     all.sort_by(|one, other| other.value.total_cmp(&one.value));
     all.truncate(LEADING);
+    let title = match all.first() {
+        Some(first) => format!("First search: {} leads with {:.1} nat", first.label, first.value),
+        None => "First search".into(),
+    };
     let axes = Axes::new(
-        "The leading causes of the first search",
+        &title,
         "ln Bayes factor over the model without any effect [nat]",
         "correction for the number of candidates: even odds against chance",
     );

@@ -11,10 +11,10 @@ const INSIDE: [f64; 2] = [0.6827, 0.9545];
 /// By repeat, and by corrector.
 pub fn section(diagnosis: &Diagnosis) -> Section {
     let mut tables =
-        vec![scores("One repeat of every setting left out at a time.", &diagnosis.before, &diagnosis.after)];
+        vec![scores("One run of frames of one setting left out at a time.", &diagnosis.before, &diagnosis.after)];
     let note = match &diagnosis.correctors {
         Some((before, after)) => {
-            tables.push(scores("All frames of every fifth corrector left out at a time.", before, after));
+            tables.push(scores("All frames of one corrector left out at a time.", before, after));
             ""
         }
         None if diagnosis.found.competitions.is_empty() => "",
@@ -43,7 +43,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     let row = |name: &str, one: &Score, gain: String| {
         [
             name.to_owned(),
-            one.readings.to_string(),
+            one.readings().to_string(),
             format!("{:.1}", one.rms * 1e6),
             format!("{:.1}", one.elpd()),
             gain,
@@ -56,7 +56,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     if !same {
         rows.push(row("with the effects found", after, format!("{} ± {error:.1}", signed(gain, 1))));
     }
-    let n = before.readings;
+    let n = before.readings();
     let empty = String::new();
     rows.push([
         "expected of correct error bars".into(),
@@ -70,7 +70,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     let header =
         ["model", "readings", "rms [µm]", "log predictive density [nat]", "gain [nat]", "within 1 σ", "within 2 σ"];
     let caption = format!(
-        "{caption} Rms of monitors in state ok; the gain has its standard error over frames; the last row is the 95 % band of the \
+        "{caption} Rms of monitors in state ok; the gain has its standard error over readings; the last row is the 95 % band of the \
          binomial distribution for independent readings."
     );
     table(&caption, header, rows)

@@ -9,7 +9,7 @@ use report::Section;
 /// State, noise and rejected readings.
 pub fn section(diagnosis: &Diagnosis) -> Section {
     let data = &diagnosis.found.data;
-    let frames = data.readings.nrows();
+    let frames = data.pools.of_frame.len();
     let faulty = data.health().iter().zip(data.ring.monitor_names()).filter(|(one, _)| one.state != MonitorState::Ok);
     let rows: Vec<[String; 5]> = faulty
         .map(|(one, name)| {
@@ -36,7 +36,8 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     Section { heading: "Faulty monitors".into(), text: vec![text], tables, ..Section::default() }
 }
 
-fn word(state: MonitorState) -> &'static str {
+/// In one word.
+pub fn word(state: MonitorState) -> &'static str {
     match state {
         MonitorState::Ok => "ok",
         MonitorState::Noisy => "noisy",

@@ -2,6 +2,7 @@
 
 use twin::{Element, Ring, Thin};
 
+use super::lattice::{STRIP, strip};
 use super::signed;
 use crate::error::FitError;
 use crate::place_scan::{Interval, PlaceScan};
@@ -14,15 +15,15 @@ const SHARE: f64 = 0.95;
 const STRETCHES: usize = 4;
 /// Density, relative to the peak, below which it is not shown, and the margin on both sides [m].
 const NEGLIGIBLE: f64 = 1e-3;
-const AROUND: f64 = 0.5;
+const AROUND: f64 = 2.5;
 
-/// The scans for normal and skew gradients.
-pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
+/// The scans for normal and skew gradients, where a cause acts like one or is not known.
+pub fn section(diagnosis: &Diagnosis) -> Result<Option<Section>, FitError> {
     let mut section = Section {
         heading: "Place scan".into(),
         text: vec![
             "ln Bayes factor of one thin gradient at every place of the ring, given all other findings, vars adapting, to first \
-             order. Below zero the readings disfavour a gradient there; a flat curve means that they contain no information on it. The credible interval has a \
+             order, with the widths of what is ordinary as in that fit: it exceeds the gain of the table where ordinary imperfections would grow without the effect. Below zero the readings disfavour a gradient there; a flat curve means that they contain no information on it. The credible interval has a \
              prior uniform along the beam, and assumes one thin gradient in a model that is otherwise correct."
                 .into(),
         ],
@@ -33,6 +34,11 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         let terms = &found.best.hypothesis.terms;
         let own = terms.iter().position(|term| term.kind.thin() == Some(kind));
         let scan = PlaceScan::of(&found.data, &found.best, own, kind)?;
+        let acts = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(kind));
+        let asked = diagnosis.findings.iter().any(|one| acts(one) || one.alternatives.iter().any(acts));
+        if !asked && diagnosis.verdict != Verdict::Unexplained {
+            continue;
+        }
         let settled = matches!(diagnosis.verdict, Verdict::Identified | Verdict::Ambiguous);
         let interval = own.filter(|_| settled).map(|_| scan.credible(SHARE));
         if let (Some(own), Some(interval)) = (own, &interval) {
@@ -40,10 +46,10 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         }
         section.figures.push(figure(diagnosis, &scan, word));
         if let Some(interval) = &interval {
-            section.figures.push(density(&scan, interval, found.data.ring.circumference, word));
+            section.figures.push(density(diagnosis, &scan, interval, word));
         }
     }
-    Ok(section)
+    Ok(Some(section).filter(|section| !section.figures.is_empty()))
 }
 
 fn stated(scan: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
@@ -87,11 +93,16 @@ fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figur
             series.push(Series::points(label, x, y));
         }
     }
-    let title = format!("A thin {word} gradient along the ring");
-    let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
     let peak = scan.peak();
+    let (best, at) = (scan.log_bayes[peak], scan.segments[peak].s);
+    let title = match best > 0.0 {
+        true => format!("A thin {word} gradient gains most at s = {at:.1} m: {best:.0} nat"),
+        false => format!("A thin {word} gradient gains nothing anywhere"),
+    };
+    let axes = Axes::new(&title, "s [m]", "ln Bayes factor [nat]").compared(Reference::Level(0.0));
+    let axes = axes.along(strip(diagnosis));
     let caption = format!(
-        "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}.",
+        "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}. {STRIP}",
         scan.segments[peak].s,
         nearest(&diagnosis.found.data.ring, scan.segments[peak].s),
         if series.len() > 1 {
@@ -111,8 +122,8 @@ fn nearest(ring: &Ring, s: f64) -> &str {
 }
 
 /// The posterior of the place near its peak: all of it, and the part within the interval.
-fn density(scan: &PlaceScan, interval: &[Interval], circumference: f64, word: &str) -> (String, Figure) {
-    let peak = scan.peak();
+fn density(diagnosis: &Diagnosis, scan: &PlaceScan, interval: &[Interval], word: &str) -> (String, Figure) {
+    let (peak, circumference) = (scan.peak(), diagnosis.found.data.ring.circumference);
     let (middle, largest) = (scan.segments[peak].s, scan.log_bayes[peak]);
     let weight = |i: usize| (scan.log_bayes[i] - largest).exp();
     let sum: f64 = (0..scan.segments.len()).map(|i| weight(i) * scan.segments[i].length).sum();
@@ -134,10 +145,10 @@ fn density(scan: &PlaceScan, interval: &[Interval], circumference: f64, word: &s
     let all: Vec<f64> = order.iter().map(|&i| weight(i) / sum).collect();
     let held = order.iter().zip(&all).map(|(&i, &y)| if inside(scan.segments[i].s) { y } else { f64::NAN }).collect();
     let series = [Series::line("posterior", x.clone(), all), Series::line("95 % credible interval", x, held)];
-    let axes =
-        Axes::new(&format!("The place of a thin {word} gradient"), "s [m]", "posterior density of the place [1/m]");
+    let title = format!("The thin {word} gradient is most likely at s = {middle:.2} m");
+    let axes = Axes::new(&title, "s [m]", "density of the place [1/m]").along(strip(diagnosis));
     let caption = format!(
-        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring."
+        "The same, near its peak, as a probability density of the place of a thin {word} gradient, prior uniform along the ring. {STRIP}"
     );
     (caption, Figure::densities(&axes, &series))
 }

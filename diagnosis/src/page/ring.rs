@@ -1,9 +1,13 @@
 //! The ring with the findings marked.
 
-use twin::{Class, Kind, Ring};
+use estimator::MonitorState;
+use twin::Ring;
 
-use crate::{Diagnosis, Finding};
-use report::{Figure, Magnet, RingMap, Section, Spotted, Symbol};
+use super::lattice::{magnets, positions};
+use super::monitors::word;
+use crate::Diagnosis;
+use crate::data::Data;
+use report::{Figure, Look, RingMap, Section, Spotted};
 
 /// Alternatives that are marked for each finding.
 const ALTERNATIVES: usize = 4;
@@ -13,64 +17,78 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     let ring = &diagnosis.found.data.ring;
     let (mut spotted, mut everywhere) = (Vec::new(), Vec::new());
     for finding in &diagnosis.findings {
-        let others = finding.alternatives.iter().take(ALTERNATIVES).map(|other| (other, true));
-        for (one, pale) in core::iter::once((finding, false)).chain(others) {
+        let others = finding.alternatives.iter().take(ALTERNATIVES).map(|other| (other, Look::Alternative));
+        for (one, look) in core::iter::once((finding, Look::Finding)).chain(others) {
             let places = positions(ring, one);
             let label = format!("{} {}", one.word().replace('_', " "), one.at);
+            let label = if look == Look::Alternative { format!("or {label}") } else { label };
             match places.is_empty() {
-                true if pale => everywhere.push(format!("or {label} (whole ring)")),
                 true => everywhere.push(format!("{label} (whole ring)")),
-                false => spotted.extend(places.into_iter().map(|s| Spotted { label: named(&label, pale), s, pale })),
+                false => spotted.extend(places.into_iter().map(|s| Spotted { label: label.clone(), s, look })),
             }
         }
     }
-    let figure = Figure::ring_map(&RingMap { spotted, everywhere, ..empty(ring) });
-    let caption = if diagnosis.findings.is_empty() {
-        "The ring; nothing was found, so nothing is marked. Names inside the path are labels."
+    let data = &diagnosis.found.data;
+    spotted.extend(faulty(data));
+    let figure = Figure::ring_map(&RingMap { title: title(diagnosis), spotted, everywhere, ..empty(ring) });
+    let what = if diagnosis.findings.is_empty() {
+        ""
     } else {
-        "The ring; filled squares are findings, open circles alternatives to them. Names inside the path are labels: a quadrupole, \
-         monitor or corrector is named by its label."
+        "filled squares are findings, open circles alternatives to them, "
     };
-    Section { heading: "Location".into(), figures: vec![(caption.into(), figure)], ..Section::default() }
+    let unread = unread(ring);
+    let unread =
+        if unread.is_empty() { "all monitors are read".into() } else { format!("not read: {}", unread.join(", ")) };
+    let caption = format!(
+        "The ring; {what}crosses faulty monitors. Names inside the path are labels: a quadrupole, monitor or corrector is named by its label. Of \
+         the monitors, {unread}."
+    );
+    Section { heading: "Where it is".into(), figures: vec![(caption, figure)], ..Section::default() }
 }
 
-fn named(label: &str, pale: bool) -> String {
-    if pale { format!("or {label}") } else { label.to_owned() }
+fn title(diagnosis: &Diagnosis) -> String {
+    let ring = &diagnosis.found.data.ring;
+    let faulty = faulty(&diagnosis.found.data).len();
+    let instruments = match faulty {
+        0 => "all monitors in order".to_owned(),
+        1 => "one faulty monitor".to_owned(),
+        _ => format!("{faulty} faulty monitors"),
+    };
+    let findings = match diagnosis.findings.len() {
+        0 => "nothing found".to_owned(),
+        1 => "one finding".to_owned(),
+        many => format!("{many} findings"),
+    };
+    format!("{}, {:.2} m: {findings}, {instruments}", ring.name, ring.circumference)
 }
 
-/// Positions of a finding: two for exchanged monitors, none for an effect on the whole ring.
-fn positions(ring: &Ring, finding: &Finding) -> Vec<f64> {
-    let Some(term) = finding.term() else { return finding.s.into_iter().collect() };
-    match term.kind.class() {
-        Class::Monitor(_) | Class::Corrector(_) | Class::Field(_) => term.site.positions(ring),
-        Class::Hold(_) | Class::Drift(_) => Vec::new(),
-    }
+/// Monitors that are not in state ok, with the word for it.
+fn faulty(data: &Data) -> Vec<Spotted> {
+    let ring = &data.ring;
+    let of = |(b, health): (usize, &estimator::Health)| {
+        let at = ring.monitors[ring.read_monitors[b]].element;
+        let label = format!("{} {}", ring.monitor_names()[b], word(health.state));
+        (health.state != MonitorState::Ok).then(|| Spotted { label, s: ring.elements[at].s, look: Look::Faulty })
+    };
+    data.health().iter().enumerate().filter_map(of).collect()
+}
+
+/// Names of the monitors that are not read.
+fn unread(ring: &Ring) -> Vec<String> {
+    (0..ring.monitors.len()).filter(|at| !ring.read_monitors.contains(at)).map(|at| ring.monitor_name(at)).collect()
 }
 
 /// The ring without anything marked.
 fn empty(ring: &Ring) -> RingMap {
-    let symbol = |kind: &Kind| match kind {
-        Kind::Bend(_) => Some(Symbol::Bend),
-        Kind::Quadrupole { k1 } if *k1 > 0.0 => Some(Symbol::Focusing),
-        Kind::Quadrupole { .. } => Some(Symbol::Defocusing),
-        Kind::Monitor => Some(Symbol::Monitor),
-        Kind::Corrector { .. } => Some(Symbol::Corrector),
-        _ => None,
-    };
-    let magnets = ring
-        .elements
-        .iter()
-        .filter_map(|element| Some(Magnet { symbol: symbol(&element.kind)?, s: element.s, length: element.length }));
     let names: Vec<(String, f64)> = (ring.quadrupoles.iter())
         .map(|q| &ring.elements[q.element])
         .map(|magnet| (magnet.label.clone(), magnet.s + 0.5 * magnet.length))
         .collect();
     RingMap {
-        title: format!("{}, {:.2} m", ring.name, ring.circumference),
         circumference: ring.circumference,
         sectors: sectors(ring),
         names,
-        magnets: magnets.collect(),
+        magnets: magnets(ring),
         ..RingMap::default()
     }
 }

@@ -13,10 +13,11 @@ const OUTER: f64 = 1.96;
 pub fn section(diagnosis: &Diagnosis) -> Section {
     let (before, after) = (&diagnosis.vars_before, &diagnosis.vars_after);
     let names = diagnosis.found.data.ring.var_names();
-    let axes = Axes::new("Quadrupole strengths: bars 68 %, lines 95 %", "quadrupole", "var [1]");
-    let axes = axes.named(&names).compared(Reference::Level(1.0));
     let moved: DVector<f64> = (&after.mean - &before.mean).component_div(&before.covariance.diagonal().map(f64::sqrt));
     let most = moved.iamax();
+    let change = moved[most].abs();
+    let title = format!("{} changes most, by {change:.1} of its standard deviations", names[most]);
+    let axes = Axes::new(&title, "quadrupole", "var [1]").named(&names).compared(Reference::Level(1.0));
     let mean = |vars: &Vars| 100.0 * vars.covariance.diagonal().map(f64::sqrt).mean();
     Section {
         heading: "Quadrupoles before and after".into(),
@@ -27,11 +28,11 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             mean(before),
             mean(after),
             names[most],
-            moved[most].abs()
+            change
         )],
         figures: vec![(
             "Each quadrupole's strength over its design, focusing ones above, defocusing ones below, without any effect (before) and averaged over \
-             the competing causes (after)."
+             the competing causes (after). Bars 68 %, lines 95 %."
                 .into(),
             Figure::bands(&axes, &[band("before", before), band("after", after)]),
         )],

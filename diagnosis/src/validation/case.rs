@@ -9,7 +9,6 @@ use twin::{Effect, EffectKind, Ring};
 use super::unmodelled::{Unmodelled, UnmodelledKind};
 use crate::hypothesis::Term;
 use crate::score::{TrueCause, TrueEffect, Truth};
-use inference::recording::Recording;
 use inference::simulate;
 
 /// Class of a case.
@@ -51,7 +50,7 @@ impl Case {
     ///
     /// # Panics
     /// If there is no effect to choose from.
-    pub fn draw(ring: &Ring, template: &Recording, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
+    pub fn draw(ring: &Ring, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
         let mut streams = simulate::seeds(seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let mut stream = || streams.next().expect("seeds do not end");
         let vars = simulate::vars(ring, true, stream()).expect("a design has tunes, and rings like it");
@@ -73,8 +72,7 @@ impl Case {
             Class::Pair => vec![effect(index), effect(7 * index + 3)],
         };
         let kind = UnmodelledKind::ALL[index % UnmodelledKind::ALL.len()];
-        let unmodelled =
-            if class == Class::Unknown { vec![Unmodelled::of(kind, ring, template, stream())] } else { Vec::new() };
+        let unmodelled = if class == Class::Unknown { vec![Unmodelled::of(kind, ring, stream())] } else { Vec::new() };
         Self { index, class, vars, effects, unmodelled, seed: stream() }
     }
 

@@ -4,12 +4,9 @@
 //!
 //! | word | what happens, `a` the size | unit |
 //! |---|---|---|
-//! | `corrector_hysteresis` | a corrector keeps the share `a` of the kick that it had before its present setting | 1 |
 //! | `quad_jump` | one quadrupole is stronger by the share `a` from some moment on | 1 |
 //! | `bpm_warm_up` | a monitor's gain is off by `a exp(-(t + 1)/0.5)`, t from -1 to 1 | 1 |
 //! | `bpm_saturation` | a monitor reads `x/(1 + (a x)^8)^(1/8)`: linear for small x, and limited to `1/a` | 1/m |
-//! | `bpm_crosstalk` | a monitor reads the share `a` of the next one of its plane as well | 1 |
-//! | `corrector_leak` | the share `a` of a corrector's kick goes to the next one as well | 1 |
 //! | `octupole` | a thin octupole of K3L `a` stands in a free straight | 1/m3 |
 //! | `orbit_drift` | the kick of an unlogged corrector varies slowly by ±`a` | rad |
 //! | `bpm_wander` | a monitor's offset varies slowly by ±`a` | m |
@@ -18,26 +15,19 @@ use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
-use twin::{Cycle, Kind, Plane, Ring, Site};
+use twin::{Cycle, Kind, Ring, Site};
 
-use inference::recording::Recording;
 use inference::simulate::Beyond;
 
 /// The kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnmodelledKind {
-    /// Hysteresis of a corrector: a share of its previous setting remains.
-    Hysteresis,
     /// A quadrupole changes at once in mid-campaign.
     QuadJump,
     /// A monitor's gain settles while its electronics warm up.
     WarmUp,
     /// A monitor saturates.
     Saturation,
-    /// A monitor sees some of its neighbour's signal.
-    Crosstalk,
-    /// A corrector's current feeds the next one too.
-    Leak,
     /// An octupole.
     Octupole,
     /// The orbit drifts.
@@ -57,35 +47,21 @@ pub struct Unmodelled {
     pub size: f64,
     /// Index of the place: read monitor, corrector, quadrupole or element.
     index: usize,
-    /// Index of the neighbour that a leak or a crosstalk concerns.
-    next: usize,
     /// Time of a jump, or phase of a slow variation, -0.5 to 0.5.
     when: f64,
 }
 
 impl UnmodelledKind {
     /// Every kind.
-    pub const ALL: [Self; 9] = [
-        Self::Hysteresis,
-        Self::QuadJump,
-        Self::WarmUp,
-        Self::Saturation,
-        Self::Crosstalk,
-        Self::Leak,
-        Self::Octupole,
-        Self::OrbitDrift,
-        Self::BpmWander,
-    ];
+    pub const ALL: [Self; 6] =
+        [Self::QuadJump, Self::WarmUp, Self::Saturation, Self::Octupole, Self::OrbitDrift, Self::BpmWander];
 
     /// The word for it.
     pub fn word(self) -> &'static str {
         match self {
-            Self::Hysteresis => "corrector_hysteresis",
             Self::QuadJump => "quad_jump",
             Self::WarmUp => "bpm_warm_up",
             Self::Saturation => "bpm_saturation",
-            Self::Crosstalk => "bpm_crosstalk",
-            Self::Leak => "corrector_leak",
             Self::Octupole => "octupole",
             Self::OrbitDrift => "orbit_drift",
             Self::BpmWander => "bpm_wander",
@@ -95,7 +71,6 @@ impl UnmodelledKind {
     /// Sizes from weak to strong.
     pub fn sizes(self) -> [f64; 2] {
         match self {
-            Self::Hysteresis | Self::Crosstalk | Self::Leak => [0.01, 0.2],
             Self::QuadJump => [2e-3, 2e-2],
             Self::WarmUp => [0.02, 0.3],
             Self::Saturation => [1.0 / 6e-3, 1.0 / 1.5e-3],
@@ -106,17 +81,13 @@ impl UnmodelledKind {
     }
 
     /// Where it may act in a campaign.
-    fn sites(self, ring: &Ring, campaign: &Recording) -> Vec<Site> {
-        let correctors = 0..ring.correctors.len();
+    fn sites(self, ring: &Ring) -> Vec<Site> {
         match self {
-            Self::WarmUp | Self::Saturation | Self::Crosstalk | Self::BpmWander => {
+            Self::WarmUp | Self::Saturation | Self::BpmWander => {
                 ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect()
             }
             Self::QuadJump => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
-            Self::OrbitDrift => correctors.map(Site::Corrector).collect(),
-            Self::Hysteresis | Self::Leak => {
-                correctors.filter(|&at| was_set(campaign, at)).map(Site::Corrector).collect()
-            }
+            Self::OrbitDrift => (0..ring.correctors.len()).map(Site::Corrector).collect(),
             Self::Octupole => {
                 let straights = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Marker);
                 straights.map(Site::Element).collect()
@@ -129,24 +100,23 @@ impl Unmodelled {
     /// One of a kind, of random place, size and sign.
     ///
     /// # Panics
-    /// If the ring or the campaign has no place for it.
-    pub fn of(kind: UnmodelledKind, ring: &Ring, campaign: &Recording, seed: u64) -> Self {
+    /// If the ring has no place for it.
+    pub fn of(kind: UnmodelledKind, ring: &Ring, seed: u64) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
-        let sites = kind.sites(ring, campaign);
+        let sites = kind.sites(ring);
         let site = *sites.choose(&mut random).expect("a ring has places of every kind");
         let [weak, strong] = kind.sizes().map(f64::ln);
         let sign = if kind != UnmodelledKind::Saturation && random.random_bool(0.5) { -1.0 } else { 1.0 };
         let size = sign * random.random_range(weak..=strong).exp();
-        let [index, next] = indices(kind, ring, site);
-        Self { kind, site, size, index, next, when: random.random_range(-0.5..=0.5) }
+        Self { kind, site, size, index: index(ring, site), when: random.random_range(-0.5..=0.5) }
     }
 
     /// One of any kind.
-    pub fn any(ring: &Ring, campaign: &Recording, seed: u64) -> Self {
+    pub fn any(ring: &Ring, seed: u64) -> Self {
         let mut streams = inference::simulate::seeds(seed);
         let mut stream = || streams.next().expect("seeds do not end");
         let kind = UnmodelledKind::ALL.choose(&mut StdRng::seed_from_u64(stream())).expect("there are some");
-        Self::of(*kind, ring, campaign, stream())
+        Self::of(*kind, ring, stream())
     }
 
     /// A slow variation between -1 and 1.
@@ -165,11 +135,9 @@ impl Beyond for Unmodelled {
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
         let late = |cycle: &&mut Cycle| cycle.time >= self.when;
         match self.kind {
-            UnmodelledKind::Hysteresis => remember(cycles, self.index, self.size),
             UnmodelledKind::QuadJump => {
                 cycles.iter_mut().filter(late).for_each(|c| c.strength[self.index] += self.size.ln_1p());
             }
-            UnmodelledKind::Leak => cycles.iter_mut().for_each(|c| c.kick[self.next] += self.size * c.kick[self.index]),
             UnmodelledKind::OrbitDrift => {
                 cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.slow_variation(c.time));
             }
@@ -178,58 +146,28 @@ impl Beyond for Unmodelled {
     }
 
     fn alter_readings(&self, cycles: &[Cycle], readings: &mut DMatrix<f64>) {
-        let read = |time: f64, x: f64, neighbour: f64| match self.kind {
+        let read = |time: f64, x: f64| match self.kind {
             UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
-            UnmodelledKind::Crosstalk => x + self.size * neighbour,
             UnmodelledKind::BpmWander => x + self.size * self.slow_variation(time),
             _ => x,
         };
-        if self.index < readings.ncols() && self.next < readings.ncols() {
-            for (i, cycle) in cycles.iter().enumerate() {
-                readings[(i, self.index)] = read(cycle.time, readings[(i, self.index)], readings[(i, self.next)]);
+        if self.index < readings.ncols() {
+            for (cycle, reading) in cycles.iter().zip(&mut readings.column_mut(self.index)) {
+                *reading = read(cycle.time, *reading);
             }
         }
     }
 }
 
-/// True if the campaign sets this corrector.
-fn was_set(campaign: &Recording, corrector: usize) -> bool {
-    campaign.rows.iter().any(|row| row.setting(corrector).is_some_and(|setting| setting != 0.0))
-}
-
-/// Index of the place among the read monitors, correctors, quadrupoles or elements, and of the neighbour that it concerns: the next
-/// read monitor of the same plane, or the next corrector, the last one's being the first.
-fn indices(kind: UnmodelledKind, ring: &Ring, site: Site) -> [usize; 2] {
-    let after = |index: usize, planes: Vec<Plane>| {
-        let mut others = (index + 1..planes.len()).chain(0..index);
-        others.find(|&i| planes[i] == planes[index]).unwrap_or(index)
-    };
-    match (kind, site) {
-        (UnmodelledKind::Leak, Site::Corrector(at)) => {
-            [at, after(at, ring.correctors.iter().map(|c| c.plane).collect())]
+/// Index of the place among the read monitors, correctors, quadrupoles or elements.
+fn index(ring: &Ring, site: Site) -> usize {
+    match site {
+        Site::Monitor(at) => {
+            ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors")
         }
-        (_, Site::Monitor(at)) => {
-            let index = ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors");
-            let is_shared = kind == UnmodelledKind::Crosstalk;
-            [index, if is_shared { after(index, ring.monitors_read().map(|m| m.plane).collect()) } else { index }]
-        }
-        (_, Site::Corrector(at) | Site::Quadrupole(at) | Site::Element(at)) => [at, at],
-        (_, Site::Ring | Site::MonitorPair(..)) => unreachable!("no kind acts there"),
-    }
-}
-
-/// Add a share of what a corrector was set to before its present setting. Read-backs fluctuate, so a setting is another one
-/// if it differs by a quarter of the largest.
-fn remember(cycles: &mut [Cycle], corrector: usize, share: f64) {
-    let kicks: Vec<f64> = cycles.iter().map(|cycle| cycle.kick[corrector]).collect();
-    let apart = 0.25 * kicks.iter().fold(0.0_f64, |largest, kick| largest.max(kick.abs()));
-    let (mut before, mut now) = (0.0, kicks.first().copied().unwrap_or(0.0));
-    for (cycle, kick) in cycles.iter_mut().zip(kicks) {
-        if (kick - now).abs() > apart {
-            (before, now) = (now, kick);
-        }
-        cycle.kick[corrector] += share * before;
+        Site::Corrector(at) | Site::Quadrupole(at) | Site::Element(at) => at,
+        Site::Ring | Site::MonitorPair(..) => unreachable!("no kind acts there"),
     }
 }
 
@@ -237,6 +175,7 @@ fn remember(cycles: &mut [Cycle], corrector: usize, share: f64) {
 mod tests {
     use super::*;
     use crate::testing::{ideal, readings, template};
+    use inference::recording::Recording;
     use inference::simulate::{Truth, campaign};
 
     /// Readings with the unknown less those without, rows frames.
@@ -254,7 +193,7 @@ mod tests {
         let (ring, recording) = template();
         for kind in UnmodelledKind::ALL {
             for seed in 0..2 {
-                let unknown = Unmodelled::of(kind, &ring, &recording, seed);
+                let unknown = Unmodelled::of(kind, &ring, seed);
                 let change = change(&unknown, &ring, &recording);
                 let moved = change.column_iter().filter(|column| column.abs().max() > 1e-9).count();
                 println!(
@@ -273,35 +212,14 @@ mod tests {
     }
 
     #[test]
-    fn a_corrector_remembers_its_last_setting() {
-        let cycle = |kick: f64| Cycle { kick: vec![kick], strength: Vec::new(), rf_offset: 0.0, time: 0.0 };
-        let mut cycles: Vec<Cycle> = [0.01, 0.0, 1.0, 1.01, -1.0, 0.0, -0.01].map(cycle).into();
-        remember(&mut cycles, 0, 0.1);
-        let added: Vec<f64> = cycles.iter().map(|c| c.kick[0]).collect();
-        let known = [0.01, 0.0, 1.001, 1.011, -0.9, -0.1, -0.11];
-        added.iter().zip(known).for_each(|(a, k)| assert!((a - k).abs() < 1e-12, "{added:?}"));
-    }
-
-    #[test]
-    fn the_last_of_a_plane_has_the_first_as_its_neighbour() {
-        let ring = Ring::booster();
-        let names = ring.monitor_names();
-        let next = |name: &str| {
-            let site = Site::Monitor(Site::monitor(&ring, name).unwrap());
-            &names[indices(UnmodelledKind::Crosstalk, &ring, site)[1]]
-        };
-        assert_eq!((next("x_A6").as_str(), next("x_F8").as_str(), next("y_F7").as_str()), ("x_A8", "x_A6", "y_A1"));
-    }
-
-    #[test]
     fn a_draw_is_within_its_sizes_and_depends_on_its_seed() {
-        let (ring, recording) = template();
-        let drawn: Vec<Unmodelled> = (0..200).map(|seed| Unmodelled::any(&ring, &recording, seed)).collect();
+        let ring = Ring::booster();
+        let drawn: Vec<Unmodelled> = (0..200).map(|seed| Unmodelled::any(&ring, seed)).collect();
         for unknown in &drawn {
             let [weak, strong] = unknown.kind.sizes();
             assert!((weak..=strong * 1.000_001).contains(&unknown.size.abs()), "{unknown:?}");
         }
         assert!(UnmodelledKind::ALL.iter().all(|kind| drawn.iter().any(|unknown| unknown.kind == *kind)));
-        assert_eq!(drawn[4], Unmodelled::any(&ring, &recording, 4));
+        assert_eq!(drawn[4], Unmodelled::any(&ring, 4));
     }
 }

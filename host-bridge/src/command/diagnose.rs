@@ -1,7 +1,7 @@
 //! `orbitcal diagnose`: what is missing in the model of a recording.
 
 use core::fmt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use comfy_table::ColumnConstraint;
 use diagnosis::average::Vars;
@@ -23,6 +23,9 @@ use crate::result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 #[derive(Debug, Serialize)]
 struct DiagnosisResult {
     recording: String,
+    /// Those that were analysed together, if several.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    recordings: Vec<String>,
     verdict: &'static str,
     sentence: String,
     findings: Vec<FindingResult>,
@@ -51,6 +54,9 @@ struct FindingResult {
     amplitude: f64,
     sigma: f64,
     unit: &'static str,
+    /// Of a field that does not grow with the magnets, in several recordings: the energy at which `amplitude` is given, and the same in tesla.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    fixed: Option<FixedResult>,
     /// Amplitude and error bar as people read them.
     #[serde(skip)]
     measured: String,
@@ -59,10 +65,24 @@ struct FindingResult {
     sentence: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     heldout_gain: Option<[f64; 2]>,
+    /// The same where kind and place are chosen without the held-out readings too.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heldout_gain_of_choice: Option<f64>,
+    /// Probability that chance alone gives the search as good a candidate.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    chance: Option<f64>,
     /// Of an alternative: such a recording is not expected to tell it from the finding.
     #[serde(skip_serializing_if = "core::ops::Not::not")]
     inseparable: bool,
     alternatives: Vec<FindingResult>,
+}
+
+#[derive(Debug, Serialize)]
+struct FixedResult {
+    #[serde(rename = "kinetic_energy_GeV")]
+    kinetic_energy: f64,
+    #[serde(rename = "integrated_gradient_T")]
+    gradient: [f64; 2],
 }
 
 #[derive(Debug, Serialize)]
@@ -122,7 +142,9 @@ impl From<&Imperfection> for ImperfectionResult {
 impl From<DataError> for CommandError {
     fn from(error: DataError) -> Self {
         match error {
-            error @ (DataError::TooLittle { .. } | DataError::Miswired { .. }) => Self::Input(error.to_string()),
+            error @ (DataError::TooLittle { .. } | DataError::Miswired { .. } | DataError::Apart { .. }) => {
+                Self::Input(error.to_string())
+            }
             error => Self::Other(error.to_string()),
         }
     }
@@ -136,17 +158,18 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     let outputs = [&options.common.json, &options.report, &options.model_out];
     check_outputs(outputs.map(Option::as_deref))?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
-    let recording = recording(&options.recording, &ring)?;
+    let recordings = recordings(&options.recordings, &ring)?;
+    let Some((recording, others)) = recordings.split_first() else { return Ok(()) };
     let bar = progress(5, "", options.common.quiet);
-    let made = Diagnosis::of(&ring, &recording, |what| {
+    let made = Diagnosis::jointly(&ring, recording, others, |what| {
         bar.set_message(what.to_owned());
         bar.inc(1);
     });
     bar.finish_and_clear();
     let diagnosis = made?;
-    let result = DiagnosisResult::of(&ring, &recording, &diagnosis)?;
+    let result = DiagnosisResult::of(&ring, recording, &diagnosis)?;
     if let Some(path) = &options.report {
-        let page = page::page(&diagnosis, &recording);
+        let page = page::page(&diagnosis, recording);
         let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
         output::bytes(path, page.render().as_bytes())?;
     }
@@ -155,6 +178,20 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
         output::say(format_args!("\n{}", path.display()))?;
     }
     options.model_out.as_deref().map_or(Ok(()), |path| write_model(&diagnosis, path))
+}
+
+/// One recording, or several at whichever energies they were taken.
+fn recordings(folders: &[PathBuf], ring: &Ring) -> Result<Vec<Recording>, CommandError> {
+    if let [folder] = folders {
+        return Ok(vec![recording(folder, ring)?]);
+    }
+    let whole = |folder: &PathBuf| folder.canonicalize().unwrap_or_else(|_| folder.clone());
+    for (i, folder) in folders.iter().enumerate() {
+        if folders[..i].iter().any(|other| whole(other) == whole(folder)) {
+            return Err(CommandError::Input(format!("{}: given twice", folder.display())));
+        }
+    }
+    Ok(folders.iter().map(|folder| Recording::read_at_its_energy(folder, ring)).collect::<Result<_, _>>()?)
 }
 
 /// Write the core's tables of the machine that was found, if they can hold all of it.
@@ -192,11 +229,16 @@ impl DiagnosisResult {
         };
         let (next, tunes) = (&found.next, tunes_of(diagnosis));
         Ok(Self {
-            recording: recording.name.clone(),
+            recording: data.names(" + "),
+            recordings: if data.is_joint() {
+                data.campaigns().map(|own| own.name.clone()).collect()
+            } else {
+                Vec::new()
+            },
             verdict: diagnosis.verdict.word(),
             sentence: diagnosis.sentence.clone(),
             findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
-            monitors: monitors(ring, data.health()),
+            monitors: monitors(ring, &data.health_in_any()),
             fit: Fits {
                 before: fit(&found.null, before)?,
                 after: fit(&found.best, after)?,
@@ -241,7 +283,11 @@ impl fmt::Display for DiagnosisResult {
             words.set_constraint(ColumnConstraint::ContentWidth);
         }
         if !self.findings.is_empty() {
-            writeln!(f, "{table}\n{}\n", fill(COLUMNS))?;
+            let energy =
+                self.findings.iter().find_map(|finding| finding.fixed.as_ref()).map(|fixed| fixed.kinetic_energy);
+            let at =
+                energy.map_or_else(String::new, |energy| format!(" Stray gradients: amplitudes at {energy:.3} GeV."));
+            writeln!(f, "{table}\n{}\n", fill(&format!("{COLUMNS}{at}")))?;
         }
         let Fits { before, after, elpd_gain, elpd_gain_se, .. } = &self.fit;
         let summary = format!(
@@ -253,7 +299,8 @@ impl fmt::Display for DiagnosisResult {
         );
         write!(f, "{}", fill(&summary))?;
         if let Some(tunes) = &self.tunes {
-            write!(f, "\ntunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
+            let of = self.recordings.first().map_or_else(String::new, |first| format!(" of {first}"));
+            write!(f, "\ntunes{of} {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
         }
         self.write_imperfections(f)?;
         self.next_measurement.as_ref().map_or(Ok(()), |next| write!(f, "\n\n{}", fill(next)))
@@ -285,11 +332,17 @@ impl FindingResult {
             amplitude: value,
             sigma,
             unit: unit.symbol,
+            fixed: finding.fixed.map(|fixed| FixedResult {
+                kinetic_energy: fixed.kinetic_energy,
+                gradient: [fixed.gradient.value, fixed.gradient.sigma],
+            }),
             measured: if sigma > 0.0 { measured } else { String::new() },
             log_evidence_gain: finding.log_evidence_gain,
             probability: finding.probability,
             sentence: finding.phrase.clone(),
-            heldout_gain: finding.heldout.map(Into::into),
+            heldout_gain: finding.tested.map(|tested| tested.gain.into()),
+            heldout_gain_of_choice: finding.tested.and_then(|tested| tested.of_choice),
+            chance: finding.tested.and_then(|tested| tested.chance),
             inseparable: finding.inseparable,
             alternatives: finding.alternatives.iter().map(Self::of).collect(),
         }
@@ -311,8 +364,9 @@ impl FindingResult {
 
 /// Tunes of the machine that was found, what is ordinary included, at the recording's mean supply currents; none if it is unstable.
 fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
-    let (machine, _) = diagnosis.found.best.machine(&diagnosis.found.data).ok()?;
-    let tunes = machine.response().ok()?.tunes;
+    let (machine, drives) = diagnosis.found.best.machine(&diagnosis.found.data).ok()?;
+    // on its orbit, where sextupoles focus
+    let tunes = machine.on_orbit(&drives.orbit).optics().and_then(|optics| optics.tunes()).ok()?;
     Some(Tunes { x: tunes.x, y: tunes.y })
 }
 

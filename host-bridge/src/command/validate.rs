@@ -67,7 +67,7 @@ fn cases(options: &Validate, ring: &Ring, template: &Recording) -> Result<Vec<Ca
     ];
     let of_class = |(class, count): (Class, usize)| {
         let (terms, offset) = (&terms, class as usize * 1_000_000);
-        (0..count).map(move |i| Case::draw(ring, template, terms, class, offset + i, options.seed))
+        (0..count).map(move |i| Case::draw(ring, terms, class, offset + i, options.seed))
     };
     Ok(classes.into_iter().flat_map(of_class).collect())
 }

@@ -48,7 +48,9 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Octupole { k3l } => thin(&[0.0; 4], &[0.0, 0.0, 0.0, k3l / 6.0]),
         Kind::Solenoid { ks } => json!({"Class": "Element", "PassMethod": "SolenoidLinearPass", "K": ks}),
         Kind::Bend(bend) => {
-            let mut value = body("Dipole", "ExactSectorBendPass", &[0.0, bend.k1], element.length);
+            let field = [0.0, bend.k1, bend.k2 / 2.0];
+            let orders = if bend.k2 == 0.0 { 2 } else { 3 };
+            let mut value = body("Dipole", "ExactSectorBendPass", &field[..orders], element.length);
             value["BendingAngle"] = json!(bend.curvature * element.length);
             (value["EntranceAngle"], value["ExitAngle"]) = (json!(bend.e1), json!(bend.e2));
             if bend.fringe != 0.0 {

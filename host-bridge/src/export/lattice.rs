@@ -196,7 +196,9 @@ impl Lattice {
                 let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);
                 planes.for_each(|channel| channel.roll += amplitude);
             }
-            MonitorEffect::Cubic | MonitorEffect::Swap => return false,
+            MonitorEffect::Cubic | MonitorEffect::Swap | MonitorEffect::Crosstalk | MonitorEffect::Timing => {
+                return false;
+            }
         }
         true
     }
@@ -208,7 +210,10 @@ impl Lattice {
             CorrectorEffect::Polarity => channel.gain = -channel.gain,
             // the ring has it
             CorrectorEffect::Roll => {}
-            CorrectorEffect::Even => return false,
+            CorrectorEffect::Even
+            | CorrectorEffect::Crosstalk
+            | CorrectorEffect::Hysteresis
+            | CorrectorEffect::Settling => return false,
         }
         true
     }

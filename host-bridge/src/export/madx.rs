@@ -66,7 +66,7 @@ fn definition(lattice: &Lattice, at: usize, element: &Element) -> String {
         }
         Kind::Bend(bend) => {
             attributes.length(element).number("angle", bend.curvature * element.length);
-            attributes.other("k1", bend.k1).other("e1", bend.e1).other("e2", bend.e2);
+            attributes.other("k1", bend.k1).other("k2", bend.k2).other("e1", bend.e1).other("e2", bend.e2);
             if bend.fringe != 0.0 {
                 attributes.number("fint", 0.5).number("hgap", bend.fringe);
             }

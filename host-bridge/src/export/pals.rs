@@ -43,7 +43,8 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Octupole { k3l } => ("Multipole", magnet(json!({"Kn3L": k3l}))),
         Kind::Solenoid { ks } => ("Solenoid", json!({"SolenoidP": {"Ksol": ks}})),
         Kind::Bend(bend) => {
-            let mut groups = magnet(json!({"Kn1": bend.k1}));
+            let field = if bend.k2 == 0.0 { json!({"Kn1": bend.k1}) } else { json!({"Kn1": bend.k1, "Kn2": bend.k2}) };
+            let mut groups = magnet(field);
             // fint times half the gap
             let edge = bend.fringe / 2.0;
             groups["BendP"] = json!({

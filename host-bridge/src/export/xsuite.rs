@@ -43,12 +43,18 @@ fn element(element: &Element) -> Value {
         Kind::Solenoid { ks } => json!({"__class__": "UniformSolenoid", "length": element.length, "ks": ks}),
         Kind::Multipole { k1l, k1sl, k2l } => multipole(&[0.0, *k1l, *k2l], &[0.0, *k1sl, 0.0]),
         Kind::Octupole { k3l } => multipole(&[0.0, 0.0, 0.0, *k3l], &[0.0; 4]),
-        Kind::Bend(bend) => json!({
+        Kind::Bend(bend) => {
+            let mut value = json!({
             "__class__": "Bend", "length": element.length, "angle": bend.curvature * element.length, "k1": bend.k1,
             "model": "rot-kick-rot", "edge_entry_model": "full", "edge_exit_model": "full",
             "edge_entry_angle": bend.e1, "edge_exit_angle": bend.e2,
             "edge_entry_fint": 0.5, "edge_exit_fint": 0.5, "edge_entry_hgap": bend.fringe, "edge_exit_hgap": bend.fringe,
-        }),
+            });
+            if bend.k2 != 0.0 {
+                value["knl"] = json!([0.0, 0.0, bend.k2 * element.length]);
+            }
+            value
+        }
     };
     let Misalignment { dx, dy, roll } = element.misalignment;
     for (word, amount) in [("shift_x", dx), ("shift_y", dy), ("rot_s_rad", roll)] {

@@ -5,6 +5,7 @@
 
 use core::fmt;
 use core::ops::Range;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -420,6 +421,23 @@ impl Text<'_> {
         let line = self.text.lines().position(is).unwrap_or(0);
         Place::new(self.file, line + 1, Part::Key(key.into()))
     }
+}
+
+/// The ring at another kinetic energy [GeV]: its strengths are over the rigidity, and stay. With a ramp in the machine file it is as it was.
+pub fn at_energy(ring: &Ring, kinetic_energy: f64) -> Cow<'_, Ring> {
+    if (kinetic_energy / ring.particle.kinetic_energy - 1.0).abs() <= SAME_ENERGY || !ring.ramp.is_empty() {
+        return Cow::Borrowed(ring);
+    }
+    let mut ring = ring.clone();
+    ring.particle.kinetic_energy = kinetic_energy;
+    Cow::Owned(ring)
+}
+
+/// Kinetic energy that a header states [GeV]; none where it cannot be read, which the strict reading refuses.
+pub(super) fn kinetic_energy(text: &str) -> Option<f64> {
+    let table: toml::Table = text.parse().ok()?;
+    let energy = table.get("kinetic_energy_GeV")?.as_float()?;
+    (energy.is_finite() && energy > 0.0).then_some(energy)
 }
 
 /// Relative difference of energies that counts as rounding.

@@ -21,7 +21,7 @@ use twin::Ring;
 
 pub use error::{Mismatch, Part, Place, RecordingError};
 pub use frames::Row;
-pub use header::{BelievedRf, Format, Header};
+pub use header::{BelievedRf, Format, Header, at_energy};
 use names::Names;
 pub use ramp::{At, Ramp};
 
@@ -54,6 +54,17 @@ impl Recording {
         let refuse = |(key, what): (&str, String)| header::refuse(&file, &header_text, key, &what);
         plausible::check(&recording).map_err(refuse)?;
         Ok(recording)
+    }
+
+    /// The same of one of several campaigns of a ring, at whichever energy it was taken; with a ramp in the machine file the frames' times say
+    /// which that is.
+    ///
+    /// # Errors
+    /// As [`Recording::read`].
+    pub fn read_at_its_energy(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
+        let energy = header::kinetic_energy(&text(&folder.join("header.toml"))?);
+        let ring = energy.map_or(Cow::Borrowed(ring), |energy| at_energy(ring, energy));
+        Self::read(folder, &ring)
     }
 
     /// The ring as the recording's supplies power it: its own in format 2; in format 1 one for the focusing quadrupoles and

@@ -14,7 +14,7 @@ use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
-use twin::{Cycle, Effect, EffectError, Machine, OrbitError, Rf, Ring, Tracked, Tunes};
+use twin::{Cycle, Effect, EffectError, Machine, Rf, Ring, Tracked, Tunes};
 
 use super::seeds;
 use crate::campaign::Drive;
@@ -105,7 +105,7 @@ pub fn campaign(
     let mut cycles = cycles(template, &ring);
     truth.beyond.iter().for_each(|beyond| beyond.alter_cycles(&mut cycles));
     let machine = Machine::new(ring, Rf::FixedMomentum, truth.effects)?;
-    let (mut readings, tunes) = track(&Tracked::of(machine, template.nominal_kick())?, &cycles)?;
+    let (mut readings, tunes) = Tracked::of(machine, template.nominal_kick())?.cycles(&cycles)?;
     truth.beyond.iter().for_each(|beyond| beyond.alter_readings(&cycles, &mut readings));
     hardware.offset(&mut readings, &mut stream());
     hardware.add_noise(&mut readings, &mut stream());
@@ -131,17 +131,6 @@ fn cycles(template: &Recording, ring: &Ring) -> Vec<Cycle> {
         Cycle { kick: drive.kick.iter().copied().collect(), strength, rf_offset: drive.rf_offset, time }
     };
     template.rows.iter().zip(template.times()).map(of).collect()
-}
-
-/// Readings, rows cycles, and tunes.
-fn track(machine: &Tracked, cycles: &[Cycle]) -> Result<(DMatrix<f64>, Vec<Tunes>), OrbitError> {
-    let (mut rows, mut tunes) = (Vec::new(), Vec::new());
-    for cycle in cycles {
-        let (readings, tune) = machine.cycle(cycle)?;
-        rows.push(nalgebra::RowDVector::from_vec(readings));
-        tunes.push(tune);
-    }
-    Ok((DMatrix::from_rows(&rows), tunes))
 }
 
 impl Hardware {

@@ -6,15 +6,22 @@ use nalgebra::{DMatrix, DVector};
 use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
 use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
+use crate::site::Site;
 
 const NOMINAL: f64 = 2e-4;
+
+/// Correctors that are powered one after the other.
+fn powered(ring: &Ring) -> [usize; 4] {
+    let n = ring.correctors.len();
+    [3, n / 2 + 5, 11, n / 2 + 17]
+}
 
 /// Frames that tell all effects apart: both planes, both signs, nothing but the RF frequency, everything at once.
 fn drives(ring: &Ring, orbit: Vec<[f64; 2]>) -> Drives {
     let n = ring.correctors.len();
     let mut kick = DMatrix::zeros(8, n);
-    let set =
-        [(0, 3, 1.0), (1, 3, -1.0), (2, n / 2 + 5, 1.0), (3, n / 2 + 5, -1.0), (4, 11, 1.0), (4, n / 2 + 17, 0.7)];
+    let [a, b, c, d] = powered(ring);
+    let set = [(0, a, 1.0), (1, a, -1.0), (2, b, 1.0), (3, b, -1.0), (4, c, 1.0), (4, d, 0.7)];
     set.iter().for_each(|&(frame, corrector, share)| kick[(frame, corrector)] = share * NOMINAL);
     kick.row_mut(5).iter_mut().enumerate().for_each(|(c, k)| *k = 0.1 * NOMINAL * (1.0 + c as f64).sin());
     let rf_offset = DVector::from_vec(vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-4, -1e-4]);
@@ -49,12 +56,18 @@ fn orbit(ring: &Ring, delta: f64) -> Vec<[f64; 2]> {
     orbit.at[..ring.elements.len()].iter().map(|z| [z[0], z[2]]).collect()
 }
 
-/// Every kind with some of its places: the first, the last and each seventh.
+/// Every kind with some of its places: the first, the last and each seventh; hysteresis of what is powered.
 fn effects(ring: &Ring) -> Vec<Effect> {
     let of = |&kind: &EffectKind| {
         let radial_loop = || Effect::parse("radial_loop@x_D8,x_E6", ring).unwrap().site;
-        let sites = if kind == EffectKind::RadialLoop { vec![radial_loop()] } else { kind.sites(ring) };
-        let step = if kind == EffectKind::BpmSwap { 41 } else { 7 };
+        let (sites, step) = match kind {
+            EffectKind::RadialLoop => (vec![radial_loop()], 1),
+            EffectKind::CorrectorHysteresis | EffectKind::CorrectorSettling => {
+                (powered(ring).map(Site::Corrector).to_vec(), 1)
+            }
+            EffectKind::BpmSwap => (kind.sites(ring), 41),
+            _ => (kind.sites(ring), 7),
+        };
         let amplitude = kind.prior_scale().unwrap_or(1.0);
         let last = sites.len() - 1;
         let some = sites.into_iter().enumerate().filter(move |(i, _)| i % step == 0 || *i == last);
@@ -71,18 +84,15 @@ fn machine(ring: &Ring, effects: &[Effect]) -> Machine {
 fn tracked(machine: Machine, drives: &Drives) -> DMatrix<f64> {
     let quadrupoles = machine.ring().quadrupoles.len();
     let tracked = Tracked::of(machine, drives.nominal_kick).unwrap();
-    let read = |kick: Vec<f64>, rf_offset: f64, time: f64| {
-        let cycle = Cycle { kick, strength: vec![0.0; quadrupoles], rf_offset, time };
-        nalgebra::RowDVector::from_vec(tracked.cycle(&cycle).unwrap().0)
+    let of = |i: usize, share: f64| {
+        let kick = drives.kick.row(i).iter().map(|kick| share * kick).collect();
+        Cycle { kick, strength: vec![0.0; quadrupoles], rf_offset: share * drives.rf_offset[i], time: drives.time[i] }
     };
-    let rows: Vec<_> = (0..drives.kick.nrows())
-        .map(|i| {
-            let kick: Vec<f64> = drives.kick.row(i).iter().copied().collect();
-            let none = vec![0.0; kick.len()];
-            read(kick, drives.rf_offset[i], drives.time[i]) - read(none, 0.0, drives.time[i])
-        })
-        .collect();
-    DMatrix::from_rows(&rows)
+    let read = |share: f64| {
+        let cycles: Vec<Cycle> = (0..drives.kick.nrows()).map(|i| of(i, share)).collect();
+        tracked.cycles(&cycles).unwrap().0
+    };
+    read(1.0) - read(0.0)
 }
 
 /// Central difference of readings, tunes and their drift about a machine; the whole change of what is there or not.
@@ -141,7 +151,8 @@ fn signatures_hold_about_a_machine_with_effects() {
     // where not the momentum is held, but for the curvature of a sextupole, which is taken at constant momentum
     // what is held beside it is held already: of a full loop nothing is left
     let holds = |kind: EffectKind| matches!(kind, EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
-    let linear = |kind: EffectKind| !kind.is_switch() && !holds(kind) && kind != EffectKind::SextupoleError;
+    let is_curved = |kind| matches!(kind, EffectKind::SextupoleError | EffectKind::DipoleSextupole);
+    let linear = |kind: EffectKind| !kind.is_switch() && !holds(kind) && !is_curved(kind);
     assert(&about("radial_loop@x_D8,x_E6"), &linear, 2e-4);
     assert(&about("fixed_rf_frequency"), &linear, 2e-4);
 }
@@ -174,7 +185,7 @@ fn typical(effect: Effect) -> Effect {
 }
 
 fn depends_on_the_orbit(ring: &Ring, effect: &Effect) -> bool {
-    !effect.kind.orbit(ring, effect.site).is_empty()
+    effect.kind == EffectKind::DipoleSextupole || !effect.kind.orbit(ring, effect.site).is_empty()
 }
 
 #[test]

@@ -1,12 +1,15 @@
-//! Errors of correctors: gain, roll, reversed polarity, even part.
+//! Errors of correctors: gain, roll, reversed polarity, even part, a share of the kick that goes to another one or stays.
 //!
-//! The actual kick is one function of the nominal kick and of an amplitude, [`CorrectorEffect::kick`]; a rolled magnet kicks
-//! in both planes, as an element of the ring.
+//! Of a gain, a polarity and an even part the actual kick is one function of the nominal kick and of an amplitude,
+//! [`CorrectorEffect::kick`]; a rolled magnet kicks in both planes, as an element of the ring. Crosstalk adds `a` times the kick of one to that of the next; a
+//! corrector with hysteresis kicks `k + a k_before`, `k_before` what it had before its present setting; one that settles lacks `a` of each change in the frame
+//! after it, `a^2` in the next: in frame i it kicks `j_i = k_i + a (j_(i-1) - k_i)`.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, DVectorView};
 use num_dual::first_derivative;
 
 use super::mechanism::{Measured, Mechanism, Unit};
+use super::monitor::{coming, mix};
 use super::{EffectError, Machine, Signature, Signatures};
 use crate::lattice::Ring;
 use crate::map::Scalar;
@@ -23,15 +26,25 @@ pub enum CorrectorEffect {
     Polarity,
     /// Its kick differs between its signs by twice this share of the nominal one; cancels in the difference that a response is.
     Even,
+    /// A share of its kick goes to the next one of its plane as well, of the last one to the first.
+    Crosstalk,
+    /// A share of the kick that it had before its present setting stays.
+    Hysteresis,
+    /// A share of each change is missing in the frame after it, and the same share of that in the next.
+    Settling,
 }
 
 /// What a corrector does in a machine.
 #[derive(Debug, Clone)]
-pub(super) struct Kick {
-    how: CorrectorEffect,
-    corrector: usize,
-    amplitude: f64,
+pub(super) enum Kick {
+    Changed { how: CorrectorEffect, corrector: usize, amplitude: f64 },
+    Shared { corrector: usize, with: usize, share: f64 },
+    Kept { corrector: usize, share: f64 },
+    Lagging { corrector: usize, share: f64 },
 }
+
+/// Change of a kick, in nominal ones, that is another setting: read-backs fluctuate by per mille.
+const ANOTHER: f64 = 0.25;
 
 impl CorrectorEffect {
     /// The actual kick for a nominal one [rad].
@@ -40,7 +53,7 @@ impl CorrectorEffect {
             Self::Gain => believed * (amplitude + 1.0),
             Self::Polarity => -believed,
             Self::Even => believed + amplitude * believed * believed / nominal,
-            Self::Roll => believed,
+            Self::Roll | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
         }
     }
 
@@ -60,24 +73,31 @@ impl Mechanism for CorrectorEffect {
             Self::Roll => "corrector_roll",
             Self::Polarity => "corrector_polarity",
             Self::Even => "corrector_even",
+            Self::Crosstalk => "corrector_crosstalk",
+            Self::Hysteresis => "corrector_hysteresis",
+            Self::Settling => "corrector_settling",
         }
     }
 
-    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a magnet by 50 mrad.
+    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a magnet by 50 mrad; a return that two supplies
+    /// share, or a controller's channels, leak some per cent; iron keeps some per mille of its field, a magnet with closed gaps some
+    /// per cent. A slow regulator or eddy currents in a thick chamber leave some per cent of a change to the next cycle, a wrong time constant tens.
     ///
     /// Source: J. Safranek, NIM A 388 (1997) 27.
     fn prior_scale(&self) -> Option<f64> {
         match self {
             Self::Gain => Some(0.08),
             Self::Roll => Some(0.06),
-            Self::Even => Some(0.05),
+            Self::Even | Self::Crosstalk => Some(0.05),
+            Self::Hysteresis => Some(0.03),
+            Self::Settling => Some(0.1),
             Self::Polarity => None,
         }
     }
 
     fn unit(&self) -> Unit {
         match self {
-            Self::Gain | Self::Even => Unit::PERCENT,
+            Self::Gain | Self::Even | Self::Crosstalk | Self::Hysteresis | Self::Settling => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
             Self::Polarity => Unit::NONE,
         }
@@ -85,21 +105,26 @@ impl Mechanism for CorrectorEffect {
 
     fn sites(&self, ring: &Ring) -> Vec<Site> {
         let is_one = |&at: &usize| match self {
-            Self::Gain | Self::Polarity | Self::Even => true,
+            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => true,
             Self::Roll => rolled(ring, at) == at,
+            Self::Crosstalk => next(ring, at).is_some(),
         };
         (0..ring.correctors.len()).filter(is_one).map(Site::Corrector).collect()
     }
 
     fn expected(&self) -> &'static str {
-        "a corrector"
+        match self {
+            Self::Gain | Self::Roll | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => "a corrector",
+            Self::Crosstalk => "a corrector with another one in its plane",
+        }
     }
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         let at = Site::corrector(ring, name)?;
         Some(Site::Corrector(match self {
-            Self::Gain | Self::Polarity | Self::Even => at,
+            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => at,
             Self::Roll => rolled(ring, at),
+            Self::Crosstalk => next(ring, at).map(|_| at)?,
         }))
     }
 
@@ -109,8 +134,14 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Roll => ring.elements[ring.correctors[corrector].element].misalignment.roll += amplitude,
             Self::Gain | Self::Polarity | Self::Even => {
-                machine.correctors.push(Kick { how: *self, corrector, amplitude });
+                machine.correctors.push(Kick::Changed { how: *self, corrector, amplitude });
             }
+            Self::Crosstalk => {
+                let with = next(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
+                machine.correctors.push(Kick::Shared { corrector, with, share: amplitude });
+            }
+            Self::Hysteresis => machine.correctors.push(Kick::Kept { corrector, share: amplitude }),
+            Self::Settling => machine.correctors.push(Kick::Lagging { corrector, share: amplitude }),
         }
         Ok(())
     }
@@ -129,6 +160,18 @@ impl Mechanism for CorrectorEffect {
                 let nominal = about.drives.nominal_kick;
                 let change = about.kick.column(corrector).map(|kick| self.change(kick, nominal));
                 signature.readings = change * about.response.column(corrector).transpose();
+            }
+            Self::Crosstalk => {
+                let with = next(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
+                signature.readings = about.kick.column(corrector) * about.response.column(with).transpose();
+            }
+            Self::Hysteresis => {
+                let before = before(&about.kick.column(corrector), about.drives.nominal_kick);
+                signature.readings = before * about.response.column(corrector).transpose();
+            }
+            Self::Settling => {
+                let lacking = coming(&about.kick.column(corrector));
+                signature.readings = lacking * about.response.column(corrector).transpose();
             }
         }
         Ok(signature)
@@ -150,26 +193,84 @@ impl Mechanism for CorrectorEffect {
                 let more = amplitude.by_sign("more", "less");
                 format!("corrector {name} kicks {} % {more} at + than at -", amplitude.size(2.0 * 100.0))
             }
+            Self::Crosstalk => {
+                let Site::Corrector(at) = site else { unreachable!("it acts on correctors") };
+                let other = next(ring, at).map_or_else(String::new, |other| ring.corrector_name(other));
+                format!("{} % of the kick of corrector {name} goes to {other} as well", amplitude.signed(100.0))
+            }
+            Self::Hysteresis => {
+                format!("corrector {name} keeps {} % of the kick that it had before", amplitude.signed(100.0))
+            }
+            Self::Settling => {
+                format!("corrector {name} is late: the frame after a change lacks {} % of it", amplitude.signed(100.0))
+            }
         }
     }
 }
 
 impl Kick {
-    /// The kick of a corrector in place of the one that it had [rad].
-    pub fn given(&self, corrector: usize, kick: f64, nominal: f64) -> f64 {
-        if corrector == self.corrector { self.how.kick(self.amplitude, kick, nominal) } else { kick }
-    }
-
-    /// The same in all frames, rows frames, columns correctors.
+    /// The kicks in place of those that were, rows frames in the order of time, columns correctors [rad].
     pub fn of_frames(&self, kick: &mut DMatrix<f64>, nominal: f64) {
-        kick.column_mut(self.corrector).apply(|kick| *kick = self.given(self.corrector, *kick, nominal));
+        match self {
+            Self::Changed { how, corrector, amplitude } => {
+                kick.column_mut(*corrector).apply(|kick| *kick = how.kick(*amplitude, *kick, nominal));
+            }
+            Self::Shared { corrector, with, share } => mix(kick, *with, *corrector, *share),
+            Self::Kept { corrector, share } => {
+                let kept = before(&kick.column(*corrector), nominal) * *share;
+                let mut column = kick.column_mut(*corrector);
+                column += kept;
+            }
+            Self::Lagging { corrector, share } => {
+                let mut column = kick.column_mut(*corrector);
+                let mut given = column[0];
+                for kick in &mut column {
+                    given = *kick + share * (given - *kick);
+                    *kick = given;
+                }
+            }
+        }
     }
 
-    /// The same of a response, columns correctors: in the limit of small kicks, so that any nominal one will do.
+    /// The same of a response, columns correctors: in the limit of small kicks, so that any nominal one will do and none was before.
     pub fn of_response(&self, response: &mut [DMatrix<f64>; 2]) {
-        let slope = first_derivative(|kick| self.how.kick(self.amplitude.into(), kick, 1.0), 0.0).1;
-        response.iter_mut().for_each(|plane| plane.column_mut(self.corrector).scale_mut(slope));
+        match self {
+            Self::Changed { how, corrector, amplitude } => {
+                let slope = first_derivative(|kick| how.kick((*amplitude).into(), kick, 1.0), 0.0).1;
+                response.iter_mut().for_each(|plane| plane.column_mut(*corrector).scale_mut(slope));
+            }
+            Self::Shared { corrector, with, share } => {
+                response.iter_mut().for_each(|plane| mix(plane, *corrector, *with, *share));
+            }
+            Self::Kept { .. } | Self::Lagging { .. } => {}
+        }
     }
+
+    /// True for one that depends on the frames before.
+    pub fn remembers(&self) -> bool {
+        matches!(self, Self::Kept { .. } | Self::Lagging { .. })
+    }
+}
+
+/// The kick that a corrector had before its present setting in each frame, 0 before the first one [rad].
+fn before(kick: &DVectorView<f64>, nominal: f64) -> DVector<f64> {
+    let (mut before, mut now) = (0.0, kick.iter().next().copied().unwrap_or(0.0));
+    kick.map(|kick| {
+        if (kick - now).abs() > ANOTHER * nominal.abs() {
+            (before, now) = (now, kick);
+        }
+        before
+    })
+}
+
+/// The next corrector in the plane of one; after the last the first.
+fn next(ring: &Ring, corrector: usize) -> Option<usize> {
+    let others = || {
+        let is_other =
+            |&other: &usize| other != corrector && ring.correctors[other].plane == ring.correctors[corrector].plane;
+        (0..ring.correctors.len()).filter(is_other)
+    };
+    others().find(|&other| other > corrector).or_else(|| others().next())
 }
 
 /// What the read monitors see of a corrector's kick, turned by a right angle [m/rad].
@@ -188,4 +289,34 @@ fn of_element(ring: &Ring, element: usize) -> impl Iterator<Item = usize> {
 /// The corrector that a rolled one is named after: the first of its element.
 fn rolled(ring: &Ring, corrector: usize) -> usize {
     of_element(ring, ring.correctors[corrector].element).next().unwrap_or(corrector)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Read-backs fluctuate; back at an old setting the corrector remembers where it comes from.
+    #[test]
+    fn a_corrector_remembers_its_last_setting() {
+        let kick = DMatrix::from_column_slice(7, 1, &[0.01, 0.0, 1.0, 1.01, -1.0, 0.0, -0.01]);
+        let mut given = kick.clone();
+        Kick::Kept { corrector: 0, share: 0.1 }.of_frames(&mut given, 1.0);
+        let kept = DMatrix::from_column_slice(7, 1, &[0.0, 0.0, 0.001, 0.001, 0.1, -0.1, -0.1]);
+        assert!((given - kick - kept).abs().max() < 1e-12);
+    }
+
+    #[test]
+    fn a_corrector_that_settles_lacks_a_falling_share_of_a_change() {
+        let mut given = DMatrix::from_column_slice(5, 1, &[1.0, 1.0, 0.0, 0.0, 2.0]);
+        Kick::Lagging { corrector: 0, share: 0.2 }.of_frames(&mut given, 1.0);
+        let lagging = DMatrix::from_column_slice(5, 1, &[1.0, 1.0, 0.2, 0.04, 1.608]);
+        assert!((given - lagging).abs().max() < 1e-12);
+    }
+
+    #[test]
+    fn the_last_of_a_plane_shares_its_kick_with_the_first() {
+        let ring = Ring::booster();
+        let name = |name: &str| ring.corrector_name(next(&ring, Site::corrector(&ring, name).unwrap()).unwrap());
+        assert_eq!([name("H_A2"), name("H_F8"), name("V_F7")], ["H_A4", "H_A2", "V_A1"]);
+    }
 }

@@ -8,7 +8,7 @@ use crate::orbit::{Hold, OrbitError};
 use crate::response::Optics;
 use crate::tune::Tunes;
 
-/// What drove the beam in the frames of a campaign, and the orbit that the kicks were added to.
+/// What drove the beam in the frames of a campaign, in the order of time, and the orbit that the kicks were added to.
 #[derive(Debug, Clone)]
 pub struct Drives {
     /// Kicks as believed, rows frames, columns correctors of the ring [rad].

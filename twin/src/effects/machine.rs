@@ -90,6 +90,14 @@ impl Machine {
         Ok(orbit.at[..self.ring.elements.len()].iter().map(|at| [at[X], at[Y]]).collect())
     }
 
+    /// Optics at the momentum that the machine has.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if there is no closed orbit.
+    pub fn optics(&self) -> Result<Optics<'_>, OrbitError> {
+        Optics::of(&self.ring, Hold::Momentum { delta: self.hold.delta })
+    }
+
     /// Relative change of all gradients from mid-campaign to its end.
     pub fn drift(&self) -> f64 {
         self.drift
@@ -103,13 +111,22 @@ impl Machine {
         Self { ring: self.ring.with_strengths(factors), ..self.clone() }
     }
 
+    /// The same machine without what remembers the frames before: for drives that do not follow each other in time.
+    #[must_use]
+    pub fn without_memory(&self) -> Self {
+        let mut machine = self.clone();
+        machine.monitors.retain(|reading| !reading.remembers());
+        machine.correctors.retain(|kick| !kick.remembers());
+        machine
+    }
+
     /// Orbit response as it would be measured, rows all monitors (H then V), columns correctors (H then V); a rolled monitor that reads
     /// both planes, or a rolled corrector that kicks in both, is so in both.
     ///
     /// # Errors
     /// [`OrbitError`] if the machine is unstable.
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
-        let optics = Optics::of(&self.ring, Hold::Momentum { delta: self.hold.delta })?;
+        let optics = self.optics()?;
         let mut response = self.held(&self.ring, &optics)?;
         self.correctors.iter().for_each(|kick| kick.of_response(&mut response));
         let orbit = |monitor: &crate::Monitor| [X, Y].map(|at| optics.orbit(monitor.element)[at]);
@@ -161,6 +178,16 @@ mod tests {
         // an H corrector rolled by 90 degrees kicks (0, 1)
         let turned = respond(&["corrector_roll@H_A2=1.5707963267948966"]);
         assert!(turned.x.column(0).abs().max() < 1e-9 && turned.y.column(0).abs().max() > 1.0);
+    }
+
+    #[test]
+    fn what_leaks_adds_to_its_row_or_column() {
+        let (ring, plain) = (Ring::booster(), respond(&[]));
+        let [e4, e6] = ["E4", "E6"].map(|label| ring.monitor(Plane::X, label).unwrap());
+        let mixed = respond(&["bpm_crosstalk@x_E4=0.1"]);
+        assert!((mixed.x.row(e4) - plain.x.row(e4) - plain.x.row(e6) * 0.1).abs().max() < 1e-12);
+        let shared = respond(&["corrector_crosstalk@H_A2=0.1"]);
+        assert!((shared.x.column(0) - plain.x.column(0) - plain.x.column(1) * 0.1).abs().max() < 1e-12);
     }
 
     #[test]

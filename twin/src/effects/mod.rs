@@ -102,12 +102,25 @@ kinds! {
     DipoleEdge => Field(FieldEffect::DipoleEdge),
     /// A sextupole field, K2L [1/m^2]; a response shows it on a displaced orbit.
     SextupoleError => Field(FieldEffect::Sextupole),
+    /// A sextupole in all dipoles, K2L of each [1/m^2], as eddy currents in their vacuum chambers make; a response shows it on a displaced orbit.
+    DipoleSextupole => Field(FieldEffect::DipoleSextupole),
     /// The beam is off momentum.
     MomentumOffset => Hold(HoldEffect::Momentum),
     /// The RF frequency is held instead of the momentum, as a fraction.
     FixedRfFrequency => Hold(HoldEffect::Frequency),
     /// The mean of two monitors is held instead of the momentum, as a fraction; `@x_D8,x_E6`.
     RadialLoop => Hold(HoldEffect::RadialLoop),
+    /// A monitor reads this share of the next one of its plane as well.
+    BpmCrosstalk => Monitor(MonitorEffect::Crosstalk),
+    /// This share of a corrector's kick goes to the next one of its plane as well.
+    CorrectorCrosstalk => Corrector(CorrectorEffect::Crosstalk),
+    /// A corrector keeps this share of the kick that it had before its present setting; a response, whose settings have none before, does
+    /// not show it.
+    CorrectorHysteresis => Corrector(CorrectorEffect::Hysteresis),
+    /// This share of each change of a corrector is missing in the frame after it; a response, whose settings last, does not show it.
+    CorrectorSettling => Corrector(CorrectorEffect::Settling),
+    /// A monitor reads this share of the frame before instead of its own; a response, whose settings last, does not show it.
+    BpmTiming => Monitor(MonitorEffect::Timing),
     /// All quadrupoles drift from -a to +a during a run; its mean, which a response is, does not move.
     QuadDrift => Drift(DriftEffect::Quadrupoles),
 }
@@ -163,6 +176,11 @@ impl EffectKind {
             Class::Monitor(_) => true,
             Class::Corrector(_) | Class::Field(_) | Class::Hold(_) | Class::Drift(_) => false,
         }
+    }
+
+    /// True for what passes within a setting: it shows in the frames after a change alone.
+    pub fn is_transient(self) -> bool {
+        matches!(self, Self::BpmTiming | Self::CorrectorSettling)
     }
 
     /// True if the orbit without kicks, and with it the monitors' baselines, changes during the campaign.
@@ -437,6 +455,7 @@ mod tests {
             ("dipole_edge=0.01", 0.001, "all dipoles have edge angles of +10.0 ± 1.0 mrad"),
             ("dipole_edge@B_C4=0.01", 0.001, "dipole B_C4 has edge angles of +10.0 ± 1.0 mrad"),
             ("sextupole_error@SX_A1=1.5", 0.2, "sextupole SX_A1 has a field K2L = +1.50 ± 0.20 /m2"),
+            ("dipole_sextupole=0.1", 0.01, "all dipoles have a field K2L = +0.100 ± 0.010 /m2"),
             ("momentum_offset=-2e-3", 1e-4, "the beam is off momentum by -2.00 ± 0.10 per mille"),
             ("fixed_rf_frequency", 0.02, "the RF frequency was held instead of the momentum, by +100.0 ± 2.0 %"),
             (
@@ -444,6 +463,19 @@ mod tests {
                 0.01,
                 "a radial loop held the mean of x_D8 and x_E6 instead of the momentum, by +80.0 ± 1.0 %",
             ),
+            ("bpm_crosstalk@x_F8=-0.05", 0.01, "BPM x_F8 reads -5.0 ± 1.0 % of x_A6 as well"),
+            ("corrector_crosstalk@H_A2=0.05", 0.01, "+5.0 ± 1.0 % of the kick of corrector H_A2 goes to H_A4 as well"),
+            (
+                "corrector_hysteresis@V_D3=0.03",
+                0.002,
+                "corrector V_D3 keeps +3.00 ± 0.20 % of the kick that it had before",
+            ),
+            (
+                "corrector_settling@H_C4=0.12",
+                0.01,
+                "corrector H_C4 is late: the frame after a change lacks +12.0 ± 1.0 % of it",
+            ),
+            ("bpm_timing@y_C5=0.2", 0.03, "+20.0 ± 3.0 % of what BPM y_C5 reads is the frame before"),
             ("quad_drift=1e-3", 1e-4, "all quadrupoles drifted by +2.00 ± 0.20 per mille from start to end"),
         ];
         let of = |text: &str| Effect::parse(text, &ring).unwrap();

@@ -1,10 +1,11 @@
-//! Errors of monitors: gain, roll, cubic term, reversed sign, exchanged names.
+//! Errors of monitors: gain, roll, cubic term, reversed sign, exchanged names, a share of another monitor or of the frame before.
 //!
-//! The reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
+//! Of the first four the reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
 //! cycle is its value, a frame's is a difference of two values, the response its slope in the position, the signature its slope in
-//! the amplitude: the last two by dual numbers.
+//! the amplitude: the last two by dual numbers. The others are linear in the positions: a monitor with crosstalk reads `x + a x_next`,
+//! one that is late `(1 - a) x_k + a x_(k-1)` in frame k, and the signature is what `a` multiplies.
 
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
+use nalgebra::{DMatrix, DVector, DVectorView, Matrix2, Vector2};
 use num_dual::{first_derivative, jacobian};
 
 use super::mechanism::{Measured, Mechanism, Unit};
@@ -26,6 +27,10 @@ pub enum MonitorEffect {
     Polarity,
     /// Its name and another one's are exchanged.
     Swap,
+    /// It reads a share of the next one of its plane as well, in the order of reading, the last one of the first.
+    Crosstalk,
+    /// It reads a share of the frame before instead of its own; of the first frame nothing else.
+    Timing,
 }
 
 /// What a monitor, or two, do in a machine.
@@ -33,6 +38,8 @@ pub enum MonitorEffect {
 pub(super) enum Reading {
     Distorted { how: MonitorEffect, monitors: Vec<usize>, amplitude: f64 },
     Exchanged { plane: Plane, monitors: [usize; 2] },
+    Mixed { plane: Plane, monitor: usize, from: usize, share: f64 },
+    Late { plane: Plane, monitor: usize, share: f64 },
 }
 
 impl MonitorEffect {
@@ -42,7 +49,7 @@ impl MonitorEffect {
             Self::Gain => position * (amplitude + 1.0),
             Self::Cubic => position + amplitude * (position * 1e3).powi(2) * position,
             Self::Polarity => position * (amplitude * -2.0 + 1.0),
-            Self::Roll | Self::Swap => position,
+            Self::Roll | Self::Swap | Self::Crosstalk | Self::Timing => position,
         };
         match (self, plane) {
             (Self::Roll, _) => {
@@ -63,7 +70,7 @@ impl MonitorEffect {
     fn monitors(self, ring: &Ring, monitor: usize) -> Vec<usize> {
         match self {
             Self::Roll => of_element(ring, ring.monitors[monitor].element).collect(),
-            Self::Gain | Self::Cubic | Self::Polarity | Self::Swap => vec![monitor],
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Swap | Self::Crosstalk | Self::Timing => vec![monitor],
         }
     }
 
@@ -72,7 +79,7 @@ impl MonitorEffect {
         match self {
             Self::Gain => 1.0 + amplitude,
             Self::Polarity => 1.0 - 2.0 * amplitude,
-            Self::Roll | Self::Cubic | Self::Swap => 1.0,
+            Self::Roll | Self::Cubic | Self::Swap | Self::Crosstalk | Self::Timing => 1.0,
         }
     }
 }
@@ -85,11 +92,14 @@ impl Mechanism for MonitorEffect {
             Self::Cubic => "bpm_cubic",
             Self::Polarity => "bpm_polarity",
             Self::Swap => "bpm_swap",
+            Self::Crosstalk => "bpm_crosstalk",
+            Self::Timing => "bpm_timing",
         }
     }
 
     /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a monitor by 50 mrad; a button monitor is
-    /// off by some per cent at 5 mm.
+    /// off by some per cent at 5 mm; channels of one crate are 40 dB apart, and a lost screen leaves 26 dB, 5 %; a gate that is set to the
+    /// wrong turn takes a fifth of its time from the frame before.
     ///
     /// Source: J. Safranek, NIM A 388 (1997) 27.
     fn prior_scale(&self) -> Option<f64> {
@@ -97,13 +107,15 @@ impl Mechanism for MonitorEffect {
             Self::Gain => Some(0.08),
             Self::Roll => Some(0.06),
             Self::Cubic => Some(1.5e-3),
+            Self::Crosstalk => Some(0.05),
+            Self::Timing => Some(0.2),
             Self::Polarity | Self::Swap => None,
         }
     }
 
     fn unit(&self) -> Unit {
         match self {
-            Self::Gain => Unit::PERCENT,
+            Self::Gain | Self::Crosstalk | Self::Timing => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
             Self::Cubic => Unit::PER_SQUARE_MILLIMETRE,
             Self::Polarity | Self::Swap => Unit::NONE,
@@ -113,7 +125,13 @@ impl Mechanism for MonitorEffect {
     fn sites(&self, ring: &Ring) -> Vec<Site> {
         let read = &ring.read_monitors;
         match self {
-            Self::Gain | Self::Cubic | Self::Polarity => read.iter().map(|&at| Site::Monitor(at)).collect(),
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Timing => {
+                read.iter().map(|&at| Site::Monitor(at)).collect()
+            }
+            Self::Crosstalk => {
+                let has_next = |&&at: &&usize| next(ring, at).is_some();
+                read.iter().filter(has_next).map(|&at| Site::Monitor(at)).collect()
+            }
             Self::Roll => {
                 let first = |&&at: &&usize| rolled(ring, at) == at;
                 read.iter().filter(first).map(|&at| Site::Monitor(at)).collect()
@@ -130,14 +148,16 @@ impl Mechanism for MonitorEffect {
 
     fn expected(&self) -> &'static str {
         match self {
-            Self::Gain | Self::Roll | Self::Cubic | Self::Polarity => "a monitor",
+            Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Timing => "a monitor",
+            Self::Crosstalk => "a monitor with another one in its plane",
             Self::Swap => "two monitors of one plane",
         }
     }
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         match self {
-            Self::Gain | Self::Cubic | Self::Polarity => Site::monitor(ring, name).map(Site::Monitor),
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Timing => Site::monitor(ring, name).map(Site::Monitor),
+            Self::Crosstalk => Site::monitor(ring, name).filter(|&at| next(ring, at).is_some()).map(Site::Monitor),
             Self::Roll => either_plane(ring, name).map(|at| Site::Monitor(rolled(ring, at))),
             Self::Swap => {
                 let [one, other] = Site::monitors(ring, name)?;
@@ -148,6 +168,7 @@ impl Mechanism for MonitorEffect {
 
     fn apply(&self, machine: &mut Machine, site: Site, amplitude: f64) -> Result<(), EffectError> {
         let ring = &machine.ring;
+        let misplaced = || self.misplaced(ring, site.name(ring));
         machine.monitors.push(match (self, site) {
             (Self::Swap, Site::MonitorPair(one, other)) => {
                 Reading::Exchanged { plane: ring.monitors[one].plane, monitors: [one, other] }
@@ -155,7 +176,14 @@ impl Mechanism for MonitorEffect {
             (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity, Site::Monitor(at)) => {
                 Reading::Distorted { how: *self, monitors: self.monitors(ring, at), amplitude }
             }
-            _ => return Err(self.misplaced(ring, site.name(ring))),
+            (Self::Crosstalk, Site::Monitor(monitor)) => {
+                let (plane, from) = (ring.monitors[monitor].plane, next(ring, monitor).ok_or_else(misplaced)?);
+                Reading::Mixed { plane, monitor, from, share: amplitude }
+            }
+            (Self::Timing, Site::Monitor(monitor)) => {
+                Reading::Late { plane: ring.monitors[monitor].plane, monitor, share: amplitude }
+            }
+            _ => return Err(misplaced()),
         });
         Ok(())
     }
@@ -185,6 +213,14 @@ impl Mechanism for MonitorEffect {
                 read.into_iter()
                     .for_each(|(monitor, b)| signature.readings.set_column(b, &self.distortion(about, monitor)));
             }
+            (Self::Crosstalk | Self::Timing, Site::Monitor(at)) => {
+                let b = about.read(at).ok_or_else(silent)?;
+                let change = match self {
+                    Self::Crosstalk => about.position(next(ring, at).ok_or_else(silent)?),
+                    _ => coming(&about.position(at).as_view()),
+                };
+                signature.readings.set_column(b, &change);
+            }
             _ => return Err(self.misplaced(ring, site.name(ring))),
         }
         Ok(signature)
@@ -208,6 +244,12 @@ impl Mechanism for MonitorEffect {
             }
             Self::Polarity => format!("BPM {name} reads with the wrong sign"),
             Self::Swap => format!("BPMs {} are exchanged", site.names(ring).join(" and ")),
+            Self::Crosstalk => {
+                let Site::Monitor(at) = site else { unreachable!("it acts on monitors") };
+                let other = next(ring, at).map_or_else(String::new, |other| ring.monitor_name(other));
+                format!("BPM {name} reads {} % of {other} as well", amplitude.signed(100.0))
+            }
+            Self::Timing => format!("{} % of what BPM {name} reads is the frame before", amplitude.signed(100.0)),
         }
     }
 }
@@ -224,7 +266,7 @@ impl MonitorEffect {
 }
 
 impl Reading {
-    /// What is read of orbits (x, y) at all monitors [m].
+    /// What is read of an orbit (x, y) at all monitors that stays [m].
     pub fn of_orbit(&self, ring: &Ring, at: &mut [[f64; 2]]) {
         match self {
             Self::Distorted { how, monitors, amplitude } => {
@@ -234,10 +276,15 @@ impl Reading {
                 let plane = plane.index();
                 (at[*one][plane], at[*other][plane]) = (at[*other][plane], at[*one][plane]);
             }
+            Self::Mixed { plane, monitor, from, share } => {
+                at[*monitor][plane.index()] += share * at[*from][plane.index()];
+            }
+            Self::Late { .. } => {}
         }
     }
 
-    /// The same of changes of the orbit, x and y, rows frames, columns monitors [m], about one without kicks, which is read too.
+    /// The same of changes of the orbit, x and y, rows frames in the order of time, columns monitors [m], about one without kicks, which is
+    /// read too.
     pub fn of_changes(&self, ring: &Ring, base: &mut [[f64; 2]], changes: &mut [DMatrix<f64>; 2]) {
         match self {
             Self::Distorted { how, monitors, amplitude } => {
@@ -252,11 +299,13 @@ impl Reading {
                 }
             }
             Self::Exchanged { plane, monitors: [one, other] } => changes[plane.index()].swap_columns(*one, *other),
+            Self::Mixed { plane, monitor, from, share } => mix(&mut changes[plane.index()], *monitor, *from, *share),
+            Self::Late { plane, monitor, share } => delay(&mut changes[plane.index()], *monitor, *share),
         }
         self.of_orbit(ring, base);
     }
 
-    /// The same of a response, rows monitors.
+    /// The same of a response, rows monitors, every kick held until no monitor reads the one before.
     pub fn of_response(&self, ring: &Ring, base: &mut [[f64; 2]], response: &mut [DMatrix<f64>; 2]) {
         match self {
             Self::Distorted { how, monitors, amplitude } => {
@@ -270,12 +319,19 @@ impl Reading {
                 }
             }
             Self::Exchanged { plane, monitors: [one, other] } => response[plane.index()].swap_rows(*one, *other),
+            Self::Mixed { plane, monitor, from, share } => {
+                let response = &mut response[plane.index()];
+                let more = response.row(*from) * *share;
+                let mut row = response.row_mut(*monitor);
+                row += more;
+            }
+            Self::Late { .. } => {}
         }
         self.of_orbit(ring, base);
     }
 
     /// What is read of a change of the orbit, of the read monitors each in its plane, columns monitors, to first order in all amplitudes but
-    /// a gain's.
+    /// a gain's and a share's.
     pub fn of_signature(&self, about: &Signatures, readings: &mut DMatrix<f64>) {
         match self {
             Self::Distorted { how, monitors, amplitude } => {
@@ -287,8 +343,49 @@ impl Reading {
                     readings.swap_columns(i, j);
                 }
             }
+            Self::Mixed { monitor, from, share, .. } => {
+                if let (Some(i), Some(j)) = (about.read(*monitor), about.read(*from)) {
+                    mix(readings, i, j, *share);
+                }
+            }
+            Self::Late { monitor, share, .. } => {
+                about.read(*monitor).into_iter().for_each(|b| delay(readings, b, *share));
+            }
         }
     }
+
+    /// True for one that depends on the frame before.
+    pub fn remembers(&self) -> bool {
+        matches!(self, Self::Late { .. })
+    }
+}
+
+/// Add a share of one column to another.
+pub(super) fn mix(columns: &mut DMatrix<f64>, to: usize, from: usize, share: f64) {
+    let more = columns.column(from) * share;
+    let mut column = columns.column_mut(to);
+    column += more;
+}
+
+/// A column of which each frame holds a share of the one before.
+fn delay(columns: &mut DMatrix<f64>, at: usize, share: f64) {
+    let more = coming(&columns.column(at)) * share;
+    let mut column = columns.column_mut(at);
+    column += more;
+}
+
+/// What the frame before has beyond each frame, none before the first.
+pub(super) fn coming(values: &DVectorView<f64>) -> DVector<f64> {
+    DVector::from_fn(values.len(), |frame, _| values[frame.saturating_sub(1)] - values[frame])
+}
+
+/// The monitor that is read next in the plane of one; after the last the first.
+fn next(ring: &Ring, monitor: usize) -> Option<usize> {
+    let others = || {
+        let read = ring.read_monitors.iter().copied();
+        read.filter(move |&other| other != monitor && ring.monitors[other].plane == ring.monitors[monitor].plane)
+    };
+    others().find(|&other| other > monitor).or_else(|| others().next())
 }
 
 /// Derivative of what is read with respect to the position (x, y).
@@ -315,4 +412,28 @@ fn either_plane(ring: &Ring, name: &str) -> Option<usize> {
         _ => None,
     };
     Site::monitor(ring, name).or_else(crossed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// In the first frame there is none before; another monitor reads its own frames.
+    #[test]
+    fn a_late_monitor_reads_a_share_of_the_frame_before() {
+        let ring = Ring::booster();
+        let x = DMatrix::from_fn(3, ring.monitors.len(), |frame, _| [1.0, 2.0, -1.0][frame]);
+        let (mut read, mut base) = ([x.clone(), x], vec![[0.0; 2]; ring.monitors.len()]);
+        let late = Reading::Late { plane: Plane::X, monitor: 4, share: 0.25 };
+        late.of_changes(&ring, &mut base, &mut read);
+        assert_eq!(read[0].column(4).as_slice(), [1.0, 1.75, -0.25]);
+        assert_eq!(read[0].column(5).as_slice(), [1.0, 2.0, -1.0]);
+    }
+
+    #[test]
+    fn the_last_monitor_of_a_plane_reads_the_first_as_well() {
+        let ring = Ring::booster();
+        let name = |name: &str| ring.monitor_name(next(&ring, Site::monitor(&ring, name).unwrap()).unwrap());
+        assert_eq!([name("x_A6"), name("x_F8"), name("y_F7")], ["x_A8", "x_A6", "y_A1"]);
+    }
 }

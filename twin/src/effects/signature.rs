@@ -205,12 +205,23 @@ impl<'m> Signatures<'m> {
 
     /// A change of gradient by `scale`.
     pub(super) fn of_gradient(&self, gradient: &Gradient, scale: f64) -> Signature {
-        let gradients = core::slice::from_ref(gradient);
-        let response = self.held.jacobian(&self.optics, &self.observers, &self.sources, gradient);
-        let mut readings = &self.kick * response.transpose() * scale;
-        let rf = self.optics.rf_jacobian(&self.observers, gradients) * scale;
-        readings.ger(1.0, &self.drives.rf_offset, &rf.column(0), 1.0);
-        Signature { readings, tunes: self.optics.tune_slope(gradient).map(|t| t * scale), tune_drift: [0.0; 2] }
+        self.of_gradients([(*gradient, scale)])
+    }
+
+    /// The same of several at once.
+    pub(super) fn of_gradients(&self, gradients: impl IntoIterator<Item = (Gradient, f64)>) -> Signature {
+        let monitors = self.observers.len();
+        let (mut response, mut rf) = (DMatrix::zeros(monitors, self.sources.len()), DVector::zeros(monitors));
+        let mut tunes = [0.0; 2];
+        for (gradient, scale) in gradients {
+            response += self.held.jacobian(&self.optics, &self.observers, &self.sources, &gradient) * scale;
+            rf += self.optics.rf_jacobian(&self.observers, core::slice::from_ref(&gradient)).column(0) * scale;
+            let slope = self.optics.tune_slope(&gradient);
+            tunes.iter_mut().zip(slope).for_each(|(to, slope)| *to += slope * scale);
+        }
+        let mut readings = &self.kick * response.transpose();
+        readings.ger(1.0, &self.drives.rf_offset, &rf, 1.0);
+        Signature { readings, tunes, tune_drift: [0.0; 2] }
     }
 
     /// Difference of the linear optics of two machines, per unit of the amplitude: central, or against none without one.

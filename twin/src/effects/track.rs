@@ -1,8 +1,10 @@
-//! Exact closed orbits of single machine cycles, nothing linearised: what simulated campaigns are made of.
+//! Exact closed orbits of machine cycles, nothing linearised: what simulated campaigns are made of.
 //!
 //! The ring is as misaligned as its elements say. Kicks, supplies, drift and what the machine holds constant enter the exact
-//! maps; the monitors' errors are applied last. An RF offset is relative to the frequency at which this ring
+//! maps; the monitors' errors are applied last, in the order of the cycles where they hold something of the one before. An RF offset is relative to the frequency at which this ring
 //! closes without kicks.
+
+use nalgebra::DMatrix;
 
 use super::drift;
 use super::hold::Closing;
@@ -44,15 +46,26 @@ impl Tracked {
         Ok(Self { machine, nominal_kick, closing })
     }
 
-    /// What the read monitors make of the orbit of one cycle [m], offsets and noise left out, and the tunes.
+    /// What the read monitors make of the orbits of a campaign's cycles, in the order of time [m], offsets and noise left out, rows cycles,
+    /// and the tunes.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring keeps no beam in one of the cycles.
+    pub fn cycles(&self, cycles: &[Cycle]) -> Result<(DMatrix<f64>, Vec<Tunes>), OrbitError> {
+        let tunes = |ring: &Ring, orbit: ClosedOrbit| {
+            let hold = Hold::Momentum { delta: orbit.at[0][DELTA] };
+            Optics::about(ring, hold, orbit)?.tunes()
+        };
+        self.read(cycles, tunes)
+    }
+
+    /// The same of one cycle, nothing before it.
     ///
     /// # Errors
     /// [`OrbitError`] if the ring keeps no beam in this cycle.
     pub fn cycle(&self, cycle: &Cycle) -> Result<(Vec<f64>, Tunes), OrbitError> {
-        let (ring, orbit) = self.orbit(cycle)?;
-        let readings = self.read(&ring, &orbit);
-        let hold = Hold::Momentum { delta: orbit.at[0][DELTA] };
-        Ok((readings, Optics::about(&ring, hold, orbit)?.tunes()?))
+        let (readings, tunes) = self.cycles(core::slice::from_ref(cycle))?;
+        Ok((readings.iter().copied().collect(), tunes[0]))
     }
 
     /// The same without the tunes, which next to a sum resonance a kicked orbit need not have.
@@ -60,34 +73,48 @@ impl Tracked {
     /// # Errors
     /// [`OrbitError`] without a closed orbit in this cycle.
     pub fn readings(&self, cycle: &Cycle) -> Result<Vec<f64>, OrbitError> {
-        self.orbit(cycle).map(|(ring, orbit)| self.read(&ring, &orbit))
+        let (readings, _) = self.read(core::slice::from_ref(cycle), |_, _| Ok(()))?;
+        Ok(readings.iter().copied().collect())
     }
 
-    /// The ring of a cycle, and its closed orbit.
-    fn orbit(&self, cycle: &Cycle) -> Result<(Ring, ClosedOrbit), OrbitError> {
-        let ring = self.driven(cycle);
-        let orbit = self.closing.orbit(&ring, cycle.rf_offset)?;
-        Ok((ring, orbit))
+    /// What the read monitors make of the orbits of some cycles, and something of each of them.
+    fn read<T>(
+        &self,
+        cycles: &[Cycle],
+        of: impl Fn(&Ring, ClosedOrbit) -> Result<T, OrbitError>,
+    ) -> Result<(DMatrix<f64>, Vec<T>), OrbitError> {
+        let ring = &self.machine.ring;
+        let mut positions = [X, Y].map(|_| DMatrix::zeros(cycles.len(), ring.monitors.len()));
+        let mut each = Vec::with_capacity(cycles.len());
+        for (i, (cycle, kick)) in cycles.iter().zip(self.kicks(cycles).row_iter()).enumerate() {
+            let driven = self.driven(cycle, kick.iter().copied());
+            let orbit = self.closing.orbit(&driven, cycle.rf_offset)?;
+            for (plane, at) in [X, Y].into_iter().enumerate() {
+                let position = |monitor: &crate::Monitor| orbit.at[monitor.element][at];
+                positions[plane].row_mut(i).iter_mut().zip(&ring.monitors).for_each(|(to, b)| *to = position(b));
+            }
+            each.push(of(&driven, orbit)?);
+        }
+        let mut zero = vec![[0.0; 2]; ring.monitors.len()];
+        self.machine.monitors.iter().for_each(|reading| reading.of_changes(ring, &mut zero, &mut positions));
+        Ok((ring.own_planes(&positions), each))
     }
 
-    /// What the read monitors make of an orbit [m].
-    fn read(&self, ring: &Ring, orbit: &ClosedOrbit) -> Vec<f64> {
-        let position = |monitor: &crate::Monitor| [X, Y].map(|at| orbit.at[monitor.element][at]);
-        let mut at: Vec<[f64; 2]> = ring.monitors.iter().map(position).collect();
-        self.machine.monitors.iter().for_each(|reading| reading.of_orbit(ring, &mut at));
-        ring.read_monitors.iter().map(|&i| at[i][ring.monitors[i].plane.index()]).collect()
+    /// The kicks that some cycles really had, rows cycles [rad].
+    fn kicks(&self, cycles: &[Cycle]) -> DMatrix<f64> {
+        let correctors = self.machine.ring.correctors.len();
+        let mut kick = DMatrix::from_fn(cycles.len(), correctors, |i, c| cycles[i].kick[c]);
+        self.machine.correctors.iter().for_each(|one| one.of_frames(&mut kick, self.nominal_kick));
+        kick
     }
 
-    /// The ring with the kicks and gradients of a cycle.
-    fn driven(&self, cycle: &Cycle) -> Ring {
+    /// The ring with the gradients of a cycle and some kicks.
+    fn driven(&self, cycle: &Cycle, kick: impl Iterator<Item = f64>) -> Ring {
         let machine = &self.machine;
         let drift = drift::factor(machine.drift, cycle.time);
         let factors: Vec<f64> = cycle.strength.iter().map(|strength| strength.exp() * drift).collect();
         let mut ring = machine.ring.with_strengths(&factors);
-        for (corrector, &believed) in cycle.kick.iter().enumerate() {
-            let given = |kick, one: &super::corrector::Kick| one.given(corrector, kick, self.nominal_kick);
-            ring.set_kick(corrector, machine.correctors.iter().fold(believed, given));
-        }
+        kick.enumerate().for_each(|(corrector, kick)| ring.set_kick(corrector, kick));
         ring
     }
 }

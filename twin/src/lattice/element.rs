@@ -44,6 +44,8 @@ pub struct Bend {
     pub curvature: f64,
     /// Gradient of the body [1/m^2].
     pub k1: f64,
+    /// Sextupole of the body [1/m^3].
+    pub k2: f64,
     /// Entrance edge angle [rad], MAD's e1.
     pub e1: f64,
     /// Exit edge angle [rad], MAD's e2.

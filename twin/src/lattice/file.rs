@@ -291,6 +291,7 @@ impl Entry {
             "sbend" => Kind::Bend(Bend {
                 curvature: self.finite("a finite angle", self.angle)? / length,
                 k1: or_zero("a finite k1", self.k1)?,
+                k2: or_zero("a finite k2", self.k2)?,
                 e1: or_zero("a finite e1", self.e1)?,
                 e2: or_zero("a finite e2", self.e2)?,
                 fringe: 2.0 * or_zero("a finite fint", self.fint)? * or_zero("a finite hgap", self.hgap)?,

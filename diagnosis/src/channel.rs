@@ -1,0 +1,189 @@
+//! The pooled readings of one monitor, or of one tune, whitened.
+//!
+//! A pool's mean has the noise of its frames: `sigma^2/n` of white noise, and otherwise the mean of the memory's covariance over the
+//! frames of both pools. With `A` the inverse of the root of that covariance, and the common terms of the readings as the thin decomposition
+//! `A U = Q D V^T`, the whitening is
+//!
+//! `T = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T) A`, so that `T^T T = (C + U U^T)^-1`.
+
+use nalgebra::{DMatrix, DVector, DVectorViewMut};
+
+use super::memory::Memory;
+
+/// A monitor's or a tune's readings.
+#[derive(Debug, Clone)]
+pub struct Channel {
+    /// Pools with readings that count.
+    pub rows: Vec<usize>,
+    /// Noise of one reading.
+    pub sigma: f64,
+    root: Root,
+    /// `Q` [rows][factors].
+    basis: DMatrix<f64>,
+    /// `1 - (1 + D^2)^(-1/2)` of each.
+    shrink: DVector<f64>,
+    /// `ln` of the covariance's determinant.
+    pub log_det: f64,
+}
+
+/// Root of the covariance of the means, in units of the noise of one reading.
+#[derive(Debug, Clone)]
+enum Root {
+    /// White noise: the roots of the numbers of readings.
+    White(DVector<f64>),
+    /// The lower factor.
+    Remembers(DMatrix<f64>),
+}
+
+impl Root {
+    /// `frames` of each row.
+    fn of(memory: Memory, frames: &[Vec<usize>]) -> Option<Self> {
+        if memory.is_none() {
+            return Some(Self::White(DVector::from_iterator(
+                frames.len(),
+                frames.iter().map(|of_row| (of_row.len() as f64).sqrt()),
+            )));
+        }
+        let all = || frames.iter().flatten().copied();
+        let (first, last) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
+        // by the distance of two frames, and of the walk the frames that both have seen
+        let apart: Vec<f64> = (first..=last).map(|frame| memory.covariance(0, frame - first)).collect();
+        let both = |i: usize, j: usize| apart[i.abs_diff(j)] + memory.steps.powi(2) * (i.min(j) - first) as f64;
+        let mean = |one: &[usize], other: &[usize]| {
+            let sum: f64 = one.iter().flat_map(|&i| other.iter().map(move |&j| (i, j))).map(|(i, j)| both(i, j)).sum();
+            sum / (one.len() * other.len()) as f64
+        };
+        let mut covariance = DMatrix::zeros(frames.len(), frames.len());
+        for i in 0..frames.len() {
+            for j in 0..=i {
+                covariance[(i, j)] = mean(&frames[i], &frames[j]);
+            }
+        }
+        Some(Self::Remembers(covariance.cholesky()?.unpack()))
+    }
+
+    fn whiten(&self, columns: &mut DMatrix<f64>) {
+        match self {
+            Self::White(roots) => columns.column_iter_mut().for_each(|mut column| column.component_mul_assign(roots)),
+            Self::Remembers(lower) => {
+                // its diagonal is that of a Cholesky factor
+                lower.solve_lower_triangular_unchecked_mut(columns);
+            }
+        }
+    }
+
+    fn log_det(&self) -> f64 {
+        match self {
+            Self::White(roots) => -2.0 * roots.iter().map(|root| root.ln()).sum::<f64>(),
+            Self::Remembers(lower) => 2.0 * lower.diagonal().iter().map(|d| d.ln()).sum::<f64>(),
+        }
+    }
+}
+
+impl Channel {
+    /// Of the readings in some frames of each row, with noise `sigma` each, and their common terms in standard deviations [rows][factors].
+    pub fn of(rows: Vec<usize>, frames: &[Vec<usize>], sigma: f64, memory: Memory, common: DMatrix<f64>) -> Self {
+        let root = Root::of(memory, frames).unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
+        let mut common = common / sigma;
+        root.whiten(&mut common);
+        let (basis, of_common) = match rows.is_empty() {
+            true => (DMatrix::zeros(0, 0), DVector::zeros(0)),
+            false => {
+                let svd = common.svd(true, false);
+                (svd.u.expect("asked for"), svd.singular_values)
+            }
+        };
+        let grown = of_common.map(|d| 1.0 + d * d);
+        let of_noise = 2.0 * rows.len() as f64 * sigma.ln() + root.log_det();
+        let log_det = of_noise + grown.iter().map(|g| g.ln()).sum::<f64>();
+        Self { rows, sigma, root, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
+    }
+
+    /// How many factors its readings have in common.
+    pub fn factors(&self) -> usize {
+        self.basis.ncols()
+    }
+
+    /// Whiten numbers in units of the noise of one reading, rows as [`Channel::rows`].
+    pub fn whiten(&self, mut columns: DMatrix<f64>) -> DMatrix<f64> {
+        self.root.whiten(&mut columns);
+        let mut common = self.basis.tr_mul(&columns);
+        common.row_iter_mut().zip(self.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
+        columns.gemm(-1.0, &self.basis, &common, 1.0);
+        columns
+    }
+
+    /// The same of one column in place.
+    pub fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
+        match &self.root {
+            Root::White(roots) => column.component_mul_assign(roots),
+            Root::Remembers(lower) => lower.solve_lower_triangular_unchecked_mut(column),
+        }
+        let common = self.basis.tr_mul(column).component_mul(&self.shrink);
+        column.gemv(-1.0, &self.basis, &common, 1.0);
+    }
+
+    /// The part of `T^T T` that common terms take, `common common^T` [rows][factors], for white noise: `T^T T = diag(n) - common common^T`.
+    pub fn taken(&self) -> DMatrix<f64> {
+        let mut taken = self.basis.clone();
+        for (mut column, shrink) in taken.column_iter_mut().zip(self.shrink.iter()) {
+            column *= (shrink * (2.0 - shrink)).sqrt();
+            if let Root::White(roots) = &self.root {
+                column.component_mul_assign(roots);
+            }
+        }
+        taken
+    }
+
+    /// Standard deviation of each row's mean, given those before, in units of the noise of one reading.
+    pub fn noise_of_means(&self) -> DVector<f64> {
+        match &self.root {
+            Root::White(roots) => roots.map(f64::recip),
+            Root::Remembers(lower) => lower.diagonal(),
+        }
+    }
+
+    /// Readings of each row of white noise.
+    pub fn readings(&self) -> DVector<f64> {
+        match &self.root {
+            Root::White(roots) => roots.map(|root| root * root),
+            Root::Remembers(lower) => DVector::from_element(lower.nrows(), 1.0),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FRAMES: [&[usize]; 4] = [&[0, 1, 2], &[4], &[5, 6], &[9, 10, 11, 12]];
+
+    /// `T^T T` is the inverse of the covariance of the means, computed from that of the frames.
+    #[test]
+    fn whitened_means_are_independent() {
+        let frames: Vec<Vec<usize>> = FRAMES.iter().map(|frames| frames.to_vec()).collect();
+        let common = DMatrix::from_fn(4, 2, |i, k| (1.3 * i as f64 + k as f64).sin() * [4.0, 0.3][k]);
+        let sigma = 0.7;
+        let none = Memory::NONE;
+        for memory in [none, Memory { share: 0.3, time: 4.0, steps: 0.1 }] {
+            let channel = Channel::of(vec![0, 1, 2, 3], &frames, sigma, memory, common.clone());
+            let mean = |one: &[usize], other: &[usize]| {
+                let all = one.iter().flat_map(|&i| other.iter().map(move |&j| memory.covariance(i, j)));
+                all.sum::<f64>() / (one.len() * other.len()) as f64
+            };
+            let noise = DMatrix::from_fn(4, 4, |i, j| sigma * sigma * mean(&frames[i], &frames[j]));
+            let covariance = noise + &common * common.transpose();
+            let t = channel.whiten(DMatrix::identity(4, 4) / sigma);
+            assert!((t.tr_mul(&t) * &covariance - DMatrix::identity(4, 4)).amax() < 1e-12, "rounding");
+            assert!((channel.log_det - covariance.determinant().ln()).abs() < 1e-12, "rounding");
+            let mut one = DVector::from_element(4, 1.0 / sigma);
+            channel.whiten_column(&mut one.as_view_mut());
+            assert!((one - t.column_sum()).amax() < 1e-12, "rounding");
+            if memory == none {
+                let taken = channel.taken();
+                let apart = DMatrix::from_diagonal(&channel.readings()) - &taken * taken.transpose();
+                assert!((t.tr_mul(&t) * sigma * sigma - apart).amax() < 1e-12, "rounding");
+            }
+        }
+    }
+}

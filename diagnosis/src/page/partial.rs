@@ -1,0 +1,79 @@
+//! What effects do to the readings, and what is measured of it: a fit with the effects taken out, everything else as fitted.
+
+use core::ops::RangeInclusive;
+
+use nalgebra::{DMatrix, DVector};
+use twin::{Signature, Tunes};
+
+use crate::data::Data;
+use crate::error::FitError;
+use crate::fit::Fitted;
+use crate::hypothesis::{Hypothesis, Term};
+
+/// Some effects of a fit.
+pub struct Partial<'f> {
+    /// The fit with them.
+    pub fitted: &'f Fitted,
+    /// The data as it whitens them.
+    pub data: &'f Data,
+    /// Whitened readings less those predicted without the effects.
+    pub measured: DVector<f64>,
+    /// Whitened change of the readings that the effects make, as predicted.
+    pub predicted: DVector<f64>,
+    /// Tunes predicted without the effects, from the start of the campaign to its end.
+    pub tunes: [RangeInclusive<f64>; 2],
+}
+
+impl<'f> Partial<'f> {
+    /// Some terms of a fit.
+    ///
+    /// # Errors
+    /// [`FitError`] where the machine without the effects keeps no beam.
+    pub fn of(data: &'f Data, fitted: &'f Fitted, is_of: impl Fn(&Term) -> bool) -> Result<Self, FitError> {
+        let kept = fitted.hypothesis.terms.iter().copied().filter(|term| !is_of(term)).collect();
+        let without = Hypothesis { terms: kept, ..fitted.hypothesis.clone() };
+        let data = fitted.data(data);
+        let (vars, u) = (fitted.params.len(), fitted.guess(data, &without));
+        let (machine, drives) = without.machine(data, &fitted.params, &u.as_slice()[vars..])?;
+        let (readings, Tunes { x, y }, tune_drift) = machine.readings(&drives)?;
+        let signature = Signature { readings, tunes: [x, y], tune_drift };
+        let measured = data.residual(&signature);
+        let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
+        let tunes = [0, 1].map(|plane| {
+            let (tune, drift) = (signature.tunes[plane], signature.tune_drift[plane]);
+            tune - drift..=tune + drift
+        });
+        Ok(Self { fitted, data, measured, predicted, tunes })
+    }
+
+    /// What the fit leaves with the effects.
+    pub fn left(&self) -> DVector<f64> {
+        &self.measured - &self.predicted
+    }
+
+    /// Share of the tune meter in what tells of the effects, their change `d` less all that the other unknowns can absorb:
+    /// `|P d|^2` of the tunes over that of all numbers.
+    ///
+    /// # Errors
+    /// [`FitError::Degenerate`].
+    pub fn share_of_tunes(&self, index: usize) -> Result<f64, FitError> {
+        let jacobian = self.fitted.jacobian.rows(0, self.data.size()).into_owned();
+        let jacobian = match self.fitted.unknown(self.data, index) {
+            Some((at, _)) => jacobian.remove_column(at),
+            None => jacobian,
+        };
+        let back = jacobian.transpose();
+        let normal = &back * &jacobian + DMatrix::identity(jacobian.ncols(), jacobian.ncols());
+        let taken = normal.cholesky().ok_or(FitError::Degenerate)?.solve(&(&back * &self.predicted));
+        let seen = &self.predicted - jacobian * taken;
+        let tunes: f64 = self
+            .data
+            .places()
+            .iter()
+            .zip(seen.iter())
+            .filter(|((_, c), _)| *c >= self.data.monitors())
+            .map(|(_, d)| d * d)
+            .sum();
+        Ok(tunes / seen.norm_squared().max(f64::MIN_POSITIVE))
+    }
+}
