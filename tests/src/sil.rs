@@ -15,7 +15,7 @@ use inference::Recording;
 use inference::stream::{self, Core, Estimate};
 use twin::Ring;
 
-use crate::qemu::{Counts, Emulator, Image, Options};
+use crate::qemu::{Counts, Emulator, Image, Options, Run};
 
 /// Steps of a frame whose instructions are counted, by the words of the table and the function in the image.
 pub const REGIONS: [(&str, &str); 8] = [
@@ -63,6 +63,27 @@ pub fn compare(
         vec![]
     };
     let emulator = Emulator::start(image, &Options { regions, ..Options::default() })?;
+    let heard = side_by_side(&emulator, (ring, recording), walk, &mut hear);
+    let run = emulator.stop()?;
+    let comparison = heard.map_err(|error| format!("{error}; {}", last_words(image, &run)))?;
+    Ok(Comparison { counts: run.counts, ..comparison })
+}
+
+/// What a chip that no longer answers left behind: its log, and what the emulator said.
+fn last_words(image: &Image, run: &Run) -> String {
+    let log = match image.log(&run.stdout) {
+        Ok(log) => log.iter().map(|line| line.message.as_str()).collect::<Vec<_>>().join("; "),
+        Err(error) => error.to_string(),
+    };
+    format!("the device's log: {log}; the emulator: {}", run.stderr)
+}
+
+fn side_by_side(
+    emulator: &Emulator,
+    (ring, recording): (&Ring, &Recording),
+    walk: Walk,
+    hear: &mut impl FnMut(&EstimateRecord) -> Result<(), Box<dyn Error>>,
+) -> Result<Comparison, Box<dyn Error>> {
     let mut core = stream::estimator(ring, recording, walk)?;
     let mut link = Link::new(emulator.uart());
     link.restart(&core.setup)?;
@@ -84,13 +105,12 @@ pub fn compare(
     }
     let (last, quality, timing) = (last.ok_or("no frames")?, fed.quality()?, fed.times.quantiles());
     let status = link.status()?;
-    let counts = emulator.stop()?.counts;
     Ok(Comparison {
         frames: recording.rows.len(),
         different,
         interrupting,
         status,
-        counts,
+        counts: Counts::new(),
         result: FitResult::of_core(CoreModel::Green.word(), ring, (recording, walk), &last, quality, timing),
     })
 }

@@ -193,6 +193,21 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
     assert!(status.vitals.silent_cycles > after.silent_cycles);
 }
 
+/// Longer than the watchdog of a board waits: the emulator stands still, its timers do not.
+#[test]
+fn a_host_that_stands_still_changes_nothing() {
+    let (ring, recording) = read("paper-vars");
+    let good = wires(&recording);
+    let emulator = start();
+    let mut pair = Pair::start(&emulator, &ring, &recording);
+    for wires in good[..40].chunks(20) {
+        wires.iter().for_each(|wire| pair.agree(wire));
+        emulator.freeze(Duration::from_secs(7)).unwrap();
+    }
+    good[40..60].iter().for_each(|wire| pair.agree(wire));
+    assert_eq!(pair.link.status().unwrap().frames, 60);
+}
+
 /// `make endure` sends twenty times as many.
 #[test]
 fn a_long_feedback_on_a_bad_line_is_the_same_on_the_chip() {

@@ -18,7 +18,8 @@ const RESET_ENABLE: u32 = 1 << 1;
 const UNLOCK: u32 = 0x1ACC_E551;
 const LOCK: u32 = 0;
 
-/// Start it; it must be fed more often than this [s], by an edge of the pin to an external one. Neither can be stopped.
+/// Start it; it must be fed more often than this [s, 171 at most], by an edge of the pin to an external one. Neither can be
+/// stopped.
 pub fn start<P: OutputPin>(seconds: u32, supervisor: P) -> Supervisor<P, fn()> {
     WATCHDOG_LOCK.write(UNLOCK);
     WATCHDOG_LOAD.write(seconds * SYSCLK_HZ);

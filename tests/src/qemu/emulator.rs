@@ -97,6 +97,23 @@ impl Emulator {
         &self.uart
     }
 
+    /// Let the program stand still for a while, as a busy host does; the clock of its timers goes on.
+    ///
+    /// # Errors
+    /// If no signal can be sent.
+    pub fn freeze(&self, time: Duration) -> Result<(), Error> {
+        self.signal("STOP")?;
+        thread::sleep(time);
+        self.signal("CONT")
+    }
+
+    fn signal(&self, signal: &str) -> Result<(), Error> {
+        let line = format!("kill -{signal} {}", self.child.id());
+        let output = Command::new("sh").arg("-c").arg(line).output().map_err(Error::starting("sh"))?;
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        if output.status.success() { Ok(()) } else { Err(Error::Failed { program: "kill", stderr }) }
+    }
+
     /// End the run now.
     ///
     /// # Errors
