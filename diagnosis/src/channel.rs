@@ -9,6 +9,7 @@
 use nalgebra::{DMatrix, DVector, DVectorViewMut};
 
 use super::memory::Memory;
+use super::triangle::solve_lower_mut;
 
 /// A monitor's or a tune's readings.
 #[derive(Debug, Clone)]
@@ -31,7 +32,7 @@ pub struct Channel {
 enum Root {
     /// White noise: the roots of the numbers of readings.
     White(DVector<f64>),
-    /// The lower factor.
+    /// The lower factor of a regular covariance.
     Remembers(DMatrix<f64>),
 }
 
@@ -65,10 +66,7 @@ impl Root {
     fn whiten(&self, columns: &mut DMatrix<f64>) {
         match self {
             Self::White(roots) => columns.column_iter_mut().for_each(|mut column| column.component_mul_assign(roots)),
-            Self::Remembers(lower) => {
-                // its diagonal is that of a Cholesky factor
-                lower.solve_lower_triangular_unchecked_mut(columns);
-            }
+            Self::Remembers(lower) => solve_lower_mut(lower, columns),
         }
     }
 
@@ -107,7 +105,7 @@ impl Channel {
     /// Whiten numbers in units of the noise of one reading, rows as [`Channel::rows`].
     pub fn whiten(&self, mut columns: DMatrix<f64>) -> DMatrix<f64> {
         self.root.whiten(&mut columns);
-        let mut common = self.basis.tr_mul(&columns);
+        let mut common = self.basis.transpose() * &columns;
         common.row_iter_mut().zip(self.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
         columns.gemm(-1.0, &self.basis, &common, 1.0);
         columns

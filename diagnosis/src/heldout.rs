@@ -26,6 +26,7 @@ use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Term};
 use super::scan::{Projection, SignatureScore, signatures};
 use super::settings::Settings;
+use super::triangle::solve_lower;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;
@@ -186,8 +187,8 @@ impl<'d> Precision<'d> {
         for (mut column, &(c, row)) in cross.column_iter_mut().zip(readings) {
             column.tr_copy_from(&self.channels[c].cross.row(row));
         }
-        let taken = self.fitted.factor.l_dirty().solve_lower_triangular(&cross).ok_or(FitError::Degenerate)?;
-        let mut precision = -taken.tr_mul(&taken);
+        let taken = solve_lower(self.fitted.factor.l_dirty(), cross);
+        let mut precision = -(taken.transpose() * taken);
         for (i, &(c, row)) in readings.iter().enumerate() {
             for (j, &(_, other)) in readings.iter().enumerate().filter(|(_, (of, _))| *of == c) {
                 precision[(i, j)] += self.channels[c].gram[(row, other)];
@@ -199,7 +200,7 @@ impl<'d> Precision<'d> {
 
     /// Whitened signatures, one a column, less what the fit absorbs of them, as they stand beside `T^T r`.
     fn back(&self, signatures: &DMatrix<f64>) -> DMatrix<f64> {
-        let taken = self.fitted.factor.solve(&self.fitted.jacobian.tr_mul(signatures));
+        let taken = self.fitted.factor.solve(&(self.fitted.jacobian.transpose() * signatures));
         let mut back = signatures - &self.fitted.jacobian * taken;
         for channel in &self.channels {
             let (start, n) = (channel.start, channel.pools.len());
@@ -215,12 +216,11 @@ impl<'d> Precision<'d> {
         let readings = self.readings(block);
         let (factor, pull) = self.of_readings(&readings)?;
         let rows: Vec<usize> = readings.iter().map(|&(c, row)| self.channels[c].start + row).collect();
-        let solved = |columns: &DMatrix<f64>| factor.l_dirty().solve_lower_triangular(columns);
-        let signatures = solved(&back.select_rows(&rows)).ok_or(FitError::Degenerate)?;
-        let pull = factor.l_dirty().solve_lower_triangular(&pull).ok_or(FitError::Degenerate)?;
-        let share =
-            |one: nalgebra::DVectorView<f64>| SignatureScore { pull: one.dot(&pull), power: one.norm_squared() };
-        Ok(signatures.column_iter().map(share).collect())
+        let signatures = back.select_rows(&rows);
+        let pulls = signatures.transpose() * factor.solve(&pull);
+        let powers =
+            solve_lower(factor.l_dirty(), signatures).column_iter().map(|one| one.norm_squared()).collect::<Vec<_>>();
+        Ok(pulls.iter().zip(powers).map(|(&pull, power)| SignatureScore { pull, power }).collect())
     }
 
     /// `ln` of the determinant of what monitors have in common in a block's pools.

@@ -47,6 +47,7 @@ pub mod search;
 pub mod settings;
 pub mod slow;
 pub mod transients;
+mod triangle;
 pub mod validation;
 pub mod verdict;
 pub mod wiring;

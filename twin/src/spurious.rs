@@ -23,17 +23,19 @@ pub fn spurious_dispersion(ring: &Ring) -> Result<[f64; 2], OrbitError> {
 }
 
 fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {
+    let design = ClosedOrbit::find(ring, Hold::Frequency { offset: 0.0 })?;
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
     let (mut change, mut orbit, step) = ([0.0; 2], [0.0; 2], optics.rf_step());
     for machine in 0..MACHINES {
         let shifted = misaligned(ring, machine, rms);
-        let at = |offset| ClosedOrbit::find(&shifted, Hold::Frequency { offset });
-        let (up, down, rest) = (at(step)?, at(-step)?, at(0.0)?);
+        let rest = ClosedOrbit::near(&shifted, Hold::Frequency { offset: 0.0 }, &design)?;
+        let at = |offset| ClosedOrbit::near(&shifted, Hold::Frequency { offset }, &rest);
+        let (up, down) = (at(step)?, at(-step)?);
         for at in ring.monitors_read().map(|monitor| monitor.element) {
-            let design = [optics.dispersion(&optics.observe(at, Plane::X)), 0.0];
+            let dispersion = [optics.dispersion(&optics.observe(at, Plane::X)), 0.0];
             for (plane, coordinate) in [(0, X), (1, Y)] {
                 let slope = |coordinate: usize| (up.at[at][coordinate] - down.at[at][coordinate]) / (2.0 * step);
-                change[plane] += (slope(coordinate) - design[plane] * slope(DELTA)).powi(2);
+                change[plane] += (slope(coordinate) - dispersion[plane] * slope(DELTA)).powi(2);
                 orbit[plane] += rest.at[at][coordinate].powi(2);
             }
         }
