@@ -39,6 +39,8 @@ pub enum Command {
     Diagnose(Diagnose),
     /// The calibrated ring as a lattice file of another code
     Export(Export),
+    /// What changed between two measurements of one machine
+    Compare(Compare),
     /// Diagnose the recordings below a folder, score them by their truth.json
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns, count how often the result is right
@@ -221,7 +223,7 @@ pub struct Response {
 /// `orbitcal fit`.
 #[derive(Debug, Args)]
 pub struct Fit {
-    /// Folder with header.toml and frames.csv
+    /// Folder with header.toml and frames.csv, or with a measured response matrix
     pub recording: PathBuf,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
@@ -238,6 +240,9 @@ pub struct Fit {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub sampling: Sampling,
+    /// What the machine held while a response matrix was measured; the frequency without it
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
     /// The optics of the calibrated ring with error bars, as one page
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
@@ -268,7 +273,7 @@ pub struct Study {
 /// `orbitcal diagnose`.
 #[derive(Debug, Args)]
 pub struct Diagnose {
-    /// Folders with header.toml and frames.csv; several of one machine are analysed together
+    /// Folders with header.toml and frames.csv; several of one machine are analysed together. Or one with a measured response matrix
     #[arg(required = true, value_name = "RECORDING")]
     pub recordings: Vec<PathBuf>,
     #[command(flatten)]
@@ -280,6 +285,9 @@ pub struct Diagnose {
     /// The report, one file with all figures and their numbers
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
+    /// What the model of a measured response matrix holds; the frequency without it
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
     /// The model with what was identified, for `orbitcal replay --model-file` and for a device
     #[arg(long, value_name = "FILE")]
     pub model_out: Option<PathBuf>,
@@ -316,6 +324,23 @@ pub enum Format {
     Xsuite,
     /// JSON in the Particle Accelerator Lattice Standard
     Pals,
+}
+
+/// `orbitcal compare`.
+#[derive(Debug, Args)]
+pub struct Compare {
+    /// The earlier measurement: a folder with a response matrix, or a recording
+    #[arg(value_name = "A")]
+    pub before: PathBuf,
+    /// The later one, of the same machine and instruments
+    #[arg(value_name = "B")]
+    pub after: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
 }
 
 /// `orbitcal challenge`.

@@ -10,10 +10,11 @@ use diagnosis::heldout::Score;
 use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::{Diagnosis, Finding, page};
 use inference::Recording;
+use measured::Folder;
 use serde::Serialize;
 use twin::{Measured, Ring};
 
-use super::{CommandError, check_outputs, deliver, machine_with, progress, recording};
+use super::{CommandError, check_outputs, deliver, machine_with, matrix, progress, recording};
 use crate::cli::Diagnose;
 use crate::model_file;
 use crate::output::{self, fill, table};
@@ -155,6 +156,14 @@ impl From<DataError> for CommandError {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Diagnose) -> Result<(), CommandError> {
+    if options.recordings.iter().any(|path| Folder::is_one(path)) {
+        return matrix::diagnose(options);
+    }
+    if options.rf.is_some() {
+        return Err(CommandError::Input(
+            "--rf is for a measured matrix; a recording's header says what the RF held".into(),
+        ));
+    }
     let outputs = [&options.common.json, &options.report, &options.model_out];
     check_outputs(outputs.map(Option::as_deref))?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;

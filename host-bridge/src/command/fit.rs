@@ -6,9 +6,12 @@ use indicatif::ProgressBar;
 use inference::campaign::supplies_of;
 use inference::nuts::{self, NutsRun};
 use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use measured::Folder;
 use twin::Ring;
 
-use super::{CommandError, campaign, check_outputs, deliver, expect_modelled, machine_with, progress, recording};
+use super::{
+    CommandError, campaign, check_outputs, deliver, expect_modelled, machine_with, matrix, progress, recording,
+};
 use crate::cli::{Fit, FitModel, Method};
 use crate::result::FitResult;
 use crate::{fit_page, output};
@@ -18,6 +21,9 @@ use crate::{fit_page, output};
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Fit) -> Result<(), CommandError> {
+    if Folder::is_one(&options.recording) {
+        return matrix::fit(options);
+    }
     check(options)?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
@@ -40,6 +46,11 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     }
     if options.method == Method::Map && options.save_draws.is_some() {
         return Err(CommandError::Input("--save-draws needs --method nuts".into()));
+    }
+    if options.rf.is_some() {
+        return Err(CommandError::Input(
+            "--rf is for a measured matrix; a recording's header says what the RF held".into(),
+        ));
     }
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)

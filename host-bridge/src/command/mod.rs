@@ -2,9 +2,11 @@
 
 pub mod challenge;
 pub mod check;
+pub mod compare;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
+pub mod matrix;
 pub mod replay;
 pub mod response;
 pub mod serve;

@@ -1,0 +1,100 @@
+//! `orbitcal fit` and `orbitcal diagnose` of a measured response matrix.
+
+use indicatif::ProgressBar;
+use measured::{Fit, Folder, MeasuredError, Model, Settings, Wiring};
+use twin::{Hold, Optics, Rf};
+
+use super::{CommandError, check_outputs, deliver};
+use crate::cli::{self, Common, Method, Priors};
+use crate::matrix_result::{MatrixDiagnosis, MatrixFit};
+
+impl From<MeasuredError> for CommandError {
+    fn from(error: MeasuredError) -> Self {
+        match error {
+            MeasuredError::Orbit(_) | MeasuredError::Singular(_) => Self::Other(error.to_string()),
+            _ => Self::Input(error.to_string()),
+        }
+    }
+}
+
+/// Fit it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
+    let refused = |what: &str| {
+        Err(CommandError::Input(format!(
+            "{what} is for a recording; {} is a measured matrix",
+            options.recording.display()
+        )))
+    };
+    if options.method == Method::Nuts {
+        return refused("--method nuts");
+    }
+    if options.report.is_some() {
+        return refused("--report");
+    }
+    if options.common.machine.is_some() {
+        return refused("--machine");
+    }
+    check_outputs([options.common.json.as_deref()])?;
+    let settings = settings(options.rf, &options.priors)?;
+    let (folder, cables) = measured::straightened(&Folder::read(&options.recording)?, &settings)?;
+    let fitted = fitted(&folder, &settings, &options.common)?;
+    deliver(&options.common, &result(&folder, &cables, &fitted, &settings)?)
+}
+
+/// Diagnose it.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
+    let [path] = options.recordings.as_slice() else {
+        return Err(CommandError::Input("one measured matrix at a time; `orbitcal compare A B` compares two".into()));
+    };
+    if options.report.is_some() || options.model_out.is_some() {
+        return Err(CommandError::Input(format!(
+            "--report and --model-out are for recordings; {} is a measured matrix",
+            path.display()
+        )));
+    }
+    check_outputs([options.common.json.as_deref()])?;
+    let settings = settings(options.rf, &options.priors)?;
+    let (folder, cables) = measured::straightened(&Folder::read(path)?, &settings)?;
+    let fitted = fitted(&folder, &settings, &options.common)?;
+    let spinner = spinner(&options.common);
+    let found = measured::diagnose(&folder, &fitted, &settings, &mut |what| spinner.set_message(what.to_owned()));
+    spinner.finish_and_clear();
+    let fit = result(&folder, &cables, &fitted, &settings)?;
+    deliver(&options.common, &MatrixDiagnosis::of(&folder, settings.rf, &cables, &found?, fit))
+}
+
+/// How a matrix is fitted.
+pub(super) fn settings(rf: Option<cli::Rf>, priors: &Priors) -> Result<Settings, CommandError> {
+    if priors.range.is_some() {
+        return Err(CommandError::Input("--range is for a recording; vars of a measured matrix have no bounds".into()));
+    }
+    let mut settings = Settings { rf: rf.map_or(Rf::FixedFrequency, Into::into), ..Settings::default() };
+    settings.widths.strength = priors.prior_width.unwrap_or(settings.widths.strength);
+    Ok(settings)
+}
+
+/// The fit of a matrix, with what it does on a terminal.
+pub(super) fn fitted(folder: &Folder, settings: &Settings, common: &Common) -> Result<Fit, CommandError> {
+    let spinner = spinner(common);
+    let fitted = measured::fit(folder, settings, &mut |what| spinner.set_message(format!("{}: {what}", folder.name)));
+    spinner.finish_and_clear();
+    Ok(fitted?)
+}
+
+pub(super) fn spinner(common: &Common) -> ProgressBar {
+    let spinner = if common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
+    spinner.enable_steady_tick(core::time::Duration::from_millis(100));
+    spinner
+}
+
+fn result(folder: &Folder, cables: &[Wiring], fitted: &Fit, settings: &Settings) -> Result<MatrixFit, CommandError> {
+    let ring = Model::of(folder, &fitted.groups, settings.rf)?.at(&fitted.unknowns, &fitted.values);
+    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok().and_then(|optics| optics.tunes().ok());
+    Ok(MatrixFit::of(folder, cables, fitted, tunes.map(|tunes| [tunes.x, tunes.y])))
+}

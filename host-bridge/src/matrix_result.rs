@@ -1,0 +1,406 @@
+//! Results of measured response matrices: as JSON and as tables.
+
+use core::fmt;
+
+use comfy_table::CellAlignment;
+use measured::Wiring;
+use measured::diagnose::Diagnosis;
+use measured::unknowns::name;
+use measured::{Fit, Folder, Kind};
+use serde::Serialize;
+use twin::Rf;
+
+use crate::output::{fill, table};
+use crate::result::{Monitor, Tunes};
+
+/// Strength factors and instruments of a measured matrix. Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct MatrixFit {
+    pub recording: String,
+    pub method: &'static str,
+    pub model: &'static str,
+    /// Elements of the matrix that count.
+    pub elements: usize,
+    pub rejected_elements: usize,
+    /// One for each row of the lattice that is fitted.
+    pub vars: Vec<MatrixVar>,
+    pub covariance: Vec<Vec<f64>>,
+    /// With what the model misses counted as an error.
+    pub chi2_per_dof: f64,
+    /// With the stated noise alone, at the values that make it least.
+    pub chi2_loco: f64,
+    pub chi2_loco_start: f64,
+    pub tunes: Option<Tunes>,
+    pub monitors: Vec<Monitor>,
+    pub other: Vec<Other>,
+    pub degenerate: Vec<Vec<String>>,
+    /// What the model misses in each block of the matrix.
+    pub model_error: Vec<BlockError>,
+    /// Cables that were put right before the fit.
+    pub wiring: Vec<Cable>,
+    /// False where the fit was still moving when its steps were used up.
+    pub has_ended: bool,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Cable {
+    pub kind: &'static str,
+    pub at: String,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct MatrixVar {
+    pub name: String,
+    pub index: usize,
+    pub mean: f64,
+    pub sigma: f64,
+    pub q025: f64,
+    pub q16: f64,
+    pub q84: f64,
+    pub q975: f64,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Other {
+    pub kind: &'static str,
+    pub at: String,
+    pub mean: f64,
+    pub sigma: f64,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct BlockError {
+    pub block: &'static str,
+    pub rms_um: f64,
+}
+
+impl MatrixFit {
+    /// Of a fit.
+    pub fn of(folder: &Folder, cables: &[Wiring], fit: &Fit, tunes: Option<[f64; 2]>) -> Self {
+        let mut rows: Vec<(usize, usize)> = Vec::new();
+        for (at, unknown) in fit.unknowns.iter().enumerate() {
+            if let Kind::Strength(group) = unknown.kind {
+                rows.extend(fit.groups[0][group].iter().map(|&row| (row, at)));
+            }
+        }
+        rows.sort_unstable();
+        let var = |&(row, at): &(usize, usize)| {
+            let (mean, sigma) = (fit.values[at], fit.sigma(at));
+            let quantile = |deviations: f64| mean + deviations * sigma;
+            let [q025, q16, q84, q975] = [-1.959_964, -0.994_458, 0.994_458, 1.959_964].map(quantile);
+            MatrixVar { name: folder.element(row), index: row, mean, sigma, q025, q16, q84, q975 }
+        };
+        let between = |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| fit.covariance[(i, j)]).collect();
+        let word = |kind: Kind| match kind {
+            Kind::Strength(_) => None,
+            Kind::Skew(_) => Some("skew_gradient"),
+            Kind::HeldFrequency => Some("fixed_rf_frequency"),
+            Kind::MonitorGain(_) => Some("bpm_gain"),
+            Kind::MonitorCoupling(_) => Some("bpm_coupling"),
+            Kind::CorrectorGain(_) => Some("corrector_gain"),
+            Kind::CorrectorCoupling(_) => Some("corrector_coupling"),
+            Kind::RfScale => Some("rf_scale"),
+        };
+        let called = |at: usize| name(folder, &fit.groups, fit.unknowns[at].kind);
+        let other = fit.unknowns.iter().enumerate().filter_map(|(at, unknown)| {
+            Some(Other { kind: word(unknown.kind)?, at: called(at), mean: fit.values[at], sigma: fit.sigma(at) })
+        });
+        let counted = fit.weight.iter().filter(|w| **w > 0.0).count() as f64;
+        let chi2 = fit.residual.component_mul(&fit.residual).dot(&fit.weight);
+        let blocks = measured::fit::BLOCKS.iter().zip(fit.discrepancy).filter(|(_, rms)| *rms > 0.0);
+        Self {
+            recording: folder.name.clone(),
+            method: "map",
+            model: "twin",
+            elements: fit.elements,
+            rejected_elements: fit.outliers.len(),
+            vars: rows.iter().map(var).collect(),
+            covariance: rows.iter().map(between).collect(),
+            chi2_per_dof: chi2 / (counted - fit.unknowns.len() as f64).max(1.0),
+            chi2_loco: fit.chi2_loco,
+            chi2_loco_start: fit.chi2_start,
+            tunes: tunes.map(|[x, y]| Tunes { x, y }),
+            monitors: monitors(folder, fit),
+            other: other.collect(),
+            degenerate: fit.degenerate().iter().map(|set| set.iter().map(|&at| called(at)).collect()).collect(),
+            model_error: blocks.map(|(block, rms)| BlockError { block, rms_um: 1e3 * rms }).collect(),
+            wiring: cables.iter().map(|one| one.named(folder)).map(|(kind, at)| Cable { kind, at }).collect(),
+            has_ended: fit.has_ended,
+        }
+    }
+}
+
+/// A monitor that reads less than this share of the orbit is dead.
+const DEAD: f64 = 0.2;
+
+/// State of each monitor: dead where it is not used or reads nothing, noisy where its rows are explained worse than others.
+fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
+    let state = |row: usize| {
+        let counted = fit.weight.row(row).iter().filter(|w| **w > 0.0).count();
+        let squares: f64 = fit.residual.row(row).iter().zip(fit.weight.row(row).iter()).map(|(r, w)| r * r * w).sum();
+        let gain = fit.unknowns.iter().position(|one| one.kind == Kind::MonitorGain(row)).map(|at| fit.values[at]);
+        let word = match (gain, squares > 4.0 * counted as f64) {
+            (Some(gain), false) if gain.abs() > DEAD => "ok",
+            (Some(gain), true) if gain.abs() > DEAD => "noisy",
+            _ => "dead",
+        };
+        let rejected = fit.outliers.iter().filter(|[at, _]| *at == row).count();
+        let rms = (fit.residual.row(row).norm_squared() / counted.max(1) as f64).sqrt();
+        Monitor { name: folder.monitor(row), state: word, sigma_mm: rms, rejected: rejected as u32 }
+    };
+    (0..folder.monitors.len()).map(state).collect()
+}
+
+impl fmt::Display for MatrixFit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { recording, elements, rejected_elements, chi2_loco, chi2_loco_start, .. } = self;
+        writeln!(f, "{recording}: {elements} elements of the response matrix, {rejected_elements} set aside\n")?;
+        for Cable { kind, at } in &self.wiring {
+            writeln!(f, "put right before the fit: {kind} at {at}\n")?;
+        }
+        if !self.has_ended {
+            let doubt = "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units.";
+            writeln!(f, "{}\n", fill(doubt))?;
+        }
+        let line = format!(
+            "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; what the model misses: {}",
+            self.model_error
+                .iter()
+                .map(|one| format!("{} {:.1} um", one.block, one.rms_um))
+                .collect::<Vec<_>>()
+                .join(", ")
+        );
+        writeln!(f, "{}\n", fill(&line))?;
+        let mut vars = table(["var", "mean", "sigma / %", "var", "mean", "sigma / %"]);
+        for pair in self.vars.chunks(2) {
+            vars.add_row(
+                pair.iter().flat_map(|var| {
+                    [var.name.clone(), format!("{:.4}", var.mean), format!("{:.2}", 100.0 * var.sigma)]
+                }),
+            );
+        }
+        for column in vars.column_iter_mut().filter(|column| column.index % 3 != 0) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        writeln!(f, "{vars}")?;
+        if let Some(tunes) = &self.tunes {
+            writeln!(f, "tunes {:.4} {:.4}", tunes.x, tunes.y)?;
+        }
+        let doubtful =
+            self.monitors.iter().filter(|one| one.state != "ok").map(|one| format!("{} {}", one.name, one.state));
+        let doubtful: Vec<String> = doubtful.collect();
+        if !doubtful.is_empty() {
+            writeln!(f, "{}", fill(&format!("monitors: {}", doubtful.join(", "))))?;
+        }
+        for set in &self.degenerate {
+            writeln!(f, "{}", fill(&format!("cannot be told apart: {}", set.join(", "))))?;
+        }
+        Ok(())
+    }
+}
+
+/// What changed. Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct Comparison {
+    pub changes: Vec<ChangeOfOne>,
+    pub sentence: String,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct ChangeOfOne {
+    pub name: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub index: Option<usize>,
+    pub relative: f64,
+    pub sigma: f64,
+    pub identifiable: bool,
+}
+
+/// Standard deviations from which on a change is one.
+const CHANGED: f64 = 3.0;
+
+impl Comparison {
+    /// Of changes, in the order of the ring.
+    pub fn of(changes: Vec<ChangeOfOne>) -> Self {
+        let mut found: Vec<&ChangeOfOne> =
+            changes.iter().filter(|one| one.identifiable && one.relative.abs() > CHANGED * one.sigma).collect();
+        found.sort_by(|a, b| (b.relative / b.sigma).abs().total_cmp(&(a.relative / a.sigma).abs()));
+        let open = changes.iter().filter(|one| !one.identifiable).count();
+        let listed: Vec<String> = found
+            .iter()
+            .take(3)
+            .map(|one| format!("{} by {:+.3} ± {:.3} %", one.name, 100.0 * one.relative, 100.0 * one.sigma))
+            .collect();
+        let more = if found.len() > 3 { format!(" and {} more", found.len() - 3) } else { String::new() };
+        let first = match listed.is_empty() {
+            true => "No quadrupole changed by three error bars.".to_owned(),
+            false => format!("{} of {} changed: {}{more}.", found.len(), changes.len(), listed.join(", ")),
+        };
+        let second = if open > 0 { format!(" Of {open} the measurements cannot tell.") } else { String::new() };
+        Self { sentence: first + &second, changes }
+    }
+}
+
+impl fmt::Display for Comparison {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}\n", fill(&self.sentence))?;
+        let mut rows = table(["quadrupole", "change / %", "sigma / %", "can be told"]);
+        for one in &self.changes {
+            let (change, sigma) = (format!("{:+.3}", 100.0 * one.relative), format!("{:.3}", 100.0 * one.sigma));
+            rows.add_row([one.name.clone(), change, sigma, if one.identifiable { "yes" } else { "no" }.into()]);
+        }
+        for column in rows.column_iter_mut().filter(|column| [1, 2].contains(&column.index)) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        write!(f, "{rows}")
+    }
+}
+
+/// What a matrix's model lacks. Field names are those of the command's JSON.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct MatrixDiagnosis {
+    pub recording: String,
+    pub verdict: &'static str,
+    pub sentence: String,
+    pub findings: Vec<MatrixFinding>,
+    pub unexplained: Vec<UnexplainedResult>,
+    pub fit: MatrixFit,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct MatrixFinding {
+    pub kind: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at: Option<String>,
+    pub amplitude: f64,
+    pub sigma: f64,
+    /// Part of `sigma` that the model's own dispersion leaves.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub systematic: Option<f64>,
+    pub unit: &'static str,
+    /// Nat; cables have none, they are seen before anything is fitted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_evidence_gain: Option<f64>,
+    /// Shuffled patterns that gain as much, and how many were tried.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub as_good_by_chance: Option<[usize; 2]>,
+    pub sentence: String,
+}
+
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct UnexplainedResult {
+    pub at: String,
+    pub rms_um: f64,
+    pub ratio: f64,
+}
+
+impl MatrixDiagnosis {
+    /// Of a diagnosis, with the fit that it began from; cables first, since nothing else counts before they are right.
+    pub fn of(folder: &Folder, rf: Rf, cables: &[Wiring], found: &Diagnosis, fit: MatrixFit) -> Self {
+        let cables = cables.iter().chain(&found.wiring).map(|one| cable(folder, one));
+        let findings: Vec<MatrixFinding> = cables.chain(is_other_hold(rf, found).then(|| share(rf, found))).collect();
+        let worst: Vec<&str> = found.unexplained.iter().take(6).map(|one| one.at.as_str()).collect();
+        let instruments = (!worst.is_empty())
+            .then(|| format!("what no magnet explains sits at {}: the measurement's side", worst.join(", ")));
+        let said: Vec<String> = findings.iter().map(|one| one.sentence.clone()).chain(instruments).collect();
+        let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
+            (false, _) => ("identified", said.join("; ")),
+            (true, false) => ("unexplained", said.join("; ")),
+            (true, true) => ("consistent", "nothing was found beside the learnt error of the model".into()),
+        };
+        let unexplained = found.unexplained.iter();
+        let unexplained =
+            unexplained.map(|one| UnexplainedResult { at: one.at.clone(), rms_um: 1e3 * one.rms, ratio: one.ratio });
+        Self { recording: folder.name.clone(), verdict, sentence, findings, unexplained: unexplained.collect(), fit }
+    }
+}
+
+/// A share of a held frequency is a finding where it is nearer to the other hold than to the one that is believed, and chance gives no like.
+fn is_other_hold(rf: Rf, found: &Diagnosis) -> bool {
+    (found.share.value > 0.5) != (rf == Rf::FixedFrequency) && found.share.as_good == 0
+}
+
+fn cable(folder: &Folder, wiring: &Wiring) -> MatrixFinding {
+    let (kind, at) = wiring.named(folder);
+    let places = at.replace(',', " and ");
+    let sentence = match wiring {
+        Wiring::MonitorsExchanged(_) | Wiring::CorrectorsExchanged(_) => format!("{places} are exchanged"),
+        Wiring::MonitorReversed(_) => format!("{places} reads with the other sign"),
+        Wiring::CorrectorReversed(_) => format!("{places} kicks with the other sign"),
+        Wiring::PlaneReversed(_) => format!("all kicks of plane {places} have the other sign, or all its readings"),
+    };
+    MatrixFinding {
+        kind,
+        at: Some(at),
+        amplitude: 1.0,
+        sigma: 0.0,
+        systematic: None,
+        unit: "1",
+        log_evidence_gain: None,
+        as_good_by_chance: None,
+        sentence,
+    }
+}
+
+fn share(rf: Rf, found: &Diagnosis) -> MatrixFinding {
+    let share = &found.share;
+    let (kind, what, amplitude) = match rf {
+        Rf::FixedMomentum => ("fixed_rf_frequency", "the RF frequency is held, not the momentum", share.value),
+        Rf::FixedFrequency => ("fixed_momentum", "the momentum is held, not the RF frequency", 1.0 - share.value),
+    };
+    MatrixFinding {
+        kind,
+        at: None,
+        amplitude,
+        sigma: share.sigma(),
+        systematic: Some(share.systematic),
+        unit: "1",
+        log_evidence_gain: Some(share.gain),
+        as_good_by_chance: Some([share.as_good, share.shuffles]),
+        sentence: format!(
+            "{what}: the term of the path length has {amplitude:.3} of its size, ± {:.3} by the scatter of the residuals, ± {:.3} since the \
+             model's dispersion differs by so much from the measured one",
+            share.scatter, share.systematic
+        ),
+    }
+}
+
+impl fmt::Display for MatrixDiagnosis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}: {}\n\n{}\n", self.recording, self.verdict, fill(&self.sentence))?;
+        let mut rows = table(["missing", "at", "amplitude", "gain / nat", "by chance"]);
+        for one in &self.findings {
+            let chance = one.as_good_by_chance.map_or(String::new(), |[as_good, of]| format!("{as_good} of {of}"));
+            let amplitude =
+                if one.sigma > 0.0 { format!("{:.3} ± {:.3}", one.amplitude, one.sigma) } else { String::new() };
+            rows.add_row([
+                one.kind.into(),
+                one.at.clone().unwrap_or_default(),
+                amplitude,
+                one.log_evidence_gain.map_or(String::new(), |gain| format!("{gain:.1}")),
+                chance,
+            ]);
+        }
+        if !self.findings.is_empty() {
+            writeln!(f, "{rows}\n")?;
+        }
+        if self.unexplained.is_empty() {
+            return Ok(());
+        }
+        let mut rows = table(["instrument", "residuals / um", "mean square over the others'"]);
+        for one in self.unexplained.iter().take(12) {
+            rows.add_row([one.at.clone(), format!("{:.1}", one.rms_um), format!("{:.1}", one.ratio)]);
+        }
+        write!(f, "{rows}")
+    }
+}

@@ -1,0 +1,302 @@
+//! What the model of a measured matrix lacks: what the RF holds, cables, and instruments whose readings nothing explains.
+//!
+//! The pattern `d` of a held frequency is scored to first order about the fit, all unknowns adapting. With `r` the residuals, `W` the weights and
+//! `P` the projection that removes what the unknowns can absorb, `g = d P r` and `h = d P d`:
+//!
+//! `ln Bayes factor = g^2/(1 + h)/2 - ln(1 + h)/2` for a share with a prior width of 1.
+//!
+//! It is then fitted with all unknowns, and the error of the model is learnt anew. What patterns gain that are like it, the same orbit with
+//! the kicks' shares in other correctors, tells how much chance and the model's other errors give.
+
+use nalgebra::{DMatrix, DVector};
+use twin::{Plane, Rf};
+
+use crate::error::MeasuredError;
+use crate::fit::{Data, Fit, Settings, descend, with_model_error};
+use crate::folder::Folder;
+use crate::model::{Model, Prediction};
+use crate::normal::Places;
+use crate::unknowns::{Kind, Unknown};
+use crate::wiring::{self, Wiring};
+
+/// Patterns that the term of a held frequency is compared with.
+const SHUFFLES: usize = 99;
+
+/// The share of a held frequency, fitted with everything else.
+#[derive(Debug, Clone)]
+pub struct Share {
+    /// 1 where the frequency is held, 0 where the momentum is.
+    pub value: f64,
+    /// Its standard deviation by the scatter of the residuals, alike along rows and columns.
+    pub scatter: f64,
+    /// What the model misses of the measured dispersion, relative: the term is the product of two dispersions, and errors of the model's
+    /// dispersion are long waves, which do not average.
+    pub systematic: f64,
+    /// Gain of `ln` likelihood, the errors of the model learnt in both fits.
+    pub gain: f64,
+    /// How many of `shuffles` patterns with the correctors' shares exchanged gain as much, to first order.
+    pub as_good: usize,
+    /// Patterns tried.
+    pub shuffles: usize,
+}
+
+impl Share {
+    /// Standard deviation of the share, both causes together.
+    pub fn sigma(&self) -> f64 {
+        self.scatter.hypot(self.systematic)
+    }
+}
+
+/// An instrument whose readings the model explains worse than its block's.
+#[derive(Debug, Clone)]
+pub struct Unexplained {
+    /// Its name.
+    pub at: String,
+    /// Rms of its residuals [mm].
+    pub rms: f64,
+    /// Its mean square over that of its block's other elements, by their weights.
+    pub ratio: f64,
+}
+
+/// What was found.
+#[derive(Debug, Clone)]
+pub struct Diagnosis {
+    /// Cables that the fitted matrix shows to be wrong, and that of the lattice as written did not.
+    pub wiring: Vec<Wiring>,
+    /// Of the held frequency.
+    pub share: Share,
+    /// Of instruments, the worst first.
+    pub unexplained: Vec<Unexplained>,
+}
+
+/// An instrument is worse than others from this ratio on.
+const WORSE: f64 = 2.5;
+
+/// Diagnose a fitted measurement.
+///
+/// # Errors
+/// [`MeasuredError`].
+pub fn diagnose(
+    folder: &Folder,
+    fitted: &Fit,
+    settings: &Settings,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Diagnosis, MeasuredError> {
+    let model = Model::of(folder, &fitted.groups, settings.rf)?;
+    let prediction = model.predict(&fitted.unknowns, &fitted.values)?;
+    let about = About::of(
+        &fitted.unknowns,
+        prediction,
+        fitted.covariance.clone(),
+        fitted.residual.clone(),
+        fitted.weight.clone(),
+    );
+    let wiring = wiring::found(folder, &model.without_instruments(&fitted.unknowns, &fitted.values)?);
+    let share = share(folder, fitted, &model, settings, &about, progress)?;
+    Ok(Diagnosis { wiring, share, unexplained: unexplained(folder, fitted) })
+}
+
+/// A fit, prepared to score further patterns.
+struct About {
+    places: Places,
+    prediction: Prediction,
+    covariance: DMatrix<f64>,
+    residual: DMatrix<f64>,
+    weight: DMatrix<f64>,
+}
+
+impl About {
+    fn of(
+        unknowns: &[Unknown],
+        prediction: Prediction,
+        covariance: DMatrix<f64>,
+        residual: DMatrix<f64>,
+        weight: DMatrix<f64>,
+    ) -> Self {
+        let places = Places::of(unknowns, weight.nrows(), weight.ncols());
+        Self { places, prediction, covariance, residual, weight }
+    }
+
+    /// `d P r` and `d P d` of a pattern [mm].
+    fn score(&self, pattern: &DMatrix<f64>) -> (f64, f64) {
+        let weighted = pattern.component_mul(&self.weight);
+        let across = self.places.back(&self.prediction, &weighted, self.covariance.nrows());
+        let own = weighted.dot(pattern);
+        (self.pull(pattern), (own - across.dot(&(&self.covariance * &across))).max(0.0))
+    }
+
+    /// Standard deviation of an unknown where the model's errors are alike along the row of a monitor and along the column of a corrector, as
+    /// they are on every measured ring: what each row and each column by itself says of the unknown, squared and added, with what stands in
+    /// both counted once; at least that of independent errors.
+    ///
+    /// Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8.
+    fn clustered(&self, unknown: usize) -> f64 {
+        let direction = self.covariance.column(unknown);
+        let influence = DMatrix::from_fn(self.weight.nrows(), self.weight.ncols(), |i, j| {
+            let of_machine: f64 =
+                self.prediction.by_machine.iter().zip(direction.iter()).map(|(slope, d)| slope[(i, j)] * d).sum();
+            let of_instruments: f64 =
+                self.places.instruments(&self.prediction, i, j).map(|(one, by)| by * direction[one]).sum();
+            (of_machine + of_instruments) * self.weight[(i, j)] * self.residual[(i, j)]
+        });
+        let squares = |sums: &mut dyn Iterator<Item = f64>| sums.map(|sum| sum * sum).sum::<f64>();
+        let by_row = squares(&mut influence.row_iter().map(|row| row.sum()));
+        let by_column = squares(&mut influence.column_iter().map(|column| column.sum()));
+        (by_row + by_column - influence.norm_squared()).max(direction[unknown]).sqrt()
+    }
+
+    /// Rms amplitude that the residuals give patterns which are not there.
+    fn of_patterns(&self, patterns: &[DMatrix<f64>]) -> f64 {
+        let squares = patterns.iter().map(|pattern| self.score(pattern)).map(|(pull, power)| (pull / power).powi(2));
+        (squares.sum::<f64>() / patterns.len() as f64).sqrt()
+    }
+
+    /// `d r` of a pattern.
+    fn pull(&self, pattern: &DMatrix<f64>) -> f64 {
+        pattern.component_mul(&self.weight).dot(&self.residual)
+    }
+}
+
+/// Of an amplitude with a prior standard deviation of 1.
+fn of_amplitude((pull, power): (f64, f64)) -> f64 {
+    0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p()
+}
+
+/// The unknowns of a fit with the share of a held frequency among those of the machine.
+fn with_share(fitted: &Fit, share: f64) -> (Vec<Unknown>, DVector<f64>) {
+    let at = fitted.groups[0].len() + fitted.groups[1].len();
+    let (mut unknowns, mut values) = (fitted.unknowns.clone(), fitted.values.as_slice().to_vec());
+    unknowns.insert(at, Unknown { kind: Kind::HeldFrequency, mean: share, width: 1.0 });
+    values.insert(at, share);
+    (unknowns, DVector::from_vec(values))
+}
+
+/// The share of a held frequency.
+fn share(
+    folder: &Folder,
+    fitted: &Fit,
+    model: &Model,
+    settings: &Settings,
+    about: &About,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Share, MeasuredError> {
+    let believed = f64::from(u8::from(settings.rf == Rf::FixedFrequency));
+    let (unknowns, values) = with_share(fitted, believed);
+    let at = fitted.groups[0].len() + fitted.groups[1].len();
+    let pattern = model.predict(&unknowns, &values)?.by_machine.swap_remove(at);
+    let horizontal = folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == Plane::X && one.is_used);
+    let horizontal: Vec<usize> = horizontal.map(|(column, _)| column).collect();
+    let patterns: Vec<DMatrix<f64>> = (1..=SHUFFLES).map(|seed| shuffled(&pattern, &horizontal, seed)).collect();
+    let own = of_amplitude(about.score(&pattern));
+    let as_good = patterns.iter().filter(|pattern| of_amplitude(about.score(pattern)) >= own).count();
+    let mut data = Data::of(folder);
+    data.sigma.zip_apply(&fitted.weight, |sigma, weight| {
+        if weight == 0.0 {
+            *sigma = f64::INFINITY
+        }
+    });
+    let from = descend(model, &unknowns, &data.measured, &fitted.weight, values)?;
+    let (here, discrepancy) = with_model_error(model, &unknowns, &data, from, progress)?;
+    let weight = data.weight(&discrepancy);
+    let residual = (&data.measured - &here.prediction.matrix).zip_map(&weight, |r, w| if w > 0.0 { r } else { 0.0 });
+    let gain = log_likelihood(&residual, &weight) - log_likelihood(&fitted.residual, &fitted.weight);
+    let systematic = dispersion_missed(folder, &here.prediction);
+    let beside = About::of(&unknowns, here.prediction, here.covariance, residual, weight);
+    let scatter = beside.clustered(at).max(beside.of_patterns(&patterns));
+    Ok(Share { value: here.values[at], scatter, systematic, gain, as_good, shuffles: SHUFFLES })
+}
+
+/// Scatter of the measured horizontal dispersion about the predicted one, at the scale that suits it best, over the rms of the predicted: by the
+/// median, since few monitors are far off. 0 where it was not measured.
+fn dispersion_missed(folder: &Folder, at: &Prediction) -> f64 {
+    let Some(dispersion) = &folder.dispersion else { return 0.0 };
+    let read = (0..folder.monitors.len())
+        .filter(|&row| folder.monitors[row].is_used && folder.monitors[row].plane == Plane::X);
+    let last = at.matrix.ncols() - 1;
+    let pairs: Vec<(f64, f64)> =
+        read.map(|row| (dispersion[row], at.matrix[(row, last)])).filter(|(m, _)| m.is_finite()).collect();
+    let [squares, product] =
+        [pairs.iter().map(|(_, p)| p * p).sum::<f64>(), pairs.iter().map(|(m, p)| m * p).sum::<f64>()];
+    let scale = product / squares;
+    let mut off: Vec<f64> = pairs.iter().map(|(m, p)| (m - scale * p).abs()).collect();
+    off.sort_by(f64::total_cmp);
+    let rms = scale.abs() * (squares / pairs.len() as f64).sqrt();
+    1.4826 * off.get(off.len() / 2).copied().unwrap_or(0.0) / rms
+}
+
+fn log_likelihood(residual: &DMatrix<f64>, weight: &DMatrix<f64>) -> f64 {
+    let one = |(&r, &w): (&f64, &f64)| if w > 0.0 { 0.5 * (w.ln() - w * r * r) } else { 0.0 };
+    residual.iter().zip(weight).map(one).sum()
+}
+
+/// The pattern with the columns of some correctors exchanged at random, the size of each with it: a permutation by a seeded generator.
+fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: usize) -> DMatrix<f64> {
+    let mut order = columns.to_vec();
+    let mut state = seed as u64;
+    for i in (1..order.len()).rev() {
+        // Knuth's MMIX generator, its upper half
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        order.swap(i, (state >> 33) as usize % (i + 1));
+    }
+    let mut other = pattern.clone();
+    for (&to, &from) in columns.iter().zip(&order) {
+        other.set_column(to, &pattern.column(from));
+    }
+    other
+}
+
+/// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
+fn unexplained(folder: &Folder, fitted: &Fit) -> Vec<Unexplained> {
+    let squares = fitted.residual.component_mul(&fitted.residual).component_mul(&fitted.weight);
+    let (all, elements) = (squares.sum(), fitted.weight.iter().filter(|w| **w > 0.0).count() as f64);
+    let judge = |at: String, squares: f64, residual: f64, n: usize| {
+        let others = (all - squares) / (elements - n as f64);
+        Unexplained { at, rms: (residual / n.max(1) as f64).sqrt(), ratio: squares / n.max(1) as f64 / others }
+    };
+    let counted = |weights: &mut dyn Iterator<Item = &f64>| weights.filter(|w| **w > 0.0).count();
+    let rows = (0..folder.monitors.len()).map(|i| {
+        judge(
+            folder.monitor(i),
+            squares.row(i).sum(),
+            fitted.residual.row(i).norm_squared(),
+            counted(&mut fitted.weight.row(i).iter()),
+        )
+    });
+    let columns = (0..folder.correctors.len()).map(|j| {
+        judge(
+            folder.corrector(j),
+            squares.column(j).sum(),
+            fitted.residual.column(j).norm_squared(),
+            counted(&mut fitted.weight.column(j).iter()),
+        )
+    });
+    let mut worst: Vec<Unexplained> = rows.chain(columns).filter(|one| one.ratio > WORSE).collect();
+    worst.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));
+    worst
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::fit;
+    use crate::testing::{NOISE, machine, measured, ring};
+
+    fn diagnosed(folder: &Folder, rf: Rf) -> Diagnosis {
+        let settings = Settings { rf, ..Settings::default() };
+        let fitted = fit(folder, &settings, &mut |_| ()).unwrap();
+        diagnose(folder, &fitted, &settings, &mut |_| ()).unwrap()
+    }
+
+    #[test]
+    fn a_held_frequency_that_the_model_lacks_is_found_in_its_size() {
+        let ring = ring();
+        let folder = measured(&ring, &machine(&ring, 11), NOISE, 1);
+        let found = diagnosed(&folder, Rf::FixedMomentum);
+        assert_eq!(found.share.as_good, 0);
+        assert!((found.share.value - 1.0).abs() < 3.0 * found.share.sigma(), "{:?}", found.share);
+        assert!(found.share.sigma() < 0.1, "{:?}", found.share);
+        let right = diagnosed(&folder, Rf::FixedFrequency);
+        assert!((right.share.value - 1.0).abs() < 3.0 * right.share.sigma(), "{:?}", right.share);
+        assert!(right.wiring.is_empty() && right.unexplained.is_empty(), "{:?}", right);
+    }
+}

@@ -1,0 +1,37 @@
+//! What can be wrong with a measurement.
+
+use twin::{LatticeError, OrbitError};
+
+/// Why a measurement cannot be read or fitted.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum MeasuredError {
+    /// A file could not be read.
+    #[error("{file}: {source}")]
+    Read {
+        /// Which one.
+        file: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A table is not what is expected.
+    #[error("{file}: {problem}")]
+    Table {
+        /// Which one.
+        file: String,
+        /// What was expected, what was found, and where.
+        problem: String,
+    },
+    /// The lattice makes no ring.
+    #[error(transparent)]
+    Lattice(#[from] LatticeError),
+    /// The ring of the start values has no closed orbit.
+    #[error(transparent)]
+    Orbit(#[from] OrbitError),
+    /// Two measurements are not of the same machine, or not of the same instruments.
+    #[error("{0}")]
+    Unlike(String),
+    /// The normal equations are singular, though every unknown has a prior: a number is not finite.
+    #[error("the normal equations are singular after {0} steps")]
+    Singular(usize),
+}

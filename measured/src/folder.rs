@@ -1,0 +1,329 @@
+//! A measurement as a folder of tables, docs/measured.md.
+//!
+//! `lattice.csv` has one row an element, `bpms.csv` and `correctors.csv` one row a monitor or corrector and plane, `orm_measured_mm.csv` the
+//! change of the orbit [mm] from minus to plus half a corrector's kick, `meta.json` what else was written down.
+
+use std::fs;
+use std::path::Path;
+
+use nalgebra::{DMatrix, DVector};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use twin::Plane;
+
+use crate::error::MeasuredError;
+
+/// One measured response matrix and what it was measured on.
+#[derive(Debug, Clone)]
+pub struct Folder {
+    /// Name of the folder.
+    pub name: String,
+    /// What was written down beside the tables.
+    pub meta: Meta,
+    /// Elements in beam order.
+    pub lattice: Vec<Row>,
+    /// Monitors, one row a plane, in the order of the matrix's rows.
+    pub monitors: Vec<MonitorRow>,
+    /// Correctors, one row a plane, in the order of the matrix's columns.
+    pub correctors: Vec<CorrectorRow>,
+    /// Orbit at plus half the kick less that at minus half [mm], rows monitors, columns correctors; NaN: not measured.
+    pub matrix: DMatrix<f64>,
+    /// Change of the orbit [mm] with `meta.delta_rf`, if it was measured.
+    pub dispersion: Option<DVector<f64>>,
+}
+
+/// `meta.json`.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Meta {
+    /// Length of the reference orbit [m].
+    #[serde(rename = "circumference_m")]
+    pub circumference: f64,
+    /// Total energy of the electrons [GeV]; where none is stated they count as ultra-relativistic.
+    #[serde(rename = "energy_GeV")]
+    pub energy: Option<f64>,
+    /// RF frequency [Hz].
+    #[serde(rename = "rf_Hz")]
+    pub rf: f64,
+    /// Step of the RF frequency for the dispersion [Hz].
+    #[serde(rename = "delta_rf_Hz")]
+    pub delta_rf: f64,
+    /// What the reference fit had free, if there was one.
+    pub reference_fit: Option<ReferenceFit>,
+}
+
+/// The parameters of another fit to the same matrix.
+#[derive(Debug, Clone, Deserialize)]
+pub struct ReferenceFit {
+    /// Magnets that were fitted together, one group each.
+    pub fit_parameters: Vec<Group>,
+    /// Its options.
+    pub flags: Flags,
+}
+
+/// Elements that share one parameter.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Group {
+    /// Rows of the lattice.
+    pub elements: Vec<usize>,
+    /// `K`: a gradient; `PolynomA`: a skew gradient.
+    pub field: String,
+}
+
+/// Options of the reference fit.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(rename_all = "PascalCase")]
+pub struct Flags {
+    /// `Yes` where the coupling blocks were used.
+    pub coupling: String,
+    /// `Yes` where the dispersion was used.
+    pub dispersion: String,
+}
+
+/// A row of `lattice.csv`.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Row {
+    /// Name of the family or of the element; several rows may share it.
+    pub name: String,
+    /// Entrance [m].
+    #[serde(rename = "s_entrance_m")]
+    pub s: f64,
+    /// Length along the reference orbit [m].
+    #[serde(rename = "length_m")]
+    pub length: f64,
+    /// Angle of a dipole [rad].
+    #[serde(rename = "bend_rad")]
+    pub bend: f64,
+    /// Edge angles [rad].
+    #[serde(rename = "edge_in_rad")]
+    pub edge_in: f64,
+    /// The same at the exit.
+    #[serde(rename = "edge_out_rad")]
+    pub edge_out: f64,
+    /// Gradient at the start of the fit [1/m^2].
+    #[serde(rename = "k1_start_1_m2")]
+    pub k1: f64,
+    /// Half the sextupole [1/m^3].
+    #[serde(rename = "k2_half_1_m3")]
+    pub half_k2: f64,
+}
+
+/// A row of `bpms.csv`.
+#[derive(Debug, Clone, Deserialize)]
+pub struct MonitorRow {
+    /// What it reads.
+    #[serde(deserialize_with = "plane")]
+    pub plane: Plane,
+    /// Row of the lattice.
+    #[serde(rename = "lattice_index")]
+    pub at: usize,
+    /// Noise of an element of the matrix, as stated [mm].
+    #[serde(rename = "sigma_mm")]
+    pub sigma: f64,
+    /// 0 where it is known to be dead.
+    #[serde(rename = "used_by_reference_fit", deserialize_with = "yes")]
+    pub is_used: bool,
+}
+
+/// A row of `correctors.csv`.
+#[derive(Debug, Clone, Deserialize)]
+pub struct CorrectorRow {
+    /// Where it kicks.
+    #[serde(deserialize_with = "plane")]
+    pub plane: Plane,
+    /// Row of the lattice.
+    #[serde(rename = "lattice_index")]
+    pub at: usize,
+    /// Kick from minus to plus half [mrad], as believed.
+    #[serde(rename = "nominal_kick_mrad")]
+    pub kick: f64,
+    /// 0 where it is known to be dead.
+    #[serde(rename = "used_by_reference_fit", deserialize_with = "yes")]
+    pub is_used: bool,
+}
+
+fn plane<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Plane, D::Error> {
+    match String::deserialize(from)?.as_str() {
+        "x" => Ok(Plane::X),
+        "y" => Ok(Plane::Y),
+        other => Err(serde::de::Error::custom(format!("a plane is x or y, found {other}"))),
+    }
+}
+
+fn yes<'de, D: serde::Deserializer<'de>>(from: D) -> Result<bool, D::Error> {
+    Ok(u8::deserialize(from)? != 0)
+}
+
+impl Folder {
+    /// True of a folder that holds a measured matrix.
+    pub fn is_one(path: &Path) -> bool {
+        path.join("orm_measured_mm.csv").is_file()
+    }
+
+    /// Read a folder.
+    ///
+    /// # Errors
+    /// [`MeasuredError`], with file and line.
+    pub fn read(path: &Path) -> Result<Self, MeasuredError> {
+        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let (lattice, monitors, correctors): (Vec<Row>, Vec<MonitorRow>, Vec<CorrectorRow>) =
+            (rows(&path.join("lattice.csv"))?, rows(&path.join("bpms.csv"))?, rows(&path.join("correctors.csv"))?);
+        let file = path.join("meta.json");
+        let meta = serde_json::from_str(&text(&file)?).map_err(|e| table(&file, e.to_string()))?;
+        let file = path.join("orm_measured_mm.csv");
+        let matrix = matrix(&file, monitors.len(), correctors.len())?;
+        let file = path.join("dispersion_orbit_mm.csv");
+        let dispersion = file.is_file().then(|| self::matrix(&file, monitors.len(), 1)).transpose()?;
+        let folder = Self {
+            name,
+            meta,
+            lattice,
+            monitors,
+            correctors,
+            matrix,
+            dispersion: dispersion.map(|one| one.column(0).into_owned()),
+        };
+        folder.check(path)?;
+        Ok(folder)
+    }
+
+    /// Places that are named exist, and noise is above zero.
+    fn check(&self, path: &Path) -> Result<(), MeasuredError> {
+        let last = self.lattice.len();
+        let mut places = (self.monitors.iter().map(|one| ("bpms.csv", one.at)))
+            .chain(self.correctors.iter().map(|one| ("correctors.csv", one.at)));
+        if let Some((file, at)) = places.find(|(_, at)| *at >= last) {
+            return Err(table(&path.join(file), format!("lattice_index {at}, lattice.csv has rows 0 to {}", last - 1)));
+        }
+        for (row, one) in self.monitors.iter().enumerate().filter(|(_, one)| one.is_used) {
+            if !(one.sigma > 0.0 && one.sigma.is_finite()) {
+                let problem = format!("row {row}: sigma_mm {}, expected above 0 where the monitor is used", one.sigma);
+                return Err(table(&path.join("bpms.csv"), problem));
+            }
+        }
+        Ok(())
+    }
+
+    /// Name of a row of the lattice: that of its family and its number.
+    pub fn element(&self, row: usize) -> String {
+        format!("{}.{row}", self.lattice[row].name)
+    }
+
+    /// Name of a monitor's row: `x_BPM.3`.
+    pub fn monitor(&self, row: usize) -> String {
+        let one = &self.monitors[row];
+        format!("{}_{}", if one.plane == Plane::X { "x" } else { "y" }, self.element(one.at))
+    }
+
+    /// Name of a corrector's column: `H_COR.8`.
+    pub fn corrector(&self, column: usize) -> String {
+        let one = &self.correctors[column];
+        format!("{}_{}", if one.plane == Plane::X { "H" } else { "V" }, self.element(one.at))
+    }
+}
+
+fn table(file: &Path, problem: String) -> MeasuredError {
+    MeasuredError::Table { file: file.display().to_string(), problem }
+}
+
+fn text(file: &Path) -> Result<String, MeasuredError> {
+    fs::read_to_string(file).map_err(|source| MeasuredError::Read { file: file.display().to_string(), source })
+}
+
+fn rows<T: DeserializeOwned>(file: &Path) -> Result<Vec<T>, MeasuredError> {
+    let text = text(file)?;
+    let mut reader = csv::Reader::from_reader(text.as_bytes());
+    reader.deserialize().collect::<Result<_, _>>().map_err(|error: csv::Error| table(file, error.to_string()))
+}
+
+/// Numbers below a line of names, each row with its own name first; an empty field was not measured.
+fn matrix(file: &Path, rows: usize, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
+    let text = text(file)?;
+    let mut reader = csv::Reader::from_reader(text.as_bytes());
+    let mut matrix = DMatrix::from_element(rows, columns, f64::NAN);
+    let mut found = 0;
+    for (i, record) in reader.records().enumerate() {
+        let record = record.map_err(|error| table(file, error.to_string()))?;
+        if i >= rows || record.len() != columns + 1 {
+            let problem = format!(
+                "line {}: expected {rows} lines of a name and {columns} numbers, found line {} with {}",
+                i + 2,
+                i + 1,
+                record.len() - 1
+            );
+            return Err(table(file, problem));
+        }
+        for (j, field) in record.iter().skip(1).enumerate().filter(|(_, field)| !field.trim().is_empty()) {
+            let refused =
+                |_| table(file, format!("line {}, column {}: expected a number, found {field}", i + 2, j + 2));
+            matrix[(i, j)] = field.trim().parse().map_err(refused)?;
+        }
+        found = i + 1;
+    }
+    if found != rows {
+        return Err(table(file, format!("expected {rows} rows, one a monitor of bpms.csv, found {found}")));
+    }
+    Ok(matrix)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LATTICE: &str = "index,name,s_entrance_m,length_m,bend_rad,edge_in_rad,edge_out_rad,k1_start_1_m2,k2_half_1_m3\n\
+                           0,BPM,0,0,0,0,0,0,0\n1,COR,0,0.1,0,0,0,0,0\n";
+    const MONITORS: &str = "row,plane,lattice_index,sigma_mm,used_by_reference_fit\n0,x,0,0.01,1\n1,y,0,0.01,0\n";
+    const CORRECTORS: &str = "col,plane,lattice_index,nominal_kick_mrad,used_by_reference_fit\n0,x,1,0.1,1\n";
+    const META: &str = r#"{"circumference_m": 10.0, "energy_GeV": null, "rf_Hz": 5e8, "delta_rf_Hz": 1000.0}"#;
+    const MATRIX: &str = ",x1\nx0,0.25\ny0,\n";
+
+    /// Tables with one of them changed.
+    fn read(name: &str, text: &str) -> Result<Folder, MeasuredError> {
+        let folder = tempfile::tempdir().unwrap();
+        let files = [
+            ("lattice.csv", LATTICE),
+            ("bpms.csv", MONITORS),
+            ("correctors.csv", CORRECTORS),
+            ("meta.json", META),
+            ("orm_measured_mm.csv", MATRIX),
+        ];
+        for (file, own) in files {
+            fs::write(folder.path().join(file), if file == name { text } else { own }).unwrap();
+        }
+        assert!(Folder::is_one(folder.path()));
+        Folder::read(folder.path())
+    }
+
+    fn refused(name: &str, text: &str) -> String {
+        let message = read(name, text).unwrap_err().to_string();
+        message[message.find(name).expect("the file is named")..].to_owned()
+    }
+
+    #[test]
+    fn a_folder_is_read_and_named() {
+        let folder = read("", "").unwrap();
+        assert_eq!((folder.monitor(1), folder.corrector(0)), ("y_BPM.0".into(), "H_COR.1".into()));
+        assert_eq!(folder.matrix[(0, 0)], 0.25);
+        assert!(folder.matrix[(1, 0)].is_nan() && folder.dispersion.is_none() && folder.meta.energy.is_none());
+    }
+
+    #[test]
+    fn what_is_wrong_is_said_with_its_place() {
+        assert!(refused("bpms.csv", &MONITORS.replace(",y,", ",z,")).contains("a plane is x or y, found z"));
+        assert_eq!(
+            refused("bpms.csv", &MONITORS.replace("x,0,", "x,7,")),
+            "bpms.csv: lattice_index 7, lattice.csv has rows 0 to 1"
+        );
+        assert!(
+            refused("bpms.csv", &MONITORS.replacen("0.01", "0", 1)).contains("row 0: sigma_mm 0, expected above 0")
+        );
+        assert_eq!(
+            refused("orm_measured_mm.csv", ",x1\nx0,a\ny0,1\n"),
+            "orm_measured_mm.csv: line 2, column 2: expected a number, found a"
+        );
+        assert_eq!(
+            refused("orm_measured_mm.csv", ",x1\nx0,1\n"),
+            "orm_measured_mm.csv: expected 2 rows, one a monitor of bpms.csv, found 1"
+        );
+        assert!(refused("meta.json", "{}").contains("circumference_m"));
+    }
+}

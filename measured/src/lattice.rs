@@ -1,0 +1,93 @@
+//! The ring of the twin from the rows of a lattice.
+//!
+//! Rows are written as a machine file (docs/machine.md), with one name each: `QF.5`. A corrector kicks in its middle, which is what a kick
+//! spread along a field-free length does. A magnet with a skew gradient to be fitted is cut in two, with a thin skew gradient between its halves.
+//! Sextupoles are left out: on the reference orbit they do nothing to first order in the kicks.
+
+use serde_json::{Value, json};
+use twin::{Plane, Ring};
+
+use crate::error::MeasuredError;
+use crate::folder::{Folder, Row};
+
+/// Of electrons of no stated energy [GeV]: `1/gamma^2` is then below a thousandth of any ring's momentum compaction.
+const ULTRA_RELATIVISTIC: f64 = 5.0;
+/// Rest energy of an electron [GeV].
+const REST: f64 = 0.000_510_998_95;
+
+/// The ring, with a thin skew gradient in the middle of some rows.
+///
+/// # Errors
+/// [`MeasuredError::Lattice`].
+pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
+    let mut elements = Vec::new();
+    for (row, one) in folder.lattice.iter().enumerate() {
+        let name = folder.element(row);
+        elements.extend(magnet(one, &name, skew.contains(&row)));
+        let planes = |of: &mut dyn Iterator<Item = (usize, Plane)>| {
+            let planes: Vec<Plane> = of.filter(|(at, _)| *at == row).map(|(_, plane)| plane).collect();
+            match (planes.contains(&Plane::X), planes.contains(&Plane::Y)) {
+                (true, true) => Some("HV"),
+                (true, false) => Some("H"),
+                (false, true) => Some("V"),
+                (false, false) => None,
+            }
+        };
+        let kicks = planes(&mut folder.correctors.iter().map(|one| (one.at, one.plane)));
+        let reads = planes(&mut folder.monitors.iter().map(|one| (one.at, one.plane)));
+        for (kind, plane, s) in [("corrector", kicks, one.s + one.length / 2.0), ("bpm", reads, one.s)] {
+            let Some(plane) = plane else { continue };
+            let name = format!("{kind} {name}");
+            elements
+                .push(json!({"name": name, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
+        }
+    }
+    let energy = folder.meta.energy.unwrap_or(ULTRA_RELATIVISTIC);
+    let machine = json!({
+        "name": folder.name,
+        "circumference_m": folder.meta.circumference,
+        "k1": {},
+        "reference": {"particle": "electron", "kinetic_energy_GeV": energy - REST},
+        "elements": elements,
+    });
+    Ok(Ring::parse(&machine.to_string(), &folder.name)?)
+}
+
+/// Names of the elements that make a row's magnet: those with a gradient, and the thin skew gradient.
+pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
+    match has_skew {
+        true => (vec![format!("{name} first"), format!("{name} second")], Some(format!("{name} skew"))),
+        false => (vec![name.into()], None),
+    }
+}
+
+fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
+    let (names, thin) = parts(name, has_skew);
+    let pieces = names.len();
+    let length = row.length / pieces as f64;
+    let mut all = Vec::new();
+    for (piece, name) in names.iter().enumerate() {
+        let s = row.s + piece as f64 * length;
+        let mut one = json!({"name": name, "label": name, "s_start": s, "length": length});
+        if row.bend != 0.0 {
+            let (first, last) = (piece == 0, piece + 1 == pieces);
+            one["type"] = json!("sbend");
+            one["angle"] = json!(row.bend / pieces as f64);
+            one["e1"] = json!(if first { row.edge_in } else { 0.0 });
+            one["e2"] = json!(if last { row.edge_out } else { 0.0 });
+            one["k1"] = json!(row.k1);
+        } else if row.k1 != 0.0 {
+            one["type"] = json!("quadrupole");
+            one["k1"] = json!(row.k1);
+        } else {
+            continue;
+        }
+        all.push(one);
+    }
+    if let Some(name) = thin {
+        let at = row.s + row.length / 2.0;
+        let skew = json!({"name": name, "label": name, "type": "multipole", "s_start": at, "length": 0});
+        all.insert(all.len().min(1), skew);
+    }
+    all
+}

@@ -1,0 +1,29 @@
+//! Measured orbit response matrices of any ring: read, fitted, compared.
+//!
+//! A measurement is a folder of tables ([`Folder`]); [`lattice`] makes the ring of the twin from it, [`Model`] predicts its matrix, and
+//! [`fit`] finds the magnets and the instruments that explain it, as LOCO does, with an error of the model whose size is learnt.
+//! [`compare`] says what changed from one measurement to the next.
+//!
+//! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
+
+pub mod compare;
+pub mod diagnose;
+pub mod error;
+pub mod fit;
+pub mod folder;
+pub mod lattice;
+pub mod model;
+pub mod normal;
+#[cfg(test)]
+mod testing;
+pub mod unknowns;
+pub mod wiring;
+
+pub use compare::{Change, compare};
+pub use diagnose::{Diagnosis, diagnose};
+pub use error::MeasuredError;
+pub use fit::{Fit, Settings, fit};
+pub use folder::Folder;
+pub use model::Model;
+pub use unknowns::{Kind, Unknown};
+pub use wiring::{Wiring, straightened};

@@ -1,0 +1,120 @@
+//! The normal equations of a matrix, built column by column: no derivative of the whole matrix by all unknowns is ever held.
+//!
+//! An element of the matrix depends on all of the machine, and on the two instruments of its row and its column.
+
+use nalgebra::{DMatrix, DVector};
+
+use crate::model::Prediction;
+use crate::unknowns::{Kind, Unknown};
+
+/// `J^T W J`, `J^T W r` and `r^T W r` of the elements of a matrix.
+pub struct Normal {
+    /// `J^T W J`.
+    pub matrix: DMatrix<f64>,
+    /// `J^T W r`.
+    pub slope: DVector<f64>,
+    /// `r^T W r`.
+    pub chi2: f64,
+}
+
+/// Where the unknowns of each row and column stand.
+pub struct Places {
+    machine: usize,
+    rows: Vec<[Option<usize>; 2]>,
+    columns: Vec<[Option<usize>; 2]>,
+}
+
+impl Places {
+    /// Of the unknowns, those of the machine first, and the shape of the matrix; the RF scale stands for a corrector of the last column.
+    pub fn of(unknowns: &[Unknown], rows: usize, columns: usize) -> Self {
+        let mut places = Self { machine: 0, rows: vec![[None; 2]; rows], columns: vec![[None; 2]; columns] };
+        for (at, unknown) in unknowns.iter().enumerate() {
+            match unknown.kind {
+                Kind::Strength(_) | Kind::Skew(_) | Kind::HeldFrequency => places.machine += 1,
+                Kind::MonitorGain(row) => places.rows[row][0] = Some(at),
+                Kind::MonitorCoupling(row) => places.rows[row][1] = Some(at),
+                Kind::CorrectorGain(column) => places.columns[column][0] = Some(at),
+                Kind::CorrectorCoupling(column) => places.columns[column][1] = Some(at),
+                Kind::RfScale => places.columns[columns - 1][0] = Some(at),
+            }
+        }
+        places
+    }
+
+    /// Unknowns of the instruments that an element depends on, and its derivatives by them.
+    pub fn instruments<'p>(
+        &'p self,
+        at: &'p Prediction,
+        row: usize,
+        column: usize,
+    ) -> impl Iterator<Item = (usize, f64)> + 'p {
+        let of_row = self.rows[row].iter().zip(&at.by_monitor);
+        let of_column = self.columns[column].iter().zip(&at.by_corrector);
+        of_row.chain(of_column).filter_map(move |(place, by)| place.map(|place| (place, by[(row, column)])))
+    }
+}
+
+impl Places {
+    /// `J^T` of weighted elements.
+    pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
+        let mut back = DVector::zeros(unknowns);
+        for (into, slope) in back.iter_mut().zip(&at.by_machine) {
+            *into = slope.dot(weighted);
+        }
+        for column in 0..weighted.ncols() {
+            for row in (0..weighted.nrows()).filter(|&row| weighted[(row, column)] != 0.0) {
+                for (one, by) in self.instruments(at, row, column) {
+                    back[one] += by * weighted[(row, column)];
+                }
+            }
+        }
+        back
+    }
+}
+
+impl Normal {
+    /// With `residual` measured less predicted and `weight` one over its variance, 0 where an element does not count.
+    pub fn of(
+        places: &Places,
+        at: &Prediction,
+        residual: &DMatrix<f64>,
+        weight: &DMatrix<f64>,
+        unknowns: usize,
+    ) -> Self {
+        let (rows, columns) = residual.shape();
+        let machine = places.machine;
+        let mut normal =
+            Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns), chi2: 0.0 };
+        let mut by_machine = DMatrix::zeros(rows, machine);
+        for column in 0..columns {
+            for (mut into, from) in by_machine.column_iter_mut().zip(&at.by_machine) {
+                into.copy_from(&from.column(column));
+            }
+            let mut weighted = by_machine.clone();
+            weighted.row_iter_mut().enumerate().for_each(|(row, mut one)| one *= weight[(row, column)]);
+            let weighted = weighted.transpose();
+            let mut block = normal.matrix.view_mut((0, 0), (machine, machine));
+            block.gemm(1.0, &weighted, &by_machine, 1.0);
+            let mut slope = normal.slope.rows_mut(0, machine);
+            slope.gemv(1.0, &weighted, &residual.column(column), 1.0);
+            for row in (0..rows).filter(|&row| weight[(row, column)] > 0.0) {
+                let (w, r) = (weight[(row, column)], residual[(row, column)]);
+                normal.chi2 += w * r * r;
+                for (one, by) in places.instruments(at, row, column) {
+                    normal.slope[one] += w * by * r;
+                    let mut across = normal.matrix.column_mut(one);
+                    across.rows_mut(0, machine).axpy(by, &weighted.column(row), 1.0);
+                    for (other, by_other) in places.instruments(at, row, column) {
+                        normal.matrix[(one, other)] += w * by * by_other;
+                    }
+                }
+            }
+        }
+        for one in machine..unknowns {
+            for of_machine in 0..machine {
+                normal.matrix[(one, of_machine)] = normal.matrix[(of_machine, one)];
+            }
+        }
+        normal
+    }
+}

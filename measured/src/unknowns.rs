@@ -1,0 +1,130 @@
+//! What is fitted: magnets, and the instruments that see them.
+
+use crate::folder::Folder;
+
+/// One fitted number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Strength factor of a group of magnets, 1 as in the lattice.
+    Strength(usize),
+    /// Integrated skew gradient of each magnet of a group [1/m].
+    Skew(usize),
+    /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
+    HeldFrequency,
+    /// What a monitor reads of its own plane: 1 if it is right, 0 if it is dead.
+    MonitorGain(usize),
+    /// What it reads of the other plane.
+    MonitorCoupling(usize),
+    /// A corrector's kick in its own plane over the one that is believed.
+    CorrectorGain(usize),
+    /// Its kick in the other plane over the same.
+    CorrectorCoupling(usize),
+    /// The step of the RF frequency over the one that is stated.
+    RfScale,
+}
+
+/// One fitted number, with its prior.
+#[derive(Debug, Clone, Copy)]
+pub struct Unknown {
+    /// What it is.
+    pub kind: Kind,
+    /// Expected beforehand.
+    pub mean: f64,
+    /// Its standard deviation.
+    pub width: f64,
+}
+
+/// Magnets that share one factor: rows of the lattice.
+pub type Magnets = Vec<usize>;
+
+/// Prior standard deviations.
+#[derive(Debug, Clone, Copy)]
+pub struct Widths {
+    /// Of a strength factor.
+    pub strength: f64,
+    /// Of an integrated skew gradient [1/m].
+    pub skew: f64,
+    /// Of the gain of a monitor and of a corrector.
+    pub gain: f64,
+    /// Of what either has of the other plane.
+    pub coupling: f64,
+}
+
+impl Default for Widths {
+    /// 3 % as for the vars of the Booster; 0.01 /m is a quadrupole of 1 /m rolled by 5 mrad; gains as far off as those of old electronics, which no
+    /// response can tell from a scale of all kicks; 5 % of the other plane is a roll of 50 mrad.
+    fn default() -> Self {
+        Self { strength: 0.03, skew: 0.01, gain: 0.2, coupling: 0.05 }
+    }
+}
+
+/// Groups of gradients and of skew gradients: those of the reference fit, else every quadrupole by itself.
+pub fn groups(folder: &Folder) -> (Vec<Magnets>, Vec<Magnets>) {
+    let Some(reference) = &folder.meta.reference_fit else { return (single(folder), Vec::new()) };
+    let of = |is_gradient: bool| {
+        let groups = reference.fit_parameters.iter().filter(move |one| (one.field == "K") == is_gradient);
+        groups.map(|one| distinct(&one.elements)).collect()
+    };
+    (of(true), of(false))
+}
+
+fn distinct(rows: &[usize]) -> Magnets {
+    let mut rows = rows.to_vec();
+    rows.sort_unstable();
+    rows.dedup();
+    rows
+}
+
+/// Every straight magnet with a gradient; neighbouring rows of one name, with nothing of length between them, are one magnet.
+fn single(folder: &Folder) -> Vec<Magnets> {
+    let mut groups: Vec<Magnets> = Vec::new();
+    for (row, one) in folder.lattice.iter().enumerate().filter(|(_, one)| one.k1 != 0.0 && one.bend == 0.0) {
+        let joins = |group: &Magnets| {
+            let &last = group.last().expect("groups are not empty");
+            folder.lattice[last].name == one.name
+                && folder.lattice[last + 1..row].iter().all(|between| between.length == 0.0)
+        };
+        match groups.last_mut() {
+            Some(group) if joins(group) => group.push(row),
+            _ => groups.push(vec![row]),
+        }
+    }
+    groups
+}
+
+/// All unknowns of a measurement, magnets first.
+pub fn unknowns(folder: &Folder, [strengths, skews]: [usize; 2], coupling: bool, widths: &Widths) -> Vec<Unknown> {
+    let magnets =
+        (0..strengths).map(|group| Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength });
+    let skews = (0..skews).map(|group| Unknown { kind: Kind::Skew(group), mean: 0.0, width: widths.skew });
+    let monitors = (0..folder.monitors.len()).filter(|&row| folder.monitors[row].is_used);
+    let monitors = monitors.flat_map(|row| {
+        [
+            Unknown { kind: Kind::MonitorGain(row), mean: 1.0, width: widths.gain },
+            Unknown { kind: Kind::MonitorCoupling(row), mean: 0.0, width: widths.coupling },
+        ]
+    });
+    let correctors = (0..folder.correctors.len()).filter(|&column| folder.correctors[column].is_used);
+    let correctors = correctors.flat_map(|column| {
+        [
+            Unknown { kind: Kind::CorrectorGain(column), mean: 1.0, width: widths.gain },
+            Unknown { kind: Kind::CorrectorCoupling(column), mean: 0.0, width: widths.coupling },
+        ]
+    });
+    let rf = folder.dispersion.is_some().then_some(Unknown { kind: Kind::RfScale, mean: 1.0, width: 0.1 });
+    let instruments = monitors.chain(correctors);
+    let instruments = instruments
+        .filter(|one| coupling || !matches!(one.kind, Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_)));
+    magnets.chain(skews).chain(instruments).chain(rf).collect()
+}
+
+/// Name of an unknown.
+pub fn name(folder: &Folder, groups: &[Vec<Magnets>; 2], kind: Kind) -> String {
+    match kind {
+        Kind::Strength(group) => folder.element(groups[0][group][0]),
+        Kind::Skew(group) => folder.element(groups[1][group][0]),
+        Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
+        Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
+        Kind::RfScale | Kind::HeldFrequency => "RF".into(),
+    }
+}
