@@ -18,8 +18,8 @@ const CHANGES: Widths = Widths { strength: 0.03, skew: 0.003, gain: 0.01, coupli
 
 /// A family's changes can be told where their found sizes would follow the true ones by a correlation of 0.92: this share of their variance is then no error.
 const TOLD: f64 = 0.85;
-/// A family in which no change shows can be told to have none where the error bars are below this.
-const STILL: f64 = 0.005;
+/// A family in which no change shows can be told to have none where the error bars are below this, less than power supplies are set to.
+const STILL: f64 = 0.001;
 
 /// Relative change of one magnet, or of the magnets of one group.
 #[derive(Debug, Clone, PartialEq)]
@@ -175,7 +175,8 @@ mod tests {
         assert!((0.3..1.9).contains(&mean), "mean square pull {mean}");
         let of = |family: &str| found.iter().filter(|one| one.family == family).all(|one| one.is_identifiable);
         assert!(of("QF"), "{found:?}");
-        assert!(of("QD"), "{found:?}");
+        // none of them changed, and a change of 0.16 % would not show
+        assert!(!of("QD"), "{found:?}");
         assert!(found.iter().all(|one| one.sigma < 0.003), "{found:?}");
     }
 
