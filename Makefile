@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop drift train bench peers exports figures validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop drift measured train bench peers exports figures validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -60,6 +60,9 @@ drift: ## a stream that drifts, and how soon steps of vars are found: docs/drift
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check
+
+measured: toolchain ## four measured rings beside LOCO's fits of them: the numbers of docs/real-rings.md; three minutes
+	cargo test --locked --release -p system-tests --test measured -- --include-ignored --nocapture --test-threads 2
 
 figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from the page of its recording
 	cargo run --locked --release -p diagnosis --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence
