@@ -223,16 +223,19 @@ pub struct ChangeOfOne {
     pub identifiable: bool,
 }
 
-/// Standard deviations from which on a change is one.
+/// Standard deviations from which on a change is one, where its family can be told; and where it cannot.
 const CHANGED: f64 = 3.0;
+const CHANGED_ALONE: f64 = 4.0;
 
 impl Comparison {
     /// Of changes, in the order of the ring.
     pub fn of(changes: Vec<ChangeOfOne>) -> Self {
+        let least = |one: &ChangeOfOne| if one.identifiable { CHANGED } else { CHANGED_ALONE };
         let mut found: Vec<&ChangeOfOne> =
-            changes.iter().filter(|one| one.identifiable && one.relative.abs() > CHANGED * one.sigma).collect();
+            changes.iter().filter(|one| one.relative.abs() > least(one) * one.sigma).collect();
         found.sort_by(|a, b| (b.relative / b.sigma).abs().total_cmp(&(a.relative / a.sigma).abs()));
-        let open = changes.iter().filter(|one| !one.identifiable).count();
+        let open =
+            changes.iter().filter(|one| !one.identifiable && one.relative.abs() <= CHANGED_ALONE * one.sigma).count();
         let listed: Vec<String> = found
             .iter()
             .take(3)

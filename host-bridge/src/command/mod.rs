@@ -225,8 +225,13 @@ fn strays(ring: &Ring, recording: &Recording) -> Option<String> {
     ))
 }
 
-fn recording(path: &Path, ring: &Ring) -> Result<Recording, RecordingError> {
-    Recording::read(path, ring)
+fn recording(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {
+    if measured::Folder::is_one(path) {
+        let path = path.display();
+        let problem = format!("{path} holds a measured response matrix; `fit`, `diagnose` and `compare` read one");
+        return Err(CommandError::Input(problem));
+    }
+    Ok(Recording::read(path, ring)?)
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.

@@ -1,0 +1,104 @@
+//! `orbitcal fit`, `diagnose` and `compare` of a response matrix that pyAT has measured on a ring of its own.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+const BEFORE: &str = "recordings/measured/twelve-cells/before";
+const AFTER: &str = "recordings/measured/twelve-cells/after";
+
+fn repository() -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn orbitcal(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_orbitcal")).args(arguments).current_dir(repository()).output().unwrap()
+}
+
+fn json(arguments: &[&str]) -> Value {
+    let run = orbitcal(&[arguments, &["--json", "-", "--quiet"]].concat());
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    serde_json::from_slice(&run.stdout).unwrap()
+}
+
+fn refused(arguments: &[&str]) -> String {
+    let run = orbitcal(arguments);
+    assert_eq!(run.status.code(), Some(2), "{arguments:?}");
+    String::from_utf8(run.stderr).unwrap()
+}
+
+fn truth() -> Value {
+    let text = std::fs::read_to_string(repository().join("recordings/measured/twelve-cells/truth.json")).unwrap();
+    serde_json::from_str(&text).unwrap()
+}
+
+#[test]
+fn factors_are_found_within_their_errors() {
+    let (result, truth) = (json(&["fit", BEFORE]), truth());
+    let vars = result["vars"].as_array().unwrap();
+    assert_eq!(vars.len(), 24);
+    let pull = |var: &Value| {
+        let name = var["name"].as_str().unwrap();
+        let off = var["mean"].as_f64().unwrap() - truth["before"][name].as_f64().unwrap();
+        (off / var["sigma"].as_f64().unwrap()).powi(2)
+    };
+    // the mean of 24 squares scatters by 0.29; three times that, the matrix of another code
+    let mean = vars.iter().map(pull).sum::<f64>() / 24.0;
+    assert!((0.13..1.87).contains(&mean), "mean square pull {mean}");
+    // 600 elements of noise as stated, 140 unknowns: 0.77 ± 0.06
+    let chi2 = result["chi2_loco"].as_f64().unwrap();
+    assert!((0.55..0.95).contains(&chi2), "{chi2}");
+    let tunes = ["x", "y"].map(|plane| result["tunes"][plane].as_f64().unwrap());
+    // pyAT: 0.18375878 and 0.21597504, of which a response tells 3e-4
+    assert!((tunes[0] - 4.18376).abs() < 1e-3 && (tunes[1] - 3.21598).abs() < 1e-3, "{tunes:?}");
+    assert_eq!(result["covariance"].as_array().unwrap().len(), 24);
+    assert_eq!(result["wiring"][0]["kind"], "bpm_swap");
+    assert!(result["other"].as_array().unwrap().iter().any(|one| one["kind"] == "corrector_gain"));
+}
+
+#[test]
+fn exchanged_monitors_and_a_held_frequency_are_found() {
+    let result = json(&["diagnose", BEFORE, "--rf", "fixed-momentum"]);
+    let findings = result["findings"].as_array().unwrap();
+    assert_eq!((&findings[0]["kind"], &findings[0]["at"]), (&"bpm_swap".into(), &"x_BPM.22,x_BPM.52".into()));
+    assert_eq!(findings[1]["kind"], "fixed_rf_frequency");
+    let [amplitude, sigma] = ["amplitude", "sigma"].map(|key| findings[1][key].as_f64().unwrap());
+    assert!((amplitude - 1.0).abs() < 3.0 * sigma && sigma < 0.1, "{amplitude} {sigma}");
+    let result = json(&["diagnose", BEFORE]);
+    assert_eq!(result["findings"].as_array().unwrap().len(), 1, "{}", result["sentence"]);
+}
+
+#[test]
+fn what_changed_is_named() {
+    let (result, truth) = (json(&["compare", BEFORE, AFTER]), truth());
+    let change = |one: &Value| {
+        let name = one["name"].as_str().unwrap();
+        let [before, after] = ["before", "after"].map(|state| truth[state][name].as_f64().unwrap());
+        let (relative, sigma) = (one["relative"].as_f64().unwrap(), one["sigma"].as_f64().unwrap());
+        ((relative - (after / before - 1.0)) / sigma).powi(2)
+    };
+    let changes = result["changes"].as_array().unwrap();
+    let mean = changes.iter().map(change).sum::<f64>() / changes.len() as f64;
+    // 24 squares, as above
+    assert!((0.13..1.87).contains(&mean), "mean square pull {mean}");
+    let sentence = result["sentence"].as_str().unwrap();
+    assert!(sentence.starts_with("2 of 24 changed: QF.24 by +1.0"), "{sentence}");
+    assert!(sentence.contains("QD.64 by -0.6"), "{sentence}");
+    let same = json(&["compare", BEFORE, BEFORE]);
+    assert!(same["sentence"].as_str().unwrap().starts_with("No quadrupole changed"), "{}", same["sentence"]);
+}
+
+#[test]
+fn what_a_matrix_is_not_for_is_said() {
+    assert!(
+        refused(&["replay", BEFORE])
+            .contains("holds a measured response matrix; `fit`, `diagnose` and `compare` read one")
+    );
+    assert!(refused(&["fit", BEFORE, "--method", "nuts"]).contains("--method nuts is for a recording"));
+    assert!(
+        refused(&["compare", BEFORE, "recordings/paper-vars"]).contains("one is a measured matrix, one a recording")
+    );
+    assert!(refused(&["diagnose", BEFORE, AFTER]).contains("orbitcal compare A B"));
+    assert!(refused(&["fit", BEFORE, "--machine", "machines/x.json"]).contains("--machine is for a recording"));
+}
