@@ -172,13 +172,15 @@ impl<L, const F: usize> Tangent<L, F> {
         Self { linearised: unlinearised, supplies: [0.0; F], ripple: [[0.0; F]; 2], chromatic: [0.0; 2], is_new: false }
     }
 
-    /// Work out how orbits follow the gradients there.
+    /// Work out how orbits of a plane follow the gradients there.
     fn follow<const B: usize, const C: usize, const N: usize>(
         &mut self,
         surrogate: &impl Surrogate<B, C, F, N, Linearised = L>,
+        plane: usize,
     ) {
-        let [(x, all_x), (y, all_y)] = [0, 1].map(|plane| surrogate.follow(&self.linearised, plane));
-        (self.ripple, self.chromatic) = ([x, y], [all_x, all_y]);
+        if let (Some(ripple), Some(chromatic)) = (self.ripple.get_mut(plane), self.chromatic.get_mut(plane)) {
+            (*ripple, *chromatic) = surrogate.follow(&self.linearised, plane);
+        }
     }
 }
 
@@ -527,7 +529,7 @@ impl<
             }
         }
         self.tangent.supplies = [0.0; F];
-        self.tangent.follow(model.surrogate);
+        (0..2).for_each(|plane| self.tangent.follow(model.surrogate, plane));
         self.design_chromatic = self.tangent.chromatic;
         Ok(())
     }

@@ -90,7 +90,7 @@ pub fn add_four<R: Real>(to: &mut [R], factors: [R; 4], rows: [&[R]; 4]) {
 /// [`add_four`] for two at a time: loads of the rows are shared. The few entries of the longer beyond the other's end are
 /// added separately.
 #[inline(never)]
-pub fn add_four_twice<R: Real>(to: [&mut [R]; 2], factors: [[R; 4]; 2], rows: [&[R]; 4]) {
+fn add_four_twice<R: Real>(to: [&mut [R]; 2], factors: [[R; 4]; 2], rows: [&[R]; 4]) {
     let [one, other] = to;
     let n = one.len().min(other.len());
     for (to, factors) in [&mut *one, &mut *other].into_iter().zip(factors) {
@@ -99,6 +99,17 @@ pub fn add_four_twice<R: Real>(to: [&mut [R]; 2], factors: [[R; 4]; 2], rows: [&
         }
     }
     two_by_four(one.get_mut(..n).unwrap_or_default(), other.get_mut(..n).unwrap_or_default(), factors, rows);
+}
+
+/// [`add_four`] for many, two at a time: each with factors of its own.
+#[inline]
+pub fn add_four_to_each<'t, R: Real>(mut each: impl Iterator<Item = (&'t mut [R], [R; 4])>, rows: [&[R]; 4]) {
+    while let Some((one, factors)) = each.next() {
+        match each.next() {
+            Some((other, others)) => add_four_twice([one, other], [factors, others], rows),
+            None => add_four(one, factors, rows),
+        }
+    }
 }
 
 /// The part of [`add_four_twice`] that both share, on a chip eight entries at a time: within a block, addresses are fixed distances
@@ -192,6 +203,10 @@ mod tests {
         let mut sum = [0.5; 3];
         combine(&mut sum, rows.iter().map(|row| (2.0, row.as_slice())));
         assert_eq!(sum, [30.5; 3]);
+        let mut sums = [[0.5; 3]; 3];
+        let each = sums.iter_mut().zip(1_u8..).map(|(to, n)| (&mut to[..n.into()], [f32::from(n); 4]));
+        add_four_to_each(each, rows.each_ref().map(<[f32; 3]>::as_slice)[..4].try_into().unwrap());
+        assert_eq!(sums, [[10.5, 0.5, 0.5], [20.5, 20.5, 0.5], [30.5; 3]]);
         let (b, x): ([f64; 19], [f64; 19]) = ([1.0; 19], core::array::from_fn(|i| if i % 2 == 0 { 2.0 } else { 0.0 }));
         assert_eq!(dot_difference(&a, &b, &x), 2.0 * (90.0 - 10.0));
         let mut less = [0.0; 19];

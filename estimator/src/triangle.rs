@@ -1,6 +1,6 @@
 //! Symmetric and triangular matrices, packed: a lower triangle row by row, half the memory of a square.
 
-use crate::linear::{Real, add, add_four, add_four_twice, combine, dot};
+use crate::linear::{Real, add, add_four, add_four_to_each, combine, dot};
 
 /// Lower triangle of an `N x N` matrix; `T = N (N + 1)/2` entries, row `i` holds columns `0..=i`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -70,13 +70,14 @@ impl<const N: usize, const T: usize, R: Real> Triangle<N, T, R> {
 
     /// `A += sum of factor * row` for four rows, each of them with its own factor for each row of `A`.
     pub fn add_products(&mut self, factors: impl Fn(usize) -> [R; 4], rows: [&[R]; 4]) {
-        let mut own = self.rows_mut().enumerate();
-        while let Some((i, one)) = own.next() {
-            match own.next() {
-                Some((j, other)) => add_four_twice([one, other], [factors(i), factors(j)], rows),
-                None => add_four(one, factors(i), rows),
-            }
-        }
+        self.add_products_from(0, factors, rows);
+    }
+
+    /// The same for the part of `A` from row and column `from` on.
+    fn add_products_from(&mut self, from: usize, factors: impl Fn(usize) -> [R; 4], rows: [&[R]; 4]) {
+        let rows = rows.map(|row| row.get(from..).unwrap_or_default());
+        let own = (from..).zip(self.rows_from_mut(from));
+        add_four_to_each(own.map(|(i, row)| (row.get_mut(from..).unwrap_or_default(), factors(i))), rows);
     }
 
     /// `A x` for the symmetric matrix.
@@ -108,12 +109,8 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
                 let (done, [column, ..]) = columns.split_at_mut_checked(m)? else { return None };
                 log_determinant += libm::log(self.factorise_column(j, column, done)?);
             }
-            for (r, row) in (to..).zip(self.rows_from_mut(to)) {
-                let terms = columns
-                    .iter()
-                    .map(|column| (-column.get(r).copied().unwrap_or(0.0), column.get(to..).unwrap_or_default()));
-                combine(row.get_mut(to..).unwrap_or_default(), terms);
-            }
+            let factors = |r: usize| columns.each_ref().map(|column| -column.get(r).copied().unwrap_or(0.0));
+            self.add_products_from(to, factors, columns.each_ref().map(<[f64; N]>::as_slice));
         }
         Some(log_determinant)
     }

@@ -143,15 +143,21 @@ impl<
     /// One slice.
     #[inline(never)]
     pub(super) fn slice(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
-        let Work::Surrogate(progress) = &mut self.anew.work else { return self.count_past(model) };
         let Tangent { linearised, supplies, .. } = &mut self.anew.tangent;
-        match model.surrogate.advance(&self.anew.to, supplies, progress, linearised) {
-            Ok(false) => {}
-            Ok(true) => {
-                self.anew.tangent.follow(model.surrogate);
-                self.anew.work = Work::Past(Pooling::BLANK);
+        match &mut self.anew.work {
+            Work::Surrogate(progress) => match model.surrogate.advance(&self.anew.to, supplies, progress, linearised) {
+                Ok(false) => {}
+                Ok(true) => self.anew.work = Work::Following(0),
+                Err(Unstable) => self.retry(),
+            },
+            Work::Following(plane) => {
+                self.anew.tangent.follow(model.surrogate, *plane);
+                *plane += 1;
+                if *plane == 2 {
+                    self.anew.work = Work::Past(Pooling::BLANK);
+                }
             }
-            Err(Unstable) => self.retry(),
+            Work::Past(_) => return self.count_past(model),
         }
         Prepared::Slice
     }

@@ -48,7 +48,8 @@ impl<
     const W: usize,
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
-    /// How well the model describes the readings of monitors in state ok, by the expected noise.
+    /// How well the model describes the readings of monitors in state ok, by the expected noise, and by what is not known of the
+    /// surrogate and of a misaligned ring's dispersion.
     ///
     /// With constant vars: residuals of all frames that belong to a setting, at the MAP. With a random walk:
     /// innovations, each against the vars of its own time, counted in NIS.
@@ -80,7 +81,8 @@ impl<
                 let residual = f64::from(measured)
                     - self.posterior.gaussian.baseline(channel)
                     - dot(&d, &self.posterior.solution.delta);
-                sum += f64::from(count) * residual * residual / expected(b);
+                let shared = f64::from(self.shared_variance(model, &self.tangent, b, drive.rf_offset));
+                sum += residual * residual / (expected(b) / f64::from(count) + shared);
                 readings += 1.0;
             }
         }

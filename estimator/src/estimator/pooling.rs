@@ -41,7 +41,7 @@ impl<const S: usize, const K: usize, const N: usize, const T: usize> Pooling<S, 
     };
 }
 
-/// Work space of either step: both are not needed at once.
+/// Work space of each step: they are not needed at once.
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)] // there is no allocator; and both are large
 pub(super) enum Work<P, const S: usize, const K: usize, const N: usize, const T: usize> {
@@ -49,6 +49,8 @@ pub(super) enum Work<P, const S: usize, const K: usize, const N: usize, const T:
     Past(Pooling<S, K, N, T>),
     /// The surrogate is linearised.
     Surrogate(P),
+    /// How orbits follow the gradients is worked out, in this plane next.
+    Following(usize),
 }
 
 /// A frame that came late.

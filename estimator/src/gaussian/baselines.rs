@@ -2,7 +2,7 @@
 
 use core::marker::PhantomData;
 
-use crate::linear::{Real, add, add_four, add_four_twice, dot};
+use crate::linear::{Real, add, add_four_to_each, dot};
 use crate::triangle::Triangle;
 
 /// Covariance of the baselines, params given [m^2].
@@ -79,12 +79,7 @@ impl<const B: usize> Moves<B> {
         }
         let rows = rows.each_ref().map(<[f64; N]>::as_slice);
         let of = |b: usize| self.gain.each_ref().map(|gain| gain.get(b).copied().unwrap_or(0.0));
-        for (i, slopes) in slopes.chunks_mut(2).enumerate() {
-            match slopes {
-                [one, other] => add_four_twice([one, other], [of(2 * i), of(2 * i + 1)], rows),
-                rest => rest.iter_mut().for_each(|one| add_four(one, of(2 * i), rows)),
-            }
-        }
+        add_four_to_each(slopes.iter_mut().enumerate().map(|(b, slope)| (slope.as_mut_slice(), of(b))), rows);
         self.gain = [[0.0; B]; 4];
     }
 }

@@ -21,7 +21,7 @@
 use super::quantised::{Column, dot_codes, dot_four_codes};
 use super::{Block, LowRank, Prediction, Steerable, Surrogate, SymmetricBlock, Unstable};
 use crate::drive::Drive;
-use crate::linear::{add, add_four, add_four_twice, dot};
+use crate::linear::{add, add_four_to_each, dot};
 use crate::sizes::Sizes;
 use crate::triangle::Triangle;
 
@@ -753,13 +753,10 @@ fn fill<const Q: usize, const T: usize>(
             kicks.iter_mut().zip(codes.iter().skip(first)).for_each(|(k, code)| *k *= f32::from(*code));
             kicks
         };
-        let mut each = columns.iter_mut().zip(table);
-        while let Some((one, codes)) = each.next() {
-            match each.next() {
-                Some((other, others)) => add_four_twice([one, other], [kicks(codes), kicks(others)], rows),
-                None => add_four(one, kicks(codes), rows),
-            }
-        }
+        add_four_to_each(
+            columns.iter_mut().zip(table).map(|(column, codes)| (column.as_mut_slice(), kicks(codes))),
+            rows,
+        );
     }
     to.iter_mut().zip(&*columns).for_each(|(to, column)| to.quantise(column));
 }
