@@ -11,6 +11,7 @@ use micromath::F32Ext;
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::{Health, MonitorState};
+use crate::wire::PositionCode;
 
 /// Decides whether two readings, or a reading and its prediction, agree.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -153,6 +154,12 @@ impl Noise {
 const SILENCE: u16 = 20;
 /// Identical codes in a row after which a monitor counts as stuck: noise of 1500 steps makes that once in 1e9 frames.
 const STUCK: u16 = 4;
+/// Codes in a row that change by less than this share of the expected noise after which a monitor counts as flat: it reads its own
+/// electronics and no beam. Of a monitor that reads one, 5.6 % of the changes are as small: eight in a row come once in 1e10 frames.
+const FLAT: u16 = 8;
+const FLAT_SHARE: f32 = 0.1;
+/// A flat monitor reads the beam again when its code changes by this many times that share: 78 % of the changes of one that reads a beam do.
+const BACK: i32 = 4;
 /// Share of rejected readings above which a monitor counts as jumping; normal noise gives 6e-7.
 const JUMPY: f32 = 0.01;
 /// Fewest rejected readings for that.
@@ -173,6 +180,9 @@ pub struct Monitor {
     jumps: bool,
     silent: u16,
     unchanged: u16,
+    flat: u16,
+    /// Change of a code that counts as none for that.
+    flatness: i32,
     /// Lately.
     reported: u16,
     refused: u16,
@@ -189,6 +199,8 @@ impl Monitor {
         jumps: false,
         silent: 0,
         unchanged: 0,
+        flat: 0,
+        flatness: 0,
         reported: 0,
         refused: 0,
         rejected: 0,
@@ -197,7 +209,8 @@ impl Monitor {
 
     /// Restart with an expected noise [m].
     pub fn expect(&mut self, sigma: f32) {
-        *self = Self { noise: Noise::expecting(sigma), ..Self::BLANK };
+        let flatness = (FLAT_SHARE * sigma / PositionCode::METRES_PER_LSB) as i32;
+        *self = Self { noise: Noise::expecting(sigma), flatness, ..Self::BLANK };
     }
 
     /// Take note of a report (a code) or its absence; true if the reading can be used.
@@ -206,9 +219,12 @@ impl Monitor {
             self.silent = self.silent.saturating_add(1);
             return false;
         };
-        self.unchanged = if code == self.last_code { self.unchanged.saturating_add(1) } else { 0 };
+        let step = code.saturating_sub(self.last_code).saturating_abs();
+        let flatness = if self.flat < FLAT { self.flatness } else { self.flatness.saturating_mul(BACK) };
+        self.unchanged = if step == 0 { self.unchanged.saturating_add(1) } else { 0 };
+        self.flat = if step <= flatness { self.flat.saturating_add(1) } else { 0 };
         self.last_code = code;
-        let moving = self.unchanged < STUCK;
+        let moving = self.unchanged < STUCK && self.flat < FLAT;
         self.silent = if moving { 0 } else { self.silent.saturating_add(1) };
         self.reported = self.reported.saturating_add(u16::from(moving));
         if self.reported >= MANY {
@@ -385,6 +401,22 @@ mod tests {
         assert_eq!(used, usize::from(STUCK) - 1);
         monitor.judge();
         assert_eq!(monitor.health().state, MonitorState::Dead);
+    }
+
+    /// Electronics without a beam scatter by a thirtieth of the noise; a monitor whose noise is a third of the expected one is no such.
+    #[test]
+    fn flat_monitors_are_dead_until_they_read_the_beam() {
+        let mut monitor = Monitor::BLANK;
+        monitor.expect(1.5e-4);
+        let mut codes = noise(1000).map(|z| (z * 50.0) as i32);
+        let used = (0..1000).filter(|_| monitor.hear(codes.next())).count();
+        assert_eq!(used, usize::from(FLAT) - 1);
+        monitor.judge();
+        assert_eq!(monitor.health().state, MonitorState::Dead);
+        let mut codes = noise(1000).map(|z| (z * 500.0) as i32);
+        let used = (0..1000).filter(|_| monitor.hear(codes.next())).count();
+        monitor.judge();
+        assert!(used > 990 && monitor.health().state == MonitorState::Ok, "{used}");
     }
 
     #[test]

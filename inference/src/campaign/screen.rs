@@ -378,15 +378,12 @@ impl<'c> Screening<'c> {
         }
     }
 
-    /// Take back every reading of a monitor that ends dead and does report: those before it was found to be stuck are no better.
+    /// Take back every reading of a monitor that ends dead and does report: those before it was found to be stuck or flat are no better.
     /// One that went silent was sound as long as it spoke.
     fn drop_stuck(&mut self) {
         let frames = self.of.drives.len();
-        let is_stuck = |b: usize| {
-            let reported = (0..frames).rev().map(|i| self.of.readings[(i, b)]).filter(|reading| !reading.is_nan());
-            let last: Vec<f64> = reported.take(2).collect();
-            self.monitors[b].health().state == MonitorState::Dead && last.len() == 2 && last[0] == last[1]
-        };
+        let reports = |b: usize| frames > 0 && !self.of.readings[(frames - 1, b)].is_nan();
+        let is_stuck = |b: usize| self.monitors[b].health().state == MonitorState::Dead && reports(b);
         let stuck: Vec<usize> = (0..self.monitors.len()).filter(|&b| is_stuck(b)).collect();
         if stuck.is_empty() {
             return;
