@@ -34,6 +34,8 @@ pub enum Verdict {
 pub(super) const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
+/// An effect in the model that something else explains better is no finding below this probability.
+const STATED: f64 = 0.05;
 /// Alternatives that the sentence names.
 const SAID: usize = 3;
 /// Share of the posterior that an interval of the place holds.
@@ -321,6 +323,7 @@ pub fn findings(
         };
         all.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
+    all.retain(|finding| finding.probability > STATED);
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
@@ -355,12 +358,12 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         }
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => {
-            let last = findings.last().map_or("", |finding| finding.phrase.as_str());
+            let last = findings.last().map_or_else(String::new, undescribed);
             // what is less than certain stands in the table, with its probability
             let named = findings.iter().take(findings.len().saturating_sub(1)).filter(|f| f.probability >= DECISIVE);
             let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
             let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
-            format!("{named}{last}, which no effect of the library describes")
+            format!("{named}{last}")
         }
     };
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
@@ -376,6 +379,24 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
     capitalised(&format!("{text}{noise}{faulty}{together}"))
 }
 
+/// What is missing and not in the library.
+fn undescribed(finding: &Finding) -> String {
+    match finding.probability >= DECISIVE {
+        true => format!("{}, which no effect of the library describes", finding.phrase),
+        false => format!("something that no effect of the library describes: {}", likely(finding)),
+    }
+}
+
+/// A cause, with its probability and the alternatives where it is less than certain.
+fn likely(finding: &Finding) -> String {
+    if finding.probability >= DECISIVE {
+        return finding.phrase.clone();
+    }
+    let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
+    let others = finding.alternatives.iter().filter(|other| other.probability > STATED).take(SAID).map(of);
+    core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ")
+}
+
 /// The alternatives that share most of the probability.
 fn ambiguous(findings: &[Finding]) -> String {
     let mut parts = Vec::new();
@@ -384,9 +405,7 @@ fn ambiguous(findings: &[Finding]) -> String {
             parts.push(finding.phrase.clone());
             continue;
         }
-        let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
-        let others = finding.alternatives.iter().take(SAID).map(of);
-        let said = core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ");
+        let said = likely(finding);
         let alike = finding.alternatives.iter().take(SAID).all(|other| other.inseparable);
         let apart = if alike && finding.together() >= DECISIVE { ", which this recording cannot separate" } else { "" };
         parts.push(format!("{said}{apart}"));

@@ -27,6 +27,9 @@ const FEWEST: usize = 20;
 const NORMAL: f64 = 1.4826;
 /// Distance from its run, in standard deviations, at which a reading jumps.
 const JUMPS: f64 = 4.5;
+/// Median distance of all readings of a frame from their run, in standard deviations, at which there was no beam, or one from elsewhere: 0.7 is
+/// usual.
+const LOST: f64 = 4.0;
 
 impl Differences {
     /// Of readings, rows frames, columns monitors, not a number where missing [m]; the setting of each frame; the noise that the header states [m]
@@ -40,9 +43,13 @@ impl Differences {
     ) -> Self {
         let runs: Vec<Range<usize>> = runs(settings).into_iter().filter(|run| run.len() > 1).collect();
         let mut counts = readings.map(f64::is_finite);
+        for frame in lost(readings, &runs, noise) {
+            counts.row_mut(frame).fill(false);
+        }
         let mut sigma = noise.to_vec();
         for (b, sigma) in sigma.iter_mut().enumerate() {
-            let column: Vec<f64> = readings.column(b).iter().copied().collect();
+            let reading = |frame: usize| if counts[(frame, b)] { readings[(frame, b)] } else { f64::NAN };
+            let column: Vec<f64> = (0..readings.nrows()).map(reading).collect();
             let [typical, rms] = repeated(&column, &runs).unwrap_or([*sigma; 2]);
             // one that jumps in later frames does so in first ones too, as if it were late
             if typical == 0.0 || jumps(&column, &runs, typical) {
@@ -138,6 +145,39 @@ pub fn run_means(values: &DMatrix<f64>, settings: &[Option<usize>]) -> DMatrix<f
     means
 }
 
+/// Frames whose readings are far from the others of their run in another way than what passes: that is a share of the orbit of the run
+/// before and of the run's own.
+fn lost(readings: &DMatrix<f64>, runs: &[Range<usize>], noise: &[f64]) -> Vec<usize> {
+    let middle = |b: usize, frames: &mut dyn Iterator<Item = usize>| {
+        median(&mut frames.map(|frame| readings[(frame, b)]).filter(|x| x.is_finite()).collect::<Vec<_>>())
+    };
+    let monitors = readings.ncols();
+    let orbit = |frames: &dyn Fn() -> Range<usize>, but: Option<usize>| {
+        DVector::from_fn(monitors, |b, _| middle(b, &mut frames().filter(|frame| Some(*frame) != but)) / noise[b])
+    };
+    let baseline = orbit(&|| 0..readings.nrows(), None);
+    let mut former = DVector::zeros(monitors);
+    let mut found = Vec::new();
+    for run in runs {
+        for frame in run.clone() {
+            let own = orbit(&|| run.clone(), Some(frame)) - &baseline;
+            let read = DVector::from_fn(monitors, |b, _| readings[(frame, b)] / noise[b]) - &baseline;
+            let known = read.map(f64::is_finite);
+            let clean = |one: &DVector<f64>| one.zip_map(&known, |x, known| if known { x } else { 0.0 });
+            let mut off = clean(&(read - &own));
+            let directions = DMatrix::from_columns(&[clean(&own), clean(&former)]).qr().q();
+            off -= &directions * directions.tr_mul(&off);
+            let mut sizes: Vec<f64> =
+                off.iter().zip(&known).filter(|(_, known)| **known).map(|(x, _)| x.abs()).collect();
+            if median(&mut sizes) > LOST {
+                found.push(frame);
+            }
+        }
+        former = orbit(&|| run.clone(), None) - &baseline;
+    }
+    found
+}
+
 /// Noise of one reading by differences of neighbours, of which none is the first of its run [m], by their median size and by their rms, larger for
 /// noise with tails: in the first something may pass.
 fn repeated(column: &[f64], runs: &[Range<usize>]) -> Option<[f64; 2]> {
@@ -187,6 +227,22 @@ mod tests {
         // two of three differences of a run, four of five directions: each has the variance 1, here by 240 numbers, within 30 %
         let variance = white.norm_squared() / (90.0 * 2.0 / 3.0 * 4.0);
         assert!((variance - 1.0).abs() < 0.3, "{variance}");
+    }
+
+    /// Frames of garbage do not count, first ones of their run or later; first ones that keep half of the former orbit do, and later ones
+    /// of one monitor that is off by itself.
+    #[test]
+    fn frames_without_the_beam_do_not_count() {
+        let orbit = |setting: usize, b: usize| 5.0 * (2.3 * (setting * 7 + b * b) as f64).sin();
+        let readings = DMatrix::from_fn(120, 9, |frame, b| {
+            let noise = 0.1 * (1.7 * (frame * frame + 31 * b) as f64).sin();
+            let setting = frame / 6;
+            let kept = if frame % 6 == 0 && frame > 0 { 0.5 } else { 0.0 };
+            let lost = if [30, 57].contains(&frame) { 3.0 * (0.7 * (b * b + frame) as f64).cos() } else { 0.0 };
+            (1.0 - kept) * orbit(setting, b) + kept * orbit(setting.saturating_sub(1), b) + noise + lost
+        });
+        let runs: Vec<Range<usize>> = (0..20).map(|run| 6 * run..6 * run + 6).collect();
+        assert_eq!(lost(&readings, &runs, &[0.1; 9]), [30, 57]);
     }
 
     #[test]
