@@ -5,8 +5,8 @@ use estimator::booster::Frame;
 use estimator::{
     CurrentCode, IngestError, MagnetCurrents, Mask, MonitorState, PositionCode, Prior, RfCode, TuneCode, Walk,
 };
-use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use inference::{Campaign, Recording};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use system_tests::faults::{Body, FAULTS, faulty, is_sealed, sealed, serialised};
@@ -369,4 +369,34 @@ fn a_silent_monitor_is_dead_until_it_reports() {
     let nees = nees(&errors(&last, &params), |i, j| core.covariance(i, j)) / 48.0;
     // 48 correlated directions: 0.6..1.5 is the 99 % range of chi-square with 48 degrees over 48
     assert!((0.6..1.5).contains(&nees), "NEES/48 {nees:.2}");
+}
+
+/// A monitor without a beam reads its own electronics, here a thirtieth of the noise about zero, from the first frame on. Taken for readings
+/// they moved the vars by thousands of standard deviations.
+#[test]
+fn a_monitor_that_reads_no_beam_is_dead_and_costs_only_itself() {
+    let (ring, recording) = paper_vars();
+    let params: Vec<f32> = truth("recordings/paper-vars", &ring).iter().map(|var| var.ln() as f32).collect();
+    for monitor in [0, 11, 20, 32] {
+        let mut recording = recording.clone();
+        let mut random = Random::new(monitor as u64);
+        for row in &mut recording.rows {
+            row.reading[monitor] = Some(5e-6 * random.normal());
+        }
+        // given to the core, frame by frame
+        let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
+        let mut last = None;
+        for mut wire in wires(&recording) {
+            core.prepare();
+            last = Some(core.ingest(&mut wire).unwrap());
+        }
+        let last = last.unwrap();
+        assert_eq!(last.health[monitor].state, MonitorState::Dead, "monitor {monitor}");
+        let of_core = nees(&errors(&last, &params), |i, j| core.covariance(i, j)) / 48.0;
+        // and to the batch fit
+        let campaign = Campaign::of(&ring, &recording).unwrap();
+        assert!(campaign.screened.accepted.column(monitor).iter().all(|accepted| !accepted), "monitor {monitor}");
+        // 0.6..1.5 is the 99 % range, and the seven readings before it was found dead count in the core
+        assert!((0.6..2.0).contains(&of_core), "monitor {monitor}: NEES/48 {of_core:.2}");
+    }
 }
