@@ -41,6 +41,8 @@ pub enum Command {
     Export(Export),
     /// What changed between two measurements of one machine
     Compare(Compare),
+    /// Put an effect into a recording or a measured matrix, its answer key beside it
+    Conceal(Conceal),
     /// Diagnose the recordings below a folder, score them by their truth.json
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns, count how often the result is right
@@ -341,6 +343,23 @@ pub struct Compare {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub priors: Priors,
+}
+
+/// `orbitcal conceal`.
+#[derive(Debug, Args)]
+pub struct Conceal {
+    /// A recording, or a folder with a response matrix
+    #[arg(value_name = "DATA")]
+    pub data: PathBuf,
+    /// Fixes kind, place and size
+    #[arg(long, value_name = "N")]
+    pub seed: u64,
+    /// Folder that is made; the answer key is DIR.truth.json beside it
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
 }
 
 /// `orbitcal challenge`.

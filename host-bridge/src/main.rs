@@ -7,7 +7,7 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, compare, diagnose, export, fit, replay, response, serve, study, surrogate,
+    CommandError, challenge, check, compare, conceal, diagnose, export, fit, replay, response, serve, study, surrogate,
     validate, watch,
 };
 use host_bridge::output::{self, OutputError};
@@ -32,6 +32,7 @@ fn main() -> ExitCode {
         Command::Study(options) => study::run(options),
         Command::Diagnose(options) => diagnose::run(options),
         Command::Compare(options) => compare::run(options),
+        Command::Conceal(options) => conceal::run(options),
         Command::Challenge(options) => challenge::run(options),
         Command::Export(options) => export::run(options),
         Command::Validate(options) => validate::run(options),

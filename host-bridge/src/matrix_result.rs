@@ -335,7 +335,7 @@ fn is_other_hold(rf: Rf, found: &Diagnosis) -> bool {
 
 fn cable(folder: &Folder, wiring: &Wiring) -> MatrixFinding {
     let (kind, at) = wiring.named(folder);
-    let places = at.replace(',', " and ");
+    let places = at.replace(',', ", ");
     let sentence = match wiring {
         Wiring::MonitorsExchanged(_) | Wiring::CorrectorsExchanged(_) => format!("{places} are exchanged"),
         Wiring::MonitorReversed(_) => format!("{places} reads with the other sign"),

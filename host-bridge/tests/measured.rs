@@ -102,3 +102,48 @@ fn what_a_matrix_is_not_for_is_said() {
     assert!(refused(&["diagnose", BEFORE, AFTER]).contains("orbitcal compare A B"));
     assert!(refused(&["fit", BEFORE, "--machine", "machines/x.json"]).contains("--machine is for a recording"));
 }
+
+/// Effects put into the matrix by a seed: cables are named again with what was wrong before, nothing else is said.
+#[test]
+fn what_was_concealed_is_found_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cables = 0;
+    for seed in 1..=16 {
+        let out = folder.path().join(format!("{seed}"));
+        let (out, seed) = (out.to_str().unwrap(), seed.to_string());
+        let conceal = ["conceal", BEFORE, "--seed", &seed, "--out", out, "--quiet"];
+        assert!(orbitcal(&conceal).status.success(), "seed {seed}");
+        let key: Value = serde_json::from_slice(&std::fs::read(format!("{out}.truth.json")).unwrap()).unwrap();
+        let effect = &key["effects"][0];
+        let result = json(&["diagnose", out]);
+        let found: Vec<&str> =
+            result["findings"].as_array().unwrap().iter().map(|one| one["at"].as_str().unwrap()).collect();
+        if ["bpm_swap", "bpm_reversed"].contains(&effect["kind"].as_str().unwrap()) {
+            cables += 1;
+            // a second exchange with one of the two joins them in a ring
+            let places: Vec<&str> = effect["at"].as_str().unwrap().split(',').collect();
+            let is_named = |place: &&str| found.iter().any(|at| at.split(',').any(|one| one == *place));
+            assert!(places.iter().all(is_named) && found.len() <= 2, "seed {seed}: {effect} {found:?}");
+        } else {
+            assert_eq!(found, ["x_BPM.22,x_BPM.52"], "seed {seed}: {effect}");
+        }
+        assert!(refused(&conceal).contains("neither is overwritten"));
+    }
+    assert!(cables >= 3, "{cables} cables of 16");
+}
+
+/// The same of a recording: readings differ by the effect alone, and a strong one is named.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn an_effect_concealed_in_a_recording_is_found_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("concealed");
+    let out = out.to_str().unwrap();
+    assert!(orbitcal(&["conceal", "recordings/paper-vars", "--seed", "4", "--out", out, "--quiet"]).status.success());
+    let key: Value = serde_json::from_slice(&std::fs::read(format!("{out}.truth.json")).unwrap()).unwrap();
+    let (effect, result) = (&key["effects"][0], json(&["diagnose", out]));
+    let finding = &result["findings"][0];
+    assert_eq!((&finding["kind"], &finding["at"]), (&effect["kind"], &effect["at"]), "{}", result["sentence"]);
+    let [found, sigma] = ["amplitude", "sigma"].map(|key| finding[key].as_f64().unwrap());
+    assert!((found - effect["amplitude"].as_f64().unwrap()).abs() < 3.0 * sigma, "{found} ± {sigma}, put in {effect}");
+}

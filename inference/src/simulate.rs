@@ -1,9 +1,10 @@
 //! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
 //!
 //! [`like`] is the machine of the estimator's model: linear optics, constant baselines, no other effects.
-//! [`campaign()`] is one of exact orbits, with any effects.
+//! [`campaign()`] is one of exact orbits, with any effects; [`conceal()`] puts effects into a recording that was measured.
 
 mod campaign;
+mod conceal;
 
 use nalgebra::DVector;
 use rand::rngs::StdRng;
@@ -17,6 +18,7 @@ use crate::prior::Width;
 use crate::recording::Recording;
 
 pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
+pub use conceal::conceal;
 
 /// What the simulated monitors do.
 #[derive(Debug, Clone)]

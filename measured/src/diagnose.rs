@@ -91,7 +91,11 @@ pub fn diagnose(
         fitted.residual.clone(),
         fitted.weight.clone(),
     );
-    let wiring = wiring::found(folder, &model.without_instruments(&fitted.unknowns, &fitted.values)?);
+    // where the fit did not end its magnets are not those of the ring
+    let wiring = match fitted.has_ended {
+        true => wiring::found(folder, &model.without_instruments(&fitted.unknowns, &fitted.values)?),
+        false => Vec::new(),
+    };
     let share = share(folder, fitted, &model, settings, &about, progress)?;
     Ok(Diagnosis { wiring, share, unexplained: unexplained(folder, fitted) })
 }

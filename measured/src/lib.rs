@@ -7,6 +7,7 @@
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
 pub mod compare;
+pub mod conceal;
 pub mod diagnose;
 pub mod error;
 pub mod fit;
@@ -20,6 +21,7 @@ pub mod unknowns;
 pub mod wiring;
 
 pub use compare::{Change, compare};
+pub use conceal::{Concealed, conceal};
 pub use diagnose::{Diagnosis, diagnose};
 pub use error::MeasuredError;
 pub use fit::{Fit, Settings, fit};

@@ -2,8 +2,8 @@
 //! written down.
 //!
 //! Of a monitor's row the elements with correctors of its own plane count, of a corrector's column those of its own plane. `u(i, j)` is the share of
-//! measured row `i` that predicted row `j` leaves unexplained at the scale that suits it best, `1 - corr^2`. Two rows are exchanged where both are
-//! explained [`BETTER`] times better by the other's prediction; a row is reversed where most of it is explained with a negative scale. Neither
+//! measured row `i` that predicted row `j` leaves unexplained at the scale that suits it best, `1 - corr^2`. Rows are exchanged, in a ring of two or
+//! more, where each is explained [`BETTER`] times better by the next one's prediction; a row is reversed where most of it is explained with a negative scale. Neither
 //! needs the strengths to be right: errors of them change all rows alike.
 
 use nalgebra::DMatrix;
@@ -16,12 +16,12 @@ use crate::model::Model;
 use crate::unknowns::groups;
 
 /// What is wrong with a cable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Wiring {
-    /// Two monitors of one plane are exchanged: rows.
-    MonitorsExchanged([usize; 2]),
-    /// Two correctors of one plane are exchanged: columns.
-    CorrectorsExchanged([usize; 2]),
+    /// Monitors of one plane are exchanged: each row is that of the monitor of the next, the last one that of the first.
+    MonitorsExchanged(Vec<usize>),
+    /// Correctors of one plane are exchanged: columns in the same way.
+    CorrectorsExchanged(Vec<usize>),
     /// A monitor reads with the other sign: its row.
     MonitorReversed(usize),
     /// A corrector kicks with the other sign: its column.
@@ -46,10 +46,14 @@ const ALIVE: f64 = 0.2;
 /// [`MeasuredError`].
 pub fn straightened(folder: &Folder, settings: &Settings) -> Result<(Folder, Vec<Wiring>), MeasuredError> {
     let predicted = Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?;
-    let found = found(folder, &predicted);
-    let mut right = folder.clone();
-    found.iter().for_each(|one| one.put_right(&mut right));
-    Ok((right, found))
+    let (mut right, mut all) = (folder.clone(), Vec::new());
+    // an exchanged row may be reversed too, which shows at its own place
+    for _ in 0..2 {
+        let more = found(&right, &predicted);
+        more.iter().for_each(|one| one.put_right(&mut right));
+        all.extend(more);
+    }
+    Ok((right, all))
 }
 
 /// What is wrong by the matrix that perfect instruments would measure [mm].
@@ -66,8 +70,8 @@ pub fn found(folder: &Folder, predicted: &DMatrix<f64>) -> Vec<Wiring> {
     let rows = monitors.reversed.iter().filter(|&&row| !planes.contains(&folder.monitors[row].plane));
     let columns = correctors.reversed.iter().filter(|&&column| !planes.contains(&folder.correctors[column].plane));
     (planes.iter().map(|&plane| Wiring::PlaneReversed(plane)))
-        .chain(monitors.exchanged.iter().map(|&pair| Wiring::MonitorsExchanged(pair)))
-        .chain(correctors.exchanged.iter().map(|&pair| Wiring::CorrectorsExchanged(pair)))
+        .chain(monitors.exchanged.into_iter().map(Wiring::MonitorsExchanged))
+        .chain(correctors.exchanged.into_iter().map(Wiring::CorrectorsExchanged))
         .chain(rows.map(|&row| Wiring::MonitorReversed(row)))
         .chain(columns.map(|&column| Wiring::CorrectorReversed(column)))
         .collect()
@@ -76,36 +80,45 @@ pub fn found(folder: &Folder, predicted: &DMatrix<f64>) -> Vec<Wiring> {
 impl Wiring {
     /// Name of what is wrong and its place.
     pub fn named(&self, folder: &Folder) -> (&'static str, String) {
-        let pair =
-            |[i, j]: [usize; 2], of: fn(&Folder, usize) -> String| format!("{},{}", of(folder, i), of(folder, j));
-        match *self {
-            Self::MonitorsExchanged(rows) => ("bpm_swap", pair(rows, Folder::monitor)),
-            Self::CorrectorsExchanged(columns) => ("corrector_swap", pair(columns, Folder::corrector)),
-            Self::MonitorReversed(row) => ("bpm_reversed", folder.monitor(row)),
-            Self::CorrectorReversed(column) => ("corrector_reversed", folder.corrector(column)),
+        let all = |lines: &[usize], of: fn(&Folder, usize) -> String| {
+            lines.iter().map(|&line| of(folder, line)).collect::<Vec<_>>().join(",")
+        };
+        match self {
+            Self::MonitorsExchanged(rows) => ("bpm_swap", all(rows, Folder::monitor)),
+            Self::CorrectorsExchanged(columns) => ("corrector_swap", all(columns, Folder::corrector)),
+            Self::MonitorReversed(row) => ("bpm_reversed", folder.monitor(*row)),
+            Self::CorrectorReversed(column) => ("corrector_reversed", folder.corrector(*column)),
             Self::PlaneReversed(Plane::X) => ("plane_reversed", "x".into()),
             Self::PlaneReversed(Plane::Y) => ("plane_reversed", "y".into()),
         }
     }
 
-    fn put_right(&self, folder: &mut Folder) {
-        match *self {
-            Self::MonitorsExchanged([i, j]) => {
-                folder.matrix.swap_rows(i, j);
-                if let Some(dispersion) = &mut folder.dispersion {
-                    dispersion.swap_rows(i, j);
+    /// Exchange or turn rows or columns: puts a wrong cable right, and a right one wrong.
+    pub fn put_right(&self, folder: &mut Folder) {
+        match self {
+            Self::MonitorsExchanged(rows) => {
+                // from the last pair on, so that each row arrives at its own place
+                for pair in rows.windows(2).rev() {
+                    folder.matrix.swap_rows(pair[0], pair[1]);
+                    if let Some(dispersion) = &mut folder.dispersion {
+                        dispersion.swap_rows(pair[0], pair[1]);
+                    }
                 }
             }
-            Self::CorrectorsExchanged([i, j]) => folder.matrix.swap_columns(i, j),
+            Self::CorrectorsExchanged(columns) => {
+                for pair in columns.windows(2).rev() {
+                    folder.matrix.swap_columns(pair[0], pair[1]);
+                }
+            }
             Self::MonitorReversed(row) => {
-                folder.matrix.row_mut(row).neg_mut();
+                folder.matrix.row_mut(*row).neg_mut();
                 if let Some(dispersion) = &mut folder.dispersion {
-                    dispersion[row] = -dispersion[row];
+                    dispersion[*row] = -dispersion[*row];
                 }
             }
-            Self::CorrectorReversed(column) => folder.matrix.column_mut(column).neg_mut(),
+            Self::CorrectorReversed(column) => folder.matrix.column_mut(*column).neg_mut(),
             Self::PlaneReversed(plane) => {
-                for (column, _) in folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == plane) {
+                for (column, _) in folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == *plane) {
                     folder.matrix.column_mut(column).neg_mut();
                 }
             }
@@ -156,7 +169,7 @@ fn own_plane(folder: &Folder, matrix: &DMatrix<f64>) -> DMatrix<f64> {
 
 /// Lines that are exchanged, and those that are reversed.
 struct Judged {
-    exchanged: Vec<[usize; 2]>,
+    exchanged: Vec<Vec<usize>>,
     reversed: Vec<usize>,
 }
 
@@ -166,15 +179,27 @@ fn judge(lines: &Lines) -> Judged {
         true => lines.compared(i, j).map_or(f64::NAN, |[r, _]| 1.0 - r * r),
         false => f64::NAN,
     });
-    let gain = |i: usize, j: usize| {
-        let by = |one: usize, other: usize| unexplained[(one, one)] / unexplained[(one, other)];
-        by(i, j).min(by(j, i))
+    let gain = |i: usize, j: usize| unexplained[(i, i)] / unexplained[(i, j)];
+    // the line whose prediction a line suits best
+    let best = |i: usize| {
+        let better = (0..n).filter(|&j| j != i && gain(i, j) > BETTER);
+        better.max_by(|&a, &b| gain(i, a).total_cmp(&gain(i, b)))
     };
-    // a line is exchanged with the one that suits it best, and that one with it
-    let best =
-        |i: usize| (0..n).filter(|&j| j != i && gain(i, j) > BETTER).max_by(|&a, &b| gain(i, a).total_cmp(&gain(i, b)));
-    let pairs = (0..n).filter_map(|i| best(i).filter(|&j| i < j && best(j) == Some(i)).map(|j| [i, j]));
-    let exchanged: Vec<[usize; 2]> = pairs.collect();
+    let ring = |first: usize| {
+        let mut ring = vec![first];
+        while let Some(next) = best(ring[ring.len() - 1]) {
+            if next == first {
+                return Some(ring);
+            }
+            // the first of a ring is its least, and a ring that does not come back to it is none
+            if next < first || ring.contains(&next) {
+                return None;
+            }
+            ring.push(next);
+        }
+        None
+    };
+    let exchanged: Vec<Vec<usize>> = (0..n).filter_map(ring).collect();
     let of = |i: usize| exchanged.iter().flatten().any(|&one| one == i);
     let is_reversed = |i: usize| lines.compared(i, i).is_some_and(|[r, scale]| r < -EXPLAINED.sqrt() && scale < -ALIVE);
     let reversed = (0..n).filter(|&i| !of(i) && is_reversed(i)).collect();
@@ -200,9 +225,9 @@ mod tests {
         let (_, _, nothing) = found(|_| ());
         assert_eq!(nothing, []);
         for wrong in [
-            Wiring::MonitorsExchanged([2, 3]),
-            Wiring::MonitorsExchanged([13, 20]),
-            Wiring::CorrectorsExchanged([0, 5]),
+            Wiring::MonitorsExchanged(vec![2, 3]),
+            Wiring::MonitorsExchanged(vec![13, 20]),
+            Wiring::CorrectorsExchanged(vec![0, 5]),
             Wiring::MonitorReversed(7),
             Wiring::CorrectorReversed(15),
             Wiring::PlaneReversed(Plane::Y),
@@ -211,6 +236,26 @@ mod tests {
             assert_eq!(found, [wrong]);
             assert_eq!((right.matrix, right.dispersion), (plain.matrix, plain.dispersion));
         }
+    }
+
+    /// Three in a ring: row 1 has what monitor 4 reads, row 4 what monitor 9 reads, row 9 what monitor 1 reads.
+    #[test]
+    fn cables_in_a_ring_are_put_right() {
+        let (plain, right, found) = found(|folder| {
+            let rows = [1, 4, 9].map(|row| folder.matrix.row(row).into_owned());
+            [1, 4, 9].iter().zip([1, 2, 0]).for_each(|(&row, from)| folder.matrix.set_row(row, &rows[from]));
+            folder.dispersion = None;
+        });
+        assert_eq!(found, [Wiring::MonitorsExchanged(vec![1, 4, 9])]);
+        assert_eq!(right.matrix, plain.matrix);
+    }
+
+    #[test]
+    fn an_exchanged_row_that_is_reversed_too_is_put_right() {
+        let wrong = [Wiring::MonitorsExchanged(vec![2, 7]), Wiring::MonitorReversed(7)];
+        let (plain, right, found) = found(|folder| wrong.iter().rev().for_each(|one| one.put_right(folder)));
+        assert_eq!(found, wrong);
+        assert_eq!(right.matrix, plain.matrix);
     }
 
     #[test]

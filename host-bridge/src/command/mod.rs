@@ -3,6 +3,7 @@
 pub mod challenge;
 pub mod check;
 pub mod compare;
+pub mod conceal;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
