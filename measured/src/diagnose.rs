@@ -9,6 +9,9 @@
 //! the kicks' shares in other correctors, tells how much chance and the model's other errors give.
 
 use nalgebra::{DMatrix, DVector};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use rand::seq::SliceRandom;
 use twin::{Plane, Rf};
 
 use crate::error::MeasuredError;
@@ -190,7 +193,7 @@ fn share(
     let pattern = model.predict(&unknowns, &values)?.by_machine.swap_remove(at);
     let horizontal = folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == Plane::X && one.is_used);
     let horizontal: Vec<usize> = horizontal.map(|(column, _)| column).collect();
-    let patterns: Vec<DMatrix<f64>> = (1..=SHUFFLES).map(|seed| shuffled(&pattern, &horizontal, seed)).collect();
+    let patterns: Vec<DMatrix<f64>> = (1..=SHUFFLES as u64).map(|seed| shuffled(&pattern, &horizontal, seed)).collect();
     let own = of_amplitude(about.score(&pattern));
     let as_good = patterns.iter().filter(|pattern| of_amplitude(about.score(pattern)) >= own).count();
     let mut data = Data::of(folder);
@@ -233,15 +236,10 @@ fn log_likelihood(residual: &DMatrix<f64>, weight: &DMatrix<f64>) -> f64 {
     residual.iter().zip(weight).map(one).sum()
 }
 
-/// The pattern with the columns of some correctors exchanged at random, the size of each with it: a permutation by a seeded generator.
-fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: usize) -> DMatrix<f64> {
+/// The pattern with the columns of some correctors exchanged at random, the size of each with it.
+fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: u64) -> DMatrix<f64> {
     let mut order = columns.to_vec();
-    let mut state = seed as u64;
-    for i in (1..order.len()).rev() {
-        // Knuth's MMIX generator, its upper half
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        order.swap(i, (state >> 33) as usize % (i + 1));
-    }
+    order.shuffle(&mut StdRng::seed_from_u64(seed));
     let mut other = pattern.clone();
     for (&to, &from) in columns.iter().zip(&order) {
         other.set_column(to, &pattern.column(from));
