@@ -21,6 +21,7 @@ fn holds_the_orbit(seed: u64) {
     let mut logarithms = Vec::new();
     for (name, frames) in scenario.stretches() {
         let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
+        // a fifth of the orbit without correction is what is asked for
         assert!(rms(estimated) <= 0.2 * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
         let [by_estimate, by_design] = [rms(estimated), rms(design)];
         assert!(by_estimate < by_design + LEFT, "seed {seed}, {name}: {by_estimate}, by the design {by_design} m");
