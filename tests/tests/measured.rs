@@ -6,12 +6,12 @@
 use std::path::PathBuf;
 
 use measured::{Folder, Kind, Model, Settings, Wiring, compare, diagnose, fit, straightened};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
 use system_tests::repository;
-use twin::Rf;
+use twin::{Plane, Rf};
 
 /// The folder of a ring, if there is one.
 fn ring(name: &str) -> Option<PathBuf> {
@@ -225,4 +225,64 @@ fn changes_that_were_put_in_are_found_at_spear3() {
 #[ignore = "make measured"]
 fn changes_that_were_put_in_are_found_at_pls() {
     changes_that_were_put_in("pls_2009", 0.005);
+}
+
+/// Elements of correctors that were left out of the fit, over the error that was predicted for them, and their residuals [mm]. A corrector's own gain
+/// and coupling are fitted to its own column, since nothing else tells them.
+fn held_out(name: &str, folds: usize) -> Option<(Vec<f64>, Vec<f64>)> {
+    let folder = Folder::read(&ring(name)?).unwrap();
+    let (folder, _) = straightened(&folder, &Settings::default()).unwrap();
+    let used: Vec<usize> = (0..folder.correctors.len()).filter(|&j| folder.correctors[j].is_used).collect();
+    let (mut scaled, mut left) = (Vec::new(), Vec::new());
+    for fold in 0..folds {
+        let out: Vec<usize> = used.iter().copied().skip(fold).step_by(folds).collect();
+        let mut others = folder.clone();
+        out.iter().for_each(|&j| others.correctors[j].is_used = false);
+        let fitted = fit(&others, &Settings::default(), &mut |_| ()).unwrap();
+        let model = Model::of(&folder, &fitted.groups, Rf::FixedFrequency).unwrap();
+        let at = model.predict(&fitted.unknowns, &fitted.values).unwrap();
+        let machine = at.by_machine.len();
+        for &j in &out {
+            let rows: Vec<usize> = (0..folder.monitors.len())
+                .filter(|&i| folder.monitors[i].is_used && folder.matrix[(i, j)].is_finite())
+                .collect();
+            let error = |i: usize| {
+                let is_y =
+                    [folder.monitors[i].plane == Plane::Y, folder.correctors[j].plane == Plane::Y].map(usize::from);
+                let slope = DVector::from_fn(machine, |k, _| at.by_machine[k][(i, j)]);
+                let of_magnets = slope.dot(&(fitted.covariance.view((0, 0), (machine, machine)) * &slope));
+                folder.monitors[i].sigma.powi(2) + fitted.discrepancy[2 * is_y[0] + is_y[1]].powi(2) + of_magnets
+            };
+            let variance: Vec<f64> = rows.iter().map(|&i| error(i)).collect();
+            let own = DMatrix::from_fn(rows.len(), 2, |r, k| at.by_corrector[k][(rows[r], j)] / variance[r].sqrt());
+            let seen = DVector::from_fn(rows.len(), |r, _| folder.matrix[(rows[r], j)] / variance[r].sqrt());
+            let numbers =
+                (own.tr_mul(&own) + DMatrix::identity(2, 2) * 1e-12).cholesky().unwrap().solve(&own.tr_mul(&seen));
+            let off = seen - own * numbers;
+            left.extend(off.iter().zip(&variance).map(|(z, variance)| z * variance.sqrt()));
+            scaled.extend(off.iter());
+        }
+    }
+    Some((scaled, left))
+}
+
+/// Bands of 68 and 95 % of what is predicted for correctors that were left out. The residuals of measured rings have heavier tails than normal ones:
+/// bands of 68 % hold more than they say, those of 95 % up to 5 % fewer.
+#[test]
+#[ignore = "make measured"]
+fn correctors_left_out_are_predicted_within_the_learnt_error() {
+    for (name, folds) in [("sps_2007", 7), ("spear3_example", 4), ("pls_2009", 3)] {
+        let Some((scaled, left)) = held_out(name, folds) else { continue };
+        let within = |limit: f64| scaled.iter().filter(|z| z.abs() < limit).count() as f64 / scaled.len() as f64;
+        let rms = (left.iter().map(|x| x * x).sum::<f64>() / left.len() as f64).sqrt();
+        println!(
+            "{name}: {:.1} % and {:.1} % of {}, rms {:.1} um",
+            100.0 * within(1.0),
+            100.0 * within(1.96),
+            left.len(),
+            1e3 * rms
+        );
+        // 83.2 and 95.0 % at SPS, 70.7 and 90.6 % at SPEAR3, 87.0 and 96.1 % at PLS: a change of 3 % would be another error of the model
+        assert!((0.68..0.90).contains(&within(1.0)) && within(1.96) > 0.88, "{name}");
+    }
 }
