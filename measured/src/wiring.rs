@@ -3,7 +3,7 @@
 //!
 //! Of a monitor's row the elements with correctors of its own plane count, of a corrector's column those of its own plane. `u(i, j)` is the share of
 //! measured row `i` that predicted row `j` leaves unexplained at the scale that suits it best, `1 - corr^2`. Rows are exchanged, in a ring of two or
-//! more, where each is explained [`BETTER`] times better by the next one's prediction; a row is reversed where most of it is explained with a negative scale. Neither
+//! more, where each is explained four times better by the next one's prediction; a row is reversed where most of it is explained with a negative scale. Neither
 //! needs the strengths to be right: errors of them change all rows alike.
 
 use nalgebra::DMatrix;
