@@ -335,7 +335,10 @@ fn is_other_hold(rf: Rf, found: &Diagnosis) -> bool {
 
 fn cable(folder: &Folder, wiring: &Wiring) -> MatrixFinding {
     let (kind, at) = wiring.named(folder);
-    let places = at.replace(',', ", ");
+    let places = match at.rsplit_once(',') {
+        Some((first, last)) => format!("{} and {last}", first.replace(',', ", ")),
+        None => at.clone(),
+    };
     let sentence = match wiring {
         Wiring::MonitorsExchanged(_) | Wiring::CorrectorsExchanged(_) => format!("{places} are exchanged"),
         Wiring::MonitorReversed(_) => format!("{places} reads with the other sign"),

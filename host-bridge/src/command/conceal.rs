@@ -61,11 +61,10 @@ fn into_recording(options: &Conceal) -> Result<Value, CommandError> {
 }
 
 fn into_matrix(options: &Conceal) -> Result<Value, CommandError> {
-    let folder = Folder::read(&options.data)?;
     let settings = measured::Settings::default();
-    // magnets change at the values that are found once the cables are right
-    let (right, _) = measured::straightened(&folder, &settings)?;
-    let fitted = matrix::fitted(&right, &settings, &options.common)?;
+    // what is put in is all that is wrong with its cables
+    let (folder, _) = measured::straightened(&Folder::read(&options.data)?, &settings)?;
+    let fitted = matrix::fitted(&folder, &settings, &options.common)?;
     let (concealed, effect) = measured::conceal(&folder, &fitted, &settings, options.seed)?;
     measured::conceal::write(&options.data, &concealed, &options.out)?;
     let effects = json!([{"kind": effect.kind, "at": effect.at, "amplitude": effect.amplitude, "gain": effect.gain}]);
