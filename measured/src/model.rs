@@ -8,12 +8,15 @@
 //! dispersion was measured, is the change of the orbit with the RF frequency.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Hold, Kind as Field, Optics, Plane, Rf, Ring};
+use twin::{Gradient, Hold, Kind as Field, Observer, Optics, Plane, Rf, Ring, Source};
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{parts, ring};
 use crate::unknowns::{Kind, Magnets, Unknown};
+
+/// Millimetres a metre.
+const MILLI: f64 = 1e3;
 
 /// The model of one measurement.
 #[derive(Debug, Clone)]
@@ -152,75 +155,71 @@ impl Model {
     pub fn predict(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Result<Prediction, MeasuredError> {
         let ring = self.at(unknowns, values);
         let instruments = self.instruments(unknowns, values);
-        let share = instruments.held_frequency;
+        let held = |hold| Ok::<_, MeasuredError>(self.held(&Optics::of(&ring, hold)?, &instruments));
         let [momentum, frequency] = [Hold::Momentum { delta: 0.0 }, Hold::Frequency { offset: 0.0 }];
-        let holds = match (self.rf, share) {
-            (Rf::FixedMomentum, None) => vec![(momentum, 1.0)],
-            (Rf::FixedFrequency, None) => vec![(frequency, 1.0)],
-            (_, Some(share)) => vec![(momentum, 1.0 - share), (frequency, share)],
-        };
-        let mut orbits = Vec::new();
-        let mut by_machine: Vec<DMatrix<f64>> = Vec::new();
-        for (hold, weight) in &holds {
-            let optics = Optics::of(&ring, *hold)?;
-            let (orbit, by_magnet) = self.orbits(&optics);
-            for (at, slope) in by_magnet.iter().enumerate() {
-                match by_machine.get_mut(at) {
-                    Some(sum) => *sum += slope * *weight,
-                    None => by_machine.push(slope * *weight),
-                }
-            }
-            orbits.push(orbit);
+        match (instruments.held_frequency, self.rf) {
+            (Some(share), _) => Ok(held(momentum)?.towards(&held(frequency)?, share)),
+            (None, Rf::FixedMomentum) => held(momentum),
+            (None, Rf::FixedFrequency) => held(frequency),
         }
-        if let [momentum, frequency] = orbits.as_slice() {
-            by_machine.push(frequency - momentum);
-        }
-        let orbit = orbits
-            .iter()
-            .zip(&holds)
-            .map(|(orbit, (_, weight))| orbit * *weight)
-            .reduce(|a, b| a + b)
-            .expect("one hold at least");
-        let by_machine = by_machine.iter().map(|slope| self.seen(slope, &instruments)).collect();
-        Ok(self.with_instruments(&orbit, by_machine, &instruments))
     }
 
-    /// Orbits in both planes at every monitor's place [m], columns kicks in both planes at every corrector [rad] and the step of the RF frequency
-    /// [mm], and their derivatives by strengths and skew gradients.
-    fn orbits(&self, optics: &Optics) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
-        let observers: Vec<_> =
-            self.monitors.iter().flat_map(|&(at, plane)| both(plane).map(|p| optics.observe(at, p))).collect();
-        let sources: Vec<_> =
-            self.correctors.iter().flat_map(|&(at, plane)| both(plane).map(|p| optics.kick(at, axis(p)))).collect();
-        let blank = DMatrix::zeros(observers.len(), sources.len() + usize::from(self.has_dispersion));
+    /// The prediction of one kind of hold.
+    fn held(&self, optics: &Optics, instruments: &Instruments) -> Prediction {
+        let observers = |weights: &dyn Fn(usize) -> [f64; 2]| -> Vec<Observer> {
+            let places = self.monitors.iter().enumerate();
+            places.map(|(row, &(at, plane))| optics.observe_along(at, along(plane, weights(row)))).collect()
+        };
+        let sources = |weights: &dyn Fn(usize) -> [f64; 2]| -> Vec<Source> {
+            let places = self.correctors.iter().enumerate();
+            places
+                .map(|(column, &(at, plane))| optics.kick(at, along(plane, weights(column))).times(self.kicks[column]))
+                .collect()
+        };
+        let (read, kicked) =
+            (observers(&|row| instruments.monitors[row]), sources(&|column| instruments.correctors[column]));
+        let [own, other] = [[1.0, 0.0], [0.0, 1.0]];
+        let rf = instruments.rf;
+        Prediction {
+            matrix: self.seen(optics, &read, &kicked, rf),
+            by_machine: self.by_magnets(optics, &read, &kicked, rf),
+            by_monitor: [own, other].map(|one| self.seen(optics, &observers(&|_| one), &kicked, rf)),
+            by_corrector: [(own, 1.0), (other, 0.0)].map(|(one, rf)| self.seen(optics, &read, &sources(&|_| one), rf)),
+        }
+    }
+
+    /// What observers see of sources [mm], and of a step of the RF frequency, `rf` times as large as it is believed to be.
+    fn seen(&self, optics: &Optics, observers: &[Observer], sources: &[Source], rf: f64) -> DMatrix<f64> {
+        let seen = optics.response(observers, sources);
+        let offset = || optics.dispersion_of(observers) * (-rf * self.rf_step * MILLI / optics.slip_factor());
+        self.and_dispersion(seen, offset)
+    }
+
+    /// Derivatives of the same by strengths and skew gradients.
+    fn by_magnets(&self, optics: &Optics, observers: &[Observer], sources: &[Source], rf: f64) -> Vec<DMatrix<f64>> {
         let strengths = self
             .strengths
             .iter()
-            .map(|group| group.iter().map(|&(at, per_unit)| (optics.gradient(at), per_unit)).unzip());
-        let skews = self.skews.iter().map(|group| group.iter().map(|&at| (optics.skew_gradient(at), 1.0)).unzip());
-        let by_magnet = strengths.chain(skews).map(|(gradients, per_unit): (Vec<_>, Vec<f64>)| {
-            let mut sum = blank.clone();
-            let of_orbit = optics.response_jacobian(&observers, &sources, &gradients);
-            for (one, per_unit) in of_orbit.iter().zip(&per_unit) {
-                let mut orbit = sum.columns_mut(0, sources.len());
-                orbit += one * *per_unit;
-            }
-            if self.has_dispersion {
-                let of_rf = optics.rf_jacobian(&observers, &gradients) * (self.rf_step * 1e3);
-                sum.set_column(sources.len(), &(of_rf * DVector::from_vec(per_unit)));
-            }
-            sum
-        });
-        let by_magnet = by_magnet.collect();
-        let mut orbit = blank.clone();
-        orbit.columns_mut(0, sources.len()).copy_from(&optics.response(&observers, &sources));
-        if self.has_dispersion {
-            orbit.set_column(
-                sources.len(),
-                &(optics.dispersion_of(&observers) * (-self.rf_step * 1e3 / optics.slip_factor())),
-            );
+            .map(|group| group.iter().map(|&(at, per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>());
+        let skews = self.skews.iter().map(|group| group.iter().map(|&at| optics.skew_gradient(at)).collect());
+        let slope = |gradients: Vec<Gradient>| {
+            let each = optics.response_jacobian(observers, sources, &gradients);
+            let sum = each.into_iter().reduce(|sum, one| sum + one);
+            let offset = || optics.rf_jacobian(observers, &gradients).column_sum() * (rf * self.rf_step * MILLI);
+            self.and_dispersion(sum.expect("a group has a magnet"), offset)
+        };
+        strengths.chain(skews).map(slope).collect()
+    }
+
+    /// A matrix with the dispersion as its last column, if it was measured.
+    fn and_dispersion(&self, matrix: DMatrix<f64>, dispersion: impl Fn() -> DVector<f64>) -> DMatrix<f64> {
+        if !self.has_dispersion {
+            return matrix;
         }
-        (orbit, by_magnet)
+        let column = matrix.ncols();
+        let mut all = matrix.insert_column(column, 0.0);
+        all.set_column(column, &dispersion());
+        all
     }
 
     fn instruments(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Instruments {
@@ -243,89 +242,28 @@ impl Model {
         }
         all
     }
+}
 
-    /// `A G B` of orbits in both planes to kicks in both.
-    fn seen(&self, orbit: &DMatrix<f64>, instruments: &Instruments) -> DMatrix<f64> {
-        self.kicked(
-            &self.read(orbit, instruments.weights(Side::Monitors)),
-            instruments.weights(Side::Correctors),
-            instruments.rf,
-        )
-    }
-
-    /// `A G`: every pair of rows as one reading.
-    fn read(&self, orbit: &DMatrix<f64>, weights: impl Fn(usize) -> [f64; 2]) -> DMatrix<f64> {
-        let mut seen = DMatrix::zeros(self.monitors.len(), orbit.ncols());
-        for row in 0..self.monitors.len() {
-            let [own, other] = weights(row);
-            seen.set_row(row, &(orbit.row(2 * row) * own + orbit.row(2 * row + 1) * other));
-        }
-        seen
-    }
-
-    /// `G B`: every pair of columns as one corrector, and the RF step.
-    fn kicked(&self, orbit: &DMatrix<f64>, weights: impl Fn(usize) -> [f64; 2], rf: f64) -> DMatrix<f64> {
-        let correctors = self.correctors.len();
-        let mut kicked = DMatrix::zeros(orbit.nrows(), correctors + usize::from(self.has_dispersion));
-        for column in 0..correctors {
-            let [own, other] = weights(column).map(|weight| weight * self.kicks[column]);
-            kicked.set_column(column, &(orbit.column(2 * column) * own + orbit.column(2 * column + 1) * other));
-        }
-        if self.has_dispersion {
-            kicked.set_column(correctors, &(orbit.column(2 * correctors) * rf));
-        }
-        kicked
-    }
-
-    fn with_instruments(
-        &self,
-        orbit: &DMatrix<f64>,
-        by_machine: Vec<DMatrix<f64>>,
-        instruments: &Instruments,
-    ) -> Prediction {
-        let read = self.read(orbit, instruments.weights(Side::Monitors));
-        let kicked = self.kicked(orbit, instruments.weights(Side::Correctors), instruments.rf);
-        let matrix = self.kicked(&read, instruments.weights(Side::Correctors), instruments.rf);
-        let [own, other] = [[1.0, 0.0], [0.0, 1.0]];
-        Prediction {
-            by_machine,
-            by_monitor: [own, other].map(|weights| self.read(&kicked, |_| weights)),
-            by_corrector: [self.kicked(&read, |_| own, 1.0), self.kicked(&read, |_| other, 0.0)],
-            matrix,
+impl Prediction {
+    /// Between two kinds of hold: `self` with share 0, `to` with 1. The derivative by the share comes after those by magnets.
+    fn towards(&self, to: &Self, share: f64) -> Self {
+        let between = |from: &DMatrix<f64>, to: &DMatrix<f64>| from * (1.0 - share) + to * share;
+        let both = |from: &[DMatrix<f64>; 2], to: &[DMatrix<f64>; 2]| [0, 1].map(|i| between(&from[i], &to[i]));
+        let by_magnets = self.by_machine.iter().zip(&to.by_machine).map(|(from, to)| between(from, to));
+        Self {
+            matrix: between(&self.matrix, &to.matrix),
+            by_machine: by_magnets.chain([&to.matrix - &self.matrix]).collect(),
+            by_monitor: both(&self.by_monitor, &to.by_monitor),
+            by_corrector: both(&self.by_corrector, &to.by_corrector),
         }
     }
 }
 
-/// Which instruments.
-#[derive(Clone, Copy)]
-enum Side {
-    Monitors,
-    Correctors,
-}
-
-impl Instruments {
-    /// Weights of the own plane and of the other one of each instrument.
-    fn weights(&self, side: Side) -> impl Fn(usize) -> [f64; 2] {
-        let all = match side {
-            Side::Monitors => &self.monitors,
-            Side::Correctors => &self.correctors,
-        };
-        |at| all[at]
-    }
-}
-
-/// A plane and the other one.
-fn both(plane: Plane) -> [Plane; 2] {
+/// The direction `(x, y)` of an instrument with weights in its own plane and in the other one.
+fn along(plane: Plane, [own, other]: [f64; 2]) -> [f64; 2] {
     match plane {
-        Plane::X => [Plane::X, Plane::Y],
-        Plane::Y => [Plane::Y, Plane::X],
-    }
-}
-
-fn axis(plane: Plane) -> [f64; 2] {
-    match plane {
-        Plane::X => [1.0, 0.0],
-        Plane::Y => [0.0, 1.0],
+        Plane::X => [own, other],
+        Plane::Y => [other, own],
     }
 }
 

@@ -75,6 +75,13 @@ pub struct Gradient {
     pub(crate) kernel: Matrix6<f64>,
 }
 
+impl Gradient {
+    /// The same with an amplitude `gain` times as large.
+    pub fn times(self, gain: f64) -> Self {
+        Self { kernel: self.kernel * gain, ..self }
+    }
+}
+
 /// Linear optics of a ring about its closed orbit.
 #[derive(Debug, Clone)]
 pub struct Optics<'r> {
@@ -151,6 +158,13 @@ impl<'r> Optics<'r> {
         let place = place.into();
         let index = if plane == Plane::X { X } else { Y };
         Observer { place, row: self.transfer(place).row(index).into_owned() }
+    }
+
+    /// An observer of the coordinate along a direction `(x, y)` at a place, longer than 1 with a gain.
+    pub fn observe_along(&self, place: impl Into<Place>, direction: [f64; 2]) -> Observer {
+        let place = place.into();
+        let map = self.transfer(place);
+        Observer { place, row: map.row(X) * direction[0] + map.row(Y) * direction[1] }
     }
 
     /// An observer of the slope in a plane, `dp/p0`, at a place.
