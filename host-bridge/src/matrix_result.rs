@@ -76,7 +76,10 @@ pub struct Other {
 #[allow(missing_docs)] // named after what they are
 pub struct BlockError {
     pub block: &'static str,
-    pub rms_um: f64,
+    /// Of Student's distribution.
+    pub scale_um: f64,
+    /// Its degrees of freedom, none where it is normal.
+    pub freedom: Option<f64>,
 }
 
 impl MatrixFit {
@@ -110,9 +113,9 @@ impl MatrixFit {
         let other = fit.unknowns.iter().enumerate().filter_map(|(at, unknown)| {
             Some(Other { kind: word(unknown.kind)?, at: called(at), mean: fit.values[at], sigma: fit.sigma(at) })
         });
-        let counted = fit.weight.iter().filter(|w| **w > 0.0).count() as f64;
-        let chi2 = fit.residual.component_mul(&fit.residual).dot(&fit.weight);
-        let blocks = measured::fit::BLOCKS.iter().zip(fit.discrepancy).filter(|(_, rms)| *rms > 0.0);
+        let weight = fit.data.weight(&fit.missed, &fit.residual);
+        let chi2 = fit.residual.component_mul(&fit.residual).dot(&weight);
+        let blocks = measured::fit::BLOCKS.iter().zip(fit.missed).filter(|(_, one)| one.scale > 0.0);
         Self {
             recording: folder.name.clone(),
             method: "map",
@@ -121,14 +124,20 @@ impl MatrixFit {
             rejected_elements: fit.outliers.len(),
             vars: rows.iter().map(var).collect(),
             covariance: rows.iter().map(between).collect(),
-            chi2_per_dof: chi2 / (counted - fit.unknowns.len() as f64).max(1.0),
+            chi2_per_dof: chi2 / (fit.elements as f64 - fit.unknowns.len() as f64).max(1.0),
             chi2_loco: fit.chi2_loco,
             chi2_loco_start: fit.chi2_start,
             tunes: tunes.map(|[x, y]| Tunes { x, y }),
             monitors: monitors(folder, fit),
             other: other.collect(),
             degenerate: fit.degenerate().iter().map(|set| set.iter().map(|&at| called(at)).collect()).collect(),
-            model_error: blocks.map(|(block, rms)| BlockError { block, rms_um: 1e3 * rms }).collect(),
+            model_error: blocks
+                .map(|(block, one)| BlockError {
+                    block,
+                    scale_um: 1e3 * one.scale,
+                    freedom: one.freedom.is_finite().then_some(one.freedom),
+                })
+                .collect(),
             wiring: cables.iter().map(|one| one.named(folder)).map(|(kind, at)| Cable { kind, at }).collect(),
             has_ended: fit.has_ended,
         }
@@ -140,9 +149,10 @@ const DEAD: f64 = 0.2;
 
 /// State of each monitor: dead where it is not used or reads nothing, noisy where its rows are explained worse than others.
 fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
+    let squares = fit.squares();
     let state = |row: usize| {
-        let counted = fit.weight.row(row).iter().filter(|w| **w > 0.0).count();
-        let squares: f64 = fit.residual.row(row).iter().zip(fit.weight.row(row).iter()).map(|(r, w)| r * r * w).sum();
+        let counted = fit.data.sigma.row(row).iter().filter(|sigma| sigma.is_finite()).count();
+        let squares = squares.row(row).sum();
         let gain = fit.unknowns.iter().position(|one| one.kind == Kind::MonitorGain(row)).map(|at| fit.values[at]);
         let word = match (gain, squares > 4.0 * counted as f64) {
             (Some(gain), false) if gain.abs() > DEAD => "ok",
@@ -171,7 +181,7 @@ impl fmt::Display for MatrixFit {
             "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; what the model misses: {}",
             self.model_error
                 .iter()
-                .map(|one| format!("{} {:.1} um", one.block, one.rms_um))
+                .map(|one| format!("{} {:.1} um", one.block, one.scale_um))
                 .collect::<Vec<_>>()
                 .join(", ")
         );

@@ -57,7 +57,7 @@ pub fn compare(
         .zip(&fitted.values)
         .map(|(one, &mean)| Unknown { mean, width: change(one.kind), ..*one })
         .collect();
-    let (first, mut data) = (Data::of(one), Data::of(other));
+    let (first, mut data) = (&fitted.data, Data::of(other));
     // what is left over grows with the kick
     let per_kick = |j: usize| match (one.correctors.get(j), other.correctors.get(j)) {
         (Some(one), Some(other)) => other.kick / one.kick,
@@ -66,13 +66,13 @@ pub fn compare(
     for j in 0..data.sigma.ncols() {
         for i in 0..data.sigma.nrows() {
             let both = first.sigma[(i, j)].hypot(data.sigma[(i, j)]);
-            let counts = both.is_finite() && fitted.weight[(i, j)] > 0.0;
+            let counts = both.is_finite();
             data.sigma[(i, j)] = if counts { both } else { f64::INFINITY };
             data.measured[(i, j)] =
                 if counts { data.measured[(i, j)] - fitted.residual[(i, j)] * per_kick(j) } else { 0.0 };
         }
     }
-    let start = descend(&model, &unknowns, &data.measured, &data.weight(&[0.0; 6]), fitted.values.clone())?;
+    let start = descend(&model, &unknowns, &data.measured, &data.stated(), fitted.values.clone())?;
     let (here, _) = with_model_error(&model, &unknowns, &data, start, progress)?;
     Ok(changes(one, fitted, &here.values, &here.covariance))
 }

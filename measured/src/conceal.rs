@@ -109,8 +109,8 @@ pub fn conceal(
 
 fn gain_of(folder: &Folder, changed: &Folder, fitted: &Fit) -> f64 {
     let change = (&changed.matrix - &folder.matrix).map(|x| if x.is_finite() { x } else { 0.0 });
-    let weight = fitted.weight.columns(0, change.ncols());
-    0.5 * change.component_mul(&change).dot(&weight)
+    let information = fitted.data.information(&fitted.missed);
+    0.5 * change.component_mul(&change).dot(&information.columns(0, change.ncols()))
 }
 
 /// Write a folder like another, with a matrix and a dispersion of its own [mm].

@@ -15,7 +15,7 @@ use rand::seq::SliceRandom;
 use twin::{Plane, Rf};
 
 use crate::error::MeasuredError;
-use crate::fit::{Data, Fit, Settings, descend, with_model_error};
+use crate::fit::{Fit, Settings, covariance, descend, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
 use crate::normal::Places;
@@ -86,20 +86,12 @@ pub fn diagnose(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Diagnosis, MeasuredError> {
     let model = Model::of(folder, &fitted.groups, settings.rf)?;
-    let prediction = model.predict(&fitted.unknowns, &fitted.values)?;
-    let about = About::of(
-        &fitted.unknowns,
-        prediction,
-        fitted.covariance.clone(),
-        fitted.residual.clone(),
-        fitted.weight.clone(),
-    );
     // where the fit did not end its magnets are not those of the ring
     let wiring = match fitted.has_ended {
         true => wiring::found(folder, &model.without_instruments(&fitted.unknowns, &fitted.values)?),
         false => Vec::new(),
     };
-    let share = share(folder, fitted, &model, settings, &about, progress)?;
+    let share = share(folder, fitted, &model, settings, progress)?;
     Ok(Diagnosis { wiring, share, unexplained: unexplained(folder, fitted) })
 }
 
@@ -108,28 +100,33 @@ struct About {
     places: Places,
     prediction: Prediction,
     covariance: DMatrix<f64>,
-    residual: DMatrix<f64>,
-    weight: DMatrix<f64>,
+    /// Slope of `ln` likelihood by each predicted element [1/mm].
+    slope: DMatrix<f64>,
+    /// What each element says [1/mm^2].
+    information: DMatrix<f64>,
+    /// Step of the unknowns that the slope asks for; 0 at the best fit.
+    step: DVector<f64>,
 }
 
 impl About {
     fn of(
         unknowns: &[Unknown],
         prediction: Prediction,
-        covariance: DMatrix<f64>,
-        residual: DMatrix<f64>,
-        weight: DMatrix<f64>,
-    ) -> Self {
-        let places = Places::of(unknowns, weight.nrows(), weight.ncols());
-        Self { places, prediction, covariance, residual, weight }
+        slope: DMatrix<f64>,
+        information: DMatrix<f64>,
+    ) -> Result<Self, MeasuredError> {
+        let places = Places::of(unknowns, slope.nrows(), slope.ncols());
+        let covariance = covariance(unknowns, &prediction, &information)?;
+        let step = &covariance * places.back(&prediction, &slope, unknowns.len());
+        Ok(Self { places, prediction, covariance, slope, information, step })
     }
 
     /// `d P r` and `d P d` of a pattern [mm].
     fn score(&self, pattern: &DMatrix<f64>) -> (f64, f64) {
-        let weighted = pattern.component_mul(&self.weight);
+        let weighted = pattern.component_mul(&self.information);
         let across = self.places.back(&self.prediction, &weighted, self.covariance.nrows());
         let own = weighted.dot(pattern);
-        (self.pull(pattern), (own - across.dot(&(&self.covariance * &across))).max(0.0))
+        (pattern.dot(&self.slope) - across.dot(&self.step), own - across.dot(&(&self.covariance * &across)))
     }
 
     /// Standard deviation of an unknown where the model's errors are alike along the row of a monitor and along the column of a corrector, as
@@ -139,12 +136,12 @@ impl About {
     /// Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8.
     fn clustered(&self, unknown: usize) -> f64 {
         let direction = self.covariance.column(unknown);
-        let influence = DMatrix::from_fn(self.weight.nrows(), self.weight.ncols(), |i, j| {
+        let influence = DMatrix::from_fn(self.slope.nrows(), self.slope.ncols(), |i, j| {
             let of_machine: f64 =
                 self.prediction.by_machine.iter().zip(direction.iter()).map(|(slope, d)| slope[(i, j)] * d).sum();
             let of_instruments: f64 =
                 self.places.instruments(&self.prediction, i, j).map(|(one, by)| by * direction[one]).sum();
-            (of_machine + of_instruments) * self.weight[(i, j)] * self.residual[(i, j)]
+            (of_machine + of_instruments) * self.slope[(i, j)]
         });
         let squares = |sums: &mut dyn Iterator<Item = f64>| sums.map(|sum| sum * sum).sum::<f64>();
         let by_row = squares(&mut influence.row_iter().map(|row| row.sum()));
@@ -156,11 +153,6 @@ impl About {
     fn of_patterns(&self, patterns: &[DMatrix<f64>]) -> f64 {
         let squares = patterns.iter().map(|pattern| self.score(pattern)).map(|(pull, power)| (pull / power).powi(2));
         (squares.sum::<f64>() / patterns.len() as f64).sqrt()
-    }
-
-    /// `d r` of a pattern.
-    fn pull(&self, pattern: &DMatrix<f64>) -> f64 {
-        pattern.component_mul(&self.weight).dot(&self.residual)
     }
 }
 
@@ -184,7 +176,6 @@ fn share(
     fitted: &Fit,
     model: &Model,
     settings: &Settings,
-    about: &About,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Share, MeasuredError> {
     let believed = f64::from(u8::from(settings.rf == Rf::FixedFrequency));
@@ -194,21 +185,20 @@ fn share(
     let horizontal = folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == Plane::X && one.is_used);
     let horizontal: Vec<usize> = horizontal.map(|(column, _)| column).collect();
     let patterns: Vec<DMatrix<f64>> = (1..=SHUFFLES as u64).map(|seed| shuffled(&pattern, &horizontal, seed)).collect();
+    // by squares: tails that the missing term has given the errors would hide it from a rank by their likelihood
+    let data = &fitted.data;
+    let precision = data.precision(&fitted.missed);
+    let prediction = model.predict(&fitted.unknowns, &fitted.values)?;
+    let about = About::of(&fitted.unknowns, prediction, precision.component_mul(&fitted.residual), precision)?;
     let own = of_amplitude(about.score(&pattern));
     let as_good = patterns.iter().filter(|pattern| of_amplitude(about.score(pattern)) >= own).count();
-    let mut data = Data::of(folder);
-    data.sigma.zip_apply(&fitted.weight, |sigma, weight| {
-        if weight == 0.0 {
-            *sigma = f64::INFINITY
-        }
-    });
-    let from = descend(model, &unknowns, &data.measured, &fitted.weight, values)?;
-    let (here, discrepancy) = with_model_error(model, &unknowns, &data, from, progress)?;
-    let weight = data.weight(&discrepancy);
-    let residual = (&data.measured - &here.prediction.matrix).zip_map(&weight, |r, w| if w > 0.0 { r } else { 0.0 });
-    let gain = log_likelihood(&residual, &weight) - log_likelihood(&fitted.residual, &fitted.weight);
+    let from = descend(model, &unknowns, &data.measured, &data.weight(&fitted.missed, &fitted.residual), values)?;
+    let (here, missed) = with_model_error(model, &unknowns, data, from, progress)?;
+    let residual = data.residual(&here.prediction);
+    let gain = data.log_likelihood(&missed, &residual) - data.log_likelihood(&fitted.missed, &fitted.residual);
     let systematic = dispersion_missed(folder, &here.prediction);
-    let beside = About::of(&unknowns, here.prediction, here.covariance, residual, weight);
+    let slope = data.weight(&missed, &residual).component_mul(&residual);
+    let beside = About::of(&unknowns, here.prediction, slope, data.information(&missed))?;
     let scatter = beside.clustered(at).max(beside.of_patterns(&patterns));
     Ok(Share { value: here.values[at], scatter, systematic, gain, as_good, shuffles: SHUFFLES })
 }
@@ -231,11 +221,6 @@ fn dispersion_missed(folder: &Folder, at: &Prediction) -> f64 {
     1.4826 * off.get(off.len() / 2).copied().unwrap_or(0.0) / rms
 }
 
-fn log_likelihood(residual: &DMatrix<f64>, weight: &DMatrix<f64>) -> f64 {
-    let one = |(&r, &w): (&f64, &f64)| if w > 0.0 { 0.5 * (w.ln() - w * r * r) } else { 0.0 };
-    residual.iter().zip(weight).map(one).sum()
-}
-
 /// The pattern with the columns of some correctors exchanged at random, the size of each with it.
 fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: u64) -> DMatrix<f64> {
     let mut order = columns.to_vec();
@@ -249,19 +234,19 @@ fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: u64) -> DMatrix<f64
 
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
 fn unexplained(folder: &Folder, fitted: &Fit) -> Vec<Unexplained> {
-    let squares = fitted.residual.component_mul(&fitted.residual).component_mul(&fitted.weight);
-    let (all, elements) = (squares.sum(), fitted.weight.iter().filter(|w| **w > 0.0).count() as f64);
+    let (squares, sigma) = (fitted.squares(), &fitted.data.sigma);
+    let (all, elements) = (squares.sum(), fitted.data.elements() as f64);
     let judge = |at: String, squares: f64, residual: f64, n: usize| {
         let others = (all - squares) / (elements - n as f64);
         Unexplained { at, rms: (residual / n.max(1) as f64).sqrt(), ratio: squares / n.max(1) as f64 / others }
     };
-    let counted = |weights: &mut dyn Iterator<Item = &f64>| weights.filter(|w| **w > 0.0).count();
+    let counted = |sigmas: &mut dyn Iterator<Item = &f64>| sigmas.filter(|sigma| sigma.is_finite()).count();
     let rows = (0..folder.monitors.len()).map(|i| {
         judge(
             folder.monitor(i),
             squares.row(i).sum(),
             fitted.residual.row(i).norm_squared(),
-            counted(&mut fitted.weight.row(i).iter()),
+            counted(&mut sigma.row(i).iter()),
         )
     });
     let columns = (0..folder.correctors.len()).map(|j| {
@@ -269,7 +254,7 @@ fn unexplained(folder: &Folder, fitted: &Fit) -> Vec<Unexplained> {
             folder.corrector(j),
             squares.column(j).sum(),
             fitted.residual.column(j).norm_squared(),
-            counted(&mut fitted.weight.column(j).iter()),
+            counted(&mut sigma.column(j).iter()),
         )
     });
     let mut worst: Vec<Unexplained> = rows.chain(columns).filter(|one| one.ratio > WORSE).collect();

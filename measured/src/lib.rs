@@ -13,6 +13,7 @@ pub mod error;
 pub mod fit;
 pub mod folder;
 pub mod lattice;
+pub mod missed;
 pub mod model;
 pub mod normal;
 #[cfg(test)]

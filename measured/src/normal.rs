@@ -70,6 +70,34 @@ impl Places {
         }
         back
     }
+
+    /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
+    pub fn variance(&self, at: &Prediction, covariance: &DMatrix<f64>) -> DMatrix<f64> {
+        let (rows, columns) = at.matrix.shape();
+        let of_machine = covariance.view((0, 0), (self.machine, self.machine));
+        let mut variance = DMatrix::zeros(rows, columns);
+        for column in 0..columns {
+            let by_machine = by_machine(at, column);
+            let spread = &by_machine * of_machine;
+            for row in 0..rows {
+                let by = by_machine.row(row);
+                let mut sum = spread.row(row).dot(&by);
+                for (one, by_one) in self.instruments(at, row, column) {
+                    sum += 2.0 * by_one * by.tr_dot(&covariance.view((0, one), (self.machine, 1)));
+                    let others = self.instruments(at, row, column);
+                    sum += by_one * others.map(|(other, by)| by * covariance[(one, other)]).sum::<f64>();
+                }
+                variance[(row, column)] = sum;
+            }
+        }
+        variance
+    }
+}
+
+/// Derivatives of a column's elements by the machine's unknowns, rows elements.
+fn by_machine(at: &Prediction, column: usize) -> DMatrix<f64> {
+    let slopes: Vec<_> = at.by_machine.iter().map(|slope| slope.column(column)).collect();
+    DMatrix::from_columns(&slopes)
 }
 
 impl Normal {
@@ -85,11 +113,8 @@ impl Normal {
         let machine = places.machine;
         let mut normal =
             Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns), chi2: 0.0 };
-        let mut by_machine = DMatrix::zeros(rows, machine);
         for column in 0..columns {
-            for (mut into, from) in by_machine.column_iter_mut().zip(&at.by_machine) {
-                into.copy_from(&from.column(column));
-            }
+            let by_machine = by_machine(at, column);
             let mut weighted = by_machine.clone();
             weighted.row_iter_mut().enumerate().for_each(|(row, mut one)| one *= weight[(row, column)]);
             let weighted = weighted.transpose();
