@@ -98,7 +98,11 @@ impl MatrixFit {
             let [q025, q16, q84, q975] = [-1.959_964, -0.994_458, 0.994_458, 1.959_964].map(quantile);
             MatrixVar { name: folder.element(row), index: row, mean, sigma, q025, q16, q84, q975 }
         };
-        let between = |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| fit.covariance[(i, j)]).collect();
+        // correlations of independent errors
+        let independent = &fit.uncertainty.independent;
+        let scale = |at: usize| fit.sigma(at) / independent[(at, at)].sqrt();
+        let between =
+            |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| scale(i) * scale(j) * independent[(i, j)]).collect();
         let word = |kind: Kind| match kind {
             Kind::Strength(_) => None,
             Kind::Skew(_) => Some("skew_gradient"),

@@ -5,12 +5,11 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::DMatrix;
-
 use crate::error::MeasuredError;
-use crate::fit::{Data, Fit, Settings, descend, with_model_error};
+use crate::fit::{Data, Fit, Learnt, Settings, descend, with_model_error};
 use crate::folder::Folder;
 use crate::model::Model;
+use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Unknown, Widths, name};
 
 /// Standard deviations of changes beforehand.
@@ -73,8 +72,8 @@ pub fn compare(
         }
     }
     let start = descend(&model, &unknowns, &data.measured, &data.stated(), fitted.values.clone())?;
-    let (here, _) = with_model_error(&model, &unknowns, &data, start, progress)?;
-    Ok(changes(one, fitted, &here.values, &here.covariance))
+    let Learnt { here, uncertainty, .. } = with_model_error(&model, &unknowns, &data, start, progress)?;
+    Ok(changes(one, fitted, &here.values, &uncertainty))
 }
 
 fn change(kind: Kind) -> f64 {
@@ -112,12 +111,12 @@ fn expect_alike(one: &Folder, other: &Folder) -> Result<(), MeasuredError> {
     }
 }
 
-fn changes(folder: &Folder, fitted: &Fit, values: &nalgebra::DVector<f64>, covariance: &DMatrix<f64>) -> Vec<Change> {
+fn changes(folder: &Folder, fitted: &Fit, values: &nalgebra::DVector<f64>, uncertainty: &Uncertainty) -> Vec<Change> {
     let mut all = Vec::new();
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         let Kind::Strength(group) = unknown.kind else { continue };
         let rows = fitted.groups[0][group].clone();
-        let sigma = covariance[(at, at)].sqrt() / fitted.values[at];
+        let sigma = uncertainty.sigma(at) / fitted.values[at];
         all.push(Change {
             name: name(folder, &fitted.groups, unknown.kind),
             family: folder.lattice[rows[0]].name.clone(),

@@ -15,7 +15,7 @@ use rand::seq::SliceRandom;
 use twin::{Plane, Rf};
 
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Settings, covariance, descend, with_model_error};
+use crate::fit::{Fit, Learnt, Settings, covariance, descend, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
 use crate::normal::Places;
@@ -129,26 +129,6 @@ impl About {
         (pattern.dot(&self.slope) - across.dot(&self.step), own - across.dot(&(&self.covariance * &across)))
     }
 
-    /// Standard deviation of an unknown where the model's errors are alike along the row of a monitor and along the column of a corrector, as
-    /// they are on every measured ring: what each row and each column by itself says of the unknown, squared and added, with what stands in
-    /// both counted once; at least that of independent errors.
-    ///
-    /// Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8.
-    fn clustered(&self, unknown: usize) -> f64 {
-        let direction = self.covariance.column(unknown);
-        let influence = DMatrix::from_fn(self.slope.nrows(), self.slope.ncols(), |i, j| {
-            let of_machine: f64 =
-                self.prediction.by_machine.iter().zip(direction.iter()).map(|(slope, d)| slope[(i, j)] * d).sum();
-            let of_instruments: f64 =
-                self.places.instruments(&self.prediction, i, j).map(|(one, by)| by * direction[one]).sum();
-            (of_machine + of_instruments) * self.slope[(i, j)]
-        });
-        let squares = |sums: &mut dyn Iterator<Item = f64>| sums.map(|sum| sum * sum).sum::<f64>();
-        let by_row = squares(&mut influence.row_iter().map(|row| row.sum()));
-        let by_column = squares(&mut influence.column_iter().map(|column| column.sum()));
-        (by_row + by_column - influence.norm_squared()).max(direction[unknown]).sqrt()
-    }
-
     /// Rms amplitude that the residuals give patterns which are not there.
     fn of_patterns(&self, patterns: &[DMatrix<f64>]) -> f64 {
         let squares = patterns.iter().map(|pattern| self.score(pattern)).map(|(pull, power)| (pull / power).powi(2));
@@ -193,14 +173,15 @@ fn share(
     let own = of_amplitude(about.score(&pattern));
     let as_good = patterns.iter().filter(|pattern| of_amplitude(about.score(pattern)) >= own).count();
     let from = descend(model, &unknowns, &data.measured, &data.weight(&fitted.missed, &fitted.residual), values)?;
-    let (here, missed) = with_model_error(model, &unknowns, data, from, progress)?;
+    let Learnt { here, missed, uncertainty } = with_model_error(model, &unknowns, data, from, progress)?;
     let residual = data.residual(&here.prediction);
     let gain = data.log_likelihood(&missed, &residual) - data.log_likelihood(&fitted.missed, &fitted.residual);
     let systematic = dispersion_missed(folder, &here.prediction);
     let slope = data.weight(&missed, &residual).component_mul(&residual);
+    let (value, scatter) = (here.values[at], uncertainty.sigma(at));
     let beside = About::of(&unknowns, here.prediction, slope, data.information(&missed))?;
-    let scatter = beside.clustered(at).max(beside.of_patterns(&patterns));
-    Ok(Share { value: here.values[at], scatter, systematic, gain, as_good, shuffles: SHUFFLES })
+    let scatter = scatter.max(beside.of_patterns(&patterns));
+    Ok(Share { value, scatter, systematic, gain, as_good, shuffles: SHUFFLES })
 }
 
 /// Scatter of the measured horizontal dispersion about the predicted one, at the scale that suits it best, over the rms of the predicted: by the

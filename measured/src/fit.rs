@@ -16,6 +16,7 @@ use crate::folder::Folder;
 use crate::missed::Missed;
 use crate::model::{Model, Prediction};
 use crate::normal::{Normal, Places};
+use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Magnets, Unknown, Widths, groups, unknowns};
 
 /// How a matrix is fitted.
@@ -48,8 +49,8 @@ pub struct Fit {
     pub unknowns: Vec<Unknown>,
     /// Most probable values.
     pub values: DVector<f64>,
-    /// Their covariance.
-    pub covariance: DMatrix<f64>,
+    /// How well they are known.
+    pub uncertainty: Uncertainty,
     /// Sum of squares over the stated noise, per element, at the values that make it least, as LOCO counts it.
     pub chi2_loco: f64,
     /// The same at the start.
@@ -223,7 +224,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
     let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
-    let (here, missed) = with_model_error(&model, &unknowns, &data, as_stated, progress)?;
+    let Learnt { here, missed, uncertainty } = with_model_error(&model, &unknowns, &data, as_stated, progress)?;
     Ok(Fit {
         groups,
         chi2_loco,
@@ -237,7 +238,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
         steps: steps + here.steps,
         has_ended: here.has_ended,
         values: here.values,
-        covariance: here.covariance,
+        uncertainty,
         unknowns,
     })
 }
@@ -252,7 +253,7 @@ pub fn with_model_error(
     data: &Data,
     from: Descent,
     progress: &mut dyn FnMut(&str),
-) -> Result<(Descent, [Missed; 6]), MeasuredError> {
+) -> Result<Learnt, MeasuredError> {
     let (mut here, mut missed, mut steps) = (from, [Missed::NOTHING; 6], 0);
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
@@ -262,15 +263,25 @@ pub fn with_model_error(
         here = descend(model, unknowns, &data.measured, &weight, here.values)?;
         steps += here.steps;
     }
-    let covariance = covariance(unknowns, &here.prediction, &data.information(&missed))?;
-    Ok((Descent { steps, covariance, ..here }, missed))
+    let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &missed)?;
+    Ok(Learnt { here: Descent { steps, ..here }, missed, uncertainty })
+}
+
+/// A descent with what the model misses.
+pub struct Learnt {
+    /// Where it ended.
+    pub here: Descent,
+    /// What the model misses in each of [`BLOCKS`].
+    pub missed: [Missed; 6],
+    /// How well the unknowns are known.
+    pub uncertainty: Uncertainty,
 }
 
 /// Where a descent ended.
 pub struct Descent {
     /// Most probable values.
     pub values: DVector<f64>,
-    /// Their covariance.
+    /// Their covariance as the elements count.
     pub covariance: DMatrix<f64>,
     /// What they predict.
     pub prediction: Prediction,
@@ -417,7 +428,7 @@ fn learnt(data: &Data, errors: &DMatrix<f64>) -> [Missed; 6] {
 impl Fit {
     /// Standard deviation of an unknown.
     pub fn sigma(&self, unknown: usize) -> f64 {
-        self.covariance[(unknown, unknown)].sqrt()
+        self.uncertainty.sigma(unknown)
     }
 
     /// Squares of the residuals over those of their scales: as an error has heavy tails, more than 1 on average.
@@ -429,10 +440,12 @@ impl Fit {
     /// correlation above 0.9 of either sign.
     pub fn degenerate(&self) -> Vec<Vec<usize>> {
         let n = self.unknowns.len();
-        let is_open = |i: usize| self.sigma(i) > 0.5 * self.unknowns[i].width;
+        let covariance = &self.uncertainty.independent;
+        let sigma = |i: usize| covariance[(i, i)].sqrt();
+        let is_open = |i: usize| sigma(i) > 0.5 * self.unknowns[i].width;
         let open: Vec<usize> =
             (0..n).filter(|&i| is_open(i) && !matches!(self.unknowns[i].kind, Kind::RfScale)).collect();
-        let follow = |i: usize, j: usize| (self.covariance[(i, j)] / (self.sigma(i) * self.sigma(j))).abs() > 0.9;
+        let follow = |i: usize, j: usize| (covariance[(i, j)] / (sigma(i) * sigma(j))).abs() > 0.9;
         let mut sets: Vec<Vec<usize>> = Vec::new();
         for &i in &open {
             let (joined, mut apart): (Vec<_>, Vec<_>) =

@@ -18,6 +18,7 @@ pub mod model;
 pub mod normal;
 #[cfg(test)]
 mod testing;
+pub mod uncertainty;
 pub mod unknowns;
 pub mod wiring;
 
