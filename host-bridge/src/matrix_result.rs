@@ -76,7 +76,9 @@ pub struct Other {
 #[allow(missing_docs)] // named after what they are
 pub struct BlockError {
     pub block: &'static str,
-    /// Of Student's distribution.
+    /// 68 % of the residuals are smaller.
+    pub residual_um: f64,
+    /// What the model misses, beside the stated noise: scale of Student's distribution.
     pub scale_um: f64,
     /// Its degrees of freedom, none where it is normal.
     pub freedom: Option<f64>,
@@ -119,7 +121,6 @@ impl MatrixFit {
         });
         let weight = fit.data.weight(&fit.missed, &fit.residual);
         let chi2 = fit.residual.component_mul(&fit.residual).dot(&weight);
-        let blocks = measured::fit::BLOCKS.iter().zip(fit.missed).filter(|(_, one)| one.scale > 0.0);
         Self {
             recording: folder.name.clone(),
             method: "map",
@@ -135,17 +136,29 @@ impl MatrixFit {
             monitors: monitors(folder, fit),
             other: other.collect(),
             degenerate: fit.degenerate().iter().map(|set| set.iter().map(|&at| called(at)).collect()).collect(),
-            model_error: blocks
-                .map(|(block, one)| BlockError {
-                    block,
-                    scale_um: 1e3 * one.scale,
-                    freedom: one.freedom.is_finite().then_some(one.freedom),
-                })
-                .collect(),
+            model_error: model_error(fit),
             wiring: cables.iter().map(|one| one.named(folder)).map(|(kind, at)| Cable { kind, at }).collect(),
             has_ended: fit.has_ended,
         }
     }
+}
+
+/// The blocks of which something was measured.
+fn model_error(fit: &Fit) -> Vec<BlockError> {
+    let of_block = |block: usize| {
+        let elements = fit.data.block.iter().zip(&fit.data.sigma).zip(&fit.residual);
+        let counted = elements.filter(|((of, sigma), _)| **of == block && sigma.is_finite());
+        let mut residuals: Vec<f64> = counted.map(|(_, residual)| residual.abs()).collect();
+        residuals.sort_by(f64::total_cmp);
+        let missed = fit.missed[block];
+        Some(BlockError {
+            block: measured::fit::BLOCKS[block],
+            residual_um: 1e3 * residuals.get((0.68 * residuals.len() as f64) as usize)?,
+            scale_um: 1e3 * missed.scale,
+            freedom: missed.freedom.is_finite().then_some(missed.freedom),
+        })
+    };
+    (0..measured::fit::BLOCKS.len()).filter_map(of_block).collect()
 }
 
 /// A monitor that reads less than this share of the orbit is dead.
@@ -182,10 +195,10 @@ impl fmt::Display for MatrixFit {
             writeln!(f, "{}\n", fill(doubt))?;
         }
         let line = format!(
-            "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; what the model misses: {}",
+            "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; 68 % of the residuals are within: {}",
             self.model_error
                 .iter()
-                .map(|one| format!("{} {:.1} um", one.block, one.scale_um))
+                .map(|one| format!("{} {:.1} um", one.block, one.residual_um))
                 .collect::<Vec<_>>()
                 .join(", ")
         );

@@ -116,7 +116,7 @@ fn changes(folder: &Folder, fitted: &Fit, values: &nalgebra::DVector<f64>, uncer
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         let Kind::Strength(group) = unknown.kind else { continue };
         let rows = fitted.groups[0][group].clone();
-        let sigma = uncertainty.sigma(at) / fitted.values[at];
+        let sigma = uncertainty.sigma[at] / fitted.values[at];
         all.push(Change {
             name: name(folder, &fitted.groups, unknown.kind),
             family: folder.lattice[rows[0]].name.clone(),

@@ -178,7 +178,7 @@ fn share(
     let gain = data.log_likelihood(&missed, &residual) - data.log_likelihood(&fitted.missed, &fitted.residual);
     let systematic = dispersion_missed(folder, &here.prediction);
     let slope = data.weight(&missed, &residual).component_mul(&residual);
-    let (value, scatter) = (here.values[at], uncertainty.sigma(at));
+    let (value, scatter) = (here.values[at], uncertainty.sigma[at]);
     let beside = About::of(&unknowns, here.prediction, slope, data.information(&missed))?;
     let scatter = scatter.max(beside.of_patterns(&patterns));
     Ok(Share { value, scatter, systematic, gain, as_good, shuffles: SHUFFLES })

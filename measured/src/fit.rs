@@ -428,7 +428,7 @@ fn learnt(data: &Data, errors: &DMatrix<f64>) -> [Missed; 6] {
 impl Fit {
     /// Standard deviation of an unknown.
     pub fn sigma(&self, unknown: usize) -> f64 {
-        self.uncertainty.sigma(unknown)
+        self.uncertainty.sigma[unknown]
     }
 
     /// Squares of the residuals over those of their scales: as an error has heavy tails, more than 1 on average.

@@ -28,6 +28,6 @@ pub use diagnose::{Diagnosis, diagnose};
 pub use error::MeasuredError;
 pub use fit::{Fit, Settings, fit};
 pub use folder::Folder;
-pub use model::Model;
+pub use model::{Model, Prediction};
 pub use unknowns::{Kind, Unknown};
 pub use wiring::{Wiring, straightened};

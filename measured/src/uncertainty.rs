@@ -22,6 +22,8 @@ use crate::unknowns::Unknown;
 pub struct Uncertainty {
     /// Covariance with independent errors.
     pub independent: DMatrix<f64>,
+    /// Standard deviation of each unknown.
+    pub sigma: DVector<f64>,
     /// `J^T s` of each row and of each column, columns.
     together: DMatrix<f64>,
     /// `J^T s s J` of all elements.
@@ -39,11 +41,15 @@ impl Uncertainty {
         let places = Places::of(unknowns, slope.nrows(), slope.ncols());
         let nothing = DMatrix::zeros(slope.nrows(), slope.ncols());
         let squares = slope.component_mul(&slope);
-        Ok(Self {
-            independent: covariance(unknowns, at, &data.information(missed))?,
-            together: together(&places, at, &slope, unknowns.len()),
-            alone: Normal::of(&places, at, &nothing, &squares, unknowns.len()).matrix,
-        })
+        let independent = covariance(unknowns, at, &data.information(missed))?;
+        let together = together(&places, at, &slope, unknowns.len());
+        let alone = Normal::of(&places, at, &nothing, &squares, unknowns.len()).matrix;
+        let (of_lines, of_elements) = (together.tr_mul(&independent), &alone * &independent);
+        let sigma = DVector::from_fn(unknowns.len(), |i, _| {
+            let variance = of_lines.column(i).norm_squared() - independent.column(i).dot(&of_elements.column(i));
+            variance.max(independent[(i, i)]).sqrt()
+        });
+        Ok(Self { independent, sigma, together, alone })
     }
 
     /// Variance of a combination of the unknowns.
@@ -52,11 +58,6 @@ impl Uncertainty {
         let together = self.together.tr_mul(&direction).norm_squared();
         let alone = direction.dot(&(&self.alone * &direction));
         (together - alone).max(combination.dot(&direction))
-    }
-
-    /// Standard deviation of one unknown.
-    pub fn sigma(&self, unknown: usize) -> f64 {
-        self.variance(&DVector::from_fn(self.independent.nrows(), |i, _| f64::from(u8::from(i == unknown)))).sqrt()
     }
 }
 
