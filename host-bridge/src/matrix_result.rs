@@ -105,19 +105,10 @@ impl MatrixFit {
         let scale = |at: usize| fit.sigma(at) / independent[(at, at)].sqrt();
         let between =
             |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| scale(i) * scale(j) * independent[(i, j)]).collect();
-        let word = |kind: Kind| match kind {
-            Kind::Strength(_) => None,
-            Kind::Skew(_) => Some("skew_gradient"),
-            Kind::HeldFrequency => Some("fixed_rf_frequency"),
-            Kind::MonitorGain(_) => Some("bpm_gain"),
-            Kind::MonitorCoupling(_) => Some("bpm_coupling"),
-            Kind::CorrectorGain(_) => Some("corrector_gain"),
-            Kind::CorrectorCoupling(_) => Some("corrector_coupling"),
-            Kind::RfScale => Some("rf_scale"),
-        };
         let called = |at: usize| name(folder, &fit.groups, fit.unknowns[at].kind);
         let other = fit.unknowns.iter().enumerate().filter_map(|(at, unknown)| {
-            Some(Other { kind: word(unknown.kind)?, at: called(at), mean: fit.values[at], sigma: fit.sigma(at) })
+            let kind = (!matches!(unknown.kind, Kind::Strength(_))).then(|| unknown.kind.word())?;
+            Some(Other { kind, at: called(at), mean: fit.values[at], sigma: fit.sigma(at) })
         });
         let weight = fit.data.weight(&fit.missed, &fit.residual);
         let chi2 = fit.residual.component_mul(&fit.residual).dot(&weight);
@@ -236,6 +227,9 @@ impl fmt::Display for MatrixFit {
 #[allow(missing_docs)] // named after what they are
 pub struct Comparison {
     pub changes: Vec<ChangeOfOne>,
+    /// Cables, gains, couplings and skew gradients that changed.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub others: Vec<OtherChange>,
     pub sentence: String,
 }
 
@@ -247,22 +241,56 @@ pub struct ChangeOfOne {
     pub index: Option<usize>,
     pub relative: f64,
     pub sigma: f64,
+    /// Too large for chance.
+    pub changed: bool,
     pub identifiable: bool,
 }
 
-/// Standard deviations from which on a change is one, where its family can be told; and where it cannot.
-const CHANGED: f64 = 3.0;
-const CHANGED_ALONE: f64 = 4.0;
+/// A change of something else. A cable has no size.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct OtherChange {
+    pub kind: &'static str,
+    pub at: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub change: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sigma: Option<f64>,
+    /// Empty of a share.
+    pub unit: &'static str,
+}
+
+impl OtherChange {
+    /// Of a gain, a coupling or a skew gradient.
+    pub fn of(one: &measured::compare::Other) -> Self {
+        let unit = if matches!(one.kind, Kind::Skew(_)) { "1/m" } else { "" };
+        Self { kind: one.kind.word(), at: one.name.clone(), change: Some(one.change), sigma: Some(one.sigma), unit }
+    }
+
+    /// Of a cable.
+    pub fn of_cable(folder: &Folder, one: &Wiring) -> Self {
+        let (kind, at) = one.named(folder);
+        Self { kind, at, change: None, sigma: None, unit: "" }
+    }
+}
+
+impl fmt::Display for OtherChange {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { kind, at, unit, .. } = self;
+        match (self.change, self.sigma, *unit) {
+            (Some(change), Some(sigma), "") => write!(f, "{kind} at {at} {:+.2} ± {:.2} %", 1e2 * change, 1e2 * sigma),
+            (Some(change), Some(sigma), unit) => write!(f, "{kind} at {at} {change:+.5} ± {sigma:.5} {unit}"),
+            _ => write!(f, "{kind} at {at}"),
+        }
+    }
+}
 
 impl Comparison {
-    /// Of changes, in the order of the ring.
-    pub fn of(changes: Vec<ChangeOfOne>) -> Self {
-        let least = |one: &ChangeOfOne| if one.identifiable { CHANGED } else { CHANGED_ALONE };
-        let mut found: Vec<&ChangeOfOne> =
-            changes.iter().filter(|one| one.relative.abs() > least(one) * one.sigma).collect();
+    /// Of changes, in the order of the ring, and of those of other things.
+    pub fn of(changes: Vec<ChangeOfOne>, others: Vec<OtherChange>) -> Self {
+        let mut found: Vec<&ChangeOfOne> = changes.iter().filter(|one| one.changed).collect();
         found.sort_by(|a, b| (b.relative / b.sigma).abs().total_cmp(&(a.relative / a.sigma).abs()));
-        let open =
-            changes.iter().filter(|one| !one.identifiable && one.relative.abs() <= CHANGED_ALONE * one.sigma).count();
+        let open = changes.iter().filter(|one| !one.identifiable && !one.changed).count();
         let listed: Vec<String> = found
             .iter()
             .take(3)
@@ -270,11 +298,14 @@ impl Comparison {
             .collect();
         let more = if found.len() > 3 { format!(" and {} more", found.len() - 3) } else { String::new() };
         let first = match listed.is_empty() {
-            true => "No quadrupole changed by three error bars.".to_owned(),
+            true => "No quadrupole changed by more than chance.".to_owned(),
             false => format!("{} of {} changed: {}{more}.", found.len(), changes.len(), listed.join(", ")),
         };
         let second = if open > 0 { format!(" Of {open} the measurements cannot tell.") } else { String::new() };
-        Self { sentence: first + &second, changes }
+        let listed: Vec<String> = others.iter().take(3).map(ToString::to_string).collect();
+        let more = if others.len() > 3 { format!(" and {} more", others.len() - 3) } else { String::new() };
+        let third = if others.is_empty() { String::new() } else { format!(" Also: {}{more}.", listed.join(", ")) };
+        Self { sentence: first + &second + &third, changes, others }
     }
 }
 
@@ -289,7 +320,11 @@ impl fmt::Display for Comparison {
         for column in rows.column_iter_mut().filter(|column| [1, 2].contains(&column.index)) {
             column.set_cell_alignment(CellAlignment::Right);
         }
-        write!(f, "{rows}")
+        write!(f, "{rows}")?;
+        for (number, one) in self.others.iter().enumerate() {
+            write!(f, "{}{one}", if number == 0 { "\n\n" } else { "\n" })?;
+        }
+        Ok(())
     }
 }
 

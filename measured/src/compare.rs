@@ -1,9 +1,13 @@
 //! What changed from one measurement of a machine to the next.
 //!
 //! What the model misses is mostly the same in both and drops out: the second matrix is fitted less what the first fit left over, from the values
-//! of the first, and what remains then is the error of the comparison, learnt as that of a fit is. Magnets may have changed by 3 %, instruments by 1 %.
+//! of the first, and what remains then is the error of the comparison, learnt as that of a fit is. Magnets may have changed by 3 %, instruments by 1 %,
+//! those that clearly have by as much as a fit allows.
 
 use std::collections::BTreeMap;
+
+use nalgebra::DVector;
+use statrs::distribution::{ContinuousCDF, Normal};
 
 use crate::error::MeasuredError;
 use crate::fit::{Data, Fit, Learnt, Settings, descend, with_model_error};
@@ -11,6 +15,7 @@ use crate::folder::Folder;
 use crate::model::Model;
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Unknown, Widths, name};
+use crate::wiring::{Wiring, straightened_by};
 
 /// Standard deviations of changes beforehand.
 const CHANGES: Widths = Widths { strength: 0.03, skew: 0.003, gain: 0.01, coupling: 0.01 };
@@ -33,30 +38,61 @@ pub struct Change {
     pub relative: f64,
     /// Its standard deviation.
     pub sigma: f64,
+    /// True where it is too large for chance.
+    pub has_changed: bool,
     /// False where the measurements cannot tell the changes of its family from their errors.
     pub is_identifiable: bool,
 }
 
-/// Changes of all fitted magnets from one measurement, which has been fitted, to another.
+/// What is not a gradient and changed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Other {
+    /// What it is.
+    pub kind: Kind,
+    /// Where.
+    pub name: String,
+    /// Of a gain its relative change; of what is read or kicked in the other plane per gain, of a skew gradient [1/m] the change itself.
+    pub change: f64,
+    /// Its standard deviation.
+    pub sigma: f64,
+}
+
+/// What changed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Changes {
+    /// Every fitted gradient.
+    pub gradients: Vec<Change>,
+    /// Skew gradients, gains and couplings, the clearest first.
+    pub others: Vec<Other>,
+    /// Cables.
+    pub wiring: Vec<Wiring>,
+}
+
+/// Comparisons in which anything is said to have changed that did not: one in so many.
+const FALSE: f64 = 100.0;
+
+/// Standard deviations from which on one of `unknowns` changed: 3.7 of 48, 4.4 of 900.
+pub fn clear(unknowns: usize) -> f64 {
+    -Normal::standard().inverse_cdf(0.5 / (FALSE * unknowns.max(1) as f64))
+}
+
+/// Changes from one measurement, whose cables were put right and which has been fitted, to another as it was measured.
 ///
 /// # Errors
 /// [`MeasuredError`]; [`MeasuredError::Unlike`] where the instruments are not the same.
 pub fn compare(
-    one: &Folder,
-    fitted: &Fit,
+    (one, cables, fitted): (&Folder, &[Wiring], &Fit),
     other: &Folder,
     settings: &Settings,
     progress: &mut dyn FnMut(&str),
-) -> Result<Vec<Change>, MeasuredError> {
+) -> Result<Changes, MeasuredError> {
     expect_alike(one, other)?;
-    let model = Model::of(one, &fitted.groups, settings.rf)?.with_kicks(other);
-    let unknowns: Vec<Unknown> = fitted
-        .unknowns
-        .iter()
-        .zip(&fitted.values)
-        .map(|(one, &mean)| Unknown { mean, width: change(one.kind), ..*one })
-        .collect();
-    let (first, mut data) = (&fitted.data, Data::of(other));
+    let mut other = other.clone();
+    cables.iter().for_each(|cable| cable.put_right(&mut other));
+    let before = fitted.data.measured.columns(0, one.correctors.len()).into_owned();
+    let (other, wiring) = straightened_by(&other, &before);
+    let model = Model::of(one, &fitted.groups, settings.rf)?.with_kicks(&other);
+    let (first, mut data) = (&fitted.data, Data::of(&other));
     // what is left over grows with the kick
     let per_kick = |j: usize| match (one.correctors.get(j), other.correctors.get(j)) {
         (Some(one), Some(other)) => other.kick / one.kick,
@@ -71,9 +107,46 @@ pub fn compare(
                 if counts { data.measured[(i, j)] - fitted.residual[(i, j)] * per_kick(j) } else { 0.0 };
         }
     }
-    let start = descend(&model, &unknowns, &data.measured, &data.stated(), fitted.values.clone())?;
-    let Learnt { here, uncertainty, .. } = with_model_error(&model, &unknowns, &data, start, progress)?;
-    Ok(changes(one, fitted, &here.values, &uncertainty))
+    let (values, uncertainty) = changed(&model, fitted, &data, progress)?;
+    Ok(Changes {
+        gradients: gradients(one, fitted, &values, &uncertainty),
+        others: others(one, fitted, &values, &uncertainty),
+        wiring,
+    })
+}
+
+/// Values of the second measurement. Most things have not changed, and what has may have changed by more than is expected: the clearest change
+/// of an instrument or of a skew gradient is given the prior of the fit, one after the other, until none is clear that is held.
+fn changed(
+    model: &Model,
+    fitted: &Fit,
+    data: &Data,
+    progress: &mut dyn FnMut(&str),
+) -> Result<(DVector<f64>, Uncertainty), MeasuredError> {
+    let held = fitted.unknowns.iter().zip(&fitted.values);
+    let mut unknowns: Vec<Unknown> =
+        held.map(|(one, &mean)| Unknown { mean, width: change(one.kind), ..*one }).collect();
+    loop {
+        let start = descend(model, &unknowns, &data.measured, &data.stated(), fitted.values.clone())?;
+        let Learnt { here, uncertainty, .. } = with_model_error(model, &unknowns, data, start, progress)?;
+        let off = |at: usize| without_prior(here.values[at] - fitted.values[at], &unknowns[at], &uncertainty, at);
+        let is_held = |at: &usize| unknowns[*at].width < fitted.unknowns[*at].width;
+        let clear = (0..unknowns.len()).filter(is_held).filter(|&at| off(at) > clear(unknowns.len()));
+        match clear.max_by(|&a, &b| off(a).total_cmp(&off(b))) {
+            Some(clearest) => unknowns[clearest].width = fitted.unknowns[clearest].width,
+            None => return Ok((here.values, uncertainty)),
+        }
+    }
+}
+
+/// How far off an unknown's change is by the data alone, over what these and its prior allow: of a posterior `m ± s` with a prior `0 ± w` the data
+/// say `m/s^2/(1/s^2 - 1/w^2)`.
+fn without_prior(change: f64, unknown: &Unknown, uncertainty: &Uncertainty, at: usize) -> f64 {
+    let independent = uncertainty.independent[(at, at)];
+    let left = (1.0 - independent / unknown.width.powi(2)).max(f64::EPSILON);
+    // the data's variance, wider where errors are alike
+    let variance = independent / left * (uncertainty.sigma[at].powi(2) / independent);
+    (change / left).abs() / (variance + unknown.width.powi(2)).sqrt()
 }
 
 fn change(kind: Kind) -> f64 {
@@ -111,18 +184,57 @@ fn expect_alike(one: &Folder, other: &Folder) -> Result<(), MeasuredError> {
     }
 }
 
-fn changes(folder: &Folder, fitted: &Fit, values: &nalgebra::DVector<f64>, uncertainty: &Uncertainty) -> Vec<Change> {
+/// What is not a gradient and changed.
+fn others(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Uncertainty) -> Vec<Other> {
+    let mut all = Vec::new();
+    for (at, unknown) in fitted.unknowns.iter().enumerate() {
+        if matches!(unknown.kind, Kind::Strength(_) | Kind::HeldFrequency) {
+            continue;
+        }
+        let (change, sigma) = change_of(fitted, at, values, uncertainty);
+        if change.abs() > clear(fitted.unknowns.len()) * sigma {
+            all.push(Other { kind: unknown.kind, name: name(folder, &fitted.groups, unknown.kind), change, sigma });
+        }
+    }
+    all.sort_by(|a, b| (b.change / b.sigma).abs().total_cmp(&(a.change / a.sigma).abs()));
+    all
+}
+
+/// Of a gain by a share of itself; of a coupling beside the gain, since electronics scale both; of a skew gradient as it is.
+fn change_of(fitted: &Fit, at: usize, values: &DVector<f64>, uncertainty: &Uncertainty) -> (f64, f64) {
+    let (before, after) = (fitted.values[at], values[at]);
+    let gain = match fitted.unknowns[at].kind {
+        Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
+        Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
+        Kind::Skew(_) => return (after - before, uncertainty.sigma[at]),
+        _ => None,
+    };
+    match gain.and_then(|gain| fitted.unknowns.iter().position(|one| one.kind == gain)) {
+        Some(gain) => {
+            let share = after / values[gain];
+            let mut combination = DVector::zeros(values.len());
+            (combination[at], combination[gain]) = (1.0, -share);
+            let sigma = uncertainty.variance(&combination).sqrt() / values[gain].abs();
+            (share - before / fitted.values[gain], sigma)
+        }
+        None => (after / before - 1.0, (uncertainty.sigma[at] / before).abs()),
+    }
+}
+
+fn gradients(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Uncertainty) -> Vec<Change> {
     let mut all = Vec::new();
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         let Kind::Strength(group) = unknown.kind else { continue };
         let rows = fitted.groups[0][group].clone();
         let sigma = uncertainty.sigma[at] / fitted.values[at];
+        let relative = values[at] / fitted.values[at] - 1.0;
         all.push(Change {
             name: name(folder, &fitted.groups, unknown.kind),
             family: folder.lattice[rows[0]].name.clone(),
             rows,
-            relative: values[at] / fitted.values[at] - 1.0,
+            relative,
             sigma,
+            has_changed: relative.abs() > clear(fitted.unknowns.len()) * sigma,
             is_identifiable: false,
         });
     }
@@ -167,7 +279,7 @@ mod tests {
         }
         let settings = Settings::default();
         let fitted = fit(&one, &settings, &mut |_| ()).unwrap();
-        let found = compare(&one, &fitted, &other, &settings, &mut |_| ()).unwrap();
+        let found = compare((&one, &[], &fitted), &other, &settings, &mut |_| ()).unwrap().gradients;
         let pulls = found.iter().zip(&changes).map(|(found, change)| ((found.relative - change) / found.sigma).powi(2));
         // 24 pulls: their mean square scatters by 0.29, three times that
         let mean = pulls.sum::<f64>() / 24.0;
@@ -180,12 +292,42 @@ mod tests {
     }
 
     #[test]
+    fn few_are_said_by_chance() {
+        for (unknowns, expected) in [(48, 3.707), (900, 4.394)] {
+            assert!((clear(unknowns) - expected).abs() < 0.005, "{}", clear(unknowns));
+        }
+    }
+
+    #[test]
+    fn gains_and_cables_that_changed_are_named() {
+        let ring = ring();
+        let truth = machine(&ring, 5);
+        let (one, mut other) = (measured(&ring, &truth, NOISE, 1), measured(&ring, &truth, NOISE, 2));
+        other.matrix.row_mut(4).scale_mut(1.03);
+        other.matrix.column_mut(7).scale_mut(0.97);
+        let exchanged = Wiring::MonitorsExchanged(vec![2, 6]);
+        exchanged.put_right(&mut other);
+        let settings = Settings::default();
+        let fitted = fit(&one, &settings, &mut |_| ()).unwrap();
+        let found = compare((&one, &[], &fitted), &other, &settings, &mut |_| ()).unwrap();
+        assert_eq!(found.wiring, [exchanged]);
+        let kinds: Vec<Kind> = found.others.iter().map(|one| one.kind).collect();
+        assert!(kinds.len() == 2, "{found:?}");
+        for (kind, change) in [(Kind::MonitorGain(4), 0.03), (Kind::CorrectorGain(7), -0.03)] {
+            let one = found.others.iter().find(|one| one.kind == kind).unwrap();
+            // 1 % is how far a gain is expected to change beforehand
+            assert!((one.change - change).abs() < 4.0 * one.sigma && one.sigma < 0.005, "{one:?}");
+        }
+        assert!(found.gradients.iter().all(|one| one.relative.abs() < 4.0 * one.sigma), "{found:?}");
+    }
+
+    #[test]
     fn other_instruments_are_refused() {
         let one = ring();
         let fitted = fit(&measured(&one, &machine(&one, 1), NOISE, 1), &Settings::default(), &mut |_| ()).unwrap();
         let mut other = one.clone();
         other.monitors.swap(0, 1);
-        let refused = compare(&one, &fitted, &other, &Settings::default(), &mut |_| ()).unwrap_err();
+        let refused = compare((&one, &[], &fitted), &other, &Settings::default(), &mut |_| ()).unwrap_err();
         assert_eq!(refused.to_string(), "ring: x_BPM.0, ring: x_BPM.8; the monitors must stand in the same order");
     }
 }

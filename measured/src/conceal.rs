@@ -12,7 +12,7 @@ use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
 use crate::model::Model;
-use crate::unknowns::{Kind, name};
+use crate::unknowns::{Kind, Unknown, name};
 use crate::wiring::Wiring;
 
 /// What was put in.
@@ -24,8 +24,8 @@ pub struct Concealed {
     pub at: String,
     /// Relative change of a gain or a strength; integrated gradient [1/m]; none of a cable.
     pub amplitude: Option<f64>,
-    /// Half the sum of squares of its change to the matrix, over the stated noise and the learnt error of the model: what it could gain at most
-    /// in `ln` likelihood.
+    /// What it could gain at most in `ln` likelihood, with the learnt error of the model, if kind and place were known: of a cable half the sum
+    /// of squares of its change to the matrix, of anything else with all other unknowns adapting, half the square over its error bar.
     pub gain: f64,
 }
 
@@ -103,11 +103,18 @@ pub fn conceal(
             if is_skew { ("skew_gradient", place, Some(skew)) } else { ("quadrupole_gradient", place, Some(strength)) }
         }
     };
-    let gain = gain_of(folder, &changed, fitted);
+    let is_it = |one: &Unknown| one.kind.word() == kind && name(folder, &fitted.groups, one.kind) == at;
+    let gain = match (amplitude, fitted.unknowns.iter().position(is_it)) {
+        (Some(amplitude), Some(one)) => {
+            let unit = if kind == "skew_gradient" { 1.0 } else { fitted.values[one] };
+            0.5 * (amplitude * unit / fitted.sigma(one)).powi(2)
+        }
+        _ => gain_of_cable(folder, &changed, fitted),
+    };
     Ok((changed, Concealed { kind, at, amplitude, gain }))
 }
 
-fn gain_of(folder: &Folder, changed: &Folder, fitted: &Fit) -> f64 {
+fn gain_of_cable(folder: &Folder, changed: &Folder, fitted: &Fit) -> f64 {
     let change = (&changed.matrix - &folder.matrix).map(|x| if x.is_finite() { x } else { 0.0 });
     let information = fitted.data.information(&fitted.missed);
     0.5 * change.component_mul(&change).dot(&information.columns(0, change.ncols()))

@@ -22,7 +22,7 @@ pub mod uncertainty;
 pub mod unknowns;
 pub mod wiring;
 
-pub use compare::{Change, compare};
+pub use compare::{Change, Changes, compare};
 pub use conceal::{Concealed, conceal};
 pub use diagnose::{Diagnosis, diagnose};
 pub use error::MeasuredError;

@@ -23,6 +23,22 @@ pub enum Kind {
     RfScale,
 }
 
+impl Kind {
+    /// Its word in results.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Strength(_) => "quadrupole_gradient",
+            Self::Skew(_) => "skew_gradient",
+            Self::HeldFrequency => "fixed_rf_frequency",
+            Self::MonitorGain(_) => "bpm_gain",
+            Self::MonitorCoupling(_) => "bpm_coupling",
+            Self::CorrectorGain(_) => "corrector_gain",
+            Self::CorrectorCoupling(_) => "corrector_coupling",
+            Self::RfScale => "rf_scale",
+        }
+    }
+}
+
 /// One fitted number, with its prior.
 #[derive(Debug, Clone, Copy)]
 pub struct Unknown {

@@ -45,15 +45,19 @@ const ALIVE: f64 = 0.2;
 /// # Errors
 /// [`MeasuredError`].
 pub fn straightened(folder: &Folder, settings: &Settings) -> Result<(Folder, Vec<Wiring>), MeasuredError> {
-    let predicted = Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?;
+    Ok(straightened_by(folder, &Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?))
+}
+
+/// The same by a matrix that perfect instruments would measure, or that the same ones have measured before [mm].
+pub fn straightened_by(folder: &Folder, expected: &DMatrix<f64>) -> (Folder, Vec<Wiring>) {
     let (mut right, mut all) = (folder.clone(), Vec::new());
     // an exchanged row may be reversed too, which shows at its own place
     for _ in 0..2 {
-        let more = found(&right, &predicted);
+        let more = found(&right, expected);
         more.iter().for_each(|one| one.put_right(&mut right));
         all.extend(more);
     }
-    Ok((right, all))
+    (right, all)
 }
 
 /// What is wrong by the matrix that perfect instruments would measure [mm].

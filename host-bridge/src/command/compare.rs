@@ -2,10 +2,11 @@
 
 use inference::{BatchFit, TuneUse};
 use measured::Folder;
+use measured::compare::clear;
 
 use super::{CommandError, campaign, check_outputs, deliver, machine_with, matrix, recording};
 use crate::cli::Compare;
-use crate::matrix_result::{ChangeOfOne, Comparison};
+use crate::matrix_result::{ChangeOfOne, Comparison, OtherChange};
 use crate::result::FitResult;
 
 /// Run it.
@@ -14,9 +15,9 @@ use crate::result::FitResult;
 /// [`CommandError`].
 pub fn run(options: &Compare) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
-    let changes = match [&options.before, &options.after].map(|path| Folder::is_one(path)) {
+    let compared = match [&options.before, &options.after].map(|path| Folder::is_one(path)) {
         [true, true] => of_matrices(options)?,
-        [false, false] => of_recordings(options)?,
+        [false, false] => Comparison::of(of_recordings(options)?, Vec::new()),
         _ => {
             let (a, b) = (options.before.display(), options.after.display());
             return Err(CommandError::Input(format!(
@@ -24,31 +25,34 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
             )));
         }
     };
-    deliver(&options.common, &Comparison::of(changes))
+    deliver(&options.common, &compared)
 }
 
-fn of_matrices(options: &Compare) -> Result<Vec<ChangeOfOne>, CommandError> {
+fn of_matrices(options: &Compare) -> Result<Comparison, CommandError> {
     let settings = matrix::settings(None, &options.priors)?;
-    let read = |path| -> Result<_, CommandError> { Ok(measured::straightened(&Folder::read(path)?, &settings)?.0) };
-    let (before, after) = (read(&options.before)?, read(&options.after)?);
+    let (before, cables) = measured::straightened(&Folder::read(&options.before)?, &settings)?;
+    let after = Folder::read(&options.after)?;
     let fitted = matrix::fitted(&before, &settings, &options.common)?;
     let spinner = matrix::spinner(&options.common);
-    let changes = measured::compare(&before, &fitted, &after, &settings, &mut |what| {
+    let changes = measured::compare((&before, &cables, &fitted), &after, &settings, &mut |what| {
         spinner.set_message(format!("{}: {what}", after.name))
     });
     spinner.finish_and_clear();
     let mut all = Vec::new();
-    for one in changes? {
+    let changes = changes?;
+    for one in &changes.gradients {
         all.extend(one.rows.iter().map(|&row| ChangeOfOne {
             name: before.element(row),
             index: Some(row),
             relative: one.relative,
             sigma: one.sigma,
+            changed: one.has_changed,
             identifiable: one.is_identifiable,
         }));
     }
     all.sort_by_key(|one| one.index);
-    Ok(all)
+    let cables = changes.wiring.iter().map(|one| OtherChange::of_cable(&before, one));
+    Ok(Comparison::of(all, cables.chain(changes.others.iter().map(OtherChange::of)).collect()))
 }
 
 /// Each recording is fitted by itself; where a var is known no better than half its prior, the prior would hide a change.
@@ -63,9 +67,11 @@ fn of_recordings(options: &Compare) -> Result<Vec<ChangeOfOne>, CommandError> {
     let widths = ring.parameters.iter().map(|parameter| parameter.prior.width);
     let change = |((one, other), width): ((_, _), f64)| {
         let (one, other): (crate::result::Var, crate::result::Var) = (one, other);
+        let (relative, sigma) = (other.mean / one.mean - 1.0, (one.sigma / one.mean).hypot(other.sigma / other.mean));
         ChangeOfOne {
-            relative: other.mean / one.mean - 1.0,
-            sigma: (one.sigma / one.mean).hypot(other.sigma / other.mean),
+            relative,
+            sigma,
+            changed: relative.abs() > clear(ring.parameters.len()) * sigma,
             identifiable: one.sigma.max(other.sigma) < 0.5 * width,
             name: one.name,
             index: None,
