@@ -374,7 +374,10 @@ pub struct Import {
     pub rf_step: Option<f64>,
     /// RF frequency [Hz]; that of the lattice's cavities without it
     #[arg(long, value_name = "HZ")]
-    pub rf: Option<f64>,
+    pub rf_frequency: Option<f64>,
+    /// What the machine held while the matrix was measured, for the comparison with the lattice; the frequency without it
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,

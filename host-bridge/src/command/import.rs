@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
+use measured::Folder;
 use measured::import::{
-    Conventions, Instruments, Lattice, Measurement, Missing, PerInstrument, Table, assemble, bare, write,
+    Conventions, Instruments, Lattice, Measurement, Missing, PerInstrument, Table, agreement, assemble, bare, write,
 };
 use measured::lattice::ring;
-use twin::{Hold, Optics};
+use twin::{Hold, Optics, Rf};
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::Import;
@@ -26,8 +27,10 @@ pub fn run(options: &Import) -> Result<(), CommandError> {
     let tunes = Optics::of(&ring(&bare(&lattice, &instruments)?, &[])?, Hold::Momentum { delta: 0.0 })?.tunes()?;
     let mut result = Imported::of(&lattice, &instruments, [tunes.x, tunes.y]);
     if let (Some(matrix), Some(out)) = (&options.matrix, &options.out) {
-        measurement(options, &lattice, &instruments, matrix, out)?;
-        result.folder = Some(out.display().to_string());
+        let folder = measurement(options, &lattice, &instruments, matrix, out)?;
+        let agreement = agreement(&folder, options.rf.map_or(Rf::FixedFrequency, Into::into))?;
+        write(&folder, out)?;
+        result = result.with_folder(&out.display().to_string(), &agreement);
     }
     deliver(&options.common, &result)
 }
@@ -38,7 +41,7 @@ fn measurement(
     instruments: &Instruments,
     matrix: &Path,
     out: &Path,
-) -> Result<(), CommandError> {
+) -> Result<Folder, CommandError> {
     if out.exists() {
         return Err(CommandError::Input(format!("{} exists; it is not overwritten", out.display())));
     }
@@ -50,7 +53,7 @@ fn measurement(
         order: options.order.map(Into::into),
         conventions: &conventions,
     };
-    Ok(write(&assemble(lattice, instruments, options.rf, &measured)?, out)?)
+    Ok(assemble(lattice, instruments, options.rf_frequency, &measured)?)
 }
 
 /// All of them, or everything that is missing.

@@ -100,7 +100,7 @@ fn column(
 fn empty(lattice: &Lattice, instruments: &Instruments, rf: Option<f64>) -> Result<Folder, MeasuredError> {
     let circumference = lattice.circumference();
     let Some(rf) = rf.or(lattice.rf()) else {
-        return lattice.refuse("no cavity with a frequency; state the RF frequency with --rf HZ".into());
+        return lattice.refuse("no cavity with a frequency; state the RF frequency with --rf-frequency HZ".into());
     };
     let mut rows = Vec::new();
     for (element, one) in lattice.elements.iter().enumerate() {

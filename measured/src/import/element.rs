@@ -12,6 +12,9 @@ use crate::folder::Particle;
 /// Speed of light [m/s].
 const LIGHT: f64 = 299_792_458.0;
 
+/// Nodes of a YAML file at most.
+const LARGEST: usize = 10_000_000;
+
 /// A lattice as a file has it.
 #[derive(Debug, Clone)]
 pub struct Lattice {
@@ -177,16 +180,20 @@ impl Lattice {
     }
 }
 
-/// JSON, which Python may have written with `NaN` and `Infinity`, or YAML.
+/// JSON, in which Python may have written `NaN` and `Infinity` (null here), or YAML.
 fn value(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
     let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
     if text.trim_start().starts_with('{') {
-        return serde_json::from_str(text).map_err(|error| refused(error.to_string()));
+        return json5::from_str(text).map_err(|error| refused(error.to_string()));
     }
     if !text.contains("PALS:") {
         return Err(unknown(file, &first_line(text)));
     }
-    serde_saphyr::from_str(text).map_err(|error| refused(error.to_string()))
+    // a large ring has more nodes than the library's own limit
+    let options = serde_saphyr::options! {
+        budget: serde_saphyr::budget! { max_nodes: LARGEST, max_events: LARGEST },
+    };
+    serde_saphyr::from_str_with_options(text, options).map_err(|error| refused(error.to_string()))
 }
 
 fn first_line(text: &str) -> String {

@@ -34,17 +34,20 @@ pub struct Instruments {
 struct Sought {
     word: &'static str,
     option: &'static str,
+    example: &'static str,
     planes: fn(Role) -> Option<[bool; 2]>,
 }
 
 const MONITORS: Sought = Sought {
     word: "monitors",
     option: "--monitors",
+    example: "'BPM*'",
     planes: |role| if let Role::Monitor(planes) = role { Some(planes) } else { None },
 };
 const CORRECTORS: Sought = Sought {
     word: "correctors",
     option: "--correctors",
+    example: "'x:CH*'",
     planes: |role| if let Role::Corrector(planes) = role { Some(planes) } else { None },
 };
 
@@ -99,10 +102,11 @@ fn chosen(lattice: &Lattice, patterns: &[Pattern], sought: Sought) -> Result<Vec
     if found.is_empty() {
         let kinds: Vec<String> = lattice.kinds().iter().map(|(kind, count)| format!("{count} {kind}")).collect();
         return lattice.refuse(format!(
-            "no {} by the types of the elements ({}); name them with {} PATTERN, such as '{0}*'",
+            "no {} by the types of the elements ({}); name them with {} PATTERN, such as {}",
             sought.word,
             kinds.join(", "),
-            sought.option
+            sought.option,
+            sought.example
         ));
     }
     Ok(found)

@@ -4,6 +4,7 @@
 //! matrix is read by their names or in a stated order ([`Table`]) and brought to millimetres and to kicks above 0 outwards and upwards
 //! ([`Conventions`]). Nothing that a file does not say is guessed.
 
+mod agreement;
 mod assemble;
 mod at;
 mod conventions;
@@ -17,6 +18,7 @@ mod table;
 mod write;
 mod xsuite;
 
+pub use agreement::{Agreement, agreement};
 pub use assemble::{Measurement, assemble, bare};
 pub use conventions::{Conventions, KickIs, Missing, OrbitUnit, PerInstrument, Signs};
 pub use element::{Element, Format, Lattice, Role};
