@@ -18,6 +18,11 @@ const ULTRA_RELATIVISTIC: f64 = 1e-4;
 /// # Errors
 /// [`MeasuredError::Lattice`].
 pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
+    Ok(Ring::parse(&machine(folder, skew).to_string(), &folder.name)?)
+}
+
+/// The same as a machine file, docs/machine.md.
+pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
     let mut elements = Vec::new();
     for (row, one) in folder.lattice.iter().enumerate() {
         let name = folder.element(row);
@@ -42,14 +47,13 @@ pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
     }
     let rest = folder.meta.particle.rest_energy();
     let energy = folder.meta.energy.unwrap_or(rest / ULTRA_RELATIVISTIC);
-    let machine = json!({
+    json!({
         "name": folder.name,
         "circumference_m": folder.meta.circumference,
         "k1": {},
         "reference": {"particle": folder.meta.particle.word(), "kinetic_energy_GeV": energy - rest},
         "elements": elements,
-    });
-    Ok(Ring::parse(&machine.to_string(), &folder.name)?)
+    })
 }
 
 /// Names of the elements that make a row's magnet: those with a gradient, and the thin skew gradient.

@@ -46,13 +46,13 @@ def odd():
         yield "bpm", "monitor", {}
         yield "l1", "drift", dict(l=0.3)
         yield "sx", "sextupole", dict(l=0.1, k2=5.0)
-        yield "qf", "quadrupole", dict(l=0.3, k1=4.2)
+        yield "qf", "quadrupole", dict(l=0.3, k1=4.0)
         yield "cor", "kicker", dict(l=0.2)
         if cell % 2:
-            yield "b1", "sbend", dict(l=1.2, angle=ANGLE, e1=0.2, e2=0.3, k1=-0.1, fint=0.5, hgap=0.02)
+            yield "b1", "sbend", dict(l=1.2, angle=ANGLE, e1=0.2, e2=0.3, k1=-0.05, fint=0.5, hgap=0.02)
         else:
             yield "b2", "rbend", dict(l=1.19, angle=ANGLE, e1=0.01, e2=-0.02, k1=0.05, fint=0.4, hgap=0.015)
-        yield "qd", "quadrupole", dict(l=0.3, k1=-2.9)
+        yield "qd", "quadrupole", dict(l=0.3, k1=-3.1)
         yield "l3", "drift", dict(l=0.8)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import import_lattices as lattices
 import numpy as np
+import pals
 from import_lattices import at, xtrack
 
 warnings.filterwarnings("ignore")
@@ -94,7 +95,7 @@ def of_xsuite(elements):
 
 
 def of_pals(elements):
-    """Validated by `pals-schema`; its numbers are pyAT's of the same ring."""
+    """The numbers are pyAT's of the same ring; `pals-schema` validates the file."""
     tunes, matrix, _, _ = of_at(elements)
     return tunes, matrix, *own_names(elements, "_")
 
@@ -127,6 +128,8 @@ def main(orbitcal):
         for ring, elements in lattices.RINGS.items():
             for code, own in CODES.items():
                 path = lattices.write(ring, code, folder)
+                if code == "pals":
+                    pals.load(str(path))
                 tunes, matrix, monitors, correctors = own(list(elements()))
                 table(folder / "matrix.csv", matrix, monitors, correctors)
                 found = imported(orbitcal, folder, path, folder / "matrix.csv", code)

@@ -53,7 +53,8 @@ fn measurement(
         order: options.order.map(Into::into),
         conventions: &conventions,
     };
-    Ok(assemble(lattice, instruments, options.rf_frequency, &measured)?)
+    let name = out.file_name().unwrap_or(out.as_os_str()).to_string_lossy().into_owned();
+    Ok(Folder { name, ..assemble(lattice, instruments, options.rf_frequency, &measured)? })
 }
 
 /// All of them, or everything that is missing.

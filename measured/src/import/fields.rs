@@ -16,9 +16,9 @@ pub(super) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// A number, 0 where there is none.
+    /// A number, 0 where there is none; null is what an infinite one was.
     pub fn number(&self, key: &str) -> Result<f64, MeasuredError> {
-        Ok(self.maybe(key)?.unwrap_or(0.0))
+        self.value.get(key).map_or(Ok(0.0), |value| self.finite(key, value))
     }
 
     /// A number, if there is one.

@@ -4,13 +4,14 @@ use std::fs;
 use std::path::Path;
 
 use nalgebra::DMatrix;
-use serde_json::json;
+use serde_json::{Value, json};
 use twin::Plane;
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
+use crate::lattice::machine;
 
-/// Write it to a folder that is made.
+/// Write it to a folder that is made, with the ring as a machine file (`machine.json`) for `orbitcal export`.
 ///
 /// # Errors
 /// [`MeasuredError::Read`]: the folder exists, or cannot be written.
@@ -25,7 +26,8 @@ pub fn write(folder: &Folder, to: &Path) -> Result<(), MeasuredError> {
         let one = DMatrix::from_column_slice(dispersion.len(), 1, dispersion.as_slice());
         matrix(folder, &["dispersion".into()], &one, &to.join("dispersion_orbit_mm.csv"))?;
     }
-    meta(folder, &to.join("meta.json"))
+    meta(folder, &to.join("meta.json"))?;
+    json(&to.join("machine.json"), &machine(folder, &[]))
 }
 
 fn lattice(folder: &Folder, file: &Path) -> Result<(), MeasuredError> {
@@ -76,6 +78,10 @@ fn meta(folder: &Folder, file: &Path) -> Result<(), MeasuredError> {
         "rf_Hz": meta.rf,
         "delta_rf_Hz": meta.delta_rf,
     });
+    json(file, &value)
+}
+
+fn json(file: &Path, value: &Value) -> Result<(), MeasuredError> {
     let failed = |source| MeasuredError::Read { file: file.display().to_string(), source };
     fs::write(file, format!("{value:#}\n")).map_err(failed)
 }
