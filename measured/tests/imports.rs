@@ -182,6 +182,25 @@ fn what_the_twin_cannot_carry_is_refused_with_its_element() {
 }
 
 #[test]
+fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
+    let line = |field: &str| {
+        let bend = format!(r#"{{"__class__": "Bend", "length": 1.0, "angle": 0.1{field}}}"#);
+        file(
+            "ring.json",
+            &format!(
+                r#"{{"element_names": ["bpm", "cor"], "elements": {{"bpm": {{"__class__": "Marker"}}, "cor": {bend}}}}}"#
+            ),
+        )
+    };
+    for same in ["", r#", "k0": 0.1"#, r#", "k0": 0.2, "k0_from_h": true"#] {
+        let (_folder, path) = line(same);
+        assert_eq!(imported(&path).unwrap().0.elements[1].bend, 0.1);
+    }
+    let (_folder, path) = line(r#", "k0": 0.11"#);
+    assert!(refused(&path).contains("element cor: field k0 0.11 /m bends by 0.11 rad, the reference orbit by 0.1 rad"));
+}
+
+#[test]
 fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     let said = |text: &str| {
         let (_folder, path) = file("ring.txt", text);

@@ -13,8 +13,7 @@ use crate::error::MeasuredError;
 use crate::folder::Particle;
 
 /// Classes without a field.
-const FIELD_FREE: [&str; 7] =
-    ["Drift", "DriftExact", "Marker", "Device", "BeamPositionMonitor", "ParticlesMonitor", "Translation"];
+const FIELD_FREE: [&str; 6] = ["Drift", "DriftExact", "Marker", "Device", "BeamPositionMonitor", "ParticlesMonitor"];
 
 /// Read it.
 pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> {
@@ -78,7 +77,10 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
             lattice.harmonic = lattice.harmonic.or(fields.maybe("harmonic")?.filter(|one| *one > 0.0));
         }
         "Bend" | "RBend" => return bend(lattice, one, fields),
-        "Quadrupole" | "Sextupole" | "Octupole" => return give(lattice, one, strengths(fields, "")?),
+        "Quadrupole" | "Sextupole" | "Octupole" => {
+            let strengths = strengths(fields, one.length)?;
+            return give(lattice, one, strengths);
+        }
         "Multipole" => return multipole(lattice, one, fields),
         _ if FIELD_FREE.contains(&class) || class.starts_with("Limit") => {}
         _ if class.contains("Slice") => {
@@ -97,7 +99,7 @@ fn bend(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result<(), 
         Some(angle) => angle,
         None => fields.number("h")? * one.length,
     };
-    let field = fields.maybe("k0")?.filter(|_| fields.value.get("k0_from_h").and_then(Value::as_bool) == Some(false));
+    let field = fields.maybe("k0")?.filter(|_| fields.value.get("k0_from_h").and_then(Value::as_bool) != Some(true));
     if let Some(k0) = field.filter(|k0| (k0 * one.length - one.bend).abs() > 1e-9) {
         return Err(fields.wrong(format!(
             "field k0 {k0} /m bends by {} rad, the reference orbit by {} rad",
@@ -114,7 +116,10 @@ fn bend(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result<(), 
         )
     };
     one.set_fringe(soft("entry")?, soft("exit")?);
-    let strengths = strengths(fields, "")?;
+    let strengths = strengths(fields, one.length)?;
+    if strengths.k1[0] != 0.0 && fields.value.get("rbend_model").and_then(Value::as_str) == Some("straight-body") {
+        lattice.leave_out("the straight body of a dipole with a gradient (taken as curved)");
+    }
     give(lattice, one, strengths)
 }
 
@@ -128,14 +133,15 @@ fn multipole(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result
     if fields.number("hxl")?.abs() > NONE {
         return Err(fields.wrong("a thin dipole, expected a lattice of thick elements".into()));
     }
-    give(lattice, one, strengths(fields, "thin")?)
+    let strengths = strengths(fields, one.length)?;
+    give(lattice, one, strengths)
 }
 
-fn strengths(fields: &Fields, thin: &str) -> Result<Strengths, MeasuredError> {
-    let length = if thin.is_empty() { fields.number("length")? } else { 1.0 };
+fn strengths(fields: &Fields, length: f64) -> Result<Strengths, MeasuredError> {
+    let per = if length > 0.0 { length } else { 1.0 };
     let of = |order: usize| {
         let [normal, skew] =
-            [fields.at("knl", order)?, fields.at("ksl", order)?].map(|one| if one == 0.0 { 0.0 } else { one / length });
+            [fields.at("knl", order)?, fields.at("ksl", order)?].map(|one| if one == 0.0 { 0.0 } else { one / per });
         Ok::<_, MeasuredError>([
             normal + fields.number(&format!("k{order}"))?,
             skew + fields.number(&format!("k{order}s"))?,
