@@ -200,6 +200,42 @@ fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
     assert!(refused(&path).contains("element cor: field k0 0.11 /m bends by 0.11 rad, the reference orbit by 0.1 rad"));
 }
 
+/// As Tao writes: `L`, `pc_ref`, and a dipole's numbers among `ParticleP`.
+const BY_TAO: &str = "PALS:
+  facility:
+    - begin:
+        kind: BeginningEle
+        ReferenceP:
+          pc_ref: 1.5e9
+    - bpm:
+        kind: Drift
+        L: 0.5
+    - cor:
+        kind: SBend
+        L: 2
+        ParticleP:
+          g_ref: 0.1
+          e1: 0.05
+    - ring:
+        kind: BeamLine
+        line: [begin, bpm, cor]
+    - lat:
+        kind: Lattice
+        branches:
+          - ring
+";
+
+#[test]
+fn the_words_of_tao_in_pals_are_read() {
+    let (_folder, path) = file("ring.pals.yaml", BY_TAO);
+    let (lattice, _) = imported(&path).unwrap();
+    let [bpm, cor] = lattice.elements.as_slice() else { panic!("{:?}", lattice.elements) };
+    assert_eq!((bpm.length, cor.length, cor.bend, cor.edge_in), (0.5, 2.0, 0.2, 0.05));
+    assert!((lattice.energy.unwrap() - 1.5).abs() < 1e-6);
+    let (_folder, path) = file("ring.pals.yaml", &BY_TAO.replace("g_ref", "g"));
+    assert!(refused(&path).contains("element cor: a dipole without g_ref or angle_ref"));
+}
+
 #[test]
 fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     let said = |text: &str| {

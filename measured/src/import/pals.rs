@@ -1,7 +1,8 @@
 //! A lattice in the Particle Accelerator Lattice Standard, as YAML or JSON.
 //!
 //! Elements stand by name among the facility, or whole in a line; lines may hold lines and `repeat` them. Signs are MAD's. The words of
-//! `pals-schema` 0.3 (`SBend`, `edge_int1`) and those of the standard since then (`Bend`, `edge1_int`) are read.
+//! `pals-schema` 0.3 (`SBend`, `edge_int1`) and those of the standard since then (`Bend`, `edge1_int`) are read, and what Tao's `write pals` has of its own: `L`,
+//! `pc_ref`, `rf_frequency`, and a dipole's numbers among `ParticleP`.
 //!
 //! Source: pals-project.readthedocs.io, Lattice Element Kinds and Parameter Groups.
 
@@ -10,7 +11,7 @@ use std::collections::HashMap;
 use serde_json::Value;
 
 use super::element::{Element, Format, Lattice, Role};
-use super::fields::{Fields, Strengths, give};
+use super::fields::{Fields, NONE, Strengths, give};
 use crate::error::MeasuredError;
 use crate::folder::Particle;
 
@@ -104,18 +105,22 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
     if let Some(reference) = fields.value.get("ReferenceP") {
         self::reference(lattice, &Fields { value: reference, ..*fields })?;
     }
-    let mut one =
-        Element { name: fields.name.into(), kind: kind.into(), length: fields.number("length")?, ..Element::default() };
+    let mut one = Element {
+        name: fields.name.into(),
+        kind: kind.into(),
+        length: either(fields, ["length", "L"])?.unwrap_or(0.0),
+        ..Element::default()
+    };
     match kind {
         "BeginningEle" => return Ok(()),
         "Instrument" => one.role = Role::Monitor([true; 2]),
         "Kicker" => one.role = Role::Corrector([true; 2]),
         "RFCavity" => {
             let group = fields.group("RFP");
-            lattice.rf = lattice.rf.or(group.maybe("frequency")?.filter(|rf| *rf > 0.0));
+            lattice.rf = lattice.rf.or(either(&group, ["frequency", "rf_frequency"])?.filter(|rf| *rf > 0.0));
             lattice.harmonic = lattice.harmonic.or(group.maybe("harmon")?.filter(|one| *one > 0.0));
         }
-        "Bend" | "SBend" | "RBend" => bend(&mut one, &fields.group("BendP"), kind)?,
+        "Bend" | "SBend" | "RBend" => bend(&mut one, fields)?,
         "Quadrupole" | "Sextupole" | "Octupole" | "Multipole" => {}
         "Solenoid" if fields.group("SolenoidP").number("Ksol")? == 0.0 => {}
         _ if FIELD_FREE.contains(&kind) => {}
@@ -131,30 +136,39 @@ fn reference(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError
         Some("proton" | "antiproton") => Particle::Proton,
         Some(other) => return Err(fields.wrong(format!("species_ref: expected electron or proton, found {other}"))),
     };
-    lattice.energy = lattice.energy.or(fields.maybe("E_tot_ref")?.map(|energy| energy * 1e-9));
+    let by_momentum = fields.maybe("pc_ref")?.map(|momentum| (momentum * 1e-9).hypot(lattice.particle.rest_energy()));
+    lattice.energy = lattice.energy.or(fields.maybe("E_tot_ref")?.map(|energy| energy * 1e-9)).or(by_momentum);
     Ok(())
 }
 
-fn bend(one: &mut Element, group: &Fields, kind: &str) -> Result<(), MeasuredError> {
-    one.bend = match group.maybe("g_ref")? {
-        Some(curvature) => curvature * one.length,
-        None => group.number("angle_ref")?,
+fn bend(one: &mut Element, fields: &Fields) -> Result<(), MeasuredError> {
+    let group = fields.group(if fields.value.get("BendP").is_some() { "BendP" } else { "ParticleP" });
+    one.bend = match (group.maybe("g_ref")?, group.maybe("angle_ref")?) {
+        (Some(curvature), _) => curvature * one.length,
+        (None, Some(angle)) => angle,
+        (None, None) => return Err(fields.wrong("a dipole without g_ref or angle_ref".into())),
     };
-    let straight =
-        |edge: &str| Ok::<_, MeasuredError>(group.maybe(&format!("{edge}_rect"))?.map(|angle| angle + one.bend / 2.0));
-    let angle = |edge: &str| match (kind, group.maybe(edge)?) {
-        ("RBend", Some(angle)) => Ok::<_, MeasuredError>(angle + one.bend / 2.0),
-        (_, Some(angle)) => Ok(angle),
-        ("RBend", None) => Ok(straight(edge)?.unwrap_or(one.bend / 2.0)),
-        _ => Ok(straight(edge)?.unwrap_or(0.0)),
+    let field = fields.group("MagneticMultipoleP").number("Kn0")? * one.length;
+    if field.abs() > NONE && (field - one.bend).abs() > 1e-9 {
+        return Err(fields.wrong(format!("field Kn0 bends by {field} rad, the reference orbit by {} rad", one.bend)));
+    }
+    let half = one.bend / 2.0;
+    // where neither angle is stated, the faces are those of its kind
+    let unstated = if kind(fields.value) == "RBend" { half } else { 0.0 };
+    let face = |sector: &str, rectangular: &str| {
+        let rectangular = group.maybe(rectangular)?.map(|angle| angle + half);
+        Ok::<_, MeasuredError>(group.maybe(sector)?.or(rectangular).unwrap_or(unstated))
     };
-    let (entrance, exit) = (angle("e1")?, angle("e2")?);
-    let soft =
-        |either: [&str; 2]| Ok::<_, MeasuredError>(group.maybe(either[0])?.or(group.maybe(either[1])?).unwrap_or(0.0));
-    (one.edge_in, one.edge_out) = (entrance, exit);
-    // each is fint times half the gap
-    one.set_fringe(2.0 * soft(["edge1_int", "edge_int1"])?, 2.0 * soft(["edge2_int", "edge_int2"])?);
+    (one.edge_in, one.edge_out) = (face("e1", "e1_rect")?, face("e2", "e2_rect")?);
+    // fint times half the gap
+    let soft = |words| Ok::<_, MeasuredError>(2.0 * either(&group, words)?.unwrap_or(0.0));
+    one.set_fringe(soft(["edge1_int", "edge_int1"])?, soft(["edge2_int", "edge_int2"])?);
     Ok(())
+}
+
+/// A number that goes by one of two words.
+fn either(fields: &Fields, words: [&str; 2]) -> Result<Option<f64>, MeasuredError> {
+    Ok(fields.maybe(words[0])?.or(fields.maybe(words[1])?))
 }
 
 fn strengths(fields: &Fields, length: f64) -> Result<Strengths, MeasuredError> {
