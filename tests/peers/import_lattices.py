@@ -1,7 +1,7 @@
 """Two rings written by the codes themselves, for `orbitcal import`: pyAT, MAD-X, Xsuite and PALS.
 
 `twelve_cells` is the ring of twelve_cells.py; recordings/measured/imports holds its files. `odd` has what conventions differ in: dipoles
-with gradients, unlike pole faces and soft edges, rectangular ones, thick monitors and correctors, rolled quadrupoles' rest.
+with gradients, unlike pole faces and soft edges, rectangular ones, sextupoles, correctors with a length.
 
     python3 import_lattices.py OUT     # OUT/twelve-cells.{at.json,tfs,xsuite.json,pals.yaml}
 """
@@ -41,7 +41,7 @@ def twelve_cells():
 
 
 def odd():
-    """Gradients, unlike faces and soft edges in dipoles, thick monitors, sextupoles."""
+    """Gradients, unlike faces and soft edges in dipoles, of sector and rectangular ones; sextupoles."""
     for cell in range(CELLS):
         yield "bpm", "monitor", {}
         yield "l1", "drift", dict(l=0.3)

@@ -12,6 +12,8 @@ use super::fields::{Fields, Strengths, give};
 use crate::error::MeasuredError;
 use crate::folder::Particle;
 
+/// More periods than any ring has.
+const MOST_PERIODS: f64 = 10_000.0;
 /// Classes without a field that matters here.
 const FIELD_FREE: [&str; 13] = [
     "Drift",
@@ -42,6 +44,9 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
     let Some(elements) = value.get("elements").and_then(Value::as_array) else {
         return lattice.refuse("elements: expected a list".into());
     };
+    if !(1.0..=MOST_PERIODS).contains(&periods) {
+        return lattice.refuse(format!("periodicity: expected 1 to {MOST_PERIODS}, found {periods}"));
+    }
     for _ in 0..periods as usize {
         for (index, value) in elements.iter().enumerate() {
             let name = value.get("FamName").and_then(Value::as_str).map_or(format!("#{index}"), str::to_owned);

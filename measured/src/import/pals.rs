@@ -17,6 +17,8 @@ use crate::folder::Particle;
 
 /// Lines within lines beyond this hold themselves.
 const DEEPEST: usize = 50;
+/// More repeats than any line has.
+const MOST_REPEATS: u64 = 10_000;
 /// Kinds without a field that matters here.
 const FIELD_FREE: [&str; 10] = [
     "Drift",
@@ -87,8 +89,8 @@ fn walk(
             _ => return lattice.refuse(format!("{name}: expected names and elements in its {key}, found {part}")),
         };
         let times = whole.and_then(|one| one.get("repeat")).map_or(Some(1), Value::as_u64);
-        let Some(times) = times else {
-            return lattice.refuse(format!("{name}: expected to repeat a number of times from 0 on"));
+        let Some(times) = times.filter(|times| *times <= MOST_REPEATS) else {
+            return lattice.refuse(format!("{name}: expected to repeat 0 to {MOST_REPEATS} times"));
         };
         for _ in 0..times {
             walk(lattice, named, name, whole, depth + 1)?;
