@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use inference::nuts::NutsSettings;
+use measured::import::{self, Pattern};
 use twin::EffectText;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
@@ -39,6 +40,8 @@ pub enum Command {
     Diagnose(Diagnose),
     /// The calibrated ring as a lattice file of another code
     Export(Export),
+    /// A lattice of another code and a response matrix as a folder for fit, diagnose and compare
+    Import(Import),
     /// What changed between two measurements of one machine
     Compare(Compare),
     /// Put an effect into a recording or a measured matrix, its answer key beside it
@@ -326,6 +329,143 @@ pub enum Format {
     Xsuite,
     /// JSON in the Particle Accelerator Lattice Standard
     Pals,
+}
+
+/// `orbitcal import`.
+#[derive(Debug, Args)]
+pub struct Import {
+    /// Lattice by pyAT or Xsuite (JSON), MAD-X (twiss table) or in PALS
+    pub lattice: PathBuf,
+    /// The measured response matrix, a plain table; without it, the lattice is shown and nothing is written
+    #[arg(long, value_name = "FILE", requires = "out")]
+    pub matrix: Option<PathBuf>,
+    /// Folder that is made
+    #[arg(long, value_name = "DIR", requires = "matrix")]
+    pub out: Option<PathBuf>,
+    /// Monitors by name, such as 'BPM*' or 'x:BPMH*', repeatable; by type without it
+    #[arg(long, value_name = "PATTERN")]
+    pub monitors: Vec<Pattern>,
+    /// Correctors by name in the same way
+    #[arg(long, value_name = "PATTERN")]
+    pub correctors: Vec<Pattern>,
+    /// Unit of the orbit in the matrix
+    #[arg(long, value_enum)]
+    pub orbit_unit: Option<OrbitUnit>,
+    /// Deflection [mrad] that an element of the matrix belongs to: a number, x=NUMBER,y=NUMBER, or a file of names and numbers
+    #[arg(long, value_name = "MRAD")]
+    pub kick: Option<String>,
+    /// What that deflection counts
+    #[arg(long, value_enum)]
+    pub kick_is: Option<KickIs>,
+    /// Whether a plus deflects to larger x, to larger y
+    #[arg(long, value_enum)]
+    pub kick_sign: Option<KickSign>,
+    /// Standard deviation of an element of the matrix, in its unit: as for --kick
+    #[arg(long, value_name = "NUMBER")]
+    pub noise: Option<String>,
+    /// Order of lines and columns that have no names
+    #[arg(long, value_enum)]
+    pub order: Option<Order>,
+    /// Change of the orbit with a step of the RF frequency, in the unit of the matrix
+    #[arg(long, value_name = "FILE", requires = "rf_step", requires = "matrix")]
+    pub dispersion: Option<PathBuf>,
+    /// That step [Hz]
+    #[arg(long, value_name = "HZ", requires = "dispersion", allow_hyphen_values = true)]
+    pub rf_step: Option<f64>,
+    /// RF frequency [Hz]; that of the lattice's cavities without it
+    #[arg(long, value_name = "HZ")]
+    pub rf_frequency: Option<f64>,
+    /// What the machine held while the matrix was measured, for the comparison with the lattice; the frequency without it
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+}
+
+/// Units of an orbit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum OrbitUnit {
+    /// Millimetres
+    Mm,
+    /// Metres
+    M,
+    /// Micrometres
+    Um,
+}
+
+impl From<OrbitUnit> for import::OrbitUnit {
+    fn from(unit: OrbitUnit) -> Self {
+        match unit {
+            OrbitUnit::Mm => Self::Millimetres,
+            OrbitUnit::M => Self::Metres,
+            OrbitUnit::Um => Self::Micrometres,
+        }
+    }
+}
+
+/// What the number of a kick counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum KickIs {
+    /// The two orbits differ by that kick
+    Full,
+    /// The orbits are at plus and at minus that kick
+    Half,
+}
+
+impl From<KickIs> for import::KickIs {
+    fn from(kick: KickIs) -> Self {
+        match kick {
+            KickIs::Full => Self::Full,
+            KickIs::Half => Self::Half,
+        }
+    }
+}
+
+/// Where a plus deflects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum KickSign {
+    /// To larger x and larger y, as in MAD-X and pyAT
+    #[value(name = "x+y+")]
+    Both,
+    /// To smaller x and larger y
+    #[value(name = "x-y+")]
+    Upwards,
+    /// To larger x and smaller y
+    #[value(name = "x+y-")]
+    Outwards,
+    /// To smaller x and smaller y
+    #[value(name = "x-y-")]
+    Neither,
+}
+
+impl From<KickSign> for import::Signs {
+    fn from(sign: KickSign) -> Self {
+        Self(match sign {
+            KickSign::Both => [true, true],
+            KickSign::Upwards => [false, true],
+            KickSign::Outwards => [true, false],
+            KickSign::Neither => [false, false],
+        })
+    }
+}
+
+/// Orders of lines and columns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Order {
+    /// All of x in beam order, then all of y
+    Planes,
+    /// x and y of each in turn
+    Pairs,
+}
+
+impl From<Order> for import::Order {
+    fn from(order: Order) -> Self {
+        match order {
+            Order::Planes => Self::Planes,
+            Order::Pairs => Self::Pairs,
+        }
+    }
 }
 
 /// `orbitcal compare`.

@@ -22,6 +22,9 @@ pub enum MeasuredError {
         /// What was expected, what was found, and where.
         problem: String,
     },
+    /// A convention of an imported matrix is not stated, or makes no sense.
+    #[error("{0}")]
+    Convention(String),
     /// The lattice makes no ring.
     #[error(transparent)]
     Lattice(#[from] LatticeError),

@@ -7,8 +7,8 @@ use std::fs;
 use std::path::Path;
 
 use nalgebra::{DMatrix, DVector};
-use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use twin::Plane;
 
 use crate::error::MeasuredError;
@@ -38,9 +38,12 @@ pub struct Meta {
     /// Length of the reference orbit [m].
     #[serde(rename = "circumference_m")]
     pub circumference: f64,
-    /// Total energy of the electrons [GeV]; where none is stated they count as ultra-relativistic.
+    /// Total energy of a particle [GeV]; where none is stated they count as ultra-relativistic.
     #[serde(rename = "energy_GeV")]
     pub energy: Option<f64>,
+    /// `electron`, which it is where none is stated, or `proton`.
+    #[serde(default)]
+    pub particle: Particle,
     /// RF frequency [Hz].
     #[serde(rename = "rf_Hz")]
     pub rf: f64,
@@ -49,6 +52,37 @@ pub struct Meta {
     pub delta_rf: f64,
     /// What the reference fit had free, if there was one.
     pub reference_fit: Option<ReferenceFit>,
+}
+
+/// What is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Particle {
+    /// Electrons or positrons.
+    #[default]
+    Electron,
+    /// Protons or antiprotons.
+    Proton,
+}
+
+impl Particle {
+    /// Its word in a file.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Electron => "electron",
+            Self::Proton => "proton",
+        }
+    }
+
+    /// Rest energy [GeV].
+    ///
+    /// Source: CODATA 2018.
+    pub fn rest_energy(self) -> f64 {
+        match self {
+            Self::Electron => 0.000_510_998_95,
+            Self::Proton => 0.938_272_088_16,
+        }
+    }
 }
 
 /// The parameters of another fit to the same matrix.
@@ -99,6 +133,9 @@ pub struct Row {
     /// The same at the exit.
     #[serde(rename = "edge_out_rad")]
     pub edge_out: f64,
+    /// Soft edges of a dipole: fringe integral times full gap [m]; 0 where the table has no such column.
+    #[serde(rename = "edge_fringe_m", default)]
+    pub fringe: f64,
     /// Gradient at the start of the fit [1/m^2].
     #[serde(rename = "k1_start_1_m2")]
     pub k1: f64,

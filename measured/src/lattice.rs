@@ -10,16 +10,19 @@ use twin::{Plane, Ring};
 use crate::error::MeasuredError;
 use crate::folder::{Folder, Row};
 
-/// Of electrons of no stated energy [GeV]: `1/gamma^2` is then below a thousandth of any ring's momentum compaction.
-const ULTRA_RELATIVISTIC: f64 = 5.0;
-/// Rest energy of an electron [GeV].
-const REST: f64 = 0.000_510_998_95;
+/// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
+const ULTRA_RELATIVISTIC: f64 = 1e-4;
 
 /// The ring, with a thin skew gradient in the middle of some rows.
 ///
 /// # Errors
 /// [`MeasuredError::Lattice`].
 pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
+    Ok(Ring::parse(&machine(folder, skew).to_string(), &folder.name)?)
+}
+
+/// The same as a machine file, docs/machine.md.
+pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
     let mut elements = Vec::new();
     for (row, one) in folder.lattice.iter().enumerate() {
         let name = folder.element(row);
@@ -42,15 +45,15 @@ pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
                 .push(json!({"name": name, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
         }
     }
-    let energy = folder.meta.energy.unwrap_or(ULTRA_RELATIVISTIC);
-    let machine = json!({
+    let rest = folder.meta.particle.rest_energy();
+    let energy = folder.meta.energy.unwrap_or(rest / ULTRA_RELATIVISTIC);
+    json!({
         "name": folder.name,
         "circumference_m": folder.meta.circumference,
         "k1": {},
-        "reference": {"particle": "electron", "kinetic_energy_GeV": energy - REST},
+        "reference": {"particle": folder.meta.particle.word(), "kinetic_energy_GeV": energy - rest},
         "elements": elements,
-    });
-    Ok(Ring::parse(&machine.to_string(), &folder.name)?)
+    })
 }
 
 /// Names of the elements that make a row's magnet: those with a gradient, and the thin skew gradient.
@@ -76,6 +79,10 @@ fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
             one["e1"] = json!(if first { row.edge_in } else { 0.0 });
             one["e2"] = json!(if last { row.edge_out } else { 0.0 });
             one["k1"] = json!(row.k1);
+            if row.fringe != 0.0 {
+                // of the integral and the half gap twice the product acts, at both ends of every piece
+                (one["fint"], one["hgap"]) = (json!(0.5), json!(row.fringe / pieces as f64));
+            }
         } else if row.k1 != 0.0 {
             one["type"] = json!("quadrupole");
             one["k1"] = json!(row.k1);

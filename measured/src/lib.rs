@@ -12,6 +12,7 @@ pub mod diagnose;
 pub mod error;
 pub mod fit;
 pub mod folder;
+pub mod import;
 pub mod lattice;
 pub mod missed;
 pub mod model;

@@ -6,7 +6,7 @@ use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
 use twin::{Plane, Rf};
 
-use crate::folder::{CorrectorRow, Flags, Folder, Group, Meta, MonitorRow, ReferenceFit, Row};
+use crate::folder::{CorrectorRow, Flags, Folder, Group, Meta, MonitorRow, Particle, ReferenceFit, Row};
 use crate::model::Model;
 use crate::unknowns::{Kind, Unknown, Widths, groups, unknowns};
 
@@ -20,7 +20,8 @@ pub fn ring() -> Folder {
     let mut s = 0.0;
     let mut add = |name: &str, length: f64, bend: f64, k1: f64| {
         let edge = bend / 2.0;
-        let row = Row { name: name.into(), s, length, bend, edge_in: edge, edge_out: edge, k1, half_k2: 0.0 };
+        let row =
+            Row { name: name.into(), s, length, bend, edge_in: edge, edge_out: edge, fringe: 0.0, k1, half_k2: 0.0 };
         s += length;
         lattice.push(row);
         lattice.len() - 1
@@ -55,6 +56,7 @@ pub fn ring() -> Folder {
     let meta = Meta {
         circumference: s,
         energy: Some(1.5),
+        particle: Particle::Electron,
         rf: 5e8,
         delta_rf: 2e3,
         reference_fit: Some(ReferenceFit { fit_parameters, flags }),

@@ -7,6 +7,7 @@ pub mod conceal;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
+pub mod import;
 pub mod matrix;
 pub mod replay;
 pub mod response;

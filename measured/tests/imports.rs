@@ -1,0 +1,290 @@
+//! Lattices as their codes wrote them (recordings/measured/imports), and what is refused.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use measured::import::{
+    Conventions, Instruments, KickIs, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, assemble,
+    bare, write,
+};
+use measured::lattice::ring;
+use measured::unknowns::groups;
+use measured::{Folder, MeasuredError, Model};
+use nalgebra::DMatrix;
+use tempfile::TempDir;
+use twin::{Hold, Optics, Rf, Tunes};
+
+const FILES: [&str; 4] =
+    ["twelve-cells.at.json", "twelve-cells.tfs", "twelve-cells.xsuite.json", "twelve-cells.pals.yaml"];
+
+fn recorded(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/measured").join(name)
+}
+
+/// A lattice and its instruments, by patterns where the file has no types for them.
+fn imported(path: &Path) -> Result<(Lattice, Instruments), MeasuredError> {
+    let lattice = Lattice::read(path)?;
+    let by = |pattern: &str| [pattern.parse().unwrap()];
+    let instruments = Instruments::choose(&lattice, &by("bpm*"), &by("cor*"))?;
+    Ok((lattice, instruments))
+}
+
+fn tunes(folder: &Folder) -> Tunes {
+    Optics::of(&ring(folder, &[]).unwrap(), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap()
+}
+
+/// The response [mm/mrad] of the lattice as written.
+fn response(folder: &Folder) -> DMatrix<f64> {
+    Model::of(folder, &groups(folder).into(), Rf::FixedMomentum).unwrap().as_written().unwrap()
+}
+
+fn conventions() -> Conventions {
+    Conventions {
+        unit: OrbitUnit::Millimetres,
+        kick: PerInstrument::parse("--kick", "x=0.2,y=0.15").unwrap(),
+        kick_is: KickIs::Full,
+        signs: Signs([true, true]),
+        noise: PerInstrument::parse("--noise", "0.002").unwrap(),
+    }
+}
+
+/// The measurement of the twelve cells by a lattice file and a table.
+fn measurement(file: &str, table: &str, order: Option<Order>, conventions: &Conventions) -> Folder {
+    let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+    let table = Table::read(&recorded("imports").join(table)).unwrap();
+    let dispersion = Table::read(&recorded("imports/dispersion.csv")).unwrap();
+    let dispersion = order.is_none().then_some((&dispersion, 2000.0));
+    let measured = Measurement { matrix: &table, dispersion, order, conventions };
+    assemble(&lattice, &instruments, Some(499_654_096.7), &measured).unwrap()
+}
+
+#[test]
+fn tunes_are_those_that_madx_wrote() {
+    let table = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let stated = |name: &str| -> f64 {
+        let line = table.lines().find(|line| line.split_whitespace().nth(1) == Some(name)).unwrap();
+        line.split_whitespace().nth(3).unwrap().parse().unwrap()
+    };
+    for file in FILES {
+        let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+        let tunes = tunes(&bare(&lattice, &instruments).unwrap());
+        // MAD-X and the twin agree to 3e-10 with angles of 15 digits
+        assert!((tunes.x - stated("Q1")).abs() < 1e-9 && (tunes.y - stated("Q2")).abs() < 1e-9, "{file}: {tunes:?}");
+    }
+}
+
+#[test]
+fn all_formats_give_one_matrix() {
+    let of = |file: &str| {
+        let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+        response(&bare(&lattice, &instruments).unwrap())
+    };
+    let first = of(FILES[0]);
+    for file in &FILES[1..] {
+        let largest = (of(file) - &first).amax();
+        assert!(largest < 1e-6, "{file}: {largest} mm/mrad");
+    }
+}
+
+#[test]
+fn what_is_imported_is_what_was_measured() {
+    let measured = Folder::read(&recorded("twelve-cells/before")).unwrap();
+    let imported = measurement(FILES[0], "response.csv", None, &conventions());
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("ring");
+    write(&imported, &path).unwrap();
+    let read = Folder::read(&path).unwrap();
+    assert_eq!((&read.matrix, &read.dispersion), (&measured.matrix, &measured.dispersion));
+    for (own, other) in read.correctors.iter().zip(&measured.correctors) {
+        assert_eq!((own.plane, own.at, own.kick), (other.plane, other.at, other.kick));
+    }
+    for (own, other) in read.monitors.iter().zip(&measured.monitors) {
+        assert_eq!((own.plane, own.at, own.sigma), (other.plane, other.at, other.sigma));
+    }
+    assert!((read.meta.rf - measured.meta.rf).abs() < 0.1 && read.meta.delta_rf == measured.meta.delta_rf);
+    assert!(twin::Ring::read(&path.join("machine.json")).is_ok());
+    let again = write(&imported, &path).unwrap_err().to_string();
+    assert!(again.contains("ring"), "{again}");
+}
+
+#[test]
+fn conventions_change_units_sizes_and_signs_and_nothing_else() {
+    let plain = measurement(FILES[1], "response.txt", Some(Order::Planes), &conventions());
+    let other =
+        Conventions { unit: OrbitUnit::Metres, kick_is: KickIs::Half, signs: Signs([false, true]), ..conventions() };
+    let other = measurement(FILES[1], "response.txt", Some(Order::Planes), &other);
+    assert_eq!(other.matrix[(0, 0)], -1e3 * plain.matrix[(0, 0)]);
+    assert_eq!(other.matrix[(0, 12)], 1e3 * plain.matrix[(0, 12)]);
+    assert_eq!((other.correctors[0].kick, other.monitors[0].sigma), (0.4, 2.0));
+}
+
+/// A pyAT file of these elements.
+fn at(elements: &str) -> (TempDir, PathBuf) {
+    file("ring.json", &format!(r#"{{"atjson": 1, "elements": [{elements}], "properties": {{"energy": 1.5e9}}}}"#))
+}
+
+fn file(name: &str, text: &str) -> (TempDir, PathBuf) {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join(name);
+    fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+fn refused(path: &Path) -> String {
+    imported(path).unwrap_err().to_string()
+}
+
+const BPM: &str = r#"{"FamName": "BPM", "Class": "Monitor", "Length": 0.2}"#;
+const COR: &str =
+    r#"{"FamName": "COR", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "PolynomA": [0, 0.1]}"#;
+
+#[test]
+fn long_monitors_and_correctors_in_magnets_act_in_the_middle() {
+    let (_folder, path) = at(&format!("{BPM}, {COR}"));
+    let (lattice, instruments) = imported(&path).unwrap();
+    let folder = bare(&lattice, &instruments).unwrap();
+    let rows: Vec<(f64, f64, f64)> = folder.lattice.iter().map(|one| (one.s, one.length, one.k1)).collect();
+    let halves = [(0.0, 0.1, 0.0), (0.1, 0.0, 0.0), (0.1, 0.1, 0.0), (0.2, 0.2, 2.0), (0.4, 0.0, 0.0), (0.4, 0.2, 2.0)];
+    assert_eq!(rows, halves);
+    assert_eq!((folder.monitors[0].at, folder.correctors[0].at), (1, 4));
+    assert_eq!(groups(&folder).0, [[3, 5]], "the halves are one magnet");
+    assert_eq!(lattice.left_out["skew gradient (couples the planes)"], 1);
+}
+
+#[test]
+fn a_roll_by_an_eighth_of_a_turn_leaves_no_normal_gradient() {
+    let s = core::f64::consts::FRAC_1_SQRT_2;
+    let rolled = format!(
+        r#"{{"FamName": "COR", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "R1": [[{s}, 0, {s}]]}}"#
+    );
+    let (_folder, path) = at(&format!("{BPM}, {rolled}"));
+    let (lattice, _) = imported(&path).unwrap();
+    assert_eq!(lattice.elements[1].k1, 0.0);
+    assert_eq!(lattice.left_out.len(), 1);
+}
+
+#[test]
+fn what_the_twin_cannot_carry_is_refused_with_its_element() {
+    let thin = r#"{"FamName": "T", "Class": "ThinMultipole", "Length": 0, "PolynomB": [0, 0.3]}"#;
+    let wiggler = r#"{"FamName": "W", "Class": "Wiggler", "Length": 1, "PassMethod": "GWigSymplecticPass"}"#;
+    let vertical = r#"{"FamName": "V", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "R1": [[0, 0, 1]]}"#;
+    let infinite = r#"{"FamName": "I", "Class": "Drift", "Length": Infinity}"#;
+    for (element, said) in [
+        (thin, "element T: a thin quadrupole of 0.3 /m"),
+        (wiggler, "element W: class Wiggler acts on the orbit"),
+        (vertical, "element V: a dipole rolled by 1.57"),
+        (infinite, "element I: Length: expected a finite number, found null"),
+    ] {
+        let (_folder, path) = at(element);
+        let found = refused(&path);
+        assert!(found.contains(said), "{found}");
+    }
+}
+
+#[test]
+fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
+    let line = |field: &str| {
+        let bend = format!(r#"{{"__class__": "Bend", "length": 1.0, "angle": 0.1{field}}}"#);
+        file(
+            "ring.json",
+            &format!(
+                r#"{{"element_names": ["bpm", "cor"], "elements": {{"bpm": {{"__class__": "Marker"}}, "cor": {bend}}}}}"#
+            ),
+        )
+    };
+    for same in ["", r#", "k0": 0.1"#, r#", "k0": 0.2, "k0_from_h": true"#] {
+        let (_folder, path) = line(same);
+        assert_eq!(imported(&path).unwrap().0.elements[1].bend, 0.1);
+    }
+    let (_folder, path) = line(r#", "k0": 0.11"#);
+    assert!(refused(&path).contains("element cor: field k0 0.11 /m bends by 0.11 rad, the reference orbit by 0.1 rad"));
+}
+
+/// As Tao writes: `L`, `pc_ref`, and a dipole's numbers among `ParticleP`.
+const BY_TAO: &str = "PALS:
+  facility:
+    - begin:
+        kind: BeginningEle
+        ReferenceP:
+          pc_ref: 1.5e9
+    - bpm:
+        kind: Drift
+        L: 0.5
+    - cor:
+        kind: SBend
+        L: 2
+        ParticleP:
+          g_ref: 0.1
+          e1: 0.05
+    - ring:
+        kind: BeamLine
+        line: [begin, bpm, cor]
+    - lat:
+        kind: Lattice
+        branches:
+          - ring
+";
+
+#[test]
+fn the_words_of_tao_in_pals_are_read() {
+    let (_folder, path) = file("ring.pals.yaml", BY_TAO);
+    let (lattice, _) = imported(&path).unwrap();
+    let [bpm, cor] = lattice.elements.as_slice() else { panic!("{:?}", lattice.elements) };
+    assert_eq!((bpm.length, cor.length, cor.bend, cor.edge_in), (0.5, 2.0, 0.2, 0.05));
+    assert!((lattice.energy.unwrap() - 1.5).abs() < 1e-6);
+    let (_folder, path) = file("ring.pals.yaml", &BY_TAO.replace("g_ref", "g"));
+    assert!(refused(&path).contains("element cor: a dipole without g_ref or angle_ref"));
+}
+
+#[test]
+fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
+    let said = |text: &str| {
+        let (_folder, path) = file("ring.txt", text);
+        refused(&path)
+    };
+    assert!(said(r#"{"lattice": [], "beam": 1}"#).contains("found the keys beam, lattice"));
+    assert!(said("Q1: QUADRUPOLE, L=0.3;").contains("found the line \"Q1: QUADRUPOLE, L=0.3;\""));
+    assert!(said("@ ENERGY %le 1.5\n* NAME S\n").contains("the table lacks KEYWORD, L, ANGLE"));
+    assert!(said("PALS:\n  facility:\n    - use: ring\n").contains("ring stands in a line and not in the facility"));
+    assert!(said("PALS: [").contains("ring.txt: "));
+    assert!(said("").contains("found the line \"\""));
+}
+
+#[test]
+fn a_table_of_madx_holds_all_elements_at_their_ends() {
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let without: String =
+        text.lines().filter(|line| !line.contains("QF.2\"")).map(|line| format!("{line}\n")).collect();
+    let (_folder, path) = file("ring.tfs", &without);
+    assert!(refused(&path).contains("COR.3 of 0.2 m ends at 0.9 m, the element before it at 0.4 m"));
+}
+
+#[test]
+fn tables_that_do_not_fit_are_refused() {
+    let (lattice, instruments) = imported(&recorded("imports/twelve-cells.at.json")).unwrap();
+    let said = |text: &str, order: Option<Order>| {
+        let (_folder, path) = file("r.csv", text);
+        let conventions = conventions();
+        let read = Table::read(&path).and_then(|matrix| {
+            assemble(
+                &lattice,
+                &instruments,
+                None,
+                &Measurement { matrix: &matrix, dispersion: None, order, conventions: &conventions },
+            )
+        });
+        read.map(|folder| format!("{:?}", folder.matrix)).unwrap_or_else(|error| error.to_string())
+    };
+    assert!(said("1 2\n3 4\n", None).contains("lines have no names; say their order with --order"));
+    assert!(said("1 2\n3 4\n", Some(Order::Pairs)).contains("2 lines, the lattice has 24 channels in that order"));
+    assert!(said("1 2\n3\n", None).contains("line 2: 1 numbers, line 1 has 2"));
+    assert!(said(",x:COR[1]\nBPM[1],0.5\n", None).contains("BPM[1] has both planes; write x:BPM[1] or y:BPM[1]"));
+    assert!(
+        said(",x:COR[1]\nx:BPM[13],0.5\n", None)
+            .contains("x:BPM[13] is none of the lattice's, which are x:BPM[1], y:BPM[1]")
+    );
+    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: number 2 stands there twice"));
+    assert!(said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number, found a"));
+    assert!(said("", None).contains("no line of numbers"));
+    assert!(said("# by hand\n; x:COR[1]; y:COR[2]\nx:BPM[2]; 0.5;\n", None).contains("0.5, NaN"));
+}
