@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::drive::{Drive, Each};
 use crate::estimate::{Health, MonitorState};
-use crate::estimator::Judged;
+use crate::judged::Judged;
 use crate::linear::dot;
 use crate::ramp::is_same_time;
 use crate::surrogate::Steerable;
@@ -40,8 +40,8 @@ use crate::triangle::Triangle;
 use crate::wire::{CurrentCode, Frame, PositionCode};
 
 use gain::Gain;
+pub use hold::Hold;
 use hold::Watch;
-pub use hold::{Hold, is_surprising};
 use pace::Pace;
 use supplies::Supplies;
 

@@ -120,7 +120,7 @@ impl<'k> Loop<'k> {
         scenario: Scenario,
     ) -> Result<Self, Box<dyn Error>> {
         let vars = simulate::vars(&Ring::booster(), true, scenario.seed)?;
-        let mut random = [Random::new(scenario.seed), Random::new(scenario.seed + 1_000_003)];
+        let mut random = [Random::new(scenario.seed), Random::new(scenario.noise)];
         let plant = Plant::new(&vars, &mut random[0])?;
         feedback.orbit.own = plant.offset.iter().map(|offset| *offset as f32).collect();
         let mut core = Box::new(Estimator::BLANK);

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::estimate::{Health, Remarks};
-use crate::estimator::{Expected, Screened};
+use crate::judged::{Expected, Screened};
 use crate::mask::Mask;
 use crate::sizes::{Layout, Sizes};
 use crate::surrogate::{Prediction, Surrogate, Tables, Unstable};
