@@ -263,7 +263,8 @@ impl<'k> Loop<'k> {
             let estimate = self.core.clone().estimate(&model, &judged);
             return Ok(Answer { estimate, steered: Some(steered), short: Some(short) });
         }
-        let mut judged = self.core.judge(&model, &mut bytes)?;
+        // a feedback aside: its surprise is what the other one would hold for, too
+        let mut judged = self.core.judge_and_steer(&model, &self.feedback, &mut self.steer.clone(), &mut bytes)?;
         let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), &judged);
         let steered = self.steers().then(|| of_design(&mut self.steer));
         self.core.learn(&model, &mut judged);

@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use std::thread;
 
 use clap::Parser;
-use system_tests::feedback::{Control, Known, Loop, Scenario, recommended, rms, settled};
+use system_tests::feedback::{Control, Known, Loop, Sample, Scenario, recommended, rms, settled};
 
 /// Close many loops.
 #[derive(Debug, Parser)]
@@ -42,16 +42,19 @@ struct Stretch {
     runs: Vec<Orbits>,
 }
 
-/// Rms orbits of a stretch [m]: of all of it, and of its second half.
+/// Rms orbits of a stretch [m], in its [`PARTS`].
 #[derive(Debug, Clone, Copy)]
 struct Orbits {
     off: f64,
-    design: [f64; 2],
-    estimated: [f64; 2],
+    design: [f64; 3],
+    estimated: [f64; 3],
 }
 
-/// Whole stretches, and their second halves.
-const PARTS: [(&str, usize); 2] = [("whole stretches", 0), ("settled", 1)];
+/// All frames of a stretch; those that follow a frame in which both responses moved the correctors, for the others show what
+/// neither had any part in; and its second half.
+const PARTS: [(&str, usize); 3] = [("whole stretches", 0), ("corrected frames", 1), ("settled", 2)];
+/// Largest share of the orbit without correction that is asked for.
+const SHARE: f64 = 0.2;
 /// Standard errors of the mean over the noises by which two responses must differ: by chance once in 200 stretches with eight
 /// noises (Student's t with 7 degrees of freedom, both sides).
 const DIFFER: f64 = 4.0;
@@ -91,9 +94,14 @@ fn orbits(known: &Known, seed: u64, noise: u64) -> Result<Vec<Orbits>, String> {
     };
     let (off, design, estimated) = (closed(Control::Off)?, closed(Control::Design)?, closed(Control::Estimated)?);
     let stretches = scenario.stretches().into_iter().map(|(_, frames)| {
-        let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
-        let both = |samples| [rms(samples), rms(settled(samples))];
-        Orbits { off: rms(off), design: both(design), estimated: both(estimated) }
+        let is_moved = |sample: &Sample| sample.steered.is_some_and(|steered| steered.hold.is_none());
+        let corrected: Vec<usize> =
+            frames.clone().filter(|k| is_moved(&design[k - 1]) && is_moved(&estimated[k - 1])).collect();
+        let parts = |samples: &[Sample]| {
+            let corrected: Vec<Sample> = corrected.iter().map(|k| samples[*k]).collect();
+            [rms(&samples[frames.clone()]), rms(&corrected), rms(settled(&samples[frames.clone()]))]
+        };
+        Orbits { off: rms(&off[frames.clone()]), design: parts(&design), estimated: parts(&estimated) }
     });
     Ok(stretches.collect())
 }
@@ -121,6 +129,12 @@ fn in_parallel<I: Sync, O: Send>(
 fn summarise(stretches: &[Stretch]) {
     let shares = stretches.iter().flat_map(|stretch| &stretch.runs).map(|run| run.estimated[0] / run.off);
     println!("largest share of the orbit without correction: {:.3}", shares.fold(0.0, f64::max));
+    for stretch in stretches {
+        let above = stretch.runs.iter().filter(|run| run.estimated[0] > SHARE * run.off).count();
+        if above > 0 {
+            println!("  above {SHARE} in {above} of {}: seed {}, {}", stretch.runs.len(), stretch.seed, stretch.name);
+        }
+    }
     for (name, part) in PARTS {
         let ratios: Vec<f64> = stretches.iter().flat_map(|stretch| stretch.ratios(part)).collect();
         let below = ratios.iter().filter(|ratio| **ratio < 0.0).count();
@@ -147,7 +161,7 @@ fn compare(stretches: &[Stretch]) {
 }
 
 fn report(stretch: &Stretch, part: usize, mean: f64, error: f64) {
-    let micrometres = |of: fn(&Orbits) -> [f64; 2]| {
+    let micrometres = |of: fn(&Orbits) -> [f64; 3]| {
         1e6 * (stretch.runs.iter().map(|run| of(run)[part].powi(2)).sum::<f64>() / stretch.runs.len() as f64).sqrt()
     };
     let (design, estimated) = (micrometres(|run| run.design), micrometres(|run| run.estimated));
