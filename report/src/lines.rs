@@ -80,6 +80,15 @@ mod tests {
     }
 
     #[test]
+    fn an_event_is_a_line_with_its_word_and_none_beyond_the_axis() {
+        let plain = Axes::new("t", "x", "y");
+        let marked = plain.clone().marked(vec![(10.0, "step".into()), (99.0, "beyond".into())]);
+        let [before, after] = [plain, marked].map(|axes| Figure::lines(&axes, &series()).svg);
+        assert!(after.contains(">\nstep\n</text>") && !after.contains("beyond"), "{after}");
+        assert!(after.matches("<polyline").count() > before.matches("<polyline").count());
+    }
+
+    #[test]
     fn a_missing_value_leaves_a_gap() {
         let gap = Series::line("gap", vec![0.0, 1.0, 2.0, 3.0, 4.0], vec![0.0, 1.0, f64::NAN, 1.0, 0.0]);
         let whole = Series::line("gap", gap.x.clone(), vec![0.0, 1.0, 1.0, 1.0, 0.0]);

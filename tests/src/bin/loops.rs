@@ -139,7 +139,16 @@ fn summarise(stretches: &[Stretch]) {
         let ratios: Vec<f64> = stretches.iter().flat_map(|stretch| stretch.ratios(part)).collect();
         let below = ratios.iter().filter(|ratio| **ratio < 0.0).count();
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
-        println!("{name}: below the design's in {below} of {}, geometric mean {:.3}", ratios.len(), mean.exp());
+        let micrometres = |of: fn(&Orbits) -> [f64; 3]| {
+            let runs = stretches.iter().flat_map(|stretch| &stretch.runs);
+            1e6 * (runs.map(|run| of(run)[part].ln()).sum::<f64>() / ratios.len() as f64).exp()
+        };
+        let (design, estimated) = (micrometres(|run| run.design), micrometres(|run| run.estimated));
+        println!(
+            "{name}: {estimated:.1} um, the design's {design:.1} um, ratio {:.3}; below it in {below} of {}",
+            mean.exp(),
+            ratios.len()
+        );
     }
 }
 

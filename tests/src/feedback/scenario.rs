@@ -59,7 +59,16 @@ impl Scenario {
     /// Nothing happens but drift.
     pub fn quiet(seed: u64, frames: u32) -> Self {
         let events = Vec::new();
-        Self { seed, noise: seed + 1_000_003, frames, campaign: CAMPAIGN, walk: 1e-5, ground: 2e-7, counts: true, events }
+        Self {
+            seed,
+            noise: seed + 1_000_003,
+            frames,
+            campaign: CAMPAIGN,
+            walk: 1e-5,
+            ground: 2e-7,
+            counts: true,
+            events,
+        }
     }
 
     /// One of everything, at places drawn from the seed.
