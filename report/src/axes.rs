@@ -19,7 +19,7 @@ pub struct Axes {
     pub reference: Option<Reference>,
     /// The magnets and instruments below, where the horizontal axis is the path length [m].
     pub strip: Option<Strip>,
-    /// What happens where on the horizontal axis: a line from bottom to top, and a word beside it.
+    /// What happens where on the horizontal axis: a line from bottom to top, and a word beside it, above the data.
     pub events: Vec<(f64, String)>,
 }
 

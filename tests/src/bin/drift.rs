@@ -204,10 +204,7 @@ fn figure(ring: &Ring, stream: &Stream, followed: &[Followed]) -> Figure {
     let axes =
         Axes::new("A stream of ten minutes: estimates with bands of 2 sigma, and the truth", "time [s]", "var [1]");
     let at = |frame: usize| stream.recording.rows[frame].time;
-    let loose = followed.iter().position(|f| f.let_loose.is_some());
-    let events = [(stream.step(), "C3 steps by -2 %"), (loose, "the core lets vars loose")];
-    let axes =
-        axes.marked(events.into_iter().filter_map(|(frame, what)| Some((at(frame?), what.to_owned()))).collect());
+    let axes = axes.marked(stream.step().map(|step| (at(step), "C3 steps".to_owned())).into_iter().collect());
     let names = ring.var_names();
     let shown: Vec<usize> =
         ["D8", "C3", "A5"].iter().filter_map(|name| names.iter().position(|var| var == name)).collect();

@@ -150,6 +150,19 @@ impl Scenario {
 }
 
 impl Event {
+    /// What it happens to.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Moves(..) => "quadrupole",
+            Self::Steps(..) => "var",
+            Self::Sticks(..) => "corrector",
+            Self::Lost(_) => "beam",
+            Self::Silent(..) => "monitors",
+            Self::Momentum(..) => "momentum",
+            Self::Gap(_) => "no frames",
+        }
+    }
+
     fn lasting(&self) -> u32 {
         match self {
             Self::Moves(..) | Self::Steps(..) | Self::Gap(_) => 1,
