@@ -4,7 +4,7 @@ use crate::linear::add;
 use crate::triangle::Triangle;
 
 /// Most times that each corrector is set in a frame.
-const SWEEPS: usize = 16;
+const SWEEPS: usize = 8;
 /// Share of a corrector's room by which it may still be off.
 const CLOSE: f32 = 1e-3;
 
