@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop drift measured train bench peers exports figures validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -54,6 +54,9 @@ endure: setup ## 20,000 simulated feedback frames on a bad line through the imag
 
 loop: setup ## the loop closed in software: orbit with estimated vars, with the design's, without; the same frames through the emulator
 	cargo run --locked --release -p system-tests --bin loop
+
+loops: ## many closed loops in pairs of runs, estimated response against the design's: the statistics of docs/feedback.md; minutes
+	cargo run --locked --release -p system-tests --bin loops -- --noises 8 --seeds 101,102,103,104,105,106,401,402,403,404,405,406,701,702,703,704,705,706
 
 drift: ## a stream that drifts, and how soon steps of vars are found: docs/drift.md with its figure; minutes
 	cargo run --locked --release -p system-tests --bin drift

@@ -6,11 +6,11 @@
 
 mod anew;
 mod drift;
-mod judged;
 mod laplace;
 mod pooling;
 mod posterior;
 mod reference;
+mod remarks;
 mod screen;
 mod sequence;
 mod steering;
@@ -28,6 +28,7 @@ use crate::drive::{Calibration, Drive, Each};
 use crate::estimate::Estimate;
 use crate::following::{self, Following};
 use crate::gaussian::{Gaussian, Independent, Reading, Solution};
+use crate::judged::{Judged, Screened};
 use crate::linear::column;
 use crate::mask::Mask;
 use crate::monitor::{Gate, Monitor, Peers};
@@ -38,17 +39,13 @@ use crate::wire::{Frame, FrameError, PositionCode};
 
 use anew::Anew;
 pub use anew::Prepared;
-pub use judged::Judged;
 pub use laplace::FitQuality;
 use pooling::Work;
 use posterior::Posterior;
 pub use posterior::Walk;
 use reference::Reference;
-pub(crate) use screen::Screened;
 use sequence::Sequence;
 use times::Times;
-#[cfg(test)]
-pub(crate) use whole::Expected;
 use whole::{Whole, WholeFrames};
 
 /// Priors that groups of params can have.

@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::drive::{Drive, Each};
 use crate::estimate::{Health, MonitorState};
-use crate::estimator::Judged;
+use crate::judged::Judged;
 use crate::linear::dot;
 use crate::ramp::is_same_time;
 use crate::surrogate::Steerable;
@@ -40,8 +40,8 @@ use crate::triangle::Triangle;
 use crate::wire::{CurrentCode, Frame, PositionCode};
 
 use gain::Gain;
+pub use hold::Hold;
 use hold::Watch;
-pub use hold::{Hold, is_surprising};
 use pace::Pace;
 use supplies::Supplies;
 
@@ -438,16 +438,16 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         }
         let setpoints = self.supplies.setpoints();
         let room = |c: usize| {
-            let (limit, kick) = (feedback.edge(c), response.kick(c));
+            let (limit, rate, kick) = (feedback.edge(c), feedback.rate, response.kick(c));
             let current = setpoints.get(c).copied().unwrap_or_default().value();
-            [(-limit - current) * kick, (limit - current) * kick]
+            // one that is beyond its limit comes back at its rate
+            [-limit - current, limit - current].map(|to| to.min(rate).max(-rate) * kick)
         };
-        let rate = |c: usize| feedback.rate * response.kick(c);
         let (pull_x, pull_y) = pull.split_at(CX.min(C));
         let mut step = [0.0; C];
         let (step_x, step_y) = step.split_at_mut(CX.min(C));
-        self.x.step(pull_x, &room, &rate, 0, step_x);
-        self.y.step(pull_y, &room, &rate, CX, step_y);
+        self.x.step(pull_x, &room, 0, step_x);
+        self.y.step(pull_y, &room, CX, step_y);
         step.iter_mut().enumerate().for_each(|(c, step)| *step /= response.kick(c));
         self.supplies.change(&step, |c| feedback.edge(c))
     }

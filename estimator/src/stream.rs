@@ -4,7 +4,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::estimate::Estimate;
-use crate::estimator::{Estimator, FitQuality, IngestError, Judged, Model, Prepared, Setup};
+use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
+use crate::judged::Judged;
 use crate::sizes::Sizes;
 use crate::steer::{Feedback, Steer, Steered};
 use crate::surrogate::{Steerable, Surrogate, Tables, Unstable};

@@ -19,6 +19,8 @@ pub struct Axes {
     pub reference: Option<Reference>,
     /// The magnets and instruments below, where the horizontal axis is the path length [m].
     pub strip: Option<Strip>,
+    /// What happens where on the horizontal axis: a line from bottom to top, and a word beside it, above the data.
+    pub events: Vec<(f64, String)>,
 }
 
 /// A line to compare the data with, dashed in grey.
@@ -52,6 +54,12 @@ impl Axes {
     #[must_use]
     pub fn along(self, strip: Strip) -> Axes {
         Axes { strip: Some(strip), ..self }
+    }
+
+    /// The same with what happens on the way.
+    #[must_use]
+    pub fn marked(self, events: Vec<(f64, String)>) -> Axes {
+        Axes { events, ..self }
     }
 
     /// The level to keep in sight, if there is one.

@@ -3,7 +3,7 @@
 use core::ops::Range;
 
 use super::axes::{Axes, aired};
-use super::canvas::draw;
+use super::canvas::{SMALL, draw, text_width};
 use super::figure::Figure;
 use super::legend::{Legend, Sample};
 use super::numbers;
@@ -17,6 +17,7 @@ impl Figure {
     /// Lines and points on common axes, each as its [`Series`] says.
     pub fn lines(axes: &Axes, series: &[Series]) -> Figure {
         let [x, y] = spans(series.iter(), axes).map(aired);
+        let y = below_words(axes, y);
         Figure::drawn(numbers::of_series(axes, series), |width| chart(axes, series, [&x, &y], width))
     }
 
@@ -28,6 +29,12 @@ impl Figure {
         let y = y.start..top;
         Figure::drawn(numbers::of_series(axes, curves), |width| chart(axes, &grounded, [&x, &y], width))
     }
+}
+
+/// The vertical range with room above the data for the words of the events: at most half of the height.
+fn below_words(axes: &Axes, y: Range<f64>) -> Range<f64> {
+    let longest = axes.events.iter().map(|(_, word)| text_width(word, SMALL) + 8.0).fold(0.0, f64::max);
+    y.start..y.start + (y.end - y.start) / (1.0 - (longest / HEIGHT).min(0.5))
 }
 
 fn on_ground(curve: Series) -> Series {
@@ -77,6 +84,15 @@ mod tests {
         for text in names.iter().map(String::as_str).chain(["magnet", "ratio [1]", "line", "points"]) {
             assert!(svg.contains(&format!(">\n{text}\n</text>")), "{text}");
         }
+    }
+
+    #[test]
+    fn an_event_is_a_line_with_its_word_and_none_beyond_the_axis() {
+        let plain = Axes::new("t", "x", "y");
+        let marked = plain.clone().marked(vec![(10.0, "step".into()), (99.0, "beyond".into())]);
+        let [before, after] = [plain, marked].map(|axes| Figure::lines(&axes, &series()).svg);
+        assert!(after.contains(">\nstep\n</text>") && !after.contains("beyond"), "{after}");
+        assert!(after.matches("<polyline").count() > before.matches("<polyline").count());
     }
 
     #[test]

@@ -7,7 +7,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
 use super::axes::{Axes, Reference, slots};
-use super::canvas::{Drawn, LABEL, Sheet, TICK, plain, px, text_width, upwards, write};
+use super::canvas::{Drawn, LABEL, SMALL, Sheet, TICK, plain, px, text_width, upwards, write};
 use super::pen::{Pen, Spot};
 use super::ticks::Ticks;
 
@@ -166,7 +166,18 @@ impl<'s, 'a> Plot<'s, 'a> {
             self.x_names(&axes.x_names)?;
         }
         self.x_label(&axes.x_label, below(&axes.x_names) - 10.0)?;
+        self.events(&axes.events)?;
         self.reference(axes.reference)
+    }
+
+    /// A dashed line at each event, and left of it what it is, read upwards and ending at the top.
+    fn events(&self, events: &[(f64, String)]) -> Drawn {
+        events.iter().filter(|(x, _)| self.x.contains(x)).try_for_each(|(x, label)| {
+            let [foot, top] = [self.y.start, self.y.end].map(|y| self.spot(*x, y));
+            Pen::reference().line(self.sheet, &[foot, top])?;
+            let at = (top.0 - px(0.6 * SMALL), top.1 + px(4.0));
+            self.sheet.draw_text(label, &upwards(SMALL, HPos::Right), at)
+        })
     }
 
     fn tick(&self, from: Spot, by: (f64, f64)) -> Drawn {

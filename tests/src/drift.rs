@@ -6,7 +6,7 @@ use estimator::booster::{Estimator, Green, PARAMS, Setup};
 use estimator::{Model, Prepared};
 use inference::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
-use inference::stream::{self, FOLLOW};
+use inference::stream::{self, FOLLOW, Walk};
 use twin::{Cycle, Ring};
 
 use crate::machine::{LAYOUT, Random, nees};
@@ -19,6 +19,8 @@ pub enum Course {
     Drifts(f64),
     /// It steps at this share of the stream, by so much of itself.
     Steps(f64, f64),
+    /// It swings to and fro by so much of itself, twice.
+    Swings(f64),
 }
 
 impl Course {
@@ -27,6 +29,7 @@ impl Course {
         match self {
             Self::Drifts(by) => 1.0 + by * time,
             Self::Steps(at, by) => 1.0 + if time >= at { by } else { 0.0 },
+            Self::Swings(by) => 1.0 + by * (2.0 * core::f64::consts::TAU * time).sin(),
         }
     }
 }
@@ -124,7 +127,7 @@ impl Stream {
     pub fn step(&self) -> Option<usize> {
         let at = |(_, course): &(usize, Course)| match course {
             Course::Steps(at, _) => Some((at * self.recording.rows.len() as f64).ceil() as usize),
-            Course::Drifts(_) => None,
+            Course::Drifts(_) | Course::Swings(_) => None,
         };
         self.changes.0.iter().find_map(at)
     }
@@ -165,8 +168,19 @@ pub struct Followed {
 /// # Panics
 /// If it refuses a frame.
 pub fn follow(ring: &Ring, stream: &Stream) -> Result<Vec<Followed>, Box<dyn Error>> {
+    follow_with(ring, stream, FOLLOW)
+}
+
+/// The same with another walk.
+///
+/// # Errors
+/// If there is no core for it.
+///
+/// # Panics
+/// If it refuses a frame.
+pub fn follow_with(ring: &Ring, stream: &Stream, walk: Walk) -> Result<Vec<Followed>, Box<dyn Error>> {
     let recording = &stream.recording;
-    let core = stream::estimator(ring, recording, FOLLOW)?;
+    let core = stream::estimator(ring, recording, walk)?;
     let (mut surrogate, setup): (_, Setup) = (Box::new(Green::BLANK), core.setup.in_room(&LAYOUT));
     core.tables.fill(&mut *surrogate)?;
     let model = Model { surrogate: &*surrogate, setup: &setup };

@@ -120,7 +120,7 @@ impl<'k> Loop<'k> {
         scenario: Scenario,
     ) -> Result<Self, Box<dyn Error>> {
         let vars = simulate::vars(&Ring::booster(), true, scenario.seed)?;
-        let mut random = [Random::new(scenario.seed), Random::new(scenario.seed + 1_000_003)];
+        let mut random = [Random::new(scenario.seed), Random::new(scenario.noise)];
         let plant = Plant::new(&vars, &mut random[0])?;
         feedback.orbit.own = plant.offset.iter().map(|offset| *offset as f32).collect();
         let mut core = Box::new(Estimator::BLANK);
@@ -263,7 +263,8 @@ impl<'k> Loop<'k> {
             let estimate = self.core.clone().estimate(&model, &judged);
             return Ok(Answer { estimate, steered: Some(steered), short: Some(short) });
         }
-        let mut judged = self.core.judge(&model, &mut bytes)?;
+        // a feedback aside: its surprise is what the other one would hold for, too
+        let mut judged = self.core.judge_and_steer(&model, &self.feedback, &mut self.steer.clone(), &mut bytes)?;
         let of_design = |steer: &mut Steer| steer.steer(&self.feedback, &self.known.of_design(), &judged);
         let steered = self.steers().then(|| of_design(&mut self.steer));
         self.core.learn(&model, &mut judged);

@@ -6,6 +6,10 @@ use system_tests::machine::Random;
 use system_tests::soak::{Row, Soak};
 use twin::Ring;
 
+/// Frames within which a step that the tunes show is found: the shorter window of the core (`estimator/drift.rs`). 16 machines
+/// whose vars step by 2 % take two or three.
+const WINDOW: usize = 8;
+
 fn sign(random: &mut Random) -> f64 {
     if random.below(2) == 0 { 1.0 } else { -1.0 }
 }
@@ -41,7 +45,7 @@ fn the_drift_stream_is_followed() {
     let sigma = drift::mean_sigma(&stream, &followed);
     assert!(sigma <= 0.0045, "mean sigma {sigma:.5}");
     let found = let_loose(&followed);
-    assert!(found.len() == 1 && (1800..1830).contains(&found[0]), "{found:?}");
+    assert!(found.len() == 1 && (1800..1800 + WINDOW).contains(&found[0]), "{found:?}");
 }
 
 #[test]
@@ -53,12 +57,13 @@ fn steps_of_any_var_are_found_and_stay_within_the_bands() {
         let followed = drift::follow(&ring, &stream).unwrap();
         let (var, _) = stream.changes.0[0];
         let found = let_loose(&followed);
-        assert!(!found.is_empty() && (900..930).contains(&found[0]), "seed {seed}: {found:?}");
+        assert!(!found.is_empty() && (900..900 + WINDOW).contains(&found[0]), "seed {seed}: {found:?}");
         let out = drift::outside(&stream, &followed, var);
         assert!(out <= 0.01, "seed {seed}: outside 3 sigma in {:.2} % of the frames", 100.0 * out);
-        // vars that stay walk in the model: what the walk adds to the variance is at most the other half of it
+        // vars that stay walk in the model: what the walk adds to the variance is at most the other half of it, which leaves 0.5 with
+        // a scatter of sqrt(2/48)/2 = 0.1; 16 machines give 0.61 to 0.98, 0.76 ± 0.11: four standard deviations above
         let nees = mean_nees(&followed);
-        assert!((0.4..1.6).contains(&nees), "seed {seed}: NEES/48 {nees:.2}");
+        assert!((0.4..1.2).contains(&nees), "seed {seed}: NEES/48 {nees:.2}");
         assert!(drift::mean_sigma(&stream, &followed) <= 0.0045, "seed {seed}");
     }
 }
@@ -71,9 +76,10 @@ fn nothing_is_let_loose_where_nothing_steps() {
         let stream = Stream::simulated(&ring, seed, 1500, |_| Changes::default()).unwrap();
         let followed = drift::follow(&ring, &stream).unwrap();
         assert_eq!(let_loose(&followed), [0; 0], "seed {seed}");
-        // twice the logarithm of how many tries there are, 48 params in 1500/48 windows, is where the largest of so many lies
+        // the logarithm of how many tries there are, 48 params in 1500/48 windows, is where the largest of so many lies, ln 1500 nat;
+        // 16 machines give 2.2 to 5.1 nat, 3.2 ± 0.8
         let largest = followed.iter().map(|f| f.evidence).fold(0.0, f32::max);
-        assert!(largest < 10.0, "seed {seed}: {largest} nat");
+        assert!(largest < 1500_f32.ln(), "seed {seed}: {largest} nat");
     }
 }
 

@@ -8,6 +8,18 @@ use system_tests::feedback::{Control, Event, Known, Loop, Sample, Scenario, WALK
 /// Orbit that noise of 0.15 mm and a walk of 2.2 um a frame leave in a filter, `sqrt(walk noise)` [m].
 const LEFT: f64 = 18e-6;
 
+/// Frames put aside in a row after which the core lets the readings count again (`quarantine.rs`).
+const PERSISTS: usize = 30;
+/// Frames that the core takes to tell that baselines have moved (`quarantine.rs`).
+const ENOUGH: usize = 10;
+/// Frames held in a run: 18 machines (seeds 101 to 106, 401 to 406, 701 to 706) give 51 to 59, 54.6 ± 2.2; four standard deviations.
+const HELD: usize = 63;
+/// Orbit that probes of 1 A add while the beam is lost from the first frame on [m]: 0.22, 0.32 and 0.26 mm in three machines (seeds
+/// 204, 214, 224), 0.27 ± 0.05 mm; four standard deviations. Other faults give 0.22 mm at most.
+const PROBE: f64 = 4.7e-4;
+/// Share of the orbit without correction that is asked for.
+const SHARE: f64 = 0.2;
+
 fn run(known: &Known, feedback: &Feedback, control: Control, scenario: &Scenario) -> Vec<Sample> {
     Loop::new(known, feedback.clone(), control, scenario.clone()).unwrap().run().unwrap()
 }
@@ -21,8 +33,7 @@ fn holds_the_orbit(seed: u64) {
     let mut logarithms = Vec::new();
     for (name, frames) in scenario.stretches() {
         let [off, design, estimated] = [&off, &design, &estimated].map(|samples| &samples[frames.clone()]);
-        // a fifth of the orbit without correction is what is asked for
-        assert!(rms(estimated) <= 0.2 * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
+        assert!(rms(estimated) <= SHARE * rms(off), "seed {seed}, {name}: {} of {} m", rms(estimated), rms(off));
         let [by_estimate, by_design] = [rms(estimated), rms(design)];
         assert!(by_estimate < by_design + LEFT, "seed {seed}, {name}: {by_estimate}, by the design {by_design} m");
         let ratio = rms(settled(estimated)) / rms(settled(design));
@@ -30,10 +41,13 @@ fn holds_the_orbit(seed: u64) {
     }
     let mean = (logarithms.iter().sum::<f64>() / logarithms.len() as f64).exp();
     assert!(mean < 1.0, "seed {seed}: {mean} of the design's on average");
-    // what holds, holds for as long as it lasts and some frames more
+    // after 30 frames put aside the model would be taken to be at fault (`quarantine.rs`): no hold is to last as long
+    for (name, frames) in scenario.stretches() {
+        assert!(held(&estimated[frames.clone()]) < PERSISTS, "seed {seed}, {name}");
+    }
     let of = |hold| estimated.iter().filter(|s| s.steered.is_some_and(|s| s.hold == Some(hold))).count();
     assert_eq!((of(Hold::Mismatch), of(Hold::Unsolved), of(Hold::Blind)), (0, 0, 0), "seed {seed}");
-    assert!(held(&estimated) < 60, "seed {seed}: {} frames held", held(&estimated));
+    assert!(held(&estimated) <= HELD, "seed {seed}: {} frames held", held(&estimated));
 }
 
 #[test]
@@ -49,7 +63,8 @@ fn the_orbit_of_another_ring_is_held_whatever_happens() {
 }
 
 /// A fault at any time, from the first frame with feedback on, without a campaign before it: the orbit never becomes worse
-/// than it would be without correction, and ends at a third of it.
+/// than it would be without correction by more than a probe, and ends at the share that is asked for: 54
+/// runs (seeds 201 to 206, 211 to 216, 221 to 226) end at 0.008 to 0.048 of it.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn no_fault_at_any_time_makes_it_unstable() {
@@ -69,11 +84,11 @@ fn no_fault_at_any_time_makes_it_unstable() {
             let samples = run(&known, &feedback, Control::Estimated, &scenario);
             let off = run(&known, &feedback, Control::Off, &scenario);
             for (frame, (sample, off)) in samples.iter().zip(&off).enumerate() {
-                let largest = 1.2 * off.rms + 3e-4; // probes move the orbit by 0.3 mm
+                let largest = off.rms + PROBE;
                 assert!(sample.rms < largest, "{fault} at {at}, walk {walk}, frame {frame}: {} m", sample.rms);
             }
             let (last, off) = (rms(&samples[130..]), rms(&off[130..]));
-            assert!(last < off / 3.0, "{fault} at {at}, walk {walk}: {last} of {off} m");
+            assert!(last <= SHARE * off, "{fault} at {at}, walk {walk}: {last} of {off} m");
         }
     }
 }
@@ -88,5 +103,6 @@ fn probes_end_a_hold() {
         let feedback = Feedback { probe, ..recommended() };
         held(&run(&known, &feedback, Control::Estimated, &scenario)[120..])
     });
-    assert!(with <= 12 && without >= 30, "{with} and {without} frames held");
+    // of 12 machines all hold 9 frames with probes, and 32 to 72 without
+    assert!(with <= ENOUGH && without >= PERSISTS, "{with} and {without} frames held");
 }

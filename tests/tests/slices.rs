@@ -60,7 +60,7 @@ fn about_to_linearise() -> [(Core, Vec<Vec<u8>>); 3] {
 fn frames_between_any_two_slices_count_once() {
     for (start, next) in about_to_linearise() {
         let total = slices(&mut start.clone(), usize::MAX);
-        assert!(total > 20, "{total} slices");
+        assert!(total >= FEWEST, "{total} slices");
         // one frame; two, which may have to wait for each other; four, for which there is no room to wait
         for burst in [1, 2, 4] {
             let (meanwhile, then) = next.split_at(burst);
@@ -98,10 +98,21 @@ fn frames_between_any_two_slices_count_once() {
     }
 }
 
-/// Evidence that depends on where the frames that came meanwhile were linearised [nat].
-const EVIDENCE: f32 = 1.0;
-/// What depends on it of the params before the next linearisation, which is due when they have moved by half an error bar.
+/// Slices of a linearisation: the three take 31, 47 and 67.
+const FEWEST: usize = 31;
+
+/// Evidence that depends on where the frames that came meanwhile were linearised [nat]. The slowest pace shows it most: the largest
+/// of five machines (seeds 3 to 7) are 0.45 to 0.80, 0.67 ± 0.13; four standard deviations. Three bursts at any slice of three
+/// linearisations give 0.61 at most.
+const EVIDENCE: f32 = 1.2;
+/// What depends on it of the params before the next linearisation, which is due when they have moved by half an error bar. The largest
+/// of the three linearisations are 0.021, 0.024 and 0.048, 0.031 ± 0.015; four standard deviations.
 const LINEARISED: f32 = 0.1;
+/// The same at any pace: the largest of five machines are 0.062 to 0.095, 0.079 ± 0.017; four standard deviations.
+const AT_ANY_PACE: f32 = 0.15;
+/// NEES over 48 after lost beams and moved baselines: 23 of 24 machines (seeds 0 to 23) give 0.54 to 2.29, 1.30 ± 0.46; three
+/// standard deviations above. One, seed 15, ends at 22.9.
+const DISTURBED: f32 = 2.7;
 
 /// The linearisation is rounded to 16 bits, column by column: 1e-5 of an orbit of 10 mm beside a noise of 0.15 mm. How baselines
 /// follow the supplies, which is learnt meanwhile, is the larger part: 3.5e-3 measured.
@@ -146,7 +157,7 @@ fn a_stream_at_any_pace_ends_where_one_that_waits_does() {
         let (off, evidence) = (distance(&last, &expected), (last.log_evidence - expected.log_evidence).abs());
         println!("pace {pace}: {off} sigma, {evidence} nat");
         assert_eq!(last.frames, expected.frames);
-        assert!(off < 0.1 && evidence < 1.0, "pace {pace}: {off} sigma, {evidence} nat");
+        assert!(off < AT_ANY_PACE && evidence < EVIDENCE, "pace {pace}: {off} sigma, {evidence} nat");
     }
 }
 
@@ -178,6 +189,6 @@ fn a_disturbed_stream_at_any_pace_stays_sound() {
         let last = ingest(&mut core, &wire_of(&machine.cycle(300)));
         let errors = last.map_params.iter().zip(&machine.params).zip(&last.params_sigma);
         let nees: f32 = errors.map(|((map, theta), sigma)| ((map - theta) / sigma).powi(2)).sum::<f32>() / 48.0;
-        assert!(nees < 2.5, "seed {seed}: {nees}");
+        assert!(nees < DISTURBED, "seed {seed}: {nees}");
     }
 }

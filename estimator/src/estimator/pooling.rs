@@ -1,10 +1,10 @@
 //! All frames so far, counted into a second Gaussian at a new linearisation, a slice at a time.
 
-use super::screen::Screened;
 use super::{Estimator, Loose, Model, Tangent, about, follow};
 use crate::drive::Drive;
 use crate::following;
 use crate::gaussian::{Gaussian, Independent, Line, Pool, Reading, Repeats};
+use crate::judged::Screened;
 use crate::linear::dot;
 use crate::mask::Mask;
 use crate::surrogate::Surrogate;

@@ -1,10 +1,10 @@
 //! Which readings of a good frame are used: what their repeats say, and where there are none, the model.
 
-use super::whole::{Expected, Whole};
+use super::whole::Whole;
 use super::{Estimator, Model};
 use crate::campaign::{Verdict, is_moved};
 use crate::drive::Drive;
-use crate::mask::Mask;
+use crate::judged::{Expected, Screened};
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
 use crate::wire::{Frame, PositionCode};
@@ -12,38 +12,6 @@ use crate::wire::{Frame, PositionCode};
 /// Information that a frame adds, up to which the params' uncertainty is none of a reading's business [nat]: shared by 33 readings
 /// it makes 1.5 % of their noise.
 const NARROWS: f64 = 0.5;
-
-/// Which readings of a frame are used.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Screened<const W: usize> {
-    pub accepted: Mask<W>,
-    pub rejected: Mask<W>,
-    pub confirmed: Mask<W>,
-    pub restarted: Mask<W>,
-    /// Growth of the repeats' squared deviations from the means of their settings, over the noise.
-    pub scatter: f64,
-    /// Innovation of each tune that is used [1].
-    pub tune: [Option<f32>; 2],
-}
-
-impl<const W: usize> Screened<W> {
-    fn note(&mut self, b: usize, verdict: Verdict) {
-        self.accepted.put(b, verdict != Verdict::Held);
-        self.rejected.put(b, verdict == Verdict::Held);
-        self.confirmed.put(b, matches!(verdict, Verdict::Confirms { .. }));
-        self.restarted.put(b, verdict == Verdict::Confirms { outvotes: true });
-    }
-
-    /// None of a frame's readings, which monitors with a 1 have reported.
-    pub fn none_of(valid: &Mask<W>) -> Self {
-        Self { rejected: *valid, ..Self::default() }
-    }
-
-    /// Number of readings that are used.
-    pub fn count(&self) -> u32 {
-        self.accepted.count() + self.tune.iter().flatten().count() as u32
-    }
-}
 
 impl<
     G: Surrogate<B, C, F, N>,

@@ -1,6 +1,7 @@
 //! What a feedback takes from the estimate: the response at the estimated vars, and the covariance of the params.
 
-use super::{Estimator, IngestError, Judged, Model};
+use super::{Estimator, IngestError, Model};
+use crate::judged::Judged;
 use crate::steer::{Feedback, Response, Steer};
 use crate::surrogate::Steerable;
 

@@ -1,12 +1,12 @@
 //! A frame as a whole, before any of it counts: is there a beam in it that the model knows?
 
-use super::{Estimator, Judged, Model, UNDERWEIGHT};
+use super::{Estimator, Model, UNDERWEIGHT};
 use crate::campaign::Setting;
 use crate::estimate::MonitorState;
+use crate::judged::{Expected, Judged, is_surprising};
 use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::quarantine::{Quarantine, Shift};
-use crate::steer::is_surprising;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -48,17 +48,6 @@ pub(super) struct WholeFrames<const B: usize> {
 impl<const B: usize> WholeFrames<B> {
     /// None so far.
     pub const NONE: Self = Self { quarantine: Quarantine::EMPTY, most_intense: 0 };
-}
-
-/// What the model makes of each reading.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Expected<const B: usize, const W: usize> {
-    /// Measured minus expected [m]; 0 where none is reported.
-    pub surprise: [f32; B],
-    /// Its variance but for the uncertainty of the params [m^2].
-    pub certain: [f32; B],
-    /// Those within the gate.
-    pub within: Mask<W>,
 }
 
 impl<

@@ -3,8 +3,10 @@
 use crate::linear::add;
 use crate::triangle::Triangle;
 
-/// Correctors that are brought back to their limit, one after the other, while the others make up for it.
-const BROUGHT_BACK: usize = 4;
+/// Most times that each corrector is set in a frame.
+const SWEEPS: usize = 8;
+/// Share of a corrector's room by which it may still be off.
+const CLOSE: f32 = 1e-3;
 
 /// `A^-1` of one plane of `C` correctors [rad^2].
 #[derive(Debug, Clone)]
@@ -40,51 +42,50 @@ impl<const C: usize, const T: usize> Gain<C, T> {
         each.for_each(|(to, from)| *to = *from as f32);
     }
 
-    /// The kicks `-A^-1 pull` [rad], within the room that each corrector has, and scaled so that none moves faster than its rate; the
-    /// plane's correctors are those from the `first` on.
+    /// The kicks of the least cost [rad] within the room that each corrector has in this frame; the plane's correctors are those from
+    /// the `first` on.
     ///
-    /// Where the best kicks are beyond a corrector's room, it is held at its edge and the others make up for it:
-    /// `d -= A^-1 e_c (d_c - edge)/(A^-1)_cc` is the minimum on condition that `d_c = edge`.
+    /// Without limits they are `-A^-1 pull`; a corrector at its edge adds a force `f_c` there: `d = -A^-1 (pull + f)`. One corrector
+    /// after the other gets the force that it needs, or loses what it needs no more, until none changes.
+    ///
+    /// Source: C. Hildreth, A quadratic programming procedure, Naval Res. Logist. Q. 4 (1957) 79.
     #[inline(never)]
-    pub fn step(
-        &self,
-        pull: &[f32],
-        room: &impl Fn(usize) -> [f32; 2],
-        rate: &impl Fn(usize) -> f32,
-        first: usize,
-        step: &mut [f32],
-    ) {
-        let (room, rate) = (|c| room(first + c), |c| rate(first + c));
+    pub fn step(&self, pull: &[f32], room: &impl Fn(usize) -> [f32; 2], first: usize, step: &mut [f32]) {
         let mut best = [0.0; C];
         best.iter_mut().zip(pull).for_each(|(to, pull)| *to = -pull);
         best = self.inverse.multiply(&best);
-        for _ in 0..BROUGHT_BACK {
-            let beyond = |(c, d): (usize, &f32)| {
-                let [lower, upper] = room(c);
-                (c, (d - upper).max(0.0) + (d - lower).min(0.0))
-            };
-            let each = best.iter().enumerate().map(beyond);
-            let worst = each.fold((0, 0.0_f32), |worst, this| if this.1.abs() > worst.1.abs() { this } else { worst });
-            if worst.1 == 0.0 {
+        let mut force = [0.0; C];
+        for _ in 0..SWEEPS {
+            if !self.sweep(&mut best, &mut force, &|c| room(first + c)) {
                 break;
             }
-            self.bring_back(&mut best, worst);
         }
-        let mut share = 1.0_f32;
-        for (c, d) in best.iter_mut().enumerate() {
-            let [lower, upper] = room(c);
-            *d = if d.is_finite() { d.min(upper).max(lower) } else { 0.0 };
-            share = share.min(rate(c) / d.abs());
+        for (c, (to, d)) in step.iter_mut().zip(best).enumerate() {
+            *to = if d.is_finite() { within(d, room(first + c)) } else { 0.0 };
         }
-        step.iter_mut().zip(best).for_each(|(to, d)| *to = share * d);
     }
 
-    fn bring_back(&self, kicks: &mut [f32; C], (c, excess): (usize, f32)) {
-        let mut column = [0.0; C];
-        self.inverse.copy_row(c, &mut column);
-        let own = self.inverse.get(c, c);
-        if own > 0.0 {
-            add(kicks, -excess / own, &column);
+    /// Set the force on one corrector after the other; true if any has changed by what counts.
+    fn sweep(&self, kicks: &mut [f32; C], force: &mut [f32; C], room: &impl Fn(usize) -> [f32; 2]) -> bool {
+        let mut changed = false;
+        for (c, force) in force.iter_mut().enumerate() {
+            let (own, [lower, upper]) = (self.inverse.get(c, c), room(c));
+            let kick = kicks.get(c).copied().unwrap_or_default();
+            let free = kick + own * *force;
+            let by = within(free, [lower, upper]) - kick;
+            if by != 0.0 && own > 0.0 {
+                let mut column = [0.0; C];
+                self.inverse.copy_row(c, &mut column);
+                add(kicks, by / own, &column);
+                *force -= by / own;
+                changed |= by.abs() > CLOSE * (upper - lower);
+            }
         }
+        changed
     }
+}
+
+/// The value within bounds that is nearest to this one.
+fn within(value: f32, [lower, upper]: [f32; 2]) -> f32 {
+    value.min(upper).max(lower)
 }

@@ -4,7 +4,7 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::estimator::Judged;
+use crate::judged::{Judged, is_surprising, most};
 
 /// Why a frame moves no corrector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,25 +50,12 @@ impl fmt::Display for Hold {
     }
 }
 
-/// Standard deviations of the NIS beyond which a frame surprises: by chance one in a million, its skewness counted.
-const SURPRISING: f32 = 6.0;
 /// Share of a frame in the running mean of NIS over readings.
 const SHARE: f32 = 1.0 / 64.0;
 /// Running mean above which model and machine disagree; that of a true model is 1.00 ± 0.02.
 const DISAGREES: f32 = 3.0;
 /// One in so many monitors must be of use.
 const BLIND: usize = 2;
-
-/// True if so many readings are further from the prediction, by their squares over their variances, than chance explains.
-pub fn is_surprising(nis: f32, readings: u32) -> bool {
-    nis > most(readings)
-}
-
-/// NIS of so many readings beyond which a frame surprises.
-fn most(readings: u32) -> f32 {
-    let expected = readings as f32;
-    expected + SURPRISING * libm::sqrtf(2.0 * expected)
-}
 
 /// The running mean of NIS over readings, less 1.
 #[derive(Debug, Clone, Copy)]

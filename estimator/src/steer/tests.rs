@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::estimate::{Health, Remarks};
-use crate::estimator::{Expected, Screened};
+use crate::judged::{Expected, Screened};
 use crate::mask::Mask;
 use crate::sizes::{Layout, Sizes};
 use crate::surrogate::{Prediction, Surrogate, Tables, Unstable};
@@ -359,12 +359,19 @@ fn limits_hold_and_the_others_make_up_for_them() {
 }
 
 #[test]
-fn no_setpoint_moves_faster_than_its_rate_and_the_direction_stays() {
-    let mut machine = Machine::new(diagonal(), Feedback { rate: 2.0, ..free() }, 0.0);
-    machine.disturbance = [1e-3, -5e-4, 0.0, 0.0];
-    machine.cycles(1);
+fn no_setpoint_moves_faster_than_its_rate_and_the_others_make_up_for_it() {
+    let mut table = diagonal();
+    // the second monitor is seen by the first and the second corrector
+    table.at[1] = [6.0, 10.0, 0.0, 0.0];
+    table.at[0] = [0.0; C];
+    let mut machine = Machine::new(table, Feedback { rate: 7.0, step_kick: STEP, ..free() }, 0.0);
+    machine.disturbance = [0.0, 1e-3, 2e-4, 0.0];
+    let steered = machine.cycle();
+    // of the 0.3 mm that the second one leaves, the first does 6^2/(6^2 + 1); the third is as if alone: 10^2/(10^2 + 1) of 2 A
+    let expected = [-5.0 * 36.0 / 37.0, -7.0, -2.0 * 100.0 / 101.0];
     let amperes = machine.amperes();
-    assert!((amperes[0] + 2.0).abs() < 1e-3 && (amperes[1] - 1.0).abs() < 1e-3, "{amperes:?}");
+    assert!(amperes.iter().zip(expected).all(|(is, expected)| (is - expected).abs() < 2e-3), "{amperes:?}");
+    assert_eq!(steered.limited, 0);
 }
 
 #[test]

@@ -32,8 +32,10 @@ pub enum Event {
 /// A run of a loop.
 #[derive(Debug, Clone)]
 pub struct Scenario {
-    /// Of machine and noise.
+    /// Of the machine and what happens to it.
     pub seed: u64,
+    /// Of the noise of its monitors and correctors: runs that differ by it alone tell what is chance.
+    pub noise: u64,
     /// How long it is.
     pub frames: u32,
     /// Frames of a campaign before the feedback is switched on: each corrector in turn, up and down.
@@ -56,7 +58,17 @@ const MOVES: u32 = 4;
 impl Scenario {
     /// Nothing happens but drift.
     pub fn quiet(seed: u64, frames: u32) -> Self {
-        Self { seed, frames, campaign: CAMPAIGN, walk: 1e-5, ground: 2e-7, counts: true, events: Vec::new() }
+        let events = Vec::new();
+        Self {
+            seed,
+            noise: seed + 1_000_003,
+            frames,
+            campaign: CAMPAIGN,
+            walk: 1e-5,
+            ground: 2e-7,
+            counts: true,
+            events,
+        }
     }
 
     /// One of everything, at places drawn from the seed.
@@ -138,6 +150,19 @@ impl Scenario {
 }
 
 impl Event {
+    /// What it happens to.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Moves(..) => "quadrupole",
+            Self::Steps(..) => "var",
+            Self::Sticks(..) => "corrector",
+            Self::Lost(_) => "beam",
+            Self::Silent(..) => "monitors",
+            Self::Momentum(..) => "momentum",
+            Self::Gap(_) => "no frames",
+        }
+    }
+
     fn lasting(&self) -> u32 {
         match self {
             Self::Moves(..) | Self::Steps(..) | Self::Gap(_) => 1,

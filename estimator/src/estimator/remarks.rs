@@ -1,39 +1,13 @@
-//! A frame that was judged, and not yet learnt: what a feedback acts on.
-//!
-//! The setpoints of the correctors, and the reply that tells them, do not wait until a frame is learnt: that takes two thirds of the
-//! time, and what one frame adds to the vars is less than their error bars. Steering has the frame's orbit, and the vars of the frame
-//! before.
+//! What is said of a frame, and of the estimator.
 
 use super::Estimator;
-use super::screen::Screened;
-use super::whole::{Expected, Whole};
+use super::whole::Whole;
 use crate::drive::Drive;
-use crate::estimate::{Health, MonitorState, Remarks};
+use crate::estimate::{MonitorState, Remarks};
+use crate::judged::{Expected, Judged, Screened};
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
-
-/// A frame, and which of its readings count: `B` monitors, `C` correctors, `F` supplies, `W` words.
-#[derive(Debug, Clone)]
-#[must_use = "it is to be learnt"]
-pub struct Judged<const B: usize, const C: usize, const F: usize, const W: usize> {
-    /// The frame.
-    pub frame: Frame<B, C, F, W>,
-    /// Normalised innovation squared of the readings used, once the frame is learnt: on average one a reading. Where it is steered by,
-    /// before that: each by itself, its correlation with others and tunes left out.
-    pub nis: f32,
-    /// The model was linearised anew since the frame before.
-    pub linearised: bool,
-    /// What is to be said of the frame as a whole, and so far of the posterior.
-    pub remarks: Remarks,
-    /// State of every monitor.
-    pub health: [Health; B],
-    pub(crate) drive: Drive<C, F>,
-    pub(crate) expected: Expected<B, W>,
-    /// The stored setting that it repeats.
-    pub(crate) cell: Option<u16>,
-    pub(crate) screened: Screened<W>,
-}
 
 impl<
     G: Surrogate<B, C, F, N>,
