@@ -219,6 +219,7 @@ pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
         Site::Monitor(at) => active.contains(at),
         Site::MonitorPair(one, other) => active.contains(one) && active.contains(other),
         Site::Corrector(at) => driven.contains(at),
+        Site::CorrectorPair(one, other) => driven.contains(one) && driven.contains(other),
         Site::Ring | Site::Quadrupole(_) | Site::Element(_) => true,
     };
     kind.sites(&data.ring).into_iter().filter(tells).map(|site| Term { kind, site }).collect()

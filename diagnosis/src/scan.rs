@@ -30,6 +30,10 @@ pub struct Candidate {
     pub adapting: DVector<f64>,
 }
 
+/// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged or reversed
+/// instruments more than a half does.
+const STAYS: f64 = 0.05;
+
 /// Signatures that are scored together.
 pub const BATCH: usize = 64;
 
@@ -82,6 +86,11 @@ impl Projection {
         let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
         let slope = &back * &residual - fitted.u.clone().remove_row(unknown);
         Ok(Self { residual, back, factor, slope })
+    }
+
+    /// `P r`, whose product with a whitened signature is its pull.
+    fn pulling(&self) -> DVector<f64> {
+        &self.residual - self.back.tr_mul(&self.factor.solve(&self.slope))
     }
 
     /// `d_i P d_j` of whitened signatures, one a column.
@@ -151,17 +160,38 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
     })
 }
 
-/// Scan them.
+/// Scan them. Of an effect without an amplitude whose pull is below half of the power that stays at least, which makes it less likely than
+/// nothing, the power is not worked out: the whole square stands for it.
 ///
 /// # Errors
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
-    let scored = Projection::of(fitted).score(signatures(data, fitted, terms)?);
-    let candidate = |(i, (term, score)): (usize, (&Term, &SignatureScore))| {
-        let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
-        Candidate { term: *term, amplitude, log_bayes, power: score.power, adapting: -scored.taken.column(i) }
+    let projection = Projection::of(fitted);
+    let columns = signatures(data, fitted, terms)?;
+    let pulling = projection.pulling();
+    let bound = |i: usize| {
+        let column = columns.column(i);
+        SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() }
     };
-    Ok(terms.iter().zip(&scored.scores).enumerate().map(candidate).collect())
+    let is_hopeless = |i: usize| {
+        let SignatureScore { pull, power } = bound(i);
+        terms[i].kind.is_switch() && pull < 0.5 * STAYS * power
+    };
+    let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
+    let Scored { scores, taken } = projection.score(columns.select_columns(&scored));
+    let mut candidates = vec![None; terms.len()];
+    let candidate = |i: usize, score: SignatureScore, adapting: DVector<f64>| {
+        let term = terms[i];
+        let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
+        Some(Candidate { term, amplitude, log_bayes, power: score.power, adapting })
+    };
+    for (at, (&i, &score)) in scored.iter().zip(&scores).enumerate() {
+        candidates[i] = candidate(i, score, -taken.column(at));
+    }
+    for i in hopeless {
+        candidates[i] = candidate(i, bound(i), DVector::zeros(fitted.u.len()));
+    }
+    Ok(candidates.into_iter().flatten().collect())
 }
 
 /// A cause and its rival: norms of what a fit cannot absorb of both, per prior standard deviation.

@@ -397,6 +397,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
         guesses.push(DVector::zeros(fitted.params.len()));
     }
     let fits = guesses.iter().filter_map(|guess| Fitted::against(data, &hypothesis, guess, least).ok());
+    let fits = fits.filter(|fitted| fitted.is_stable(data));
     // a candidate without a stable machine is excluded
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
@@ -423,7 +424,8 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
     }
 }
 
-/// The same fit with the ordinary widths that the recording then shows, if it is the better. A poor one stays as it is; one that was poor before
+/// The same fit with the ordinary widths that the recording then shows, if it is the better and keeps a beam: as wide as that, imperfections
+/// that are of first order in the fit may leave none. A poor one stays as it is; one that was poor before
 /// gets the ordinary imperfections that it lacks.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_gross() {
@@ -436,5 +438,6 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let lacks_all = fitted.hypothesis.ordinary.is_empty();
     let begun = if lacks_all { again(Family::all(), &fitted) } else { Ok(fitted.clone()) };
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
-    learnt.ok().filter(|learnt| lacks_all || learnt.log_evidence > fitted.log_evidence).unwrap_or(fitted)
+    let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
+    learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted)
 }

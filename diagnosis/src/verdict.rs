@@ -280,7 +280,11 @@ pub fn tests(
     after: &Score,
     blocks: &[Block],
 ) -> Result<Vec<Tested>, FitError> {
-    let penalty = corrections(candidates);
+    // chance exchanges no cables: of such a pair the whole response changes, so that only those that were found are tested
+    let is_tested = |term: &Term| term.kind != EffectKind::CorrectorSwap || found.best.hypothesis.terms.contains(term);
+    let all = candidates.iter().copied().zip(corrections(candidates));
+    let (candidates, penalty): (Vec<Term>, Vec<f64>) = all.filter(|(term, _)| is_tested(term)).unzip();
+    let (candidates, penalty) = (&candidates, &penalty);
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let without = &reduced(data, &found.best, i)?;
@@ -289,8 +293,8 @@ pub fn tests(
         if without.is_gross() {
             return Ok(Tested { gain, of_choice: None, chance: None });
         }
-        let of_choice = Some(gain_of_choice(data, without, candidates, &penalty)?);
-        Ok(Tested { gain, of_choice, chance: Some(chance::of_search(data, without, candidates, &penalty)?) })
+        let of_choice = Some(gain_of_choice(data, without, candidates, penalty)?);
+        Ok(Tested { gain, of_choice, chance: Some(chance::of_search(data, without, candidates, penalty)?) })
     };
     (0..found.competitions.len()).map(test).collect()
 }

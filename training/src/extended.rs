@@ -73,6 +73,7 @@ impl Form {
             | EffectKind::BpmSwap
             | EffectKind::CorrectorGain
             | EffectKind::CorrectorPolarity
+            | EffectKind::CorrectorSwap
             | EffectKind::MomentumOffset => Self::Instruments,
             EffectKind::BpmRoll
             | EffectKind::CorrectorRoll
@@ -113,8 +114,12 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
                     instruments.monitor_gain.swap(one, other);
                 }
             }
-            (EffectKind::CorrectorGain, Site::Corrector(c)) => instruments.corrector_gain[c] *= 1.0 + amplitude,
-            (EffectKind::CorrectorPolarity, Site::Corrector(c)) => instruments.corrector_gain[c] *= -1.0,
+            (EffectKind::CorrectorGain, Site::Corrector(c)) => *instruments.gain_of(c) *= 1.0 + amplitude,
+            (EffectKind::CorrectorPolarity, Site::Corrector(c)) => *instruments.gain_of(c) *= -1.0,
+            (EffectKind::CorrectorSwap, Site::CorrectorPair(one, other)) => {
+                let [one, other] = [one, other].map(|c| instruments.supply_of(c));
+                instruments.corrector.swap(one, other);
+            }
             _ => {}
         }
     }
@@ -215,6 +220,8 @@ mod tests {
             ["bpm_swap@x_E4,x_E6", "bpm_gain@x_E4=0.1"],
             ["bpm_gain@x_E4=0.1", "bpm_swap@x_E4,x_E6"],
             ["corrector_gain@H_A4=0.1", "corrector_polarity@V_D3"],
+            ["corrector_swap@H_A4,H_C2", "corrector_gain@H_A4=0.1"],
+            ["corrector_gain@H_A4=0.1", "corrector_swap@H_A4,H_C2"],
             ["stray_gradient@SLOT_F6=0.025", "dipole_gradient@B_C4=0.012"],
             ["dipole_edge=0.02", "dipole_edge@B_C4=0.01"],
         ] {

@@ -11,7 +11,9 @@ pub(crate) struct Instruments {
     pub monitor: Vec<usize>,
     /// What each one makes of a metre [B].
     pub monitor_gain: Vec<f64>,
-    /// What each corrector makes of a radian [C].
+    /// Which corrector each one really is [C].
+    pub corrector: Vec<usize>,
+    /// What each one makes of a radian [C].
     pub corrector_gain: Vec<f64>,
 }
 
@@ -23,6 +25,7 @@ impl Instruments {
             delta: 0.0,
             monitor: (0..monitors).collect(),
             monitor_gain: vec![1.0; monitors],
+            corrector: (0..correctors).collect(),
             corrector_gain: vec![1.0; correctors],
         }
     }
@@ -33,8 +36,20 @@ impl Instruments {
         self.monitor.iter().zip(&self.monitor_gain).map(|(&b, &gain)| read[b].times(gain)).collect()
     }
 
+    /// The corrector whose setting powers one.
+    pub fn supply_of(&self, corrector: usize) -> usize {
+        self.corrector.iter().position(|&c| c == corrector).expect("exchanges leave every corrector powered")
+    }
+
+    /// What one makes of a radian.
+    pub fn gain_of(&mut self, corrector: usize) -> &mut f64 {
+        let supply = self.supply_of(corrector);
+        &mut self.corrector_gain[supply]
+    }
+
     /// The correctors as they are.
     pub fn correctors(&self, optics: &Optics) -> Vec<Source> {
-        optics.correctors().into_iter().zip(&self.corrector_gain).map(|(source, &gain)| source.times(gain)).collect()
+        let sources = optics.correctors();
+        self.corrector.iter().zip(&self.corrector_gain).map(|(&c, &gain)| sources[c].times(gain)).collect()
     }
 }

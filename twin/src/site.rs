@@ -14,6 +14,8 @@ pub enum Site {
     MonitorPair(usize, usize),
     /// One plane of a corrector, into [`Ring::correctors`].
     Corrector(usize),
+    /// Two of them, the lower index first.
+    CorrectorPair(usize, usize),
     /// Into [`Ring::quadrupoles`].
     Quadrupole(usize),
     /// Any other element, into [`Ring::elements`].
@@ -26,6 +28,11 @@ impl Site {
         Self::MonitorPair(one.min(other), one.max(other))
     }
 
+    /// Two correctors in either order.
+    pub fn corrector_pair(one: usize, other: usize) -> Self {
+        Self::CorrectorPair(one.min(other), one.max(other))
+    }
+
     /// The monitor of a name with its plane, `x_D8` or `x_PUH_D8`.
     pub fn monitor(ring: &Ring, name: &str) -> Option<usize> {
         planed(name, ["x", "y"]).and_then(|(plane, name)| ring.monitor(plane, name).ok())
@@ -33,14 +40,17 @@ impl Site {
 
     /// The two different monitors of a name, `x_D8,x_E6`.
     pub fn monitors(ring: &Ring, names: &str) -> Option<[usize; 2]> {
-        let (one, other) = names.split_once(',')?;
-        let [one, other] = [one, other].map(|name| Self::monitor(ring, name.trim()));
-        Some([one?, other?]).filter(|[one, other]| one != other)
+        two(names, |name| Self::monitor(ring, name))
     }
 
     /// The corrector of a name with its plane, `H_A4` or `H_DCH_A4`.
     pub fn corrector(ring: &Ring, name: &str) -> Option<usize> {
         planed(name, ["H", "V"]).and_then(|(plane, name)| ring.corrector(plane, name).ok())
+    }
+
+    /// The two different correctors of a name, `H_A4,H_A6`.
+    pub fn correctors(ring: &Ring, names: &str) -> Option<[usize; 2]> {
+        two(names, |name| Self::corrector(ring, name))
     }
 
     /// The element of some sort that is called so, by its label or its name.
@@ -61,6 +71,7 @@ impl Site {
             Self::Monitor(at) => vec![ring.monitor_name(at)],
             Self::MonitorPair(one, other) => [one, other].map(|at| ring.monitor_name(at)).into(),
             Self::Corrector(at) => vec![ring.corrector_name(at)],
+            Self::CorrectorPair(one, other) => [one, other].map(|at| ring.corrector_name(at)).into(),
             Self::Quadrupole(at) => vec![ring.label(ring.quadrupoles[at].element).to_owned()],
             Self::Element(at) => {
                 let element = &ring.elements[at];
@@ -77,6 +88,7 @@ impl Site {
             Self::Monitor(at) => vec![ring.monitors[at].element],
             Self::MonitorPair(one, other) => [one, other].map(|at| ring.monitors[at].element).into(),
             Self::Corrector(at) => vec![ring.correctors[at].element],
+            Self::CorrectorPair(one, other) => [one, other].map(|at| ring.correctors[at].element).into(),
             Self::Quadrupole(at) => vec![ring.quadrupoles[at].element],
             Self::Element(at) => vec![at],
         }
@@ -87,6 +99,13 @@ impl Site {
         let middle = |at: usize| ring.elements[at].s + 0.5 * ring.elements[at].length;
         self.elements(ring).into_iter().map(middle).collect()
     }
+}
+
+/// Two different places of a name, `one,other`.
+fn two(names: &str, find: impl Fn(&str) -> Option<usize>) -> Option<[usize; 2]> {
+    let (one, other) = names.split_once(',')?;
+    let [one, other] = [one, other].map(|name| find(name.trim()));
+    Some([one?, other?]).filter(|[one, other]| one != other)
 }
 
 /// Plane and rest of a name that begins with one of two words for the planes.
@@ -111,6 +130,9 @@ mod tests {
         assert_eq!((of("x_D8"), of("y_C5")), (of("x_PUH_D8"), of("y_PUV_C5")));
         assert_eq!(Site::monitors(&ring, "x_E6, x_E4"), Some([of("x_E6"), of("x_E4")]));
         assert_eq!(Site::pair(of("x_E6"), of("x_E4")).name(&ring), "x_E4,x_E6");
+        let of = |name| Site::corrector(&ring, name).unwrap();
+        assert_eq!(Site::correctors(&ring, "H_A6,H_A4"), Some([of("H_A6"), of("H_A4")]));
+        assert_eq!(Site::corrector_pair(of("H_A6"), of("H_A4")).name(&ring), "H_A4,H_A6");
         let dipole = Site::element(&ring, "C4", |kind| matches!(kind, Kind::Bend(_))).unwrap();
         assert_eq!(Site::Element(dipole).name(&ring), "B_C4");
     }

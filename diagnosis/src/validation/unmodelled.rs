@@ -167,7 +167,7 @@ fn index(ring: &Ring, site: Site) -> usize {
             ring.read_monitors.iter().position(|&read| read == at).expect("its sites are read monitors")
         }
         Site::Corrector(at) | Site::Quadrupole(at) | Site::Element(at) => at,
-        Site::Ring | Site::MonitorPair(..) => unreachable!("no kind acts there"),
+        Site::Ring | Site::MonitorPair(..) | Site::CorrectorPair(..) => unreachable!("no kind acts there"),
     }
 }
 

@@ -210,7 +210,8 @@ impl Lattice {
             CorrectorEffect::Polarity => channel.gain = -channel.gain,
             // the ring has it
             CorrectorEffect::Roll => {}
-            CorrectorEffect::Even
+            CorrectorEffect::Swap
+            | CorrectorEffect::Even
             | CorrectorEffect::Crosstalk
             | CorrectorEffect::Hysteresis
             | CorrectorEffect::Settling => return false,

@@ -66,6 +66,10 @@ fn effects(ring: &Ring) -> Vec<Effect> {
                 (powered(ring).map(Site::Corrector).to_vec(), 1)
             }
             EffectKind::BpmSwap => (kind.sites(ring), 41),
+            EffectKind::CorrectorSwap => {
+                let [a, b, c, d] = powered(ring);
+                (vec![Site::corrector_pair(a, c), Site::corrector_pair(b, d), Site::corrector_pair(a, a + 1)], 1)
+            }
             _ => (kind.sites(ring), 7),
         };
         let amplitude = kind.prior_scale().unwrap_or(1.0);

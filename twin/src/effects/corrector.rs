@@ -1,4 +1,4 @@
-//! Errors of correctors: gain, roll, reversed polarity, even part, a share of the kick that goes to another one or stays.
+//! Errors of correctors: gain, roll, reversed polarity, exchanged cables, even part, a share of the kick that goes to another one or stays.
 //!
 //! Of a gain, a polarity and an even part the actual kick is one function of the nominal kick and of an amplitude,
 //! [`CorrectorEffect::kick`]; a rolled magnet kicks in both planes, as an element of the ring. Crosstalk adds `a` times the kick of one to that of the next; a
@@ -24,6 +24,8 @@ pub enum CorrectorEffect {
     Roll,
     /// Its sign is reversed.
     Polarity,
+    /// Its cable and another one's are exchanged: each gives the kick that is believed of the other.
+    Swap,
     /// Its kick differs between its signs by twice this share of the nominal one; cancels in the difference that a response is.
     Even,
     /// A share of its kick goes to the next one of its plane as well, of the last one to the first.
@@ -38,6 +40,7 @@ pub enum CorrectorEffect {
 #[derive(Debug, Clone)]
 pub(super) enum Kick {
     Changed { how: CorrectorEffect, corrector: usize, amplitude: f64 },
+    Exchanged { correctors: [usize; 2] },
     Shared { corrector: usize, with: usize, share: f64 },
     Kept { corrector: usize, share: f64 },
     Lagging { corrector: usize, share: f64 },
@@ -53,7 +56,7 @@ impl CorrectorEffect {
             Self::Gain => believed * (amplitude + 1.0),
             Self::Polarity => -believed,
             Self::Even => believed + amplitude * believed * believed / nominal,
-            Self::Roll | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
+            Self::Roll | Self::Swap | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
         }
     }
 
@@ -72,6 +75,7 @@ impl Mechanism for CorrectorEffect {
             Self::Gain => "corrector_gain",
             Self::Roll => "corrector_roll",
             Self::Polarity => "corrector_polarity",
+            Self::Swap => "corrector_swap",
             Self::Even => "corrector_even",
             Self::Crosstalk => "corrector_crosstalk",
             Self::Hysteresis => "corrector_hysteresis",
@@ -91,7 +95,7 @@ impl Mechanism for CorrectorEffect {
             Self::Even | Self::Crosstalk => Some(0.05),
             Self::Hysteresis => Some(0.03),
             Self::Settling => Some(0.1),
-            Self::Polarity => None,
+            Self::Polarity | Self::Swap => None,
         }
     }
 
@@ -99,15 +103,19 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Gain | Self::Even | Self::Crosstalk | Self::Hysteresis | Self::Settling => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
-            Self::Polarity => Unit::NONE,
+            Self::Polarity | Self::Swap => Unit::NONE,
         }
     }
 
     fn sites(&self, ring: &Ring) -> Vec<Site> {
+        if *self == Self::Swap {
+            return pairs(ring);
+        }
         let is_one = |&at: &usize| match self {
             Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => true,
             Self::Roll => rolled(ring, at) == at,
             Self::Crosstalk => next(ring, at).is_some(),
+            Self::Swap => false,
         };
         (0..ring.correctors.len()).filter(is_one).map(Site::Corrector).collect()
     }
@@ -116,22 +124,35 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Gain | Self::Roll | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => "a corrector",
             Self::Crosstalk => "a corrector with another one in its plane",
+            Self::Swap => "two correctors of one plane",
         }
     }
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
-        let at = Site::corrector(ring, name)?;
-        Some(Site::Corrector(match self {
-            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => at,
-            Self::Roll => rolled(ring, at),
-            Self::Crosstalk => next(ring, at).map(|_| at)?,
-        }))
+        let one = || Site::corrector(ring, name);
+        match self {
+            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => one().map(Site::Corrector),
+            Self::Roll => one().map(|at| Site::Corrector(rolled(ring, at))),
+            Self::Crosstalk => one().filter(|&at| next(ring, at).is_some()).map(Site::Corrector),
+            Self::Swap => {
+                let [one, other] = Site::correctors(ring, name)?;
+                of_a_plane(ring, one, other).then(|| Site::corrector_pair(one, other))
+            }
+        }
     }
 
     fn apply(&self, machine: &mut Machine, site: Site, amplitude: f64) -> Result<(), EffectError> {
         let ring = &mut machine.ring;
-        let Site::Corrector(corrector) = site else { return Err(self.misplaced(ring, site.name(ring))) };
+        let corrector = match (self, site) {
+            (Self::Swap, Site::CorrectorPair(one, other)) => {
+                machine.correctors.push(Kick::Exchanged { correctors: [one, other] });
+                return Ok(());
+            }
+            (_, Site::Corrector(corrector)) => corrector,
+            _ => return Err(self.misplaced(ring, site.name(ring))),
+        };
         match self {
+            Self::Swap => return Err(self.misplaced(ring, site.name(ring))),
             Self::Roll => ring.elements[ring.correctors[corrector].element].misalignment.roll += amplitude,
             Self::Gain | Self::Polarity | Self::Even => {
                 machine.correctors.push(Kick::Changed { how: *self, corrector, amplitude });
@@ -148,9 +169,19 @@ impl Mechanism for CorrectorEffect {
 
     fn signature(&self, about: &Signatures, site: Site) -> Result<Signature, EffectError> {
         let ring = &about.machine.ring;
-        let Site::Corrector(corrector) = site else { return Err(self.misplaced(ring, site.name(ring))) };
         let mut signature = about.nothing();
+        let corrector = match (self, site) {
+            (Self::Swap, Site::CorrectorPair(one, other)) => {
+                let more = about.kick.column(other) - about.kick.column(one);
+                let seen = about.response.column(one) - about.response.column(other);
+                signature.readings = more * seen.transpose();
+                return Ok(signature);
+            }
+            (_, Site::Corrector(corrector)) => corrector,
+            _ => return Err(self.misplaced(ring, site.name(ring))),
+        };
         match self {
+            Self::Swap => return Err(self.misplaced(ring, site.name(ring))),
             Self::Roll => {
                 for at in of_element(ring, ring.correctors[corrector].element) {
                     signature.readings.ger(1.0, &about.kick.column(at), &turned(about, at), 1.0);
@@ -189,6 +220,7 @@ impl Mechanism for CorrectorEffect {
             }
             Self::Roll => format!("corrector {name} is rolled by {} mrad", amplitude.signed(1e3)),
             Self::Polarity => format!("corrector {name} has the wrong polarity"),
+            Self::Swap => format!("the cables of correctors {} are exchanged", site.names(ring).join(" and ")),
             Self::Even => {
                 let more = amplitude.by_sign("more", "less");
                 format!("corrector {name} kicks {} % {more} at + than at -", amplitude.size(2.0 * 100.0))
@@ -215,6 +247,7 @@ impl Kick {
             Self::Changed { how, corrector, amplitude } => {
                 kick.column_mut(*corrector).apply(|kick| *kick = how.kick(*amplitude, *kick, nominal));
             }
+            Self::Exchanged { correctors: [one, other] } => kick.swap_columns(*one, *other),
             Self::Shared { corrector, with, share } => mix(kick, *with, *corrector, *share),
             Self::Kept { corrector, share } => {
                 let kept = before(&kick.column(*corrector), nominal) * *share;
@@ -238,6 +271,9 @@ impl Kick {
             Self::Changed { how, corrector, amplitude } => {
                 let slope = first_derivative(|kick| how.kick((*amplitude).into(), kick, 1.0), 0.0).1;
                 response.iter_mut().for_each(|plane| plane.column_mut(*corrector).scale_mut(slope));
+            }
+            Self::Exchanged { correctors: [one, other] } => {
+                response.iter_mut().for_each(|plane| plane.swap_columns(*one, *other));
             }
             Self::Shared { corrector, with, share } => {
                 response.iter_mut().for_each(|plane| mix(plane, *corrector, *with, *share));
@@ -271,6 +307,19 @@ fn next(ring: &Ring, corrector: usize) -> Option<usize> {
         (0..ring.correctors.len()).filter(is_other)
     };
     others().find(|&other| other > corrector).or_else(|| others().next())
+}
+
+/// All pairs of correctors of one plane.
+fn pairs(ring: &Ring) -> Vec<Site> {
+    let n = ring.correctors.len();
+    let all = (0..n).flat_map(|one| (one + 1..n).map(move |other| (one, other)));
+    all.filter(|&(one, other)| of_a_plane(ring, one, other))
+        .map(|(one, other)| Site::CorrectorPair(one, other))
+        .collect()
+}
+
+fn of_a_plane(ring: &Ring, one: usize, other: usize) -> bool {
+    ring.correctors[one].plane == ring.correctors[other].plane
 }
 
 /// What the read monitors see of a corrector's kick, turned by a right angle [m/rad].
@@ -311,6 +360,21 @@ mod tests {
         Kick::Lagging { corrector: 0, share: 0.2 }.of_frames(&mut given, 1.0);
         let lagging = DMatrix::from_column_slice(5, 1, &[1.0, 1.0, 0.2, 0.04, 1.608]);
         assert!((given - lagging).abs().max() < 1e-12);
+    }
+
+    /// Exchanged twice they are as they were; a pair is the same in either order.
+    #[test]
+    fn exchanged_correctors_give_each_others_kicks() {
+        let kick = DMatrix::from_fn(5, 3, |frame, c| (1.0 + c as f64) * (frame as f64).sin());
+        let mut given = kick.clone();
+        let swap = Kick::Exchanged { correctors: [0, 2] };
+        swap.of_frames(&mut given, 1.0);
+        assert_eq!([0, 1, 2].map(|c| given.column(c)), [2, 1, 0].map(|c| kick.column(c)));
+        swap.of_frames(&mut given, 1.0);
+        assert_eq!(given, kick);
+        let ring = Ring::booster();
+        // of 24 in each plane
+        assert_eq!(pairs(&ring).len(), 2 * 24 * 23 / 2);
     }
 
     #[test]

@@ -128,7 +128,8 @@ impl Machine {
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
         let optics = self.optics()?;
         let mut response = self.held(&self.ring, &optics)?;
-        self.correctors.iter().for_each(|kick| kick.of_response(&mut response));
+        // the last effect is next to the beam
+        self.correctors.iter().rev().for_each(|kick| kick.of_response(&mut response));
         let orbit = |monitor: &crate::Monitor| [X, Y].map(|at| optics.orbit(monitor.element)[at]);
         let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(orbit).collect();
         self.monitors.iter().for_each(|reading| reading.of_response(&self.ring, &mut base, &mut response));
@@ -172,6 +173,10 @@ mod tests {
         let e4 = Ring::booster().monitor(Plane::X, "E4").unwrap();
         assert!((respond(&["bpm_gain@x_E4=0.1"]).x.row(e4) - plain.x.row(e4) * 1.1).abs().max() < 1e-12);
         assert!((respond(&["corrector_polarity@H_A2"]).x.column(0) + plain.x.column(0)).abs().max() < 1e-12);
+        let exchanged = respond(&["corrector_swap@H_A2,H_A6"]);
+        let scaled = respond(&["corrector_gain@H_A2=0.1", "corrector_swap@H_A2,H_A6"]);
+        assert!((scaled.x.column(0) - plain.x.column(2) * 1.1).abs().max() < 1e-12);
+        assert_eq!([0, 1, 2].map(|c| exchanged.x.column(c)), [2, 1, 0].map(|c| plain.x.column(c)));
         // x_read = x cos + y sin: a pure y orbit shows in x by the sine of the roll
         let rolled = respond(&["bpm_roll@x_E4=0.1"]);
         assert!((rolled.x.row(e4)[30] - plain.y.row(e4)[30] * 0.1_f64.sin()).abs() < 1e-12);

@@ -90,6 +90,8 @@ kinds! {
     BpmSwap => Monitor(MonitorEffect::Swap),
     /// A corrector's sign is reversed.
     CorrectorPolarity => Corrector(CorrectorEffect::Polarity),
+    /// Two correctors' cables are exchanged.
+    CorrectorSwap => Corrector(CorrectorEffect::Swap),
     /// A corrector's strength differs between its signs; cancels in the difference that a response is.
     CorrectorEven => Corrector(CorrectorEffect::Even),
     /// A gradient where the model has none, K1L [1/m].
@@ -162,7 +164,7 @@ impl EffectKind {
         self.mechanism().phrase(ring, site, amplitude)
     }
 
-    /// True for what one corrector does: a held-out corrector could not show it.
+    /// True for what one corrector does, or two: a held-out corrector could not show it.
     pub fn is_of_a_corrector(self) -> bool {
         match self.class() {
             Class::Corrector(_) => true,
@@ -371,6 +373,10 @@ mod tests {
                 "bpm_swap@x_E4,y_C5",
                 "effect bpm_swap: expected two monitors of one plane such as x_A6,x_A8, found \"x_E4,y_C5\"",
             ),
+            (
+                "corrector_swap@H_A4,V_A3",
+                "effect corrector_swap: expected two correctors of one plane such as H_A2,H_A4, found \"H_A4,V_A3\"",
+            ),
             ("corrector_gain@A4", "effect corrector_gain: expected a corrector such as H_A2, found \"A4\""),
             (
                 "stray_gradient@QH_A2",
@@ -391,6 +397,7 @@ mod tests {
             ["bpm_roll@y_C5", "bpm_roll@x_C5"],
             ["bpm_gain@x_E4", "bpm_gain@x_PUH_E4"],
             ["bpm_swap@x_E4,x_E6", "bpm_swap@x_E6,x_E4"],
+            ["corrector_swap@H_E4,H_E6", "corrector_swap@H_E6,H_E4"],
             ["corrector_gain@H_A4", "corrector_gain@H_DCH_A4"],
             ["stray_gradient@F6", "stray_gradient@SLOT_F6"],
             ["dipole_gradient@C4", "dipole_gradient@B_C4"],
@@ -447,6 +454,7 @@ mod tests {
             ("bpm_cubic@x_A6=1e-3", 1e-4, "BPM x_A6 is not linear: +2.50 ± 0.25 % of the position at 5 mm"),
             ("bpm_polarity@x_E4", 0.0, "BPM x_E4 reads with the wrong sign"),
             ("bpm_swap@x_E4,x_E6", 0.0, "BPMs x_E4 and x_E6 are exchanged"),
+            ("corrector_swap@H_E4,H_E6", 0.0, "the cables of correctors H_E4 and H_E6 are exchanged"),
             ("corrector_polarity@H_A4", 0.0, "corrector H_A4 has the wrong polarity"),
             ("corrector_even@H_A4=0.04", 0.01, "corrector H_A4 kicks 8.0 ± 2.0 % more at + than at -"),
             ("stray_gradient@SLOT_F6=0.02", 0.001, "there is a gradient K1L = +0.0200 ± 0.0010 /m at SLOT_F6"),
