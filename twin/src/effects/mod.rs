@@ -426,7 +426,9 @@ mod tests {
     fn no_kind_acts_at_a_site_of_another_sort() {
         let ring = Ring::booster();
         let marker = Site::Element(ring.element("QH_A2").unwrap());
-        let sites = [Site::Ring, Site::Monitor(0), Site::pair(0, 1), Site::Corrector(0), Site::Quadrupole(0), marker];
+        // correctors 0 and 1 are of one plane, as monitors 0 and 1 are
+        let pairs = [Site::pair(0, 1), Site::corrector_pair(0, 1)];
+        let sites = [Site::Ring, Site::Monitor(0), pairs[0], Site::Corrector(0), pairs[1], Site::Quadrupole(0), marker];
         for &kind in EffectKind::ALL {
             let acts = |&&site: &&Site| {
                 Machine::new(ring.clone(), Rf::FixedMomentum, &[Effect { kind, site, amplitude: 1e-6 }]).is_ok()
