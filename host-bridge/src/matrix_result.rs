@@ -143,13 +143,13 @@ fn model_error(fit: &Fit) -> Vec<BlockError> {
         residuals.sort_by(f64::total_cmp);
         let missed = fit.missed[block];
         Some(BlockError {
-            block: measured::fit::BLOCKS[block],
+            block: measured::data::BLOCKS[block],
             residual_um: 1e3 * residuals.get((0.68 * residuals.len() as f64) as usize)?,
             scale_um: 1e3 * missed.scale,
             freedom: missed.freedom.is_finite().then_some(missed.freedom),
         })
     };
-    (0..measured::fit::BLOCKS.len()).filter_map(of_block).collect()
+    (0..measured::data::BLOCKS.len()).filter_map(of_block).collect()
 }
 
 /// A monitor that reads less than this share of the orbit is dead.

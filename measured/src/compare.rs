@@ -9,8 +9,10 @@ use std::collections::BTreeMap;
 use nalgebra::DVector;
 use statrs::distribution::{ContinuousCDF, Normal};
 
+use crate::data::Data;
+use crate::descent::descend;
 use crate::error::MeasuredError;
-use crate::fit::{Data, Fit, Learnt, Settings, descend, with_model_error};
+use crate::fit::{Fit, Learnt, Settings, with_model_error};
 use crate::folder::Folder;
 use crate::model::Model;
 use crate::uncertainty::Uncertainty;

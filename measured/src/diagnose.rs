@@ -14,11 +14,12 @@ use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 use twin::{Plane, Rf};
 
+use crate::descent::descend;
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Learnt, Settings, covariance, descend, with_model_error};
+use crate::fit::{Fit, Learnt, Settings, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
-use crate::normal::Places;
+use crate::normal::{Places, covariance};
 use crate::unknowns::{Kind, Unknown};
 use crate::wiring::{self, Wiring};
 

@@ -9,13 +9,15 @@
 //! the model misses more, error bars from it alone are wrong.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Plane, Rf};
+use twin::Rf;
 
+use crate::data::Data;
+use crate::descent::{Descent, descend};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::missed::Missed;
-use crate::model::{Model, Prediction};
-use crate::normal::{Normal, Places};
+use crate::model::Model;
+use crate::normal::Places;
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Magnets, Unknown, Widths, groups, unknowns};
 
@@ -36,9 +38,6 @@ impl Default for Settings {
         Self { rf: Rf::FixedFrequency, widths: Widths::default(), coupling: None }
     }
 }
-
-/// Monitors' plane and correctors' plane, or the dispersion in a plane.
-pub const BLOCKS: [&str; 6] = ["x to H", "x to V", "y to H", "y to V", "x to RF", "y to RF"];
 
 /// A fitted measurement.
 #[derive(Debug, Clone)]
@@ -61,7 +60,7 @@ pub struct Fit {
     pub outliers: Vec<[usize; 2]>,
     /// What was fitted, without the outliers.
     pub data: Data,
-    /// What the model misses in each of [`BLOCKS`].
+    /// What the model misses in each of [`crate::data::BLOCKS`].
     pub missed: [Missed; 6],
     /// Measured less predicted [mm], with the dispersion as the last column; 0 where nothing counts.
     pub residual: DMatrix<f64>,
@@ -73,123 +72,10 @@ pub struct Fit {
     pub has_ended: bool,
 }
 
-/// Steps of one descent; those of measured rings take 5 to 60.
-const STEPS: usize = 100;
-/// A descent has ended when the best step promises less than this, or this share of its sum of squares.
-const ENOUGH: f64 = 1e-3;
-const ENOUGH_SHARE: f64 = 1e-7;
-/// LOCO's outlier factor.
-const OUTLIER: f64 = 10.0;
 /// Rounds of the model's error.
 const ROUNDS: usize = 6;
 /// Of an element that the unknowns follow further than this, what is left tells nothing of its error.
 const LEAST_LEFT: f64 = 0.1;
-
-/// Measured elements, and what they count.
-#[derive(Debug, Clone)]
-pub struct Data {
-    /// The matrix with the dispersion as its last column [mm]; 0 where nothing counts.
-    pub measured: DMatrix<f64>,
-    /// Stated noise [mm]; infinite where nothing counts.
-    pub sigma: DMatrix<f64>,
-    /// Which of [`BLOCKS`] each element is of.
-    pub block: DMatrix<usize>,
-}
-
-impl Data {
-    /// Of a folder.
-    pub fn of(folder: &Folder) -> Self {
-        let (rows, correctors) = folder.matrix.shape();
-        let columns = correctors + usize::from(folder.dispersion.is_some());
-        let value = |i: usize, j: usize| match &folder.dispersion {
-            Some(dispersion) if j == correctors => dispersion[i],
-            _ => folder.matrix[(i, j)],
-        };
-        let uses_dispersion = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.dispersion == "Yes");
-        let counts = |i: usize, j: usize| {
-            let column = if j == correctors { uses_dispersion } else { folder.correctors[j].is_used };
-            folder.monitors[i].is_used && column && value(i, j).is_finite()
-        };
-        Self {
-            measured: DMatrix::from_fn(rows, columns, |i, j| if counts(i, j) { value(i, j) } else { 0.0 }),
-            sigma: DMatrix::from_fn(
-                rows,
-                columns,
-                |i, j| if counts(i, j) { folder.monitors[i].sigma } else { f64::INFINITY },
-            ),
-            block: DMatrix::from_fn(rows, columns, |i, j| {
-                let is_y = usize::from(folder.monitors[i].plane == Plane::Y);
-                match folder.correctors.get(j) {
-                    Some(one) => 2 * is_y + usize::from(one.plane == Plane::Y),
-                    None => 4 + is_y,
-                }
-            }),
-        }
-    }
-
-    /// Measured less predicted [mm], where it counts.
-    pub fn residual(&self, at: &Prediction) -> DMatrix<f64> {
-        residual(&self.measured, at, &self.stated())
-    }
-
-    /// One over the square of the stated noise of each element [1/mm^2].
-    pub fn stated(&self) -> DMatrix<f64> {
-        self.each(&[Missed::NOTHING; 6], |missed, sigma| missed.spread(sigma).powi(-2))
-    }
-
-    /// The same with what the model misses in each block.
-    pub fn precision(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
-        self.each(missed, |missed, sigma| missed.spread(sigma).powi(-2))
-    }
-
-    /// What each element counts [1/mm^2], the less the further it is off.
-    pub fn weight(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> DMatrix<f64> {
-        DMatrix::from_fn(residual.nrows(), residual.ncols(), |i, j| {
-            missed[self.block[(i, j)]].weight(self.sigma[(i, j)], residual[(i, j)])
-        })
-    }
-
-    /// What each element says on average [1/mm^2].
-    pub fn information(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
-        self.each(missed, Missed::information)
-    }
-
-    /// `ln` of the likelihood of residuals [mm].
-    pub fn log_likelihood(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> f64 {
-        let elements = self.sigma.iter().zip(&self.block).zip(residual).filter(|((sigma, _), _)| sigma.is_finite());
-        elements.map(|((&sigma, &block), &residual)| missed[block].log_likelihood(sigma, residual)).sum()
-    }
-
-    fn each(&self, missed: &[Missed; 6], of: impl Fn(&Missed, f64) -> f64) -> DMatrix<f64> {
-        self.sigma.zip_map(&self.block, |sigma, block| of(&missed[block], sigma))
-    }
-
-    /// Sum of squares over the stated noise.
-    fn chi2(&self, at: &Prediction) -> f64 {
-        let left = self.residual(at);
-        left.component_mul(&left).dot(&self.stated())
-    }
-
-    /// Let elements count no longer that are ten times further off than the rms of all, by the stated noise.
-    fn set_outliers_aside(&mut self, at: &Prediction) -> Vec<[usize; 2]> {
-        let largest = OUTLIER * (self.chi2(at) / self.elements() as f64).sqrt();
-        let mut found = Vec::new();
-        for j in 0..self.sigma.ncols() {
-            for i in 0..self.sigma.nrows() {
-                if ((self.measured[(i, j)] - at.matrix[(i, j)]) / self.sigma[(i, j)]).abs() > largest {
-                    self.sigma[(i, j)] = f64::INFINITY;
-                    found.push([i, j]);
-                }
-            }
-        }
-        found
-    }
-
-    /// Elements that count.
-    pub fn elements(&self) -> usize {
-        self.sigma.iter().filter(|sigma| sigma.is_finite()).count()
-    }
-}
 
 /// Fit a measurement.
 ///
@@ -271,136 +157,10 @@ pub fn with_model_error(
 pub struct Learnt {
     /// Where it ended.
     pub here: Descent,
-    /// What the model misses in each of [`BLOCKS`].
+    /// What the model misses in each of [`crate::data::BLOCKS`].
     pub missed: [Missed; 6],
     /// How well the unknowns are known.
     pub uncertainty: Uncertainty,
-}
-
-/// Where a descent ended.
-pub struct Descent {
-    /// Most probable values.
-    pub values: DVector<f64>,
-    /// Their covariance as the elements count.
-    pub covariance: DMatrix<f64>,
-    /// What they predict.
-    pub prediction: Prediction,
-    /// Steps taken.
-    pub steps: usize,
-    /// False where the steps were used up before.
-    pub has_ended: bool,
-}
-
-/// Measured less predicted, where it counts.
-fn residual(measured: &DMatrix<f64>, at: &Prediction, weight: &DMatrix<f64>) -> DMatrix<f64> {
-    (measured - &at.matrix).zip_map(weight, |residual, weight| if weight > 0.0 { residual } else { 0.0 })
-}
-
-/// Damped Gauss-Newton.
-///
-/// # Errors
-/// [`MeasuredError`].
-pub fn descend(
-    model: &Model,
-    unknowns: &[Unknown],
-    measured: &DMatrix<f64>,
-    weight: &DMatrix<f64>,
-    mut values: DVector<f64>,
-) -> Result<Descent, MeasuredError> {
-    let n = unknowns.len();
-    let places = Places::of(unknowns, measured.nrows(), measured.ncols());
-    let width = DVector::from_iterator(n, unknowns.iter().map(|one| one.width));
-    let mean = DVector::from_iterator(n, unknowns.iter().map(|one| one.mean));
-    let off = |values: &DVector<f64>| (values - &mean).component_div(&width);
-    let mut prediction = model.predict(unknowns, &values)?;
-    let mut damping = 1e-3;
-    let mut step = 0;
-    loop {
-        let normal = Normal::of(&places, &prediction, &residual(measured, &prediction, weight), weight, n);
-        let matrix = in_widths(normal.matrix, &width);
-        let slope = normal.slope.component_mul(&width) - off(&values);
-        let now = normal.chi2 + off(&values).norm_squared();
-        let factor = matrix.clone().cholesky().ok_or(MeasuredError::Singular(step))?;
-        let has_ended = slope.dot(&factor.solve(&slope)) < ENOUGH.max(ENOUGH_SHARE * now);
-        let further = (!has_ended && step < STEPS).then(|| {
-            let sum = |values: &DVector<f64>, at: &Prediction| {
-                let left = residual(measured, at, weight);
-                left.component_mul(&left).dot(weight) + off(values).norm_squared()
-            };
-            further(
-                model,
-                unknowns,
-                (&matrix, &slope),
-                &mut damping,
-                |moved| &values + moved.component_mul(&width),
-                |v, at| sum(v, at) < now,
-            )
-        });
-        match further.flatten() {
-            Some(better) => (values, prediction) = better,
-            None => {
-                let covariance = times(factor.inverse(), &width);
-                return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
-            }
-        }
-        step += 1;
-    }
-}
-
-/// An information matrix in units of the priors' widths, with the priors.
-fn in_widths(information: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
-    let n = width.len();
-    times(information, width) + DMatrix::identity(n, n)
-}
-
-/// Each element times the widths of its row and of its column.
-fn times(mut matrix: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
-    for (mut column, &of_column) in matrix.column_iter_mut().zip(width) {
-        column.component_mul_assign(width);
-        column *= of_column;
-    }
-    matrix
-}
-
-/// Covariance of the unknowns about a prediction, with what each element says [1/mm^2].
-pub(crate) fn covariance(
-    unknowns: &[Unknown],
-    at: &Prediction,
-    information: &DMatrix<f64>,
-) -> Result<DMatrix<f64>, MeasuredError> {
-    let (rows, columns) = information.shape();
-    let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
-    let places = Places::of(unknowns, rows, columns);
-    let normal = Normal::of(&places, at, &DMatrix::zeros(rows, columns), information, unknowns.len());
-    let factor = in_widths(normal.matrix, &width).cholesky().ok_or(MeasuredError::Singular(0))?;
-    Ok(times(factor.inverse(), &width))
-}
-
-/// The first better point along the curve of damped steps, from the longest on; none where not even a millionth of a step is better: the
-/// best ring is one at the edge of stability.
-fn further(
-    model: &Model,
-    unknowns: &[Unknown],
-    (matrix, slope): (&DMatrix<f64>, &DVector<f64>),
-    damping: &mut f64,
-    to: impl Fn(&DVector<f64>) -> DVector<f64>,
-    is_better: impl Fn(&DVector<f64>, &Prediction) -> bool,
-) -> Option<(DVector<f64>, Prediction)> {
-    while *damping < 1e9 {
-        let mut damped = matrix.clone();
-        for i in 0..slope.len() {
-            damped[(i, i)] *= 1.0 + *damping;
-        }
-        let values = to(&damped.cholesky()?.solve(slope));
-        match model.predict(unknowns, &values) {
-            Ok(at) if is_better(&values, &at) => {
-                *damping = (*damping * 0.1).max(1e-9);
-                return Some((values, at));
-            }
-            _ => *damping *= 10.0,
-        }
-    }
-    None
 }
 
 /// Residuals as large as the errors that they are left of [mm]: the unknowns follow each element with a share `h` of it, its weight times the

@@ -8,6 +8,8 @@
 
 pub mod compare;
 pub mod conceal;
+pub mod data;
+pub mod descent;
 pub mod diagnose;
 pub mod error;
 pub mod fit;

@@ -4,6 +4,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use crate::error::MeasuredError;
 use crate::model::Prediction;
 use crate::unknowns::{Kind, Unknown};
 
@@ -142,4 +143,33 @@ impl Normal {
         }
         normal
     }
+}
+
+/// An information matrix in units of the priors' widths, with the priors.
+pub fn in_widths(information: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
+    let n = width.len();
+    times(information, width) + DMatrix::identity(n, n)
+}
+
+/// Each element times the widths of its row and of its column.
+pub fn times(mut matrix: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
+    for (mut column, &of_column) in matrix.column_iter_mut().zip(width) {
+        column.component_mul_assign(width);
+        column *= of_column;
+    }
+    matrix
+}
+
+/// Covariance of the unknowns about a prediction, with what each element says [1/mm^2].
+pub fn covariance(
+    unknowns: &[Unknown],
+    at: &Prediction,
+    information: &DMatrix<f64>,
+) -> Result<DMatrix<f64>, MeasuredError> {
+    let (rows, columns) = information.shape();
+    let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
+    let places = Places::of(unknowns, rows, columns);
+    let normal = Normal::of(&places, at, &DMatrix::zeros(rows, columns), information, unknowns.len());
+    let factor = in_widths(normal.matrix, &width).cholesky().ok_or(MeasuredError::Singular(0))?;
+    Ok(times(factor.inverse(), &width))
 }

@@ -10,11 +10,11 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::fit::{Data, covariance};
 use crate::missed::Missed;
 use crate::model::Prediction;
-use crate::normal::{Normal, Places};
+use crate::normal::{Normal, Places, covariance};
 use crate::unknowns::Unknown;
 
 /// Of the unknowns of a fit.

@@ -14,6 +14,7 @@ mod instruments;
 mod madx;
 mod pals;
 mod pattern;
+mod read;
 mod table;
 mod write;
 mod xsuite;

@@ -1,0 +1,125 @@
+//! The measured elements of a matrix, and what each of them counts.
+
+use nalgebra::DMatrix;
+use twin::Plane;
+
+use crate::folder::Folder;
+use crate::missed::Missed;
+use crate::model::Prediction;
+
+/// Monitors' plane and correctors' plane, or the dispersion in a plane.
+pub const BLOCKS: [&str; 6] = ["x to H", "x to V", "y to H", "y to V", "x to RF", "y to RF"];
+
+/// LOCO's outlier factor.
+const OUTLIER: f64 = 10.0;
+
+/// Measured elements, and what they count.
+#[derive(Debug, Clone)]
+pub struct Data {
+    /// The matrix with the dispersion as its last column [mm]; 0 where nothing counts.
+    pub measured: DMatrix<f64>,
+    /// Stated noise [mm]; infinite where nothing counts.
+    pub sigma: DMatrix<f64>,
+    /// Which of [`BLOCKS`] each element is of.
+    pub block: DMatrix<usize>,
+}
+
+impl Data {
+    /// Of a folder.
+    pub fn of(folder: &Folder) -> Self {
+        let (rows, correctors) = folder.matrix.shape();
+        let columns = correctors + usize::from(folder.dispersion.is_some());
+        let value = |i: usize, j: usize| match &folder.dispersion {
+            Some(dispersion) if j == correctors => dispersion[i],
+            _ => folder.matrix[(i, j)],
+        };
+        let uses_dispersion = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.dispersion == "Yes");
+        let counts = |i: usize, j: usize| {
+            let column = if j == correctors { uses_dispersion } else { folder.correctors[j].is_used };
+            folder.monitors[i].is_used && column && value(i, j).is_finite()
+        };
+        Self {
+            measured: DMatrix::from_fn(rows, columns, |i, j| if counts(i, j) { value(i, j) } else { 0.0 }),
+            sigma: DMatrix::from_fn(
+                rows,
+                columns,
+                |i, j| if counts(i, j) { folder.monitors[i].sigma } else { f64::INFINITY },
+            ),
+            block: DMatrix::from_fn(rows, columns, |i, j| {
+                let is_y = usize::from(folder.monitors[i].plane == Plane::Y);
+                match folder.correctors.get(j) {
+                    Some(one) => 2 * is_y + usize::from(one.plane == Plane::Y),
+                    None => 4 + is_y,
+                }
+            }),
+        }
+    }
+
+    /// Measured less predicted [mm], where it counts.
+    pub fn residual(&self, at: &Prediction) -> DMatrix<f64> {
+        residual(&self.measured, at, &self.stated())
+    }
+
+    /// One over the square of the stated noise of each element [1/mm^2].
+    pub fn stated(&self) -> DMatrix<f64> {
+        self.each(&[Missed::NOTHING; 6], |missed, sigma| missed.spread(sigma).powi(-2))
+    }
+
+    /// The same with what the model misses in each block.
+    pub fn precision(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
+        self.each(missed, |missed, sigma| missed.spread(sigma).powi(-2))
+    }
+
+    /// What each element counts [1/mm^2], the less the further it is off.
+    pub fn weight(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> DMatrix<f64> {
+        DMatrix::from_fn(residual.nrows(), residual.ncols(), |i, j| {
+            missed[self.block[(i, j)]].weight(self.sigma[(i, j)], residual[(i, j)])
+        })
+    }
+
+    /// What each element says on average [1/mm^2].
+    pub fn information(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
+        self.each(missed, Missed::information)
+    }
+
+    /// `ln` of the likelihood of residuals [mm].
+    pub fn log_likelihood(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> f64 {
+        let elements = self.sigma.iter().zip(&self.block).zip(residual).filter(|((sigma, _), _)| sigma.is_finite());
+        elements.map(|((&sigma, &block), &residual)| missed[block].log_likelihood(sigma, residual)).sum()
+    }
+
+    fn each(&self, missed: &[Missed; 6], of: impl Fn(&Missed, f64) -> f64) -> DMatrix<f64> {
+        self.sigma.zip_map(&self.block, |sigma, block| of(&missed[block], sigma))
+    }
+
+    /// Sum of squares over the stated noise.
+    pub fn chi2(&self, at: &Prediction) -> f64 {
+        let left = self.residual(at);
+        left.component_mul(&left).dot(&self.stated())
+    }
+
+    /// Let elements count no longer that are ten times further off than the rms of all, by the stated noise.
+    pub fn set_outliers_aside(&mut self, at: &Prediction) -> Vec<[usize; 2]> {
+        let largest = OUTLIER * (self.chi2(at) / self.elements() as f64).sqrt();
+        let mut found = Vec::new();
+        for j in 0..self.sigma.ncols() {
+            for i in 0..self.sigma.nrows() {
+                if ((self.measured[(i, j)] - at.matrix[(i, j)]) / self.sigma[(i, j)]).abs() > largest {
+                    self.sigma[(i, j)] = f64::INFINITY;
+                    found.push([i, j]);
+                }
+            }
+        }
+        found
+    }
+
+    /// Elements that count.
+    pub fn elements(&self) -> usize {
+        self.sigma.iter().filter(|sigma| sigma.is_finite()).count()
+    }
+}
+
+/// Measured less predicted, where it counts.
+pub fn residual(measured: &DMatrix<f64>, at: &Prediction, weight: &DMatrix<f64>) -> DMatrix<f64> {
+    (measured - &at.matrix).zip_map(weight, |residual, weight| if weight > 0.0 { residual } else { 0.0 })
+}
