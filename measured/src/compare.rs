@@ -202,7 +202,7 @@ fn others(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Un
     all
 }
 
-/// Of a gain by a share of itself; of a coupling beside the gain, since electronics scale both; of a skew gradient as it is.
+/// Of a strength or a gain by a share of itself; of a coupling beside the gain, since electronics scale both; of a skew gradient as it is.
 fn change_of(fitted: &Fit, at: usize, values: &DVector<f64>, uncertainty: &Uncertainty) -> (f64, f64) {
     let (before, after) = (fitted.values[at], values[at]);
     let gain = match fitted.unknowns[at].kind {
@@ -228,8 +228,7 @@ fn gradients(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: 
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         let Kind::Strength(group) = unknown.kind else { continue };
         let rows = fitted.groups[0][group].clone();
-        let sigma = uncertainty.sigma[at] / fitted.values[at];
-        let relative = values[at] / fitted.values[at] - 1.0;
+        let (relative, sigma) = change_of(fitted, at, values, uncertainty);
         all.push(Change {
             name: name(folder, &fitted.groups, unknown.kind),
             family: folder.lattice[rows[0]].name.clone(),

@@ -62,7 +62,7 @@ impl Data {
 
     /// One over the square of the stated noise of each element [1/mm^2].
     pub fn stated(&self) -> DMatrix<f64> {
-        self.each(&[Missed::NOTHING; 6], |missed, sigma| missed.spread(sigma).powi(-2))
+        self.precision(&[Missed::NOTHING; 6])
     }
 
     /// The same with what the model misses in each block.

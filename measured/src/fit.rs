@@ -143,9 +143,9 @@ pub fn with_model_error(
     let (mut here, mut missed, mut steps) = (from, [Missed::NOTHING; 6], 0);
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
-        missed = learnt(data, &errors(data, unknowns, &here, &missed));
-
-        let weight = data.weight(&missed, &data.residual(&here.prediction));
+        let residual = data.residual(&here.prediction);
+        missed = learnt(data, &errors(unknowns, &here, &residual, &data.weight(&missed, &residual)));
+        let weight = data.weight(&missed, &residual);
         here = descend(model, unknowns, &data.measured, &weight, here.values)?;
         steps += here.steps;
     }
@@ -167,10 +167,9 @@ pub struct Learnt {
 /// variance that their covariance gives it, and leave `1 - h` of its variance.
 ///
 /// Source: D. A. Belsley, E. Kuh and R. E. Welsch, Regression Diagnostics (1980), eq. 2.15.
-fn errors(data: &Data, unknowns: &[Unknown], here: &Descent, missed: &[Missed; 6]) -> DMatrix<f64> {
-    let residual = data.residual(&here.prediction);
+fn errors(unknowns: &[Unknown], here: &Descent, residual: &DMatrix<f64>, weight: &DMatrix<f64>) -> DMatrix<f64> {
     let places = Places::of(unknowns, residual.nrows(), residual.ncols());
-    let followed = places.variance(&here.prediction, &here.covariance).component_mul(&data.weight(missed, &residual));
+    let followed = places.variance(&here.prediction, &here.covariance).component_mul(weight);
     residual.zip_map(&followed, |residual, followed| residual / (1.0 - followed).max(LEAST_LEFT).sqrt())
 }
 

@@ -75,13 +75,13 @@ impl Particle {
     }
 
     /// Rest energy [GeV].
-    ///
-    /// Source: CODATA 2018.
     pub fn rest_energy(self) -> f64 {
-        match self {
-            Self::Electron => 0.000_510_998_95,
-            Self::Proton => 0.938_272_088_16,
-        }
+        twin::Particle::rest_energy_of(self.word()).expect("a machine file may name it")
+    }
+
+    /// The particle of a rest energy [GeV], which other codes state to a thousandth or better.
+    pub fn of_rest_energy(energy: f64) -> Option<Self> {
+        [Self::Electron, Self::Proton].into_iter().find(|one| (energy / one.rest_energy() - 1.0).abs() < 1e-3)
     }
 }
 

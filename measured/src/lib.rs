@@ -16,6 +16,7 @@ pub mod fit;
 pub mod folder;
 pub mod import;
 pub mod lattice;
+mod likeness;
 pub mod missed;
 pub mod model;
 pub mod normal;

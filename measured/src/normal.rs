@@ -53,9 +53,7 @@ impl Places {
         let of_column = self.columns[column].iter().zip(&at.by_corrector);
         of_row.chain(of_column).filter_map(move |(place, by)| place.map(|place| (place, by[(row, column)])))
     }
-}
 
-impl Places {
     /// `J^T` of weighted elements.
     pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
         let mut back = DVector::zeros(unknowns);

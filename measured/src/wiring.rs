@@ -14,6 +14,7 @@ use twin::Plane;
 use crate::error::MeasuredError;
 use crate::fit::Settings;
 use crate::folder::Folder;
+use crate::likeness::Likeness;
 use crate::model::Model;
 use crate::unknowns::groups;
 
@@ -156,16 +157,10 @@ impl Lines {
         Self { measured, predicted, planes }
     }
 
-    /// Correlation of measured line `i` with predicted line `j`, and the scale that suits it best; `None` where too few elements count.
-    fn compared(&self, i: usize, j: usize) -> Option<[f64; 2]> {
+    /// Measured line `i` beside predicted line `j`; `None` where too few elements count.
+    fn compared(&self, i: usize, j: usize) -> Option<Likeness> {
         let pairs = self.measured.row(i).into_iter().copied().zip(self.predicted.row(j).into_iter().copied());
-        let (mut sums, mut counted) = ([0.0; 3], 0);
-        for (m, p) in pairs.filter(|(m, p)| m.is_finite() && p.is_finite()) {
-            sums = [sums[0] + m * m, sums[1] + m * p, sums[2] + p * p];
-            counted += 1;
-        }
-        let size = (sums[0] * sums[2]).sqrt();
-        (counted >= ENOUGH && size > 0.0).then(|| [sums[1] / size, sums[1] / sums[2]])
+        Likeness::of(pairs).filter(|likeness| likeness.counted >= ENOUGH)
     }
 }
 
@@ -187,13 +182,14 @@ struct Judged {
 fn judge(lines: &Lines) -> Judged {
     let n = lines.planes.len();
     let unexplained = DMatrix::from_fn(n, n, |i, j| match lines.planes[i] == lines.planes[j] {
-        true => lines.compared(i, j).map_or(f64::NAN, |[r, _]| 1.0 - r * r),
+        true => lines.compared(i, j).map_or(f64::NAN, |one| 1.0 - one.correlation.powi(2)),
         false => f64::NAN,
     });
     // with the right sign, which an exchanged line of a place in antiphase has not
-    let own = |i: usize| lines.compared(i, i).map_or(f64::NAN, |[r, _]| 1.0 - r.max(0.0).powi(2));
+    let own = |i: usize| lines.compared(i, i).map_or(f64::NAN, |one| 1.0 - one.correlation.max(0.0).powi(2));
+    let own: Vec<f64> = (0..n).map(own).collect();
     let is_better =
-        |i: usize, j: usize| own(i) > LEAST * unexplained[(i, j)] && unexplained[(i, i)] > unexplained[(i, j)];
+        |i: usize, j: usize| own[i] > LEAST * unexplained[(i, j)] && unexplained[(i, i)] > unexplained[(i, j)];
     // the line whose prediction a line suits best
     let best = |i: usize| {
         let better = (0..n).filter(|&j| j != i && is_better(i, j));
@@ -214,14 +210,15 @@ fn judge(lines: &Lines) -> Judged {
         None
     };
     // a noisy line gains less than the others of its ring
-    let gain = |i: usize, j: usize| own(i) / unexplained[(i, j)];
+    let gain = |i: usize, j: usize| own[i] / unexplained[(i, j)];
     let is_clear = |ring: &Vec<usize>| {
         let gains = (0..ring.len()).map(|at| gain(ring[at], ring[(at + 1) % ring.len()]));
         gains.product::<f64>() > BETTER.powi(ring.len() as i32)
     };
     let exchanged: Vec<Vec<usize>> = (0..n).filter_map(ring).filter(is_clear).collect();
     let of = |i: usize| exchanged.iter().flatten().any(|&one| one == i);
-    let is_reversed = |i: usize| lines.compared(i, i).is_some_and(|[r, scale]| r < -EXPLAINED.sqrt() && scale < -ALIVE);
+    let is_reversed =
+        |i: usize| lines.compared(i, i).is_some_and(|one| one.correlation < -EXPLAINED.sqrt() && one.factor < -ALIVE);
     let reversed = (0..n).filter(|&i| !of(i) && is_reversed(i)).collect();
     Judged { exchanged, reversed }
 }

@@ -4,6 +4,7 @@ use twin::{Plane, Rf};
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
+use crate::likeness::Likeness;
 use crate::model::Model;
 use crate::unknowns::groups;
 
@@ -37,19 +38,10 @@ pub fn agreement(folder: &Folder, rf: Rf) -> Result<Vec<Agreement>, MeasuredErro
                 .map(move |(column, _)| (row, column))
         };
         let both = rows.flat_map(|(row, _)| columns(row)).map(|at| (folder.matrix[at], written[at]));
-        of(plane, &both.filter(|(measured, _)| measured.is_finite()).collect::<Vec<_>>())
+        let both: Vec<(f64, f64)> = both.filter(|(measured, _)| measured.is_finite()).collect();
+        let Likeness { correlation, factor, .. } = Likeness::of(both.iter().copied())?;
+        let largest = both.iter().map(|(m, w)| (m - w).abs()).fold(0.0, f64::max);
+        Some(Agreement { plane, factor, correlation, largest })
     };
     Ok([Plane::X, Plane::Y].into_iter().filter_map(of_plane).collect())
-}
-
-fn of(plane: Plane, both: &[(f64, f64)]) -> Option<Agreement> {
-    let sum = |of: fn((f64, f64)) -> f64| both.iter().map(|one| of(*one)).sum::<f64>();
-    let [measured, written, product] = [sum(|(m, _)| m * m), sum(|(_, w)| w * w), sum(|(m, w)| m * w)];
-    let largest = both.iter().map(|(m, w)| (m - w).abs()).fold(0.0, f64::max);
-    (measured > 0.0 && written > 0.0).then(|| Agreement {
-        plane,
-        factor: product / written,
-        correlation: product / (measured * written).sqrt(),
-        largest,
-    })
 }

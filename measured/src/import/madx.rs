@@ -80,10 +80,10 @@ fn header(lattice: &mut Lattice, line: usize, words: &[&str]) -> Result<(), Meas
     match *name {
         "ENERGY" => lattice.energy = Some(number(lattice)?),
         "MASS" => {
-            lattice.particle = match number(lattice)? {
-                mass if (mass / 0.000_510_998_95 - 1.0).abs() < 1e-3 => Particle::Electron,
-                mass if (mass / 0.938_272_088 - 1.0).abs() < 1e-3 => Particle::Proton,
-                mass => {
+            let mass = number(lattice)?;
+            match Particle::of_rest_energy(mass) {
+                Some(particle) => lattice.particle = particle,
+                None => {
                     return lattice
                         .refuse(format!("line {line}: MASS {mass} GeV, expected an electron's or a proton's"));
                 }

@@ -51,11 +51,8 @@ fn reference(lattice: &mut Lattice, value: &Value) -> Result<(), MeasuredError> 
     let file = lattice.file.clone();
     let fields = Fields { file: &file, name: "particle_ref", value };
     let rest = fields.maybe("mass0")?.unwrap_or(0.0);
-    lattice.particle = match rest {
-        rest if (rest / 510_998.95 - 1.0).abs() < 1e-3 => Particle::Electron,
-        rest if (rest / 938_272_088.0 - 1.0).abs() < 1e-3 => Particle::Proton,
-        other => return Err(fields.wrong(format!("mass0 {other} eV, expected that of an electron or a proton"))),
-    };
+    lattice.particle = Particle::of_rest_energy(rest * 1e-9)
+        .ok_or_else(|| fields.wrong(format!("mass0 {rest} eV, expected that of an electron or a proton")))?;
     let momentum =
         if value.get("p0c").is_some_and(Value::is_array) { fields.at("p0c", 0)? } else { fields.number("p0c")? };
     lattice.energy = Some(momentum.hypot(rest) * 1e-9);

@@ -14,7 +14,7 @@ const REST_ENERGY: [(&str, f64); 2] = [("proton", 0.938_272_088_16), ("electron"
 
 impl Particle {
     /// Rest energy of a particle that a machine file may name [GeV].
-    pub(super) fn rest_energy_of(name: &str) -> Option<f64> {
+    pub fn rest_energy_of(name: &str) -> Option<f64> {
         REST_ENERGY.iter().find(|(known, _)| *known == name).map(|particle| particle.1)
     }
 
