@@ -42,6 +42,8 @@ pub enum Command {
     Export(Export),
     /// A lattice of another code and a response matrix as a folder for fit, diagnose and compare
     Import(Import),
+    /// The raw orbits of a measured response as a recording, instruments as fitted
+    Frames(Frames),
     /// What changed between two measurements of one machine
     Compare(Compare),
     /// Put an effect into a recording or a measured matrix, its answer key beside it
@@ -129,6 +131,9 @@ pub struct Replay {
     /// Random walk of each ln var, standard deviation per sqrt(cycle), lost cycles counted; 0 for a campaign, whose vars are constant
     #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
     pub process_noise: f32,
+    /// Random walk of each baseline [um per sqrt(cycle)]: an orbit that drifts from frame to frame
+    #[arg(long, value_name = "UM", default_value_t = 0.0, value_parser = baseline_walk, conflicts_with = "follow")]
+    pub baseline_walk: f32,
     /// Follow a machine whose vars and baselines may drift, and look for steps of single vars
     #[arg(long, conflicts_with = "process_noise")]
     pub follow: bool,
@@ -468,6 +473,38 @@ impl From<Order> for import::Order {
     }
 }
 
+/// `orbitcal frames`.
+#[derive(Debug, Args)]
+pub struct Frames {
+    /// Folder with a measured response matrix and the raw orbits that it was made of
+    #[arg(value_name = "RING")]
+    pub measurement: PathBuf,
+    /// Folder that is made: the recording, its machine file and the core's model
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Folder of a measurement of the same ring, where RING holds raw orbits alone: its lattice and its instruments, found by their responses
+    #[arg(long, value_name = "DIR", requires = "monitors", requires = "correctors")]
+    pub lattice: Option<PathBuf>,
+    /// How many of the raw orbits' rows are of x, of y
+    #[arg(long, value_name = "X,Y", value_parser = counts, requires = "lattice")]
+    pub monitors: Option<Counts>,
+    /// How many of their columns are of horizontal, of vertical correctors
+    #[arg(long, value_name = "H,V", value_parser = counts, requires = "lattice")]
+    pub correctors: Option<Counts>,
+    /// What the machine held while the orbits were read; the frequency without it
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub priors: Priors,
+}
+
+/// How many of each plane.
+pub type Counts = [usize; 2];
+
 /// `orbitcal compare`.
 #[derive(Debug, Args)]
 pub struct Compare {
@@ -676,6 +713,18 @@ fn range(text: &str) -> Result<Range, String> {
 fn walk(text: &str) -> Result<f32, String> {
     let wrong = || format!("expected a number from 0 to 0.1, found {text:?}");
     text.parse().ok().filter(|v: &f32| (0.0..=0.1).contains(v)).ok_or_else(wrong)
+}
+
+fn counts(text: &str) -> Result<Counts, String> {
+    let wrong = || format!("expected two whole numbers such as 122,122, found {text:?}");
+    let all: Vec<usize> =
+        text.split(',').map(|one| one.trim().parse()).collect::<Result<_, _>>().map_err(|_| wrong())?;
+    all.try_into().map_err(|_| wrong())
+}
+
+fn baseline_walk(text: &str) -> Result<f32, String> {
+    let wrong = || format!("expected a number of um from 0 to 1000, found {text:?}");
+    text.parse().ok().filter(|v: &f32| (0.0..=1000.0).contains(v)).ok_or_else(wrong)
 }
 
 #[cfg(test)]

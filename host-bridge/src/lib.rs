@@ -5,6 +5,7 @@ pub mod cli;
 pub mod command;
 pub mod export;
 pub mod fit_page;
+pub mod frames_result;
 pub mod import_result;
 pub mod matrix_result;
 pub mod model_file;

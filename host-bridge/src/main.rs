@@ -7,8 +7,8 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, compare, conceal, diagnose, export, fit, import, replay, response, serve, study,
-    surrogate, validate, watch,
+    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, replay, response, serve,
+    study, surrogate, validate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -32,6 +32,7 @@ fn main() -> ExitCode {
         Command::Study(options) => study::run(options),
         Command::Diagnose(options) => diagnose::run(options),
         Command::Compare(options) => compare::run(options),
+        Command::Frames(options) => frames::run(options),
         Command::Conceal(options) => conceal::run(options),
         Command::Challenge(options) => challenge::run(options),
         Command::Import(options) => import::run(options),

@@ -258,11 +258,11 @@ impl Folder {
     }
 }
 
-fn table(file: &Path, problem: String) -> MeasuredError {
+pub(crate) fn table(file: &Path, problem: String) -> MeasuredError {
     MeasuredError::Table { file: file.display().to_string(), problem }
 }
 
-fn text(file: &Path) -> Result<String, MeasuredError> {
+pub(crate) fn text(file: &Path) -> Result<String, MeasuredError> {
     fs::read_to_string(file).map_err(|source| MeasuredError::Read { file: file.display().to_string(), source })
 }
 

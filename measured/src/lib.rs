@@ -6,6 +6,7 @@
 //!
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
+pub mod calibrated;
 pub mod compare;
 pub mod conceal;
 pub mod data;
@@ -19,13 +20,16 @@ pub mod lattice;
 mod likeness;
 pub mod missed;
 pub mod model;
+pub mod named;
 pub mod normal;
+pub mod raw;
 #[cfg(test)]
 mod testing;
 pub mod uncertainty;
 pub mod unknowns;
 pub mod wiring;
 
+pub use calibrated::Calibrated;
 pub use compare::{Change, Changes, compare};
 pub use conceal::{Concealed, conceal};
 pub use diagnose::{Diagnosis, diagnose};
@@ -33,5 +37,6 @@ pub use error::MeasuredError;
 pub use fit::{Fit, Settings, fit};
 pub use folder::Folder;
 pub use model::{Model, Prediction};
+pub use raw::RawOrbits;
 pub use unknowns::{Kind, Unknown};
 pub use wiring::{Wiring, straightened};

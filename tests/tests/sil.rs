@@ -100,7 +100,7 @@ fn the_chip_answers_a_drifting_machine_as_the_host_does() {
     recording.rows.truncate(500);
     for process_noise in [0.0, 2e-4] {
         let run =
-            compare(&IMAGE, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise), false, |_| Ok(()))
+            compare(&IMAGE, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise, 0.0), false, |_| Ok(()))
                 .unwrap();
         assert_eq!((run.frames, run.different.as_slice()), (500, [].as_slice()), "walk {process_noise}");
         assert_eq!(run.status.vitals.lost_bytes, 0);

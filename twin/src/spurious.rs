@@ -12,6 +12,9 @@ use crate::response::Optics;
 /// the shift.
 const MACHINES: u32 = 40;
 const SHIFT: f64 = 0.2e-3;
+/// A ring of a small slip factor keeps its frequency with a large momentum, and may lose the orbit: its quadrupoles are shifted less, but not
+/// by less than this [m].
+const LEAST_SHIFT: f64 = 1e-7;
 
 /// Rms change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit,
 /// beyond the design dispersion [1]; 0 in a plane in which shifted quadrupoles make no orbit that is read.
@@ -19,7 +22,13 @@ const SHIFT: f64 = 0.2e-3;
 /// # Errors
 /// [`OrbitError`] if a ring has no closed orbit.
 pub fn spurious_dispersion(ring: &Ring) -> Result<[f64; 2], OrbitError> {
-    of_shifts(ring, SHIFT)
+    let mut rms = SHIFT;
+    loop {
+        match of_shifts(ring, rms) {
+            Err(_) if rms > LEAST_SHIFT => rms /= 4.0,
+            found => return found,
+        }
+    }
 }
 
 fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {

@@ -7,6 +7,7 @@ pub mod conceal;
 pub mod diagnose;
 pub mod export;
 pub mod fit;
+pub mod frames;
 pub mod import;
 pub mod matrix;
 pub mod replay;
@@ -204,9 +205,10 @@ fn expect_modelled(recording: &Recording) -> Result<(), CommandError> {
     not_modelled(recording).map_or(Ok(()), |why| Err(CommandError::Input(why)))
 }
 
-/// The same as a line on stderr, of a core that goes on.
-fn warn_if_not_modelled(ring: &Ring, recording: &Recording) {
-    not_modelled(recording).into_iter().chain(strays(ring, recording)).for_each(output::warn);
+/// The same as a line on stderr, of a core that goes on; a model file holds what it was made for.
+fn warn_if_not_modelled(ring: &Ring, recording: &Recording, has_model_file: bool) {
+    let held = not_modelled(recording).filter(|_| !has_model_file);
+    held.into_iter().chain(strays(ring, recording)).for_each(output::warn);
 }
 
 /// Distance of a supply at one time in the cycle from its mean over all frames up to which first order in it is enough: at three times

@@ -12,6 +12,9 @@ use crate::result::FitResult;
 use crate::source::{self, Clock};
 use crate::stop::Stop;
 
+/// Metres a micrometre.
+const MICRO: f32 = 1e-6;
+
 /// Run it.
 ///
 /// # Errors
@@ -20,10 +23,14 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
-    warn_if_not_modelled(&ring, &recording);
+    warn_if_not_modelled(&ring, &recording, options.model_file.is_some());
     let powered = recording.powered(&ring);
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
-    let walk = if options.follow { stream::FOLLOW } else { stream::walk_per_cycle(&recording, options.process_noise) };
+    let walk = if options.follow {
+        stream::FOLLOW
+    } else {
+        stream::walk_per_cycle(&recording, options.process_noise, options.baseline_walk * MICRO)
+    };
     let core = Core::with_tables(tables, stream::setup(&powered, &recording, walk)?)?;
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);

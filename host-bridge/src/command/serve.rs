@@ -63,9 +63,9 @@ fn feed(
     recording: &Recording,
     mut link: Link<Box<dyn Line>>,
 ) -> Result<(), CommandError> {
-    warn_if_not_modelled(ring, recording);
+    warn_if_not_modelled(ring, recording, false);
     let powered = recording.powered(ring);
-    let given = options.process_noise.map(|sigma| stream::walk_per_cycle(recording, sigma));
+    let given = options.process_noise.map(|sigma| stream::walk_per_cycle(recording, sigma, 0.0));
     let setup = stream::setup(&powered, recording, given.unwrap_or(stream::FOLLOW))?;
     let tables = tables(options.model, &powered, options.model_file.as_deref())?;
     link.restart(&setup).map_err(CommandError::other)?;

@@ -38,14 +38,15 @@ pub struct Setup {
     pub tune_calibration: Option<f32>,
 }
 
-/// A random walk of the params by so much per square root of a cycle of a recording, lost ones counted.
-pub fn walk_per_cycle(recording: &Recording, sigma: f32) -> Walk {
+/// A random walk of the params, and of the baselines [m], by so much per square root of a cycle of a recording, lost ones counted.
+pub fn walk_per_cycle(recording: &Recording, params: f32, baselines: f32) -> Walk {
     let cycles = |rows: &[Row]| f64::from(rows[1].sequence - rows[0].sequence);
     let mut periods: Vec<f64> =
         recording.rows.windows(2).map(|rows| (rows[1].time - rows[0].time) / cycles(rows)).collect();
     periods.sort_by(f64::total_cmp);
     let period = periods.get(periods.len() / 2).copied().unwrap_or(1.0);
-    Walk { params: sigma / period.sqrt() as f32, ..Walk::NONE }
+    let per_second = 1.0 / period.sqrt() as f32;
+    Walk { params: params * per_second, baselines: baselines * per_second }
 }
 
 /// What is known beforehand of a recording of a ring, from its header.

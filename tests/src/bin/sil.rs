@@ -56,7 +56,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
         let comparison =
-            compare(&image, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise), true, |record| {
+            compare(&image, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise, 0.0), true, |record| {
                 bar.inc(1);
                 Ok(publisher.publish(record)?)
             })?;
