@@ -57,6 +57,22 @@ fn the_start_matrix_is_that_of_at() {
     }
 }
 
+/// The stated noise is that of a difference of frames next to each other, in which the orbit has no time to drift.
+#[test]
+fn the_stated_noise_is_that_of_pairs_of_frames() {
+    let Some(path) = ring("sps_2007") else { return };
+    let folder = Folder::read(&path).unwrap();
+    let text = std::fs::read_to_string(path.join("noise_frames_100_mm.csv")).unwrap();
+    let numbers = |line: &str| line.split(',').skip(1).map(|field| field.parse().unwrap()).collect::<Vec<f64>>();
+    let frames: Vec<Vec<f64>> = text.lines().skip(1).map(numbers).collect();
+    for (row, one) in folder.monitors.iter().enumerate().filter(|(_, one)| one.is_used) {
+        let squares: f64 = frames.windows(2).map(|pair| (pair[1][row] - pair[0][row]).powi(2)).sum();
+        let pairs = (squares / (frames.len() - 1) as f64).sqrt();
+        // a hundredth: the mean of the differences counts or not
+        assert!((one.sigma / pairs - 1.0).abs() < 0.01, "{}: {} {pairs}", folder.monitor(row), one.sigma);
+    }
+}
+
 /// Chi-square as LOCO counts it, with no more unknowns than the reference had, is not above the reference's.
 fn the_fit_is_no_worse_than_that_of_loco(name: &str, reference: f64) {
     let Some(path) = ring(name) else { return };
