@@ -99,9 +99,8 @@ fn the_chip_answers_a_drifting_machine_as_the_host_does() {
     let (ring, mut recording) = read("drift-stream");
     recording.rows.truncate(500);
     for process_noise in [0.0, 2e-4] {
-        let run =
-            compare(&IMAGE, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise, 0.0), false, |_| Ok(()))
-                .unwrap();
+        let walk = stream::walk_per_cycle(&recording, process_noise, 0.0);
+        let run = compare(&IMAGE, (&ring, &recording), walk, false, |_| Ok(())).unwrap();
         assert_eq!((run.frames, run.different.as_slice()), (500, [].as_slice()), "walk {process_noise}");
         assert_eq!(run.status.vitals.lost_bytes, 0);
     }

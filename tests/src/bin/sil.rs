@@ -55,11 +55,11 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
         let mut recording = Recording::read(&repository(name), &ring)?;
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
-        let comparison =
-            compare(&image, (&ring, &recording), stream::walk_per_cycle(&recording, process_noise, 0.0), true, |record| {
-                bar.inc(1);
-                Ok(publisher.publish(record)?)
-            })?;
+        let walk = stream::walk_per_cycle(&recording, process_noise, 0.0);
+        let comparison = compare(&image, (&ring, &recording), walk, true, |record| {
+            bar.inc(1);
+            Ok(publisher.publish(record)?)
+        })?;
         bar.finish_and_clear();
         print(&comparison, &sizes);
         results.push(summary(&recording.name, &comparison, &sizes));
