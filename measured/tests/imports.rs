@@ -14,8 +14,14 @@ use nalgebra::DMatrix;
 use tempfile::TempDir;
 use twin::{Hold, Optics, Rf, Tunes};
 
-const FILES: [&str; 4] =
-    ["twelve-cells.at.json", "twelve-cells.tfs", "twelve-cells.xsuite.json", "twelve-cells.pals.yaml"];
+const FILES: [&str; 6] = [
+    "twelve-cells.at.json",
+    "twelve-cells.at.mat",
+    "twelve-cells.octave.mat",
+    "twelve-cells.tfs",
+    "twelve-cells.xsuite.json",
+    "twelve-cells.pals.yaml",
+];
 
 fn recorded(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/measured").join(name)
@@ -109,10 +115,10 @@ fn what_is_imported_is_what_was_measured() {
 
 #[test]
 fn conventions_change_units_sizes_and_signs_and_nothing_else() {
-    let plain = measurement(FILES[1], "response.txt", Some(Order::Planes), &conventions());
+    let plain = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &conventions());
     let other =
         Conventions { unit: OrbitUnit::Metres, kick_is: KickIs::Half, signs: Signs([false, true]), ..conventions() };
-    let other = measurement(FILES[1], "response.txt", Some(Order::Planes), &other);
+    let other = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &other);
     assert_eq!(other.matrix[(0, 0)], -1e3 * plain.matrix[(0, 0)]);
     assert_eq!(other.matrix[(0, 12)], 1e3 * plain.matrix[(0, 12)]);
     assert_eq!((other.correctors[0].kick, other.monitors[0].sigma), (0.4, 2.0));
@@ -248,6 +254,20 @@ fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     assert!(said("PALS:\n  facility:\n    - use: ring\n").contains("ring stands in a line and not in the facility"));
     assert!(said("PALS: [").contains("ring.txt: "));
     assert!(said("").contains("found the line \"\""));
+}
+
+#[test]
+fn a_mat_file_is_read_by_the_name_of_its_lattice() {
+    let several = recorded("imports/twelve-cells.at.mat");
+    let of = |name: &str| Lattice::read(Path::new(&format!("{}:{name}", several.display())));
+    assert_eq!(of("RING").unwrap().elements.len(), 90);
+    let problem = of("THERING").unwrap_err().to_string();
+    assert!(problem.ends_with("THERING is no lattice of AT; found RING (1x90 cells)"), "{problem}");
+    let none = recorded("imports/values.octave.mat");
+    assert!(
+        refused(&none)
+            .contains("expected a cell array of elements with FamName, found f (a 1x1 struct), P (a 1x2 struct)")
+    );
 }
 
 #[test]
