@@ -11,6 +11,8 @@ use measured::lattice::ring;
 use measured::unknowns::groups;
 use measured::{Folder, MeasuredError, Model};
 use nalgebra::DMatrix;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
 use tempfile::TempDir;
 use twin::{Hold, Optics, Rf, Tunes};
 
@@ -111,6 +113,53 @@ fn what_is_imported_is_what_was_measured() {
     assert!(twin::Ring::read(&path.join("machine.json")).is_ok());
     let again = write(&imported, &path).unwrap_err().to_string();
     assert!(again.contains("ring"), "{again}");
+}
+
+#[test]
+fn a_dataset_of_hdf5_is_a_table_without_names() {
+    let file = recorded("imports/response.h5");
+    let of = |path: &str| Table::read(Path::new(&format!("{}{path}", file.display())));
+    let (lattice, instruments) = imported(&recorded("imports/twelve-cells.at.mat")).unwrap();
+    let folder = |table: &Table, unit| {
+        let conventions = Conventions { unit, ..conventions() };
+        let measured =
+            Measurement { matrix: table, dispersion: None, order: Some(Order::Planes), conventions: &conventions };
+        assemble(&lattice, &instruments, None, &measured)
+    };
+    let own = folder(&of(":/response_matrix").unwrap(), OrbitUnit::Metres).unwrap();
+    let other = folder(&Table::read(&recorded("imports/response.txt")).unwrap(), OrbitUnit::Millimetres).unwrap();
+    // metres of the file, rounded once each way
+    assert!((own.matrix - other.matrix).amax() < 1e-15);
+    let said = |path: &str| of(path).unwrap_err().to_string();
+    assert!(said("").ends_with("response.h5:PATH; it has /dkick (f64), /response_matrix (24x24 f64)"), "{}", said(""));
+    assert!(said(":/orm").contains("path not found: orm; the file has /dkick (f64)"), "{}", said(":/orm"));
+    assert!(said(":/dkick").contains("expected a matrix or a list of numbers, found f64"));
+    let column = folder(&Table::read(&recorded("imports/values.octave.mat:i8")).unwrap(), OrbitUnit::Metres);
+    assert!(
+        column
+            .unwrap_err()
+            .to_string()
+            .contains("values.octave.mat:i8: 2 lines, the lattice has 24 channels in that order")
+    );
+    let lattice = Table::read(&recorded("imports/twelve-cells.at.mat:RING")).unwrap_err().to_string();
+    assert!(lattice.ends_with("RING: expected numbers, found 1x90 cells"), "{lattice}");
+}
+
+#[test]
+fn no_byte_of_hdf5_makes_it_panic() {
+    let whole = fs::read(recorded("imports/response.h5")).unwrap();
+    let mut random = StdRng::seed_from_u64(8);
+    for _ in 0..1500 {
+        let mut bytes = whole.clone();
+        for _ in 0..random.random_range(1..4) {
+            let at = random.random_range(8..bytes.len());
+            bytes[at] = if random.random() { 0xff } else { random.random() };
+        }
+        let folder = TempDir::new().unwrap();
+        let path = folder.path().join("some.h5");
+        fs::write(&path, bytes).unwrap();
+        drop(Table::read(Path::new(&format!("{}:/response_matrix", path.display()))));
+    }
 }
 
 #[test]

@@ -28,7 +28,7 @@ impl Input {
         let words = file.display().to_string();
         let bytes = fs::read(&file).map_err(|source| MeasuredError::Read { file: words.clone(), source })?;
         if name.is_none() && MatFile::is_one(&bytes) {
-            let file = MatFile::of(&words, &bytes)?;
+            let file = MatFile::of(&words, bytes)?;
             if loco::is_one(&file) {
                 return Ok(Self::Loco(Box::new(loco::read(&file, lacking)?)));
             }

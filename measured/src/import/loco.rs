@@ -320,7 +320,7 @@ mod tests {
     const FILE: &[u8] = include_bytes!("../../../recordings/measured/imports/twelve-cells.loco.mat");
 
     fn file() -> MatFile {
-        MatFile::of("loco.mat", FILE).unwrap()
+        MatFile::of("loco.mat", FILE.to_vec()).unwrap()
     }
 
     fn read(file: &MatFile) -> Result<Loco, MeasuredError> {

@@ -12,6 +12,7 @@ mod at_mat;
 mod conventions;
 mod element;
 mod fields;
+mod hdf5;
 mod input;
 mod instruments;
 mod loco;

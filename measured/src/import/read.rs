@@ -22,7 +22,7 @@ impl Lattice {
         let file = path.display().to_string();
         let bytes = fs::read(&path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
         if MatFile::is_one(&bytes) {
-            return at_mat::read(&MatFile::of(&file, &bytes)?, name.as_deref());
+            return at_mat::read(&MatFile::of(&file, bytes)?, name.as_deref());
         }
         let text = String::from_utf8(bytes).map_err(|_| unknown(&file, "bytes that are no text"))?;
         if text.trim_start().starts_with('@') {

@@ -1,10 +1,12 @@
 //! Files of Matlab, Octave and `scipy.io.savemat`: their variables, with the place of each value in every error.
 
 mod level5;
+mod level73;
 mod place;
 
 pub(super) use place::Place;
 
+use super::hdf5::Matrix;
 use crate::error::MeasuredError;
 
 /// Dimensions of an array; the first runs fastest.
@@ -69,8 +71,9 @@ impl MatFile {
     ///
     /// # Errors
     /// [`MeasuredError::Table`]: the file is cut off or is not what it says.
-    pub fn of(file: &str, bytes: &[u8]) -> Result<Self, MeasuredError> {
-        match level5::variables(bytes) {
+    pub fn of(file: &str, bytes: Vec<u8>) -> Result<Self, MeasuredError> {
+        let variables = if level73::is_one(&bytes) { level73::variables(bytes) } else { level5::variables(&bytes) };
+        match variables {
             Ok(variables) => Ok(Self { file: file.into(), variables }),
             Err(problem) => Err(MeasuredError::Table { file: file.into(), problem }),
         }
@@ -80,6 +83,21 @@ impl MatFile {
     pub fn variable<'a>(&'a self, name: &'a str) -> Option<Place<'a>> {
         let (_, value) = self.variables.iter().find(|(own, _)| own == name)?;
         Some(Place::of(&self.file, name, value))
+    }
+
+    /// The numbers of a variable as a matrix.
+    pub fn matrix(&self, name: Option<&str>) -> Result<Matrix, MeasuredError> {
+        let refuse = |problem: String| MeasuredError::Table { file: self.file.clone(), problem };
+        let Some(name) = name else {
+            return Err(refuse(format!("name a variable, {}:NAME; it has {}", self.file, self.words())));
+        };
+        let place =
+            self.variable(name).ok_or_else(|| refuse(format!("no variable {name}; it has {}", self.words())))?;
+        let (Some([lines, width]), values) = (place.shape(), place.numbers()?) else {
+            return Err(place.expected("a matrix"));
+        };
+        let line = |line: usize| values.iter().skip(line).step_by(lines);
+        Ok(Matrix { width, values: (0..lines).flat_map(line).copied().collect() })
     }
 
     /// Names and kinds of the variables, for an error.
@@ -104,13 +122,13 @@ mod tests {
     ];
 
     fn read(bytes: &[u8]) -> Result<(), MeasuredError> {
-        at_mat::read(&MatFile::of("file", bytes)?, None).map(drop)
+        at_mat::read(&MatFile::of("file", bytes.to_vec())?, None).map(drop)
     }
 
     #[test]
     fn every_kind_of_value_of_octave_is_read() {
         let bytes = include_bytes!("../../../../recordings/measured/imports/values.octave.mat");
-        let file = MatFile::of("file", bytes).unwrap();
+        let file = MatFile::of("file", bytes.to_vec()).unwrap();
         let value = |name| file.variable(name).unwrap();
         assert_eq!(value("i8").value, &Mat::Numbers(vec![2, 2], vec![1.0, 3.0, 2.0, 4.0]));
         assert_eq!(value("c").text(), Some("abcd"));
@@ -123,9 +141,40 @@ mod tests {
     }
 
     #[test]
+    fn structs_and_cells_of_level_7_3_are_read() {
+        let bytes = include_bytes!("../../../../recordings/measured/imports/values.v73.mat");
+        let file = MatFile::of("file", bytes.to_vec()).unwrap();
+        let value = |name| file.variable(name).unwrap();
+        assert_eq!(value("i8").value, &Mat::Numbers(vec![2, 2], vec![1.0, 3.0, 2.0, 4.0]));
+        let numbers = Mat::Numbers(vec![1, 2], vec![1.0, 2.0]);
+        assert_eq!(value("c").value, &Mat::Cells(vec![1, 2], vec![numbers, Mat::Text("text".into())]));
+        assert!(value("z").value.is_empty());
+        assert_eq!(value("s").need("a").unwrap().number().unwrap(), 1.5);
+        assert_eq!(value("P").need_of(1, "ElemIndex").unwrap().number().unwrap(), 4.0);
+        assert_eq!(value("P").need_of(1, "FieldName").unwrap().text(), Some("PolynomB"));
+    }
+
+    #[test]
+    fn no_byte_of_level_7_3_makes_it_panic() {
+        let whole = include_bytes!("../../../../recordings/measured/imports/values.v73.mat");
+        let mut random = StdRng::seed_from_u64(7);
+        for _ in 0..1500 {
+            let mut bytes = whole.to_vec();
+            for _ in 0..random.random_range(1..4) {
+                let at = random.random_range(512..bytes.len());
+                bytes[at] = if random.random() { 0xff } else { random.random() };
+            }
+            if random.random_range(0..4) == 0 {
+                bytes.truncate(random.random_range(520..whole.len()));
+            }
+            drop(MatFile::of("file", bytes));
+        }
+    }
+
+    #[test]
     fn what_is_wrong_is_said_with_its_place() {
         let bytes = include_bytes!("../../../../recordings/measured/imports/values.octave.mat");
-        let file = MatFile::of("file", bytes).unwrap();
+        let file = MatFile::of("file", bytes.to_vec()).unwrap();
         let groups = file.variable("P").unwrap();
         assert_eq!(
             groups.need_of(1, "Args").unwrap_err().to_string(),
