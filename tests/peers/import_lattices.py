@@ -163,6 +163,8 @@ def write_values(folder):
     with h5py.File(folder / "response.h5", "w") as file:
         file.create_dataset("response_matrix", data=matrix / 1e3, compression="gzip")
         file.create_dataset("dkick", data=1e-4)
+        for plane, part in zip("xy", np.split(np.loadtxt(folder / "dispersion.csv", delimiter=",", usecols=1), 2)):
+            file.create_dataset(f"measured_eta_{plane}", data=part / 1e3)
 
 
 def pyat(elements):

@@ -20,7 +20,7 @@ from scipy.io import savemat
 
 ROUNDING = {"lattice.csv": 1e-11, "bpms.csv": 0.0, "correctors.csv": 0.0, "meta.json": 1e-9}  # lengths and strengths of a table have twelve digits or ten, the circumference is their sum
 POSITION = 5e-5  # m: entrances in a table have four decimals at least; here they are sums of lengths
-FIT = 1e-4  # relative: the iterations of a fit stop elsewhere when positions are rounded; 3e-5 found
+FIT = 1e-4  # relative: the iterations of a fit stop elsewhere when positions are rounded; 4e-5 found
 OCTAVE = """
 load('{file}');
 for i = 1:numel(FitParameters)

@@ -22,7 +22,7 @@ pub(super) fn is_one(bytes: &[u8]) -> bool {
     hdf5_pure::is_hdf5_bytes(bytes)
 }
 
-/// The matrix of a dataset; a list is a column.
+/// The matrix of a dataset, or of several with commas between their paths, one below the other; a list is a column.
 ///
 /// # Errors
 /// [`MeasuredError::Table`], with the datasets that there are where none is named.
@@ -38,15 +38,26 @@ pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, Measured
     let Some(path) = &source.name else {
         return Err(refused(format!("name a dataset, {name}:PATH; it has {}", have())));
     };
-    let dataset = file.dataset(path).map_err(|error| refused(format!("{path}: {error}; the file has {}", have())))?;
-    let shape = shape(&dataset).map_err(&refused)?;
-    let width = match shape.as_slice() {
-        [_, width] => *width,
-        [_] => 1,
-        _ => return Err(refused(format!("{path}: expected a matrix or a list of numbers, found {}", words(&dataset)))),
-    };
-    let values = numbers(&dataset).map_err(|problem| refused(format!("{path}: {problem}")))?;
-    Ok(Matrix { width, values })
+    let mut matrix = Matrix { width: 0, values: Vec::new() };
+    for path in path.split(',') {
+        let dataset =
+            file.dataset(path).map_err(|error| refused(format!("{path}: {error}; the file has {}", have())))?;
+        let width = match shape(&dataset).map_err(&refused)?.as_slice() {
+            [_, width] => *width,
+            [_] => 1,
+            _ => {
+                let problem = format!("{path}: expected a matrix or a list of numbers, found {}", words(&dataset));
+                return Err(refused(problem));
+            }
+        };
+        if !matrix.values.is_empty() && matrix.width != width {
+            let problem = format!("{path}: {width} numbers in a line, {} in the dataset before it", matrix.width);
+            return Err(refused(problem));
+        }
+        matrix.width = width;
+        matrix.values.extend(numbers(&dataset).map_err(|problem| refused(format!("{path}: {problem}")))?);
+    }
+    Ok(matrix)
 }
 
 /// Dimensions; the last runs fastest.

@@ -51,7 +51,7 @@ pub struct Loco {
 pub struct Lacking {
     /// Kicks [mrad], where `CMData` has none.
     pub kick: Option<PerInstrument>,
-    /// RF frequency [Hz], where neither `LocoMeasData` nor `RINGData` has it.
+    /// RF frequency [Hz], where neither `LocoMeasData` nor `RINGData` has it nor a cavity.
     pub rf: Option<f64>,
 }
 
@@ -274,7 +274,13 @@ fn frequency(structs: &Structs, lacking: &Lacking, lattice: &mut Lattice) -> Res
     {
         return Err(place.wrong(&format!("{stated} Hz, but RINGData.CavityFrequency is {of_model} Hz")));
     }
-    lattice.rf = lacking.rf.or(stated).or(of_model).or(lattice.rf);
+    let found = stated.or(of_model).or(lattice.rf);
+    if let (Some(found), Some(_)) = (found, lacking.rf) {
+        return Err(structs
+            .measured
+            .wrong(&format!("the file states the RF frequency, {found} Hz; leave --rf-frequency out")));
+    }
+    lattice.rf = found.or(lacking.rf);
     Ok(lattice.rf)
 }
 
@@ -475,6 +481,18 @@ mod tests {
         assert!(read(&file).unwrap_err().to_string().contains("state with --kick MRAD"));
         let own = super::read(&file, &stated).unwrap().folder;
         assert!(own.correctors.iter().zip(&whole.correctors).all(|(own, whole)| own.kick == whole.kick));
+    }
+
+    #[test]
+    fn an_rf_frequency_that_the_file_lacks_is_asked_for() {
+        let mut file = file();
+        let stated = Lacking { rf: Some(5e8), kick: None };
+        assert!(super::read(&file, &stated).unwrap_err().to_string().contains("leave --rf-frequency out"));
+        for (variable, name) in [("LocoMeasData", "RF"), ("RINGData", "CavityFrequency")] {
+            *field(&mut file, variable, 0, name) = Mat::Numbers(vec![0, 0], Vec::new());
+        }
+        assert!(read(&file).unwrap_err().to_string().contains("state the RF frequency with --rf-frequency HZ"));
+        assert_eq!(super::read(&file, &stated).unwrap().folder.meta.rf, 5e8);
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
-//! dataset of an HDF5 file, `FILE.h5:/PATH`, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
+//! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
 
 use std::fs;
 use std::path::Path;
