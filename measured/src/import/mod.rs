@@ -16,7 +16,6 @@ mod hdf5;
 mod input;
 mod instruments;
 mod loco;
-mod loco_fit;
 mod madx;
 mod mat;
 mod pals;

@@ -7,9 +7,10 @@
 
 use serde_json::{Map, Value, json};
 
-use super::mat::{Mat, MatFile, Place};
 use crate::error::MeasuredError;
 use crate::folder::{Flags, Folder, Group, ReferenceFit};
+use crate::import::element::Lattice;
+use crate::import::mat::{Mat, MatFile, Place};
 
 /// Words of `LocoFlags` that are kept.
 const FLAGS: [&str; 3] = ["SVmethod", "OutlierFactor", "ClosedOrbitType"];
@@ -81,15 +82,20 @@ impl<'a> LocoFit<'a> {
     /// The fit, for the folder; none where nothing was fitted.
     pub fn reference(
         &self,
-        monitors: &Place,
-        correctors: &Place,
+        [monitors, correctors]: [&Place; 2],
         folder: &Folder,
+        lattice: &Lattice,
         places: &[usize],
     ) -> Result<Option<ReferenceFit>, MeasuredError> {
         let kept: Vec<(usize, &'static str)> =
             self.parameters.iter().enumerate().filter_map(|(at, one)| Some((at, one.word()?))).collect();
         let (Some(flags), false) = (&self.flags, kept.is_empty()) else { return Ok(None) };
-        let rows = |one: &Parameter| one.fields.iter().flat_map(|one| rows(places[one.element], folder)).collect();
+        // a magnet with a corrector in it was cut around a row of no length
+        let of_element = |one: &Field| match places[one.element] {
+            cut if folder.lattice[cut].length < lattice.elements[one.element].length => vec![cut - 1, cut + 1],
+            whole => vec![whole],
+        };
+        let rows = |one: &Parameter| one.fields.iter().flat_map(of_element).collect();
         let fit_parameters = kept
             .iter()
             .map(|&(at, field)| Group { elements: rows(&self.parameters[at]), field: field.into() })
@@ -120,16 +126,6 @@ impl<'a> LocoFit<'a> {
         let all = all.map(|one| one.number()).collect::<Result<Vec<_>, _>>()?;
         Ok((!all.is_empty()).then(|| json!(all)))
     }
-}
-
-/// Rows of an element: itself, or both halves of a magnet around the row where its corrector acts.
-fn rows(place: usize, folder: &Folder) -> Vec<usize> {
-    let is_cut = folder.lattice[place].length == 0.0
-        && place > 0
-        && folder.lattice.get(place + 1).is_some_and(|next| {
-            next.length > 0.0 && next.name == folder.lattice[place].name && folder.lattice[place - 1].name == next.name
-        });
-    if is_cut { vec![place - 1, place + 1] } else { vec![place] }
 }
 
 fn options(flags: &Place) -> Result<Flags, MeasuredError> {
