@@ -82,13 +82,14 @@ peers: build .venv-peers ## NUTS of numpyro and blackjax beside ours, on the den
 	cargo run --locked --release -p system-tests --bin density -- $(RECORDING) --json target/density.json
 	.venv-peers/bin/python tests/peers/numpyro_nuts.py target/density.json $(ORBITCAL) $(RECORDING)
 
-exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the schema of PALS, their own lattices imported, tunes and responses compared; two minutes
+exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the schema of PALS, their own lattices and a LOCO file imported, tunes and responses compared; two minutes
 	.venv-export/bin/python tests/peers/exports.py $(ORBITCAL)
 	.venv-export/bin/python tests/peers/imports.py $(ORBITCAL)
+	.venv-export/bin/python tests/peers/loco.py --check $(ORBITCAL) recordings/measured/twelve-cells/before recordings/measured/twelve-cells/after
 
 .venv-export:
 	python3 -m venv .venv-export
-	.venv-export/bin/pip install --quiet numpy cpymad==1.20.0 accelerator-toolbox==0.9.0 xsuite==0.67.0 xtrack==0.118.4 pals-schema==0.3.0 pyyaml==6.0.3
+	.venv-export/bin/pip install --quiet numpy cpymad==1.20.0 accelerator-toolbox==0.9.0 xsuite==0.67.0 xtrack==0.118.4 pals-schema==0.3.0 pyyaml==6.0.3 h5py==3.16.0 hdf5storage==0.2.2
 
 # apart from .venv, as JAX is large
 .venv-peers:

@@ -3,7 +3,7 @@
 use core::fmt;
 use std::collections::BTreeMap;
 
-use measured::import::{Agreement, Instruments, Lattice};
+use measured::import::{Agreement, Format, Instruments, Lattice};
 use serde::Serialize;
 use twin::Plane;
 
@@ -33,7 +33,28 @@ pub struct Imported {
     pub agreement: Vec<PlaneAgreement>,
     /// The folder that was made.
     pub folder: Option<String>,
+    #[serde(skip)]
+    hints: &'static Hints,
 }
+
+/// Where a convention that looks wrong is stated.
+#[derive(Debug)]
+struct Hints {
+    sign: &'static str,
+    order: &'static str,
+    size: &'static str,
+}
+
+const OF_OPTIONS: Hints = Hints {
+    sign: "--kick-sign, or the sign of all monitors",
+    order: "the order of its lines and columns, and the lattice",
+    size: "--orbit-unit, --kick and --kick-is",
+};
+const OF_LOCO: Hints = Hints {
+    sign: "the signs of CMData's HCMKicks and VCMKicks, or of all monitors",
+    order: "HBPMIndex, VBPMIndex, HCMIndex and VCMIndex, and the lattice",
+    size: "LocoMeasData.M, which LOCO has in mm, and HCMKicks and VCMKicks, the whole kicks in mrad",
+};
 
 /// One plane of the matrix.
 #[derive(Debug, Serialize)]
@@ -60,20 +81,14 @@ impl PlaneAgreement {
     }
 
     /// What to look at, where something is wrong.
-    fn doubt(&self) -> Option<String> {
+    fn doubt(&self, hints: &Hints) -> Option<String> {
         let Self { plane, factor, correlation, .. } = self;
         if *correlation < -0.5 {
-            Some(format!(
-                "{plane}: the measured matrix has the other sign: see --kick-sign, or the sign of all monitors."
-            ))
+            Some(format!("{plane}: the measured matrix has the other sign: see {}.", hints.sign))
         } else if *correlation < 0.5 {
-            Some(format!(
-                "{plane}: the matrix does not look like this ring's: see the order of its lines and columns, and the lattice."
-            ))
+            Some(format!("{plane}: the matrix does not look like this ring's: see {}.", hints.order))
         } else if !PLAUSIBLE.contains(factor) {
-            Some(format!(
-                "{plane}: the matrix is {factor:.3} times the lattice's: see --orbit-unit, --kick and --kick-is."
-            ))
+            Some(format!("{plane}: the matrix is {factor:.3} times the lattice's: see {}.", hints.size))
         } else {
             None
         }
@@ -96,13 +111,19 @@ impl Imported {
             left_out: lattice.left_out.clone(),
             agreement: Vec::new(),
             folder: None,
+            hints: if lattice.format == Format::Loco { &OF_LOCO } else { &OF_OPTIONS },
         }
     }
 
-    /// With a folder that was made.
-    pub fn with_folder(mut self, folder: &str, agreement: &[Agreement]) -> Self {
-        self.folder = Some(folder.into());
+    /// With a matrix beside the lattice's.
+    pub fn with_agreement(mut self, agreement: &[Agreement]) -> Self {
         self.agreement = agreement.iter().map(PlaneAgreement::of).collect();
+        self
+    }
+
+    /// With a folder that was made.
+    pub fn with_folder(mut self, folder: &str) -> Self {
+        self.folder = Some(folder.into());
         self
     }
 }
@@ -126,7 +147,7 @@ impl fmt::Display for Imported {
             rows.add_row([format!("{}, measured/lattice", one.plane), numbers]);
         }
         write!(to, "{rows}")?;
-        for doubt in self.agreement.iter().filter_map(PlaneAgreement::doubt) {
+        for doubt in self.agreement.iter().filter_map(|one| one.doubt(self.hints)) {
             write!(to, "\n\n{}", fill(&doubt))?;
         }
         for (what, count) in &self.left_out {

@@ -143,3 +143,34 @@ fn an_effect_concealed_in_a_recording_is_found_again() {
     let [found, sigma] = ["amplitude", "sigma"].map(|key| finding[key].as_f64().unwrap());
     assert!((found - effect["amplitude"].as_f64().unwrap()).abs() < 3.0 * sigma, "{found} ± {sigma}, put in {effect}");
 }
+
+const LOCO: &str = "recordings/measured/imports/twelve-cells.loco.mat";
+
+#[test]
+fn a_loco_file_in_one_command_is_fitted_as_its_folder_is() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("before");
+    let made = json(&["import", LOCO, "--out", out.to_str().unwrap()]);
+    assert_eq!((&made["format"], &made["left_out"]), (&"LOCO file".into(), &serde_json::json!({})));
+    assert!(made["agreement"][1]["correlation"].as_f64().unwrap() > 0.99);
+    let [own, other] = [out.to_str().unwrap(), BEFORE].map(|folder| json(&["fit", folder]));
+    for (own, other) in own["vars"].as_array().unwrap().iter().zip(other["vars"].as_array().unwrap()) {
+        assert_eq!(own["name"], other["name"]);
+        for key in ["mean", "sigma"] {
+            // positions are sums of the same lengths in another order
+            assert!((own[key].as_f64().unwrap() - other[key].as_f64().unwrap()).abs() < 1e-9, "{own} {other}");
+        }
+    }
+    assert_eq!(own["wiring"], other["wiring"]);
+}
+
+#[test]
+fn what_a_loco_file_states_is_not_asked_for_nor_taken_twice() {
+    for option in [["--kick-sign", "x+y+"], ["--orbit-unit", "mm"], ["--noise", "1"], ["--order", "planes"]] {
+        let said = refused(&[&["import", LOCO], &option[..]].concat());
+        assert!(said.contains(&format!("is a LOCO file, which states it; leave {} out", option[0])), "{said}");
+    }
+    assert!(refused(&["import", LOCO, "--kick", "1"]).contains("leave --kick out"));
+    let lattice = "recordings/measured/imports/twelve-cells.at.mat";
+    assert!(refused(&["import", lattice, "--out", "none"]).contains("is a lattice alone; --out needs --matrix"));
+}

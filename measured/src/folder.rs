@@ -9,6 +9,7 @@ use std::path::Path;
 use nalgebra::{DMatrix, DVector};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use twin::Plane;
 
 use crate::error::MeasuredError;
@@ -86,16 +87,19 @@ impl Particle {
 }
 
 /// The parameters of another fit to the same matrix.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Deserialize, Serialize)]
 pub struct ReferenceFit {
     /// Magnets that were fitted together, one group each.
     pub fit_parameters: Vec<Group>,
     /// Its options.
     pub flags: Flags,
+    /// What it found, which nothing here uses.
+    #[serde(flatten)]
+    pub rest: Map<String, Value>,
 }
 
 /// Elements that share one parameter.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Deserialize, Serialize)]
 pub struct Group {
     /// Rows of the lattice.
     pub elements: Vec<usize>,
@@ -104,13 +108,16 @@ pub struct Group {
 }
 
 /// Options of the reference fit.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Deserialize, Serialize)]
 #[serde(rename_all = "PascalCase")]
 pub struct Flags {
     /// `Yes` where the coupling blocks were used.
     pub coupling: String,
     /// `Yes` where the dispersion was used.
     pub dispersion: String,
+    /// Others, which nothing here uses.
+    #[serde(flatten)]
+    pub rest: Map<String, Value>,
 }
 
 /// A row of `lattice.csv`.

@@ -52,14 +52,14 @@ pub fn ring() -> Folder {
     let gradients = (0..lattice.len()).filter(|&row| lattice[row].k1 != 0.0).map(|row| group(vec![row, row], "K"));
     let skews = skew.iter().map(|&row| group(vec![row], "PolynomA"));
     let fit_parameters = gradients.chain(skews).collect();
-    let flags = Flags { coupling: "Yes".into(), dispersion: "Yes".into() };
+    let flags = Flags { coupling: "Yes".into(), dispersion: "Yes".into(), rest: Default::default() };
     let meta = Meta {
         circumference: s,
         energy: Some(1.5),
         particle: Particle::Electron,
         rf: 5e8,
         delta_rf: 2e3,
-        reference_fit: Some(ReferenceFit { fit_parameters, flags }),
+        reference_fit: Some(ReferenceFit { fit_parameters, flags, rest: Default::default() }),
     };
     let matrix = DMatrix::zeros(monitors.len(), correctors.len());
     let dispersion = Some(DVector::zeros(monitors.len()));

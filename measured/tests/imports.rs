@@ -11,11 +11,19 @@ use measured::lattice::ring;
 use measured::unknowns::groups;
 use measured::{Folder, MeasuredError, Model};
 use nalgebra::DMatrix;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
 use tempfile::TempDir;
 use twin::{Hold, Optics, Rf, Tunes};
 
-const FILES: [&str; 4] =
-    ["twelve-cells.at.json", "twelve-cells.tfs", "twelve-cells.xsuite.json", "twelve-cells.pals.yaml"];
+const FILES: [&str; 6] = [
+    "twelve-cells.at.json",
+    "twelve-cells.at.mat",
+    "twelve-cells.octave.mat",
+    "twelve-cells.tfs",
+    "twelve-cells.xsuite.json",
+    "twelve-cells.pals.yaml",
+];
 
 fn recorded(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/measured").join(name)
@@ -108,11 +116,71 @@ fn what_is_imported_is_what_was_measured() {
 }
 
 #[test]
+fn a_dataset_of_hdf5_is_a_table_without_names() {
+    let file = recorded("imports/response.h5");
+    let of = |path: &str| Table::read(Path::new(&format!("{}{path}", file.display())));
+    let (lattice, instruments) = imported(&recorded("imports/twelve-cells.at.mat")).unwrap();
+    let folder = |table: &Table, unit| {
+        let conventions = Conventions { unit, ..conventions() };
+        let measured =
+            Measurement { matrix: table, dispersion: None, order: Some(Order::Planes), conventions: &conventions };
+        assemble(&lattice, &instruments, None, &measured)
+    };
+    let own = folder(&of(":/response_matrix").unwrap(), OrbitUnit::Metres).unwrap();
+    let other = folder(&Table::read(&recorded("imports/response.txt")).unwrap(), OrbitUnit::Millimetres).unwrap();
+    // metres of the file, rounded once each way
+    assert!((own.matrix - other.matrix).amax() < 1e-15);
+    let said = |path: &str| of(path).unwrap_err().to_string();
+    assert!(said("").contains("response.h5:PATH; it has /dkick (f64), /measured_eta_x (12 f64), /measured_eta_y"));
+    assert!(said(":/orm").contains("path not found: orm; the file has /dkick (f64)"), "{}", said(":/orm"));
+    assert!(said(":/dkick").contains("expected a matrix or a list of numbers, found f64"));
+    let both = of(":/measured_eta_x,/measured_eta_y").unwrap();
+    assert!(folder(&both, OrbitUnit::Metres).unwrap_err().to_string().contains("1 columns, the lattice has 24"));
+    assert!(
+        said(":/response_matrix,/measured_eta_x")
+            .contains("/measured_eta_x: 1 numbers in a line, 24 in the dataset before it")
+    );
+    let conventions = Conventions { unit: OrbitUnit::Metres, ..conventions() };
+    let dispersion = Some((&both, 2000.0));
+    let matrix = &of(":/response_matrix").unwrap();
+    let measured = Measurement { matrix, dispersion, order: Some(Order::Planes), conventions: &conventions };
+    let dispersion = assemble(&lattice, &instruments, None, &measured).unwrap().dispersion.unwrap();
+    let stated = measurement("twelve-cells.at.json", "response.csv", None, &self::conventions()).dispersion.unwrap();
+    assert!((dispersion - stated).amax() < 1e-15);
+    let column = folder(&Table::read(&recorded("imports/values.octave.mat:i8")).unwrap(), OrbitUnit::Metres);
+    assert!(
+        column
+            .unwrap_err()
+            .to_string()
+            .contains("values.octave.mat:i8: 2 lines, the lattice has 24 channels in that order")
+    );
+    let lattice = Table::read(&recorded("imports/twelve-cells.at.mat:RING")).unwrap_err().to_string();
+    assert!(lattice.ends_with("RING: expected numbers, found 1x90 cells"), "{lattice}");
+}
+
+#[test]
+fn no_byte_of_hdf5_makes_it_panic() {
+    let whole = fs::read(recorded("imports/response.h5")).unwrap();
+    let mut random = StdRng::seed_from_u64(8);
+    for _ in 0..1500 {
+        let mut bytes = whole.clone();
+        for _ in 0..random.random_range(1..4) {
+            let at = random.random_range(8..bytes.len());
+            bytes[at] = if random.random() { 0xff } else { random.random() };
+        }
+        let folder = TempDir::new().unwrap();
+        let path = folder.path().join("some.h5");
+        fs::write(&path, bytes).unwrap();
+        drop(Table::read(Path::new(&format!("{}:/response_matrix", path.display()))));
+    }
+}
+
+#[test]
 fn conventions_change_units_sizes_and_signs_and_nothing_else() {
-    let plain = measurement(FILES[1], "response.txt", Some(Order::Planes), &conventions());
+    let plain = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &conventions());
     let other =
         Conventions { unit: OrbitUnit::Metres, kick_is: KickIs::Half, signs: Signs([false, true]), ..conventions() };
-    let other = measurement(FILES[1], "response.txt", Some(Order::Planes), &other);
+    let other = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &other);
     assert_eq!(other.matrix[(0, 0)], -1e3 * plain.matrix[(0, 0)]);
     assert_eq!(other.matrix[(0, 12)], 1e3 * plain.matrix[(0, 12)]);
     assert_eq!((other.correctors[0].kick, other.monitors[0].sigma), (0.4, 2.0));
@@ -248,6 +316,20 @@ fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     assert!(said("PALS:\n  facility:\n    - use: ring\n").contains("ring stands in a line and not in the facility"));
     assert!(said("PALS: [").contains("ring.txt: "));
     assert!(said("").contains("found the line \"\""));
+}
+
+#[test]
+fn a_mat_file_is_read_by_the_name_of_its_lattice() {
+    let several = recorded("imports/twelve-cells.at.mat");
+    let of = |name: &str| Lattice::read(Path::new(&format!("{}:{name}", several.display())));
+    assert_eq!(of("RING").unwrap().elements.len(), 90);
+    let problem = of("THERING").unwrap_err().to_string();
+    assert!(problem.ends_with("THERING is no lattice of AT; found RING (1x90 cells)"), "{problem}");
+    let none = recorded("imports/values.octave.mat");
+    assert!(
+        refused(&none)
+            .contains("expected a cell array of elements with FamName, found f (a 1x1 struct), P (a 1x2 struct)")
+    );
 }
 
 #[test]

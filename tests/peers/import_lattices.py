@@ -1,17 +1,24 @@
-"""Two rings written by the codes themselves, for `orbitcal import`: pyAT, MAD-X, Xsuite and PALS.
+"""Two rings written by the codes themselves, for `orbitcal import`: pyAT (JSON and MAT-file), MAD-X, Xsuite and PALS.
+
+Octave, where it is installed, and hdf5storage write pyAT's MAT-file again: compressed, and as level 7.3 of Matlab, which is HDF5.
 
 `twelve_cells` is the ring of twelve_cells.py; recordings/measured/imports holds its files. `odd` has what conventions differ in: dipoles
 with gradients, unlike pole faces and soft edges, rectangular ones, sextupoles, correctors with a length.
 
-    python3 import_lattices.py OUT     # OUT/twelve-cells.{at.json,tfs,xsuite.json,pals.yaml}
+    python3 import_lattices.py OUT     # OUT/twelve-cells.{at.json,at.mat,octave.mat,tfs,xsuite.json,pals.yaml}, response.h5, values.{octave,v73}.mat
 """
 
 import contextlib
 import io
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
+import h5py
+import hdf5storage
 import numpy as np
+import scipy.io
 
 with contextlib.redirect_stdout(io.StringIO()):  # a word on plotting, which is not used
     import at
@@ -57,7 +64,7 @@ def odd():
 
 
 RINGS = {"twelve-cells": twelve_cells, "odd": odd}
-SUFFIXES = {"at": ".at.json", "madx": ".tfs", "xsuite": ".xsuite.json", "pals": ".pals.yaml"}
+SUFFIXES = {"at": ".at.json", "mat": ".at.mat", "octave": ".octave.mat", "v73": ".v73.mat", "madx": ".tfs", "xsuite": ".xsuite.json", "pals": ".pals.yaml"}
 
 
 def madx(elements):
@@ -100,6 +107,64 @@ def xsuite(elements):
 
 def write_at(elements, path):
     at.save_lattice(pyat(elements), str(path))
+
+
+def write_mat(elements, path):
+    at.save_mat(pyat(elements), str(path))
+
+
+def octave(commands):
+    subprocess.run(["octave", "-qf", "--eval", commands], check=True, capture_output=True)
+
+
+def write_octave(elements, path):
+    write_mat(elements, path)
+    octave(f"load('{path}'); THERING = RING; save('-v7', '{path}', 'THERING');")
+
+
+def write_v73(elements, path):
+    write_mat(elements, path)
+    ring = plain_values(scipy.io.loadmat(path)["RING"])
+    path.unlink()  # hdf5storage adds to a file that exists
+    hdf5storage.savemat(str(path), {"RING": ring}, format="7.3", oned_as="row")
+
+
+def plain_values(value):
+    """What scipy reads as hdf5storage writes it: text, structs as dictionaries, struct arrays, cells."""
+    if value.dtype.kind == "U":
+        return str(value[0]) if value.size else ""
+    if value.dtype.names:
+        items = [{name: plain_values(one[name]) for name in value.dtype.names} for one in value.flat]
+        if len(items) == 1:
+            return items[0]
+        array = np.empty(value.shape, dtype=[(name, object) for name in value.dtype.names])
+        array.flat = [tuple(one.values()) for one in items]
+        return array
+    if value.dtype == object:
+        array = np.empty(value.shape, dtype=object)
+        for place, one in np.ndenumerate(value):
+            array[place] = plain_values(one)
+        return array
+    return value
+
+
+def write_values(folder):
+    """Values of every kind, by Octave and as level 7.3; the matrix of the twelve cells [m] as pyLOCO measures it."""
+    octave(f"""f = inline('a*x'); P = struct('ElemIndex', {{3,4}}, 'Function', f); s = sparse([1 0;0 2]); i8 = int8([1 2;3 4]);
+        c = ['ab';'cd']; z = {{}}; e = struct([]); w = 1+2i; b = true; save('-v7', '{folder}/values.octave.mat', 'f', 'P', 's', 'i8', 'c', 'z', 'e', 'w', 'b');""")
+    groups = np.empty((1, 2), dtype=[("ElemIndex", object), ("FieldName", object)])
+    groups[0, 0], groups[0, 1] = (np.array([[3.0]]), "K"), (np.array([[4.0]]), "PolynomB")
+    cells = np.empty((1, 2), dtype=object)
+    cells[0, :] = [np.array([[1.0, 2.0]]), "text"]
+    (folder / "values.v73.mat").unlink(missing_ok=True)
+    values = {"P": groups, "i8": np.array([[1, 2], [3, 4]], dtype=np.int8), "c": cells, "z": np.empty((0, 0)), "s": {"a": np.array([[1.5]])}}
+    hdf5storage.savemat(str(folder / "values.v73.mat"), values, format="7.3", oned_as="row")
+    matrix = np.loadtxt(folder / "response.txt")
+    with h5py.File(folder / "response.h5", "w") as file:
+        file.create_dataset("response_matrix", data=matrix / 1e3, compression="gzip")
+        file.create_dataset("dkick", data=1e-4)
+        for plane, part in zip("xy", np.split(np.loadtxt(folder / "dispersion.csv", delimiter=",", usecols=1), 2)):
+            file.create_dataset(f"measured_eta_{plane}", data=part / 1e3)
 
 
 def pyat(elements):
@@ -175,7 +240,11 @@ def pals_element(kind, a):
     raise ValueError(kind)
 
 
-WRITERS = {"at": write_at, "madx": write_madx, "xsuite": write_xsuite, "pals": write_pals}
+WRITERS = {"at": write_at, "mat": write_mat, "octave": write_octave, "v73": write_v73, "madx": write_madx, "xsuite": write_xsuite, "pals": write_pals}
+
+
+if not shutil.which("octave"):
+    del WRITERS["octave"]
 
 
 def write(ring, code, folder):
@@ -186,5 +255,6 @@ def write(ring, code, folder):
 
 
 if __name__ == "__main__":
-    for code in WRITERS:
+    for code in WRITERS.keys() - {"v73"}:
         write("twelve-cells", code, Path(sys.argv[1]))
+    write_values(Path(sys.argv[1]))

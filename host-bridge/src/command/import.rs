@@ -1,10 +1,11 @@
-//! `orbitcal import`: a lattice of another code and a response matrix made into the folder that `fit`, `diagnose` and `compare` read.
+//! `orbitcal import`: a lattice of another code and a response matrix, or a LOCO file, made into the folder that `fit`, `diagnose` and `compare` read.
 
 use std::path::Path;
 
 use measured::Folder;
 use measured::import::{
-    Conventions, Instruments, Lattice, Measurement, Missing, PerInstrument, Table, agreement, assemble, bare, write,
+    Conventions, Input, Instruments, Lacking, Lattice, Loco, Measurement, Missing, PerInstrument, Table, agreement,
+    assemble, bare, write,
 };
 use measured::lattice::ring;
 use twin::{Hold, Optics, Rf};
@@ -22,17 +23,82 @@ pub fn run(options: &Import) -> Result<(), CommandError> {
         return Err(CommandError::Input("--machine is for a recording; the lattice is the machine".into()));
     }
     check_outputs([options.common.json.as_deref()])?;
-    let lattice = Lattice::read(&options.lattice)?;
-    let instruments = Instruments::choose(&lattice, &options.monitors, &options.correctors)?;
-    let tunes = Optics::of(&ring(&bare(&lattice, &instruments)?, &[])?, Hold::Momentum { delta: 0.0 })?.tunes()?;
-    let mut result = Imported::of(&lattice, &instruments, [tunes.x, tunes.y]);
-    if let (Some(matrix), Some(out)) = (&options.matrix, &options.out) {
-        let folder = measurement(options, &lattice, &instruments, matrix, out)?;
-        let agreement = agreement(&folder, options.rf.map_or(Rf::FixedFrequency, Into::into))?;
-        write(&folder, out)?;
-        result = result.with_folder(&out.display().to_string(), &agreement);
-    }
+    let lacking = Lacking { kick: kick(options)?, rf: options.rf_frequency };
+    let result = match Input::read(&options.lattice, &lacking)? {
+        Input::Lattice(lattice) => of_lattice(options, &lattice)?,
+        Input::Loco(loco) => of_loco(options, *loco)?,
+    };
     deliver(&options.common, &result)
+}
+
+/// A lattice, and a matrix if there is one.
+fn of_lattice(options: &Import, lattice: &Lattice) -> Result<Imported, CommandError> {
+    let instruments = Instruments::choose(lattice, &options.monitors, &options.correctors)?;
+    let result = Imported::of(lattice, &instruments, tunes(&bare(lattice, &instruments)?)?);
+    match (&options.matrix, &options.out) {
+        (Some(matrix), Some(out)) => {
+            let folder = measurement(options, lattice, &instruments, matrix, out)?;
+            made(options, &folder, out, result)
+        }
+        (None, Some(_)) => {
+            Err(CommandError::Input(format!("{} is a lattice alone; --out needs --matrix", lattice.file)))
+        }
+        _ => Ok(result),
+    }
+}
+
+/// A file that states everything.
+fn of_loco(options: &Import, loco: Loco) -> Result<Imported, CommandError> {
+    let Loco { lattice, instruments, folder } = loco;
+    let stated = [
+        ("--matrix", options.matrix.is_some()),
+        ("--monitors", !options.monitors.is_empty()),
+        ("--correctors", !options.correctors.is_empty()),
+        ("--orbit-unit", options.orbit_unit.is_some()),
+        ("--kick-is", options.kick_is.is_some()),
+        ("--kick-sign", options.kick_sign.is_some()),
+        ("--noise", options.noise.is_some()),
+        ("--order", options.order.is_some()),
+    ];
+    if let Some((option, _)) = stated.iter().find(|(_, is_given)| *is_given) {
+        return Err(CommandError::Input(format!(
+            "{} is a LOCO file, which states it; leave {option} out",
+            lattice.file
+        )));
+    }
+    let result = Imported::of(&lattice, &instruments, tunes(&folder)?);
+    match &options.out {
+        Some(out) => made(options, &Folder { name: name(out)?, ..folder }, out, result),
+        None => Ok(result.with_agreement(&agreement(&folder, rf(options))?)),
+    }
+}
+
+/// Write the folder, and compare the matrix with the lattice's.
+fn made(options: &Import, folder: &Folder, out: &Path, result: Imported) -> Result<Imported, CommandError> {
+    let agreement = agreement(folder, rf(options))?;
+    write(folder, out)?;
+    Ok(result.with_agreement(&agreement).with_folder(&out.display().to_string()))
+}
+
+fn rf(options: &Import) -> Rf {
+    options.rf.map_or(Rf::FixedFrequency, Into::into)
+}
+
+fn kick(options: &Import) -> Result<Option<PerInstrument>, CommandError> {
+    Ok(options.kick.as_deref().map(|kick| PerInstrument::parse("--kick", kick)).transpose()?)
+}
+
+fn tunes(folder: &Folder) -> Result<[f64; 2], CommandError> {
+    let tunes = Optics::of(&ring(folder, &[])?, Hold::Momentum { delta: 0.0 })?.tunes()?;
+    Ok([tunes.x, tunes.y])
+}
+
+/// Name of a folder that does not exist yet.
+fn name(out: &Path) -> Result<String, CommandError> {
+    if out.exists() {
+        return Err(CommandError::Input(format!("{} exists; it is not overwritten", out.display())));
+    }
+    Ok(out.file_name().unwrap_or(out.as_os_str()).to_string_lossy().into_owned())
 }
 
 fn measurement(
@@ -42,9 +108,7 @@ fn measurement(
     matrix: &Path,
     out: &Path,
 ) -> Result<Folder, CommandError> {
-    if out.exists() {
-        return Err(CommandError::Input(format!("{} exists; it is not overwritten", out.display())));
-    }
+    let name = name(out)?;
     let conventions = conventions(options)?;
     let dispersion = options.dispersion.as_deref().map(Table::read).transpose()?;
     let measured = Measurement {
@@ -53,14 +117,13 @@ fn measurement(
         order: options.order.map(Into::into),
         conventions: &conventions,
     };
-    let name = out.file_name().unwrap_or(out.as_os_str()).to_string_lossy().into_owned();
     Ok(Folder { name, ..assemble(lattice, instruments, options.rf_frequency, &measured)? })
 }
 
 /// All of them, or everything that is missing.
 fn conventions(options: &Import) -> Result<Conventions, CommandError> {
     let (Some(unit), Some(kick), Some(kick_is), Some(signs), Some(noise)) =
-        (options.orbit_unit, &options.kick, options.kick_is, options.kick_sign, &options.noise)
+        (options.orbit_unit, kick(options)?, options.kick_is, options.kick_sign, &options.noise)
     else {
         let asked = [
             (options.orbit_unit.is_none(), Missing::Unit),
@@ -77,7 +140,7 @@ fn conventions(options: &Import) -> Result<Conventions, CommandError> {
     };
     Ok(Conventions {
         unit: unit.into(),
-        kick: PerInstrument::parse("--kick", kick)?,
+        kick,
         kick_is: kick_is.into(),
         signs: signs.into(),
         noise: PerInstrument::parse("--noise", noise)?,

@@ -97,7 +97,7 @@ fn column(
 }
 
 /// Rows of the lattice, and nothing measured.
-fn empty(lattice: &Lattice, instruments: &Instruments, rf: Option<f64>) -> Result<Folder, MeasuredError> {
+pub(super) fn empty(lattice: &Lattice, instruments: &Instruments, rf: Option<f64>) -> Result<Folder, MeasuredError> {
     let circumference = lattice.circumference();
     let Some(rf) = rf.or(lattice.rf()) else {
         return lattice.refuse("no cavity with a frequency; state the RF frequency with --rf-frequency HZ".into());
@@ -167,7 +167,7 @@ fn pieces(one: &Element, s: f64, is_cut: bool) -> Vec<Row> {
 }
 
 /// Row of the folder where each element acts: the row of no length, where it is cut.
-fn places(lattice: &Lattice, instruments: &Instruments) -> Vec<usize> {
+pub(super) fn places(lattice: &Lattice, instruments: &Instruments) -> Vec<usize> {
     let mut next = 0;
     let places = lattice.elements.iter().enumerate().map(|(element, one)| {
         let cut = usize::from(is_cut(instruments, element, one));

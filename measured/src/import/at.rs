@@ -15,7 +15,7 @@ use crate::folder::Particle;
 /// More periods than any ring has.
 const MOST_PERIODS: f64 = 10_000.0;
 /// Classes without a field that matters here.
-const FIELD_FREE: [&str; 13] = [
+const FIELD_FREE: [&str; 14] = [
     "Drift",
     "Marker",
     "Monitor",
@@ -29,6 +29,7 @@ const FIELD_FREE: [&str; 13] = [
     "SimpleQuantDiff",
     "SimpleRadiation",
     "EnergyLoss",
+    "RingParam",
 ];
 /// Classes of magnets.
 const MAGNETS: [&str; 8] =
@@ -105,9 +106,12 @@ fn dipole(one: &mut Element, fields: &Fields) -> Result<(), MeasuredError> {
 
 fn strengths(fields: &Fields) -> Result<Strengths, MeasuredError> {
     let of = |index| Ok::<_, MeasuredError>([fields.at("PolynomB", index)?, fields.at("PolynomA", index)?]);
-    let k1 = match fields.value.get("PolynomB") {
-        Some(_) => of(1)?,
-        None => [fields.number("K")?, 0.0],
+    // the linear maps of AT go by K, the others by PolynomB
+    let pass = fields.value.get("PassMethod").and_then(Value::as_str).unwrap_or_default();
+    let k1 = match (fields.value.get("PolynomB"), fields.value.get("K")) {
+        (None, Some(_)) => [fields.number("K")?, 0.0],
+        (Some(_), Some(_)) if pass.ends_with("LinearPass") => [fields.number("K")?, of(1)?[1]],
+        _ => of(1)?,
     };
     Ok(Strengths {
         k1,

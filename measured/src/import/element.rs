@@ -35,6 +35,10 @@ pub struct Lattice {
 pub enum Format {
     /// JSON by pyAT's `at.save_lattice`.
     At,
+    /// MAT-file by pyAT's `at.save_mat`, or Matlab's `save` of AT's cell array.
+    AtMat,
+    /// MAT-file of LOCO, `RINGData.Lattice`.
+    Loco,
     /// JSON by Xsuite's `line.to_json`.
     Xsuite,
     /// Table by MAD-X's `twiss, file=`.
@@ -47,6 +51,8 @@ impl fmt::Display for Format {
     fn fmt(&self, to: &mut fmt::Formatter) -> fmt::Result {
         to.write_str(match self {
             Self::At => "pyAT JSON",
+            Self::AtMat => "AT MAT-file",
+            Self::Loco => "LOCO file",
             Self::Xsuite => "Xsuite JSON",
             Self::Madx => "MAD-X table",
             Self::Pals => "PALS",

@@ -4,20 +4,27 @@ use std::fs;
 use std::path::Path;
 
 use super::element::Lattice;
-use super::{at, madx, pals, xsuite};
+use super::mat::MatFile;
+use super::source::Source;
+use super::{at, at_mat, madx, pals, xsuite};
 use crate::error::MeasuredError;
 
 /// Nodes of a YAML file at most.
 const LARGEST: usize = 10_000_000;
 
 impl Lattice {
-    /// Read a file of any of the formats.
+    /// Read a file of any of the formats; of a MAT-file with several lattices `FILE:VARIABLE`.
     ///
     /// # Errors
     /// [`MeasuredError::Table`]: the file is of no known format, or has an element that the twin of a measured ring cannot carry.
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
+        let Source { path, name } = Source::of(path);
         let file = path.display().to_string();
-        let text = fs::read_to_string(path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        let bytes = fs::read(&path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        if MatFile::is_one(&bytes) {
+            return at_mat::read(&MatFile::of(&file, bytes)?, name.as_deref());
+        }
+        let text = String::from_utf8(bytes).map_err(|_| unknown(&file, "bytes that are no text"))?;
         if text.trim_start().starts_with('@') {
             return madx::read(&file, &text);
         }
@@ -58,7 +65,7 @@ fn first_line(text: &str) -> String {
 
 fn unknown(file: &str, seen: &str) -> MeasuredError {
     let problem = format!(
-        "expected a lattice by pyAT (JSON with atjson), Xsuite (JSON with element_names), MAD-X (a table that begins with @) or in PALS, found {seen}"
+        "expected a lattice by pyAT (JSON with atjson, or a MAT-file), Xsuite (JSON with element_names), MAD-X (a table that begins with @) or in PALS, found {seen}"
     );
     MeasuredError::Table { file: file.into(), problem }
 }

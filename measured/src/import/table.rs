@@ -1,9 +1,13 @@
-//! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without.
+//! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
+//! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
 
 use std::fs;
 use std::path::Path;
 
+use super::hdf5::{self, Matrix};
 use super::instruments::{Channel, Instrument, Order, channel, in_order};
+use super::mat::MatFile;
+use super::source::Source;
 use crate::error::MeasuredError;
 
 /// A table as it was read.
@@ -29,9 +33,33 @@ impl Table {
     /// # Errors
     /// [`MeasuredError`], with file and line.
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
-        let file = path.display().to_string();
-        let text = fs::read_to_string(path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
-        Self::parse(&file, &text)
+        let source = Source::of(path);
+        let file = source.path.display().to_string();
+        let bytes = fs::read(&source.path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        if MatFile::is_one(&bytes) {
+            return Self::of(path, MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?);
+        }
+        if hdf5::is_one(&bytes) {
+            return Self::of(path, hdf5::matrix(&source, bytes)?);
+        }
+        match String::from_utf8(bytes) {
+            Ok(text) => Self::parse(&file, &text),
+            Err(_) => {
+                Err(MeasuredError::Table { file, problem: "expected a table of text, HDF5 or a MAT-file".into() })
+            }
+        }
+    }
+
+    /// Numbers alone.
+    fn of(path: &Path, Matrix { width, values }: Matrix) -> Result<Self, MeasuredError> {
+        let lines = values.chunks(width.max(1)).enumerate();
+        let rows = lines.map(|(at, values)| Line { number: at + 1, name: None, values: values.to_vec() }).collect();
+        let mut table = Self { file: path.display().to_string(), columns: None, rows };
+        table.check()?;
+        match values.iter().position(|one| one.is_infinite()) {
+            Some(at) => table.refuse(format!("line {}: expected a number, found {}", at / width + 1, values[at])),
+            None => Ok(table),
+        }
     }
 
     fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {

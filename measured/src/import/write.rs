@@ -71,13 +71,16 @@ fn matrix(folder: &Folder, columns: &[String], numbers: &DMatrix<f64>, file: &Pa
 
 fn meta(folder: &Folder, file: &Path) -> Result<(), MeasuredError> {
     let meta = &folder.meta;
-    let value = json!({
+    let mut value = json!({
         "circumference_m": meta.circumference,
         "energy_GeV": meta.energy,
         "particle": meta.particle,
         "rf_Hz": meta.rf,
         "delta_rf_Hz": meta.delta_rf,
     });
+    if let Some(fit) = &meta.reference_fit {
+        value["reference_fit"] = json!(fit);
+    }
     json(file, &value)
 }
 

@@ -1,0 +1,144 @@
+//! A MAT-file of level 7.3 (`save -v7.3`): an HDF5 file whose groups are structs and whose references are cells.
+//!
+//! The attribute `MATLAB_class` says what a dataset is. Dimensions stand in reverse order, so that the first of Matlab's runs fastest in both. A struct
+//! array is a group whose fields are datasets of references, one an element. The number of an empty array is that of its dimensions.
+//!
+//! Source: pyAT 0.9, `at.load.matfile`, and hdf5storage 0.2, "Storage of Various Types", which describe what Matlab writes.
+
+use hdf5_pure::{AttrValue, DType, Dataset, File, Group, Object};
+
+use super::{Mat, Shape};
+use crate::import::hdf5;
+
+/// Structs within structs at most.
+const DEEPEST: usize = 64;
+/// Values at most: references may form circles.
+const MOST: usize = 10_000_000;
+
+/// True of such a file: Matlab's text, then an HDF5 file behind 512 bytes.
+pub(super) fn is_one(bytes: &[u8]) -> bool {
+    bytes.get(512..520) == Some(b"\x89HDF\r\n\x1a\n")
+}
+
+/// Variables by name.
+pub(super) fn variables(bytes: Vec<u8>) -> Result<Vec<(String, Mat)>, String> {
+    let file = File::from_bytes(bytes).map_err(|error| error.to_string())?;
+    let mut reader = Reader { left: MOST };
+    let root = file.root();
+    let mut found = Vec::new();
+    // names with # hold what others refer to
+    for name in names(&root)?.into_iter().filter(|name| !name.starts_with('#')) {
+        let value = reader.member(&root, &name, 0).map_err(|problem| format!("{name}: {problem}"))?;
+        found.push((name, value));
+    }
+    Ok(found)
+}
+
+fn names(group: &Group) -> Result<Vec<String>, String> {
+    let both = group.datasets().and_then(|datasets| Ok([datasets, group.groups()?].concat()));
+    both.map_err(|error| error.to_string())
+}
+
+struct Reader {
+    left: usize,
+}
+
+impl Reader {
+    fn count(&mut self, depth: usize) -> Result<(), String> {
+        self.left = self.left.checked_sub(1).ok_or_else(|| format!("more than {MOST} values"))?;
+        if depth > DEEPEST { Err(format!("more than {DEEPEST} structs or cells within each other")) } else { Ok(()) }
+    }
+
+    fn member(&mut self, group: &Group, name: &str, depth: usize) -> Result<Mat, String> {
+        match group.dataset(name) {
+            Ok(dataset) => self.dataset(&dataset, depth),
+            Err(_) => self.group(&group.group(name).map_err(|error| error.to_string())?, depth),
+        }
+    }
+
+    fn object(&mut self, object: &Object, depth: usize) -> Result<Mat, String> {
+        match object {
+            Object::Dataset(dataset) => self.dataset(dataset, depth),
+            Object::Group(group) => self.group(group, depth),
+            _ => Ok(Mat::Other("object")),
+        }
+    }
+
+    fn dataset(&mut self, dataset: &Dataset, depth: usize) -> Result<Mat, String> {
+        self.count(depth)?;
+        let attributes = dataset.attrs().map_err(|error| error.to_string())?;
+        let class = attributes.get("MATLAB_class").and_then(AttrValue::as_str).unwrap_or_default();
+        if attributes.contains_key("MATLAB_empty") {
+            return empty(class, dataset);
+        }
+        let shape: Shape = hdf5::shape(dataset)?.into_iter().rev().collect();
+        match class {
+            "cell" => {
+                let objects = dataset.dereference().map_err(|error| error.to_string())?;
+                let values = objects.iter().map(|one| self.object(one, depth + 1)).collect::<Result<_, _>>()?;
+                Ok(Mat::Cells(shape, values))
+            }
+            "char" => {
+                let codes = hdf5::numbers(dataset)?;
+                let rows = shape.first().copied().unwrap_or(1).max(1);
+                let across = (0..rows.min(codes.len())).flat_map(|row| codes.iter().skip(row).step_by(rows));
+                let text = char::decode_utf16(across.map(|one| *one as u16));
+                Ok(Mat::Text(text.map(|one| one.unwrap_or(char::REPLACEMENT_CHARACTER)).collect()))
+            }
+            "double" | "single" | "logical" | "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64"
+            | "uint64" => match hdf5::numbers(dataset) {
+                Ok(values) => Ok(Mat::Numbers(shape, values)),
+                Err(_) => Ok(Mat::Other("complex matrix")),
+            },
+            _ => Ok(Mat::Other("object")),
+        }
+    }
+
+    /// A struct, or a struct array where all fields are references without a class.
+    fn group(&mut self, group: &Group, depth: usize) -> Result<Mat, String> {
+        self.count(depth)?;
+        let names = names(group)?;
+        if let Some(array) = self.array(group, &names, depth)? {
+            return Ok(array);
+        }
+        let fields = names
+            .iter()
+            .map(|name| self.member(group, name, depth + 1).map_err(|problem| format!("{name}: {problem}")));
+        let fields = fields.collect::<Result<Vec<_>, _>>()?;
+        Ok(Mat::Structs(vec![1, 1], names, vec![fields]))
+    }
+
+    fn array(&mut self, group: &Group, names: &[String], depth: usize) -> Result<Option<Mat>, String> {
+        let mut shape = None;
+        let mut columns = Vec::new();
+        for name in names {
+            let Ok(dataset) = group.dataset(name) else { return Ok(None) };
+            let is_reference = matches!(dataset.dtype(), Ok(DType::ObjectReference));
+            if !is_reference || dataset.attrs().is_ok_and(|all| all.contains_key("MATLAB_class")) {
+                return Ok(None);
+            }
+            let own: Shape = hdf5::shape(&dataset)?.into_iter().rev().collect();
+            if *shape.get_or_insert_with(|| own.clone()) != own {
+                return Err(format!("{name}: {own:?} elements, other fields have another number"));
+            }
+            let objects = dataset.dereference().map_err(|error| format!("{name}: {error}"))?;
+            let values = objects.iter().map(|one| self.object(one, depth + 1));
+            columns.push(values.collect::<Result<Vec<_>, _>>().map_err(|problem| format!("{name}: {problem}"))?);
+        }
+        let Some(shape) = shape else { return Ok(None) };
+        let element = |at: usize| columns.iter().map(|column| column[at].clone()).collect();
+        let values = (0..columns[0].len()).map(element).collect();
+        Ok(Some(Mat::Structs(shape, names.to_vec(), values)))
+    }
+}
+
+/// Of an empty array the dataset holds the dimensions.
+fn empty(class: &str, dataset: &Dataset) -> Result<Mat, String> {
+    let shape: Shape = hdf5::numbers(dataset)?.into_iter().map(|one| one as usize).collect();
+    Ok(match class {
+        "cell" => Mat::Cells(shape, Vec::new()),
+        "char" => Mat::Text(String::new()),
+        "struct" => Mat::Structs(shape, Vec::new(), Vec::new()),
+        _ => Mat::Numbers(shape, Vec::new()),
+    })
+}
