@@ -482,7 +482,10 @@ impl MatrixDiagnosis {
         let left_over = LeftOver::of(&diagnosis.sides, &worst);
         let is_told = left_over.side != "neither";
         let coupling = lacks_coupling(found).then(|| coupling(&diagnosis.sides));
-        let said: Vec<String> = (coupling.into_iter().chain(findings.iter().map(|one| one.sentence.clone())))
+        let more = findings.len().saturating_sub(SAID);
+        let said: Vec<String> = (coupling.into_iter())
+            .chain(findings.iter().take(SAID).map(|one| one.sentence.clone()))
+            .chain((more > 0).then(|| format!("{more} more are listed")))
             .chain(is_told.then(|| left_over.sentence.clone()))
             .collect();
         let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
@@ -514,6 +517,9 @@ impl Found<'_> {
         }
     }
 }
+
+/// Findings that the sentence says.
+const SAID: usize = 6;
 
 /// True where skew gradients explain elements that they were not learnt from, beside the couplings of the instruments, and the model has none.
 fn lacks_coupling(found: &Found) -> bool {
@@ -559,7 +565,10 @@ fn departure(one: &Departure) -> MatrixFinding {
 }
 
 fn missing(one: &Term) -> MatrixFinding {
-    let sentence = format!("{} at {} is missing: {:+.5} ± {:.5} /m", one.kind, one.at, one.amplitude, one.sigma);
+    let sentence = format!(
+        "{} at {} would explain most of what is left: {:+.5} ± {:.5} /m",
+        one.kind, one.at, one.amplitude, one.sigma
+    );
     finding(one.kind, &one.at, (one.amplitude, one.sigma), one.log_evidence_gain, sentence)
 }
 
