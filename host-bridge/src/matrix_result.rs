@@ -566,7 +566,7 @@ fn departure(one: &Departure) -> MatrixFinding {
 
 fn missing(one: &Term) -> MatrixFinding {
     let sentence = format!(
-        "{} at {} would explain most of what is left: {:+.5} ± {:.5} /m",
+        "{} at {} would explain part of what is left: {:+.5} ± {:.5} /m",
         one.kind, one.at, one.amplitude, one.sigma
     );
     finding(one.kind, &one.at, (one.amplitude, one.sigma), one.log_evidence_gain, sentence)
