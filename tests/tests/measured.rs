@@ -548,8 +548,7 @@ fn hidden_values_are_found_again_at_sps() {
 #[test]
 #[ignore = "make measured"]
 fn hidden_values_are_found_again_at_larger_rings() {
-    // at PLS five pairs of monitors exchanged at once make the columns of two neighbouring correctors look exchanged, which their gains then undo: three
-    // false ones in each of two runs
+    // known at PLS: three false ones in each of two runs, among them the gains of two neighbouring correctors
     for (name, most_false) in [("spear3_example", 0), ("pls_2009", 6), ("als_2005_topoff", 0)] {
         if let Some(path) = ring(name) {
             hidden_values_are_found_again(path, 0.9, most_false);
