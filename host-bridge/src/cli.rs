@@ -298,6 +298,12 @@ pub struct Diagnose {
     /// What the model of a measured response matrix holds; the frequency without it
     #[arg(long, value_enum)]
     pub rf: Option<Rf>,
+    /// The model of a measured response matrix that is believed: JSON of `orbitcal fit` of this ring, for what the measurement says against it
+    #[arg(long, value_name = "FIT.json")]
+    pub model_file: Option<PathBuf>,
+    /// Take values out of that model: a place (`x_BPM.3`, `SD*`) or a kind and a place (`skew_gradient *`); may be given again
+    #[arg(long, value_name = "NAME", requires = "model_file")]
+    pub without: Vec<String>,
     /// The model with what was identified, for `orbitcal replay --model-file` and for a device
     #[arg(long, value_name = "FILE")]
     pub model_out: Option<PathBuf>,

@@ -3,11 +3,13 @@
 use core::fmt;
 
 use comfy_table::CellAlignment;
-use measured::Wiring;
+use measured::believed::{Believed, Departure, Value};
 use measured::diagnose::Diagnosis;
+use measured::sides::{Gain, Sides, Term, Verdict};
+use measured::standing::Standing;
 use measured::unknowns::name;
-use measured::{Fit, Folder, Kind};
-use serde::Serialize;
+use measured::{Against, Fit, Folder, Kind, Wiring};
+use serde::{Deserialize, Serialize};
 use twin::Rf;
 
 use crate::output::{fill, table};
@@ -82,6 +84,43 @@ pub struct BlockError {
     pub scale_um: f64,
     /// Its degrees of freedom, none where it is normal.
     pub freedom: Option<f64>,
+}
+
+/// The values of a fit as its JSON states them.
+#[derive(Debug, Deserialize)]
+pub struct StatedModel {
+    vars: Vec<StatedVar>,
+    other: Vec<StatedOther>,
+    wiring: Vec<StatedCable>,
+}
+
+#[derive(Debug, Deserialize)]
+struct StatedVar {
+    name: String,
+    mean: f64,
+}
+
+#[derive(Debug, Deserialize)]
+struct StatedOther {
+    kind: String,
+    at: String,
+    mean: f64,
+}
+
+#[derive(Debug, Deserialize)]
+struct StatedCable {
+    kind: String,
+    at: String,
+}
+
+impl From<StatedModel> for Believed {
+    fn from(stated: StatedModel) -> Self {
+        let vars = stated.vars.into_iter().map(|one| ("quadrupole_gradient".to_owned(), one.name, one.mean));
+        let others = stated.other.into_iter().map(|one| (one.kind, one.at, one.mean));
+        let values = vars.chain(others).map(|(kind, at, value)| Value { kind, at, value });
+        let cables = stated.wiring.into_iter().map(|one| [one.kind, one.at]);
+        Self { values: values.collect(), cables: cables.collect() }
+    }
 }
 
 impl MatrixFit {
@@ -337,6 +376,8 @@ pub struct MatrixDiagnosis {
     pub sentence: String,
     pub findings: Vec<MatrixFinding>,
     pub unexplained: Vec<UnexplainedResult>,
+    /// Where what is left over lies.
+    pub left_over: LeftOver,
     pub fit: MatrixFit,
 }
 
@@ -369,25 +410,180 @@ pub struct UnexplainedResult {
     pub ratio: f64,
 }
 
+/// What the lattice's side and the instruments' side gain on elements that they were not learnt from.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct LeftOver {
+    pub side: &'static str,
+    pub lattice: GainResult,
+    pub skew_gradients: GainResult,
+    pub instruments: GainResult,
+    pub sentence: String,
+}
+
+/// `ln` likelihood [nat] and share of the squares.
+#[derive(Debug, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct GainResult {
+    pub log_likelihood: f64,
+    pub share: f64,
+}
+
+impl From<Gain> for GainResult {
+    fn from(gain: Gain) -> Self {
+        Self { log_likelihood: gain.log_likelihood, share: gain.share }
+    }
+}
+
+impl LeftOver {
+    fn of(sides: &Sides, worst: &[&str]) -> Self {
+        let (lattice, instruments) = (sides.lattice, sides.instruments);
+        let numbers = format!(
+            "errors of their own of instruments gain {:.0} nat, gradients and skew gradients that the lattice lacks {:.0} nat",
+            instruments.log_likelihood, lattice.log_likelihood
+        );
+        let places = if worst.is_empty() { String::new() } else { format!(" at {}", worst.join(", ")) };
+        let (side, sentence) = match sides.verdict() {
+            Verdict::Measurement => {
+                ("measurement", format!("what is left over{places} is of the measurement's side: {numbers}"))
+            }
+            Verdict::Lattice => ("lattice", format!("what is left over is of the lattice: {numbers}")),
+            Verdict::Neither => ("neither", format!("what is left over is clearly of neither side: {numbers}")),
+        };
+        Self {
+            side,
+            lattice: lattice.into(),
+            skew_gradients: sides.skew.into(),
+            instruments: instruments.into(),
+            sentence,
+        }
+    }
+}
+
+/// All that was found of a matrix.
+pub struct Found<'f> {
+    /// Cables that the lattice as written shows to be wrong.
+    pub cables: &'f [Wiring],
+    /// The fit.
+    pub fitted: &'f Fit,
+    /// What its diagnosis found.
+    pub diagnosis: &'f Diagnosis,
+    /// What the matrix says against a model that is believed, if one is.
+    pub against: Option<&'f Against>,
+}
+
 impl MatrixDiagnosis {
     /// Of a diagnosis, with the fit that it began from; cables first, since nothing else counts before they are right.
-    pub fn of(folder: &Folder, rf: Rf, cables: &[Wiring], found: &Diagnosis, fit: MatrixFit) -> Self {
-        let cables = cables.iter().chain(&found.wiring).map(|one| cable(folder, one));
-        let findings: Vec<MatrixFinding> = cables.chain(is_other_hold(rf, found).then(|| share(rf, found))).collect();
-        let worst: Vec<&str> = found.unexplained.iter().take(6).map(|one| one.at.as_str()).collect();
-        let instruments = (!worst.is_empty())
-            .then(|| format!("what no magnet explains sits at {}: the measurement's side", worst.join(", ")));
-        let said: Vec<String> = findings.iter().map(|one| one.sentence.clone()).chain(instruments).collect();
+    pub fn of(folder: &Folder, rf: Rf, found: &Found, fit: MatrixFit) -> Self {
+        let diagnosis = found.diagnosis;
+        let mut findings = found.findings(folder);
+        findings.extend(is_other_hold(rf, diagnosis).then(|| share(rf, diagnosis)));
+        let worst: Vec<&str> = diagnosis.unexplained.iter().take(6).map(|one| one.at.as_str()).collect();
+        let left_over = LeftOver::of(&diagnosis.sides, &worst);
+        let is_told = left_over.side != "neither";
+        let coupling = lacks_coupling(found).then(|| coupling(&diagnosis.sides));
+        let more = findings.len().saturating_sub(SAID);
+        let said: Vec<String> = (coupling.into_iter())
+            .chain(findings.iter().take(SAID).map(|one| one.sentence.clone()))
+            .chain((more > 0).then(|| format!("{more} more are listed")))
+            .chain(is_told.then(|| left_over.sentence.clone()))
+            .collect();
         let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
             (false, _) => ("identified", said.join("; ")),
             (true, false) => ("unexplained", said.join("; ")),
             (true, true) => ("consistent", "nothing was found beside the learnt error of the model".into()),
         };
-        let unexplained = found.unexplained.iter();
+        let unexplained = diagnosis.unexplained.iter();
         let unexplained =
             unexplained.map(|one| UnexplainedResult { at: one.at.clone(), rms_um: 1e3 * one.rms, ratio: one.ratio });
-        Self { recording: folder.name.clone(), verdict, sentence, findings, unexplained: unexplained.collect(), fit }
+        let (recording, unexplained) = (folder.name.clone(), unexplained.collect());
+        Self { recording, verdict, sentence, findings, unexplained, left_over, fit }
     }
+}
+
+impl Found<'_> {
+    /// Cables and values against the model that is believed; without one, cables against the lattice as written and values that stand out.
+    fn findings(&self, folder: &Folder) -> Vec<MatrixFinding> {
+        let terms = self.diagnosis.sides.terms.iter().map(missing);
+        match self.against {
+            Some(against) => {
+                let cables = against.wiring.iter().map(|one| cable(folder, one));
+                cables.chain(against.departures.iter().map(departure)).chain(terms).collect()
+            }
+            None => {
+                let cables = self.cables.iter().chain(&self.diagnosis.wiring).map(|one| cable(folder, one));
+                cables.chain(terms).chain(self.diagnosis.standing.iter().map(stands_out)).collect()
+            }
+        }
+    }
+}
+
+/// Findings that the sentence says.
+const SAID: usize = 6;
+
+/// True where skew gradients explain elements that they were not learnt from, beside the couplings of the instruments, and the model has none.
+fn lacks_coupling(found: &Found) -> bool {
+    let has = |is_it: fn(&Kind) -> bool| found.fitted.unknowns.iter().any(|one| is_it(&one.kind));
+    let couples = has(|kind| matches!(kind, Kind::MonitorCoupling(_)));
+    couples && !has(|kind| matches!(kind, Kind::Skew(_))) && found.diagnosis.sides.lacks_skew()
+}
+
+fn coupling(sides: &Sides) -> String {
+    format!(
+        "coupling in the ring is missing: skew gradients gain {:.0} nat beside the couplings of the instruments",
+        sides.skew.log_likelihood
+    )
+}
+
+/// A finding with an amplitude.
+fn finding(kind: &'static str, at: &str, (amplitude, sigma): (f64, f64), gain: f64, sentence: String) -> MatrixFinding {
+    MatrixFinding {
+        kind,
+        at: Some(at.into()),
+        amplitude,
+        sigma,
+        systematic: None,
+        unit: if kind.ends_with("skew_gradient") || STRAY.contains(&kind) { "1/m" } else { "1" },
+        log_evidence_gain: Some(gain),
+        as_good_by_chance: None,
+        sentence,
+    }
+}
+
+/// Integrated gradients where the lattice has none.
+const STRAY: [&str; 2] = ["stray_gradient", "dipole_gradient"];
+
+fn departure(one: &Departure) -> MatrixFinding {
+    let (kind, at) = (one.kind.word(), &one.at);
+    let (amplitude, sigma) = (one.amplitude, one.sigma);
+    let size = match one.kind {
+        Kind::Skew(_) => format!("{amplitude:+.5} ± {sigma:.5} /m"),
+        _ => format!("{:+.2} ± {:.2} %", 1e2 * amplitude, 1e2 * sigma),
+    };
+    let sentence = format!("{kind} at {at} is off the model by {size}");
+    finding(kind, at, (amplitude, sigma), one.log_evidence_gain, sentence)
+}
+
+fn missing(one: &Term) -> MatrixFinding {
+    let sentence = format!(
+        "{} at {} would explain part of what is left: {:+.5} ± {:.5} /m",
+        one.kind, one.at, one.amplitude, one.sigma
+    );
+    finding(one.kind, &one.at, (one.amplitude, one.sigma), one.log_evidence_gain, sentence)
+}
+
+fn stands_out(one: &Standing) -> MatrixFinding {
+    let (kind, [middle, spread]) = (one.kind.word(), one.others);
+    let sentence = format!(
+        "{kind} at {} stands out: {:.4} ± {:.4}, {:.1} robust standard deviations from the median {middle:.4} ± {spread:.4} of its {}",
+        one.at, one.value, one.sigma, one.off, one.count
+    );
+    let nothing = if matches!(one.kind, Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) | Kind::Skew(_)) {
+        0.0
+    } else {
+        1.0
+    };
+    finding(kind, &one.at, (one.value - nothing, one.sigma), one.log_evidence_gain, sentence)
 }
 
 /// A share of a held frequency is a finding where it is nearer to the other hold than to the one that is believed, and chance gives no like.
@@ -449,8 +645,15 @@ impl fmt::Display for MatrixDiagnosis {
         let mut rows = table(["missing", "at", "amplitude", "gain / nat", "by chance"]);
         for one in &self.findings {
             let chance = one.as_good_by_chance.map_or(String::new(), |[as_good, of]| format!("{as_good} of {of}"));
-            let amplitude =
-                if one.sigma > 0.0 { format!("{:.3} ± {:.3}", one.amplitude, one.sigma) } else { String::new() };
+            let amplitude = if one.sigma > 0.0 {
+                if one.unit == "1/m" {
+                    format!("{:.5} ± {:.5} /m", one.amplitude, one.sigma)
+                } else {
+                    format!("{:.3} ± {:.3}", one.amplitude, one.sigma)
+                }
+            } else {
+                String::new()
+            };
             rows.add_row([
                 one.kind.into(),
                 one.at.clone().unwrap_or_default(),
@@ -462,6 +665,7 @@ impl fmt::Display for MatrixDiagnosis {
         if !self.findings.is_empty() {
             writeln!(f, "{rows}\n")?;
         }
+        writeln!(f, "{}\n", fill(&self.left_over.sentence))?;
         if self.unexplained.is_empty() {
             return Ok(());
         }

@@ -1,26 +1,18 @@
 //! What changed from one measurement of a machine to the next.
 //!
 //! What the model misses is mostly the same in both and drops out: the second matrix is fitted less what the first fit left over, from the values
-//! of the first, and what remains then is the error of the comparison, learnt as that of a fit is. Magnets may have changed by 3 %, instruments by 1 %,
-//! those that clearly have by as much as a fit allows.
+//! of the first, and what remains then is the error of the comparison, learnt as that of a fit is.
 
 use std::collections::BTreeMap;
 
-use nalgebra::DVector;
-use statrs::distribution::{ContinuousCDF, Normal};
-
 use crate::data::Data;
-use crate::descent::descend;
+use crate::departure::Departures;
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Learnt, Settings, with_model_error};
+use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
 use crate::model::Model;
-use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Kind, Unknown, Widths, name};
+use crate::unknowns::{Kind, name};
 use crate::wiring::{Wiring, straightened_by};
-
-/// Standard deviations of changes beforehand.
-const CHANGES: Widths = Widths { strength: 0.03, skew: 0.003, gain: 0.01, coupling: 0.01 };
 
 /// A family's changes can be told where their found sizes would follow the true ones by a correlation of 0.92: this share of their variance is then no error.
 const TOLD: f64 = 0.85;
@@ -70,14 +62,6 @@ pub struct Changes {
     pub wiring: Vec<Wiring>,
 }
 
-/// Comparisons in which anything is said to have changed that did not: one in so many.
-const FALSE: f64 = 100.0;
-
-/// Standard deviations from which on one of `unknowns` changed: 3.7 of 48, 4.4 of 900.
-pub fn clear(unknowns: usize) -> f64 {
-    -Normal::standard().inverse_cdf(0.5 / (FALSE * unknowns.max(1) as f64))
-}
-
 /// Changes from one measurement, whose cables were put right and which has been fitted, to another as it was measured.
 ///
 /// # Errors
@@ -109,55 +93,8 @@ pub fn compare(
                 if counts { data.measured[(i, j)] - fitted.residual[(i, j)] * per_kick(j) } else { 0.0 };
         }
     }
-    let (values, uncertainty) = changed(&model, fitted, &data, progress)?;
-    Ok(Changes {
-        gradients: gradients(one, fitted, &values, &uncertainty),
-        others: others(one, fitted, &values, &uncertainty),
-        wiring,
-    })
-}
-
-/// Values of the second measurement. Most things have not changed, and what has may have changed by more than is expected: the clearest change
-/// of an instrument or of a skew gradient is given the prior of the fit, one after the other, until none is clear that is held.
-fn changed(
-    model: &Model,
-    fitted: &Fit,
-    data: &Data,
-    progress: &mut dyn FnMut(&str),
-) -> Result<(DVector<f64>, Uncertainty), MeasuredError> {
-    let held = fitted.unknowns.iter().zip(&fitted.values);
-    let mut unknowns: Vec<Unknown> =
-        held.map(|(one, &mean)| Unknown { mean, width: change(one.kind), ..*one }).collect();
-    loop {
-        let start = descend(model, &unknowns, &data.measured, &data.stated(), fitted.values.clone())?;
-        let Learnt { here, uncertainty, .. } = with_model_error(model, &unknowns, data, start, progress)?;
-        let off = |at: usize| without_prior(here.values[at] - fitted.values[at], &unknowns[at], &uncertainty, at);
-        let is_held = |at: &usize| unknowns[*at].width < fitted.unknowns[*at].width;
-        let clear = (0..unknowns.len()).filter(is_held).filter(|&at| off(at) > clear(unknowns.len()));
-        match clear.max_by(|&a, &b| off(a).total_cmp(&off(b))) {
-            Some(clearest) => unknowns[clearest].width = fitted.unknowns[clearest].width,
-            None => return Ok((here.values, uncertainty)),
-        }
-    }
-}
-
-/// How far off an unknown's change is by the data alone, over what these and its prior allow: of a posterior `m ± s` with a prior `0 ± w` the data
-/// say `m/s^2/(1/s^2 - 1/w^2)`.
-fn without_prior(change: f64, unknown: &Unknown, uncertainty: &Uncertainty, at: usize) -> f64 {
-    let independent = uncertainty.independent[(at, at)];
-    let left = (1.0 - independent / unknown.width.powi(2)).max(f64::EPSILON);
-    // the data's variance, wider where errors are alike
-    let variance = independent / left * (uncertainty.sigma[at].powi(2) / independent);
-    (change / left).abs() / (variance + unknown.width.powi(2)).sqrt()
-}
-
-fn change(kind: Kind) -> f64 {
-    match kind {
-        Kind::Strength(_) => CHANGES.strength,
-        Kind::Skew(_) => CHANGES.skew,
-        Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::RfScale | Kind::HeldFrequency => CHANGES.gain,
-        Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => CHANGES.coupling,
-    }
+    let found = Departures::of(&model, &fitted.unknowns, &fitted.values, &data, progress)?;
+    Ok(Changes { gradients: gradients(one, fitted, &found), others: others(one, fitted, &found), wiring })
 }
 
 /// The same elements and instruments, in the same order.
@@ -187,14 +124,14 @@ fn expect_alike(one: &Folder, other: &Folder) -> Result<(), MeasuredError> {
 }
 
 /// What is not a gradient and changed.
-fn others(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Uncertainty) -> Vec<Other> {
+fn others(folder: &Folder, fitted: &Fit, found: &Departures) -> Vec<Other> {
     let mut all = Vec::new();
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         if matches!(unknown.kind, Kind::Strength(_) | Kind::HeldFrequency) {
             continue;
         }
-        let (change, sigma) = change_of(fitted, at, values, uncertainty);
-        if change.abs() > clear(fitted.unknowns.len()) * sigma {
+        let (change, sigma) = found.change(at);
+        if found.is_clear((change, sigma)) {
             all.push(Other { kind: unknown.kind, name: name(folder, &fitted.groups, unknown.kind), change, sigma });
         }
     }
@@ -202,40 +139,19 @@ fn others(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Un
     all
 }
 
-/// Of a strength or a gain by a share of itself; of a coupling beside the gain, since electronics scale both; of a skew gradient as it is.
-fn change_of(fitted: &Fit, at: usize, values: &DVector<f64>, uncertainty: &Uncertainty) -> (f64, f64) {
-    let (before, after) = (fitted.values[at], values[at]);
-    let gain = match fitted.unknowns[at].kind {
-        Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
-        Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-        Kind::Skew(_) => return (after - before, uncertainty.sigma[at]),
-        _ => None,
-    };
-    match gain.and_then(|gain| fitted.unknowns.iter().position(|one| one.kind == gain)) {
-        Some(gain) => {
-            let share = after / values[gain];
-            let mut combination = DVector::zeros(values.len());
-            (combination[at], combination[gain]) = (1.0, -share);
-            let sigma = uncertainty.variance(&combination).sqrt() / values[gain].abs();
-            (share - before / fitted.values[gain], sigma)
-        }
-        None => (after / before - 1.0, (uncertainty.sigma[at] / before).abs()),
-    }
-}
-
-fn gradients(folder: &Folder, fitted: &Fit, values: &DVector<f64>, uncertainty: &Uncertainty) -> Vec<Change> {
+fn gradients(folder: &Folder, fitted: &Fit, found: &Departures) -> Vec<Change> {
     let mut all = Vec::new();
     for (at, unknown) in fitted.unknowns.iter().enumerate() {
         let Kind::Strength(group) = unknown.kind else { continue };
         let rows = fitted.groups[0][group].clone();
-        let (relative, sigma) = change_of(fitted, at, values, uncertainty);
+        let (relative, sigma) = found.change(at);
         all.push(Change {
             name: name(folder, &fitted.groups, unknown.kind),
             family: folder.lattice[rows[0]].name.clone(),
             rows,
             relative,
             sigma,
-            has_changed: relative.abs() > clear(fitted.unknowns.len()) * sigma,
+            has_changed: found.is_clear((relative, sigma)),
             is_identifiable: false,
         });
     }
@@ -290,13 +206,6 @@ mod tests {
         // none of them changed, and a change of 0.16 % would not show
         assert!(!of("QD"), "{found:?}");
         assert!(found.iter().all(|one| one.sigma < 0.003), "{found:?}");
-    }
-
-    #[test]
-    fn few_are_said_by_chance() {
-        for (unknowns, expected) in [(48, 3.707), (900, 4.394)] {
-            assert!((clear(unknowns) - expected).abs() < 0.005, "{}", clear(unknowns));
-        }
     }
 
     #[test]

@@ -14,12 +14,14 @@ use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 use twin::{Plane, Rf};
 
+use crate::about::About;
 use crate::descent::descend;
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Learnt, Settings, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
-use crate::normal::{Places, covariance};
+use crate::sides::{Sides, sides};
+use crate::standing::{Standing, standing};
 use crate::unknowns::{Kind, Unknown};
 use crate::wiring::{self, Wiring};
 
@@ -71,6 +73,10 @@ pub struct Diagnosis {
     pub share: Share,
     /// Of instruments, the worst first.
     pub unexplained: Vec<Unexplained>,
+    /// Values that stand out of those of their kind.
+    pub standing: Vec<Standing>,
+    /// Where what is left over lies.
+    pub sides: Sides,
 }
 
 /// An instrument is worse than others from this ratio on.
@@ -93,48 +99,15 @@ pub fn diagnose(
         false => Vec::new(),
     };
     let share = share(folder, fitted, &model, settings, progress)?;
-    Ok(Diagnosis { wiring, share, unexplained: unexplained(folder, fitted) })
-}
-
-/// A fit, prepared to score further patterns.
-struct About {
-    places: Places,
-    prediction: Prediction,
-    covariance: DMatrix<f64>,
-    /// Slope of `ln` likelihood by each predicted element [1/mm].
-    slope: DMatrix<f64>,
-    /// What each element says [1/mm^2].
-    information: DMatrix<f64>,
-    /// Step of the unknowns that the slope asks for; 0 at the best fit.
-    step: DVector<f64>,
-}
-
-impl About {
-    fn of(
-        unknowns: &[Unknown],
-        prediction: Prediction,
-        slope: DMatrix<f64>,
-        information: DMatrix<f64>,
-    ) -> Result<Self, MeasuredError> {
-        let places = Places::of(unknowns, slope.nrows(), slope.ncols());
-        let covariance = covariance(unknowns, &prediction, &information)?;
-        let step = &covariance * places.back(&prediction, &slope, unknowns.len());
-        Ok(Self { places, prediction, covariance, slope, information, step })
-    }
-
-    /// `d P r` and `d P d` of a pattern [mm].
-    fn score(&self, pattern: &DMatrix<f64>) -> (f64, f64) {
-        let weighted = pattern.component_mul(&self.information);
-        let across = self.places.back(&self.prediction, &weighted, self.covariance.nrows());
-        let own = weighted.dot(pattern);
-        (pattern.dot(&self.slope) - across.dot(&self.step), own - across.dot(&(&self.covariance * &across)))
-    }
-
-    /// Rms amplitude that the residuals give patterns which are not there.
-    fn of_patterns(&self, patterns: &[DMatrix<f64>]) -> f64 {
-        let squares = patterns.iter().map(|pattern| self.score(pattern)).map(|(pull, power)| (pull / power).powi(2));
-        (squares.sum::<f64>() / patterns.len() as f64).sqrt()
-    }
+    progress("lattice or instruments");
+    let unexplained = unexplained(folder, fitted);
+    Ok(Diagnosis {
+        wiring,
+        share,
+        sides: sides(folder, fitted, &model)?,
+        standing: standing(folder, fitted),
+        unexplained,
+    })
 }
 
 /// Of an amplitude with a prior standard deviation of 1.

@@ -2,14 +2,17 @@
 //!
 //! A measurement is a folder of tables ([`Folder`]); [`lattice`] makes the ring of the twin from it, [`Model`] predicts its matrix, and
 //! [`fit`] finds the magnets and the instruments that explain it, as LOCO does, with an error of the model whose size is learnt.
-//! [`compare`] says what changed from one measurement to the next.
+//! [`compare`] says what changed from one measurement to the next, [`against`] what a measurement says against a model that is believed.
 //!
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
+mod about;
+pub mod believed;
 pub mod calibrated;
 pub mod compare;
 pub mod conceal;
 pub mod data;
+pub mod departure;
 pub mod descent;
 pub mod diagnose;
 pub mod error;
@@ -23,12 +26,15 @@ pub mod model;
 pub mod named;
 pub mod normal;
 pub mod raw;
+pub mod sides;
+pub mod standing;
 #[cfg(test)]
 mod testing;
 pub mod uncertainty;
 pub mod unknowns;
 pub mod wiring;
 
+pub use believed::{Against, Believed, against};
 pub use calibrated::Calibrated;
 pub use compare::{Change, Changes, compare};
 pub use conceal::{Concealed, conceal};

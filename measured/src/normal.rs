@@ -70,6 +70,18 @@ impl Places {
         back
     }
 
+    /// `J` times a step of the unknowns.
+    pub fn forward(&self, at: &Prediction, step: &DVector<f64>) -> DMatrix<f64> {
+        let (rows, columns) = at.matrix.shape();
+        let mut sum = DMatrix::from_fn(rows, columns, |row, column| {
+            self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum()
+        });
+        for (by, &step) in at.by_machine.iter().zip(step.iter()) {
+            sum.zip_apply(by, |sum, by| *sum += by * step);
+        }
+        sum
+    }
+
     /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
     pub fn variance(&self, at: &Prediction, covariance: &DMatrix<f64>) -> DMatrix<f64> {
         let (rows, columns) = at.matrix.shape();

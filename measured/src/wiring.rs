@@ -102,6 +102,29 @@ impl Wiring {
         }
     }
 
+    /// What [`Self::named`] names.
+    ///
+    /// # Errors
+    /// [`MeasuredError::Unlike`]: a kind or an instrument that the measurement has not.
+    pub fn of_name(folder: &Folder, kind: &str, at: &str) -> Result<Self, MeasuredError> {
+        let unlike = || MeasuredError::Unlike(format!("{kind} at {at}: no such cable in {}", folder.name));
+        let lines = |count: usize, of: fn(&Folder, usize) -> String| {
+            let line = |name: &str| (0..count).find(|&line| of(folder, line) == name).ok_or_else(unlike);
+            at.split(',').map(line).collect::<Result<Vec<_>, _>>()
+        };
+        let rows = || lines(folder.monitors.len(), Folder::monitor);
+        let columns = || lines(folder.correctors.len(), Folder::corrector);
+        Ok(match (kind, at) {
+            ("bpm_swap", _) => Self::MonitorsExchanged(rows()?),
+            ("corrector_swap", _) => Self::CorrectorsExchanged(columns()?),
+            ("bpm_reversed", _) => Self::MonitorReversed(rows()?[0]),
+            ("corrector_reversed", _) => Self::CorrectorReversed(columns()?[0]),
+            ("plane_reversed", "x") => Self::PlaneReversed(Plane::X),
+            ("plane_reversed", "y") => Self::PlaneReversed(Plane::Y),
+            _ => return Err(unlike()),
+        })
+    }
+
     /// Exchange or turn rows or columns: puts a wrong cable right, and a right one wrong.
     pub fn put_right(&self, folder: &mut Folder) {
         match self {
@@ -250,6 +273,8 @@ mod tests {
             Wiring::PlaneReversed(Plane::Y),
         ] {
             let (plain, right, found) = found(|folder| wrong.put_right(folder));
+            let (kind, at) = wrong.named(&plain);
+            assert_eq!(Wiring::of_name(&plain, kind, &at).unwrap(), wrong);
             assert_eq!(found, [wrong]);
             assert_eq!((right.matrix, right.dispersion), (plain.matrix, plain.dispersion));
         }

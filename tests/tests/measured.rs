@@ -5,12 +5,15 @@
 
 use std::path::PathBuf;
 
+use measured::departure::beforehand;
+use measured::sides::Verdict;
 use measured::{
-    Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Wiring, compare, conceal, diagnose, fit,
-    straightened,
+    Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Wiring, against, compare, conceal,
+    diagnose, fit, straightened,
 };
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
+use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use statrs::distribution::{ContinuousCDF, Normal, StudentsT};
@@ -445,4 +448,141 @@ fn effects_put_into_measured_data_are_named() {
         // of 4.4 standard deviations one comparison of a hundred says something false; none of 160 did
         assert!(all.iter().all(|(_, said)| *said != Answer::Wrong), "{name}");
     }
+}
+
+/// Of a measured ring the gains of ten instruments that an oracle would gain 25 nat from, ten pairs of monitors and all skew gradients are taken out of the fitted model, five
+/// gains and five pairs at a time, and looked for in the measurement: how many of each
+/// were named, of how many, and what was said of other places.
+fn hidden(path: PathBuf) -> [[usize; 2]; 4] {
+    let settings = Settings::default();
+    let as_measured = Folder::read(&path).unwrap();
+    let (folder, cables) = straightened(&as_measured, &settings).unwrap();
+    let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
+    let whole = Believed::of(&as_measured, &cables, &fitted);
+    let mut random = StdRng::seed_from_u64(8);
+    let named = |kind: Kind| measured::unknowns::name(&folder, &fitted.groups, kind);
+    let value = |kind: Kind| fitted.values[fitted.unknowns.iter().position(|one| one.kind == kind).unwrap()];
+    // what kind and place alone could gain [nat], everything else adapting as far as it may depart
+    let independent = &fitted.uncertainty.independent;
+    let mut precision = independent.clone().try_inverse().unwrap();
+    let width = |at: usize| beforehand(fitted.unknowns[at].kind);
+    (0..fitted.unknowns.len())
+        .for_each(|at| precision[(at, at)] += width(at).powi(-2) - fitted.unknowns[at].width.powi(-2));
+    let held = precision.try_inverse().unwrap();
+    let oracle = |at: usize, nothing: f64| {
+        let alike = fitted.sigma(at).powi(2) / independent[(at, at)];
+        0.5 * (fitted.values[at] - nothing).powi(2) * (held[(at, at)].recip() - width(at).powi(-2)) / alike
+    };
+    let is_known = |at: &usize| {
+        let is_gain = matches!(fitted.unknowns[*at].kind, Kind::MonitorGain(_) | Kind::CorrectorGain(_));
+        is_gain && oracle(*at, 1.0) > 25.0
+    };
+    let known: Vec<usize> = (0..fitted.unknowns.len()).filter(is_known).collect();
+    let gains: Vec<Kind> = known.sample(&mut random, 10).map(|&at| fitted.unknowns[at].kind).collect();
+    // monitors that read, and whose cables are right
+    let reads = |row: &usize| {
+        let is_hidden = gains.contains(&Kind::MonitorGain(*row));
+        let name = folder.monitor(*row);
+        let is_wrong = cables.iter().any(|one| one.named(&folder).1.contains(&name));
+        folder.monitors[*row].is_used && !is_hidden && !is_wrong && value(Kind::MonitorGain(*row)) > 0.3
+    };
+    let mut rows: Vec<usize> = (0..folder.monitors.len()).filter(reads).collect();
+    rows.shuffle(&mut random);
+    let (horizontal, vertical): (Vec<usize>, Vec<usize>) =
+        rows.into_iter().partition(|&row| folder.monitors[row].plane == twin::Plane::X);
+    let pairs: Vec<Vec<usize>> = horizontal
+        .chunks_exact(2)
+        .zip(vertical.chunks_exact(2))
+        .flat_map(|(x, y)| [x, y])
+        .take(10)
+        .map(|pair| vec![pair[0].min(pair[1]), pair[0].max(pair[1])])
+        .collect();
+    let [mut of_gains, mut of_pairs, mut of_skews, mut wrong] = [[0, 0]; 4];
+    for half in 0..2 {
+        let mut model = whole.clone();
+        let out: Vec<Kind> = gains.iter().skip(half).step_by(2).copied().collect();
+        out.iter()
+            .for_each(|&kind| assert_eq!(model.take_out(&format!("{} {}", kind.word(), named(kind))).unwrap(), 1));
+        let exchanged: Vec<Wiring> =
+            pairs.iter().skip(half).step_by(2).cloned().map(Wiring::MonitorsExchanged).collect();
+        let mut measured = as_measured.clone();
+        exchanged.iter().for_each(|one| one.put_right(&mut measured));
+        let found = against(&measured, &fitted, &model, &settings, &mut |_| ()).unwrap();
+        let right = found.departures.iter().filter(|one| out.contains(&one.kind)).count();
+        let cables = found.wiring.iter().filter(|one| exchanged.contains(one)).count();
+        for one in &found.departures {
+            println!(
+                "{} {}: {:+.4} ± {:.4}, hidden {:+.4}",
+                one.kind.word(),
+                one.at,
+                one.amplitude,
+                one.sigma,
+                value(one.kind) - 1.0
+            );
+        }
+        of_gains = [of_gains[0] + right, of_gains[1] + out.len()];
+        of_pairs = [of_pairs[0] + cables, of_pairs[1] + exchanged.len()];
+        wrong[0] += found.departures.len() - right + found.wiring.len() - cables;
+        wrong[1] += found.departures.len() + found.wiring.len();
+    }
+    let mut model = whole;
+    if model.take_out("skew_gradient *").is_ok() {
+        let found = against(&as_measured, &fitted, &model, &settings, &mut |_| ()).unwrap();
+        let is_skew = |kind: Kind| matches!(kind, Kind::Skew(_));
+        let skews = fitted.unknowns.iter().enumerate().filter(|(_, one)| is_skew(one.kind));
+        of_skews[1] = skews.filter(|(at, _)| oracle(*at, 0.0) > 25.0).count();
+        of_skews[0] = found.departures.iter().filter(|one| is_skew(one.kind)).count();
+        wrong[0] += found.departures.len() - of_skews[0] + found.wiring.len();
+        wrong[1] += found.departures.len() + found.wiring.len();
+    }
+    println!("{}: gains {of_gains:?}, pairs {of_pairs:?}, skew gradients {of_skews:?}, wrong {wrong:?}", folder.name);
+    [of_gains, of_pairs, of_skews, wrong]
+}
+
+/// Nothing false is said but a known number; of cables, and of gains where the ring tells them, nine of ten are named.
+fn hidden_values_are_found_again(path: PathBuf, least: f64, most_false: usize) {
+    let [gains, pairs, skews, wrong] = hidden(path);
+    let share = gains[0] as f64 / gains[1] as f64;
+    assert!(share >= least && 10 * pairs[0] >= 9 * pairs[1], "{gains:?} {pairs:?}");
+    // an oracle knows all others; of skew gradients that are all unknown some follow each other
+    assert!(10 * skews[0] >= 9 * skews[1] && wrong[0] <= most_false, "{skews:?} {wrong:?}");
+}
+
+#[test]
+fn hidden_values_are_found_again_in_twelve_cells() {
+    hidden_values_are_found_again(repository("recordings/measured/twelve-cells/before"), 0.9, 0);
+}
+
+#[test]
+fn hidden_values_are_found_again_at_sps() {
+    if let Some(path) = ring("sps_2007") {
+        // residuals of 100 um hide gains that are 5 % off: three of eight
+        hidden_values_are_found_again(path, 0.3, 0);
+    }
+}
+
+#[test]
+#[ignore = "make measured"]
+fn hidden_values_are_found_again_at_larger_rings() {
+    // known at PLS: three false ones in each of two runs, among them the gains of two neighbouring correctors
+    for (name, most_false) in [("spear3_example", 0), ("pls_2009", 6), ("als_2005_topoff", 0)] {
+        if let Some(path) = ring(name) {
+            hidden_values_are_found_again(path, 0.9, most_false);
+        }
+    }
+}
+
+/// What remains of the SPS is of its monitors and correctors: gradients gain nothing where they were not learnt.
+#[test]
+fn what_remains_at_sps_is_of_the_measurement() {
+    let Some(path) = ring("sps_2007") else { return };
+    let settings = Settings::default();
+    let (folder, _) = straightened(&Folder::read(&path).unwrap(), &settings).unwrap();
+    let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
+    let found = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap();
+    println!("sps_2007: {:?}", found.sides);
+    assert_eq!(found.sides.verdict(), Verdict::Measurement, "{:?}", found.sides);
+    // y monitors 1 and 17, counted from 1, and V corrector 3 or 4 are among them
+    let has = |name: String| found.unexplained.iter().any(|one| one.at == name);
+    assert!(has("y_BPM.3".into()) && has("y_BPM.169".into()) && has("V_CORV.58".into()), "{:?}", found.unexplained);
 }

@@ -2,7 +2,7 @@
 
 use inference::{BatchFit, TuneUse};
 use measured::Folder;
-use measured::compare::clear;
+use measured::departure::clear;
 
 use super::{CommandError, campaign, check_outputs, deliver, machine_with, matrix, recording};
 use crate::cli::Compare;

@@ -164,6 +164,11 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
             "--rf is for a measured matrix; a recording's header says what the RF held".into(),
         ));
     }
+    if options.model_file.is_some() {
+        return Err(CommandError::Input(
+            "--model-file is for a measured matrix; the model of a recording is its machine file".into(),
+        ));
+    }
     let outputs = [&options.common.json, &options.report, &options.model_out];
     check_outputs(outputs.map(Option::as_deref))?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;

@@ -1,12 +1,12 @@
 //! `orbitcal fit` and `orbitcal diagnose` of a measured response matrix.
 
 use indicatif::ProgressBar;
-use measured::{Fit, Folder, MeasuredError, Model, Settings, Wiring};
+use measured::{Believed, Fit, Folder, MeasuredError, Model, Settings, Wiring};
 use twin::{Hold, Optics, Rf};
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::{self, Common, Method, Priors};
-use crate::matrix_result::{MatrixDiagnosis, MatrixFit};
+use crate::matrix_result::{Found, MatrixDiagnosis, MatrixFit, StatedModel};
 
 impl From<MeasuredError> for CommandError {
     fn from(error: MeasuredError) -> Self {
@@ -60,13 +60,32 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
     }
     check_outputs([options.common.json.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
-    let (folder, cables) = measured::straightened(&Folder::read(path)?, &settings)?;
+    let believed = believed(options)?;
+    let as_measured = Folder::read(path)?;
+    let (folder, cables) = measured::straightened(&as_measured, &settings)?;
     let fitted = fitted(&folder, &settings, &options.common)?;
     let spinner = spinner(&options.common);
-    let found = measured::diagnose(&folder, &fitted, &settings, &mut |what| spinner.set_message(what.to_owned()));
+    let mut say = |what: &str| spinner.set_message(what.to_owned());
+    let found = measured::diagnose(&folder, &fitted, &settings, &mut say);
+    let against = believed.map(|model| measured::against(&as_measured, &fitted, &model, &settings, &mut say));
     spinner.finish_and_clear();
+    let (diagnosis, against) = (found?, against.transpose()?);
     let fit = result(&folder, &cables, &fitted, &settings)?;
-    deliver(&options.common, &MatrixDiagnosis::of(&folder, settings.rf, &cables, &found?, fit))
+    let found = Found { cables: &cables, fitted: &fitted, diagnosis: &diagnosis, against: against.as_ref() };
+    deliver(&options.common, &MatrixDiagnosis::of(&folder, settings.rf, &found, fit))
+}
+
+/// The model that is believed, less what is taken out of it.
+fn believed(options: &cli::Diagnose) -> Result<Option<Believed>, CommandError> {
+    let Some(path) = &options.model_file else { return Ok(None) };
+    let wrong = |why: String| CommandError::Input(format!("{}: {why}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let stated: StatedModel = serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+    let mut model = stated.into();
+    for named in &options.without {
+        Believed::take_out(&mut model, named)?;
+    }
+    Ok(Some(model))
 }
 
 /// How a matrix is fitted.
