@@ -529,7 +529,7 @@ mod tests {
             assert!(search.competitions() <= 8, "{kind}@{place}: {} competitions", search.competitions());
             assert!(found.null.is_stable(&found.data), "what was found of the vars without effects is stated");
         }
-        // the first one moves the vertical tune to a resonance, and a monitor's gain is taken for it beside wrong vars
+        // of the first one vars and ordinary imperfections absorb nearly all, and a monitor's gain is taken for the rest
         assert!(found_right >= 7, "{found_right} of 8");
     }
 }
