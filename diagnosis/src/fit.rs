@@ -189,6 +189,12 @@ impl Fitted {
         self.residual.norm_squared() > GROSS * self.residual.len() as f64
     }
 
+    /// True where the recording is not one of a machine of the prior: `|r|^2 + |u|^2` at its least has the chi-square distribution of as many degrees of freedom
+    /// as there are numbers, whatever the unknowns. Ordinary imperfections far out of their widths absorb even a reversed corrector.
+    pub fn is_extraordinary(&self) -> bool {
+        self.cost > GROSS * self.residual.len() as f64
+    }
+
     /// `ln` posterior at the best point, up to a constant of the recording: the evidence without its determinant.
     pub fn log_posterior(&self, data: &Data) -> f64 {
         -0.5 * (self.cost + self.data(data).whole_log_det())

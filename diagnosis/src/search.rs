@@ -157,12 +157,12 @@ impl Search {
         Ok(found)
     }
 
-    /// The fit of the vars and of what is ordinary. What makes a fit poor is not: ordinary imperfections, small by their nature, are then left out
+    /// The fit of the vars and of what is ordinary. What no machine of the prior has is not: ordinary imperfections, small by their nature, are then left out
     /// until the effects are in the model that explain it.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
-        let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
+        let ordinary = if first.is_extraordinary() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
         let fitted = fit_linearised(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
