@@ -117,19 +117,19 @@ impl Data {
         Ok(all)
     }
 
-    /// The same of several columns.
+    /// The same of several columns, of which those that are not given are 0.
     ///
     /// # Errors
     /// Those of `of`.
     pub fn stacked_columns<E>(
         &self,
         columns: usize,
-        of: impl Fn(usize, &Self) -> Result<Vec<DVector<f64>>, E>,
+        of: impl Fn(usize, &Self) -> Result<DMatrix<f64>, E>,
     ) -> Result<DMatrix<f64>, E> {
         let mut all = DMatrix::zeros(self.whole_size(), columns);
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
-            let mut part = all.rows_range_mut(rows);
-            part.column_iter_mut().zip(of(index, one)?).for_each(|(mut to, column)| to.copy_from(&column));
+            let of_one = of(index, one)?;
+            all.view_range_mut(rows, ..of_one.ncols()).copy_from(&of_one);
         }
         Ok(all)
     }
@@ -167,7 +167,7 @@ impl Data {
 }
 
 /// Ranges of some lengths, one after the other.
-fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
+pub(super) fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
     lengths
         .scan(0, |end, length| {
             let start = *end;

@@ -1,7 +1,8 @@
 //! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
 //! better.
 //!
-//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]); what passes within a
+//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]), and read-backs that are not
+//! the settings are told ([`readback`]); what passes within a
 //! setting is found by the differences of its frames and taken out ([`transients`]); the recording is
 //! whitened ([`data`]), fitted by the exact twin without any
 //! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]), and so is an unmodelled discrepancy
@@ -38,6 +39,7 @@ pub mod page;
 pub mod period;
 pub mod place_scan;
 pub mod pools;
+pub mod readback;
 mod repeats;
 pub mod sample;
 mod scale;
@@ -66,6 +68,7 @@ use heldout::Score;
 use hypothesis::Term;
 use imperfection::Imperfection;
 use inference::recording::{Recording, at_energy};
+use readback::Contradiction;
 use search::{Found, Search};
 use transients::{Transient, Transients};
 pub use verdict::{Finding, Verdict};
@@ -76,6 +79,8 @@ use wiring::Miswired;
 pub struct Diagnosis {
     /// All that was found, with its fits.
     pub found: Found,
+    /// Read-backs of correctors that contradict their settings.
+    pub contradictions: Vec<Contradiction>,
     /// What passes within settings, which is not in the data of `found`.
     pub transients: Vec<Transient>,
     /// The verdict.
@@ -124,6 +129,9 @@ impl Diagnosis {
                 return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
             }
         }
+        let names = ring.corrector_names();
+        let of_each = recordings.iter().flat_map(|recording| Contradiction::all(recording, &names));
+        let contradictions: Vec<Contradiction> = of_each.collect();
         progress("what passes within settings");
         let (mut transients, mut joined) = (Vec::new(), Vec::new());
         for (index, recording) in recordings.iter().enumerate() {
@@ -159,10 +167,11 @@ impl Diagnosis {
         progress("what to measure next");
         // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
-        let sentence = verdict::sentence(data, &found, verdict, &findings);
+        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions);
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
         Ok(Self {
             found,
+            contradictions,
             transients,
             verdict,
             sentence,

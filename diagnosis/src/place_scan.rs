@@ -76,8 +76,8 @@ impl PlaceScan {
             let of_batch = |batch: &[Segment]| {
                 let columns = data.stacked_columns(batch.len(), |campaign, own| {
                     let scale = scale * data.scale(campaign, of_kind);
-                    let of = |at: &Segment| own.signature(&signatures[campaign].of_thin(at.place, kind)) * scale;
-                    Ok::<_, Infallible>(batch.iter().map(of).collect())
+                    let of = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
+                    own.signatures::<Infallible>(batch.len(), batch.iter().map(of))
                 });
                 let Ok(columns) = columns;
                 projection.score(columns).scores

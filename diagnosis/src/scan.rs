@@ -155,8 +155,12 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
         let (machine, drives) = fitted.machine_in(data, campaign)?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let column = |term: &Term| whitened(own, &signatures, term) * data.scale(campaign, term.kind);
-        Ok(terms.iter().map(column).collect())
+        let of = |term: &Term| {
+            let scale = term.kind.prior_scale().unwrap_or(1.0) * data.scale(campaign, term.kind);
+            // none if there is no stable machine with it
+            Ok(signatures.of_effect(term.kind, term.site).ok().map(|one| one * scale))
+        };
+        own.signatures(terms.len(), terms.iter().map(of))
     })
 }
 
@@ -242,11 +246,4 @@ pub fn separations(
         Rivals { power, rival, both, free }.expected(amplitude)
     };
     Ok(others.iter().enumerate().map(of).collect())
-}
-
-/// The whitened signature of a term, per prior standard deviation; zero if there is no stable machine with it.
-fn whitened(data: &Data, signatures: &Signatures, term: &Term) -> DVector<f64> {
-    let scale = term.kind.prior_scale().unwrap_or(1.0);
-    let signature = signatures.of_effect(term.kind, term.site);
-    signature.map_or_else(|_| DVector::zeros(data.size()), |one| data.signature(&one) * scale)
 }

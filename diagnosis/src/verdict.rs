@@ -12,6 +12,7 @@ use super::heldout::{Block, Score, VALIDATED, gain_of_choice, reduced};
 use super::hypothesis::Term;
 use super::limits::Limits;
 use super::place_scan::{Interval, PlaceScan};
+use super::readback::Contradiction;
 use super::scan::separations;
 use super::search::{Found, corrections};
 use super::transients::Transient;
@@ -347,7 +348,13 @@ pub fn findings(
 }
 
 /// In one sentence.
-pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Finding]) -> String {
+pub fn sentence(
+    data: &Data,
+    found: &Found,
+    verdict: Verdict,
+    findings: &[Finding],
+    contradictions: &[Contradiction],
+) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
     let text = match verdict {
@@ -376,11 +383,16 @@ pub fn sentence(data: &Data, found: &Found, verdict: Verdict, findings: &[Findin
         .collect();
     let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
     let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
+    let of_one = |one: &Contradiction| match data.is_joint() {
+        true => format!("; in {} {one}", one.recording),
+        false => format!("; {one}"),
+    };
+    let contradicted: String = contradictions.iter().map(of_one).collect();
     let together = match data.is_joint() {
         true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
         false => String::new(),
     };
-    capitalised(&format!("{text}{noise}{faulty}{together}"))
+    capitalised(&format!("{text}{contradicted}{noise}{faulty}{together}"))
 }
 
 /// What is missing and not in the library.

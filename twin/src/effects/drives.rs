@@ -41,8 +41,12 @@ impl Machine {
 
     /// Linear optics of a ring that holds what this machine holds.
     pub(super) fn seen(&self, ring: &Ring) -> Result<Seen, OrbitError> {
-        let optics = Optics::of(ring, Hold::Momentum { delta: self.hold.delta })?;
-        let response = self.held(ring, &optics)?;
+        self.seen_by(ring, &Optics::of(ring, Hold::Momentum { delta: self.hold.delta })?)
+    }
+
+    /// The same, given the ring's optics at this momentum.
+    pub(super) fn seen_by(&self, ring: &Ring, optics: &Optics) -> Result<Seen, OrbitError> {
+        let response = self.held(ring, optics)?;
         let eta = optics.slip_factor();
         let with_rf = |plane: Plane| {
             let response = &response[plane.index()];

@@ -27,7 +27,8 @@ impl Machine {
     /// [`OrbitError`] if the machine is unstable.
     pub fn readings(&self, drives: &Drives) -> Result<(DMatrix<f64>, Tunes, [f64; 2]), OrbitError> {
         let ring = self.on_orbit(&drives.orbit).ring;
-        let seen = self.seen(&ring)?;
+        let optics = Optics::of(&ring, Hold::Momentum { delta: self.hold.delta })?;
+        let seen = self.seen_by(&ring, &optics)?;
         let kick = self.kicks(drives);
         let mut positions = drives.positions(&seen, &kick);
         let mut tune_drift = [0.0; 2];
@@ -37,7 +38,6 @@ impl Machine {
             tune_drift = of_tunes;
         }
         if !self.sextupoles.is_empty() {
-            let optics = Optics::of(&ring, Hold::Momentum { delta: self.hold.delta })?;
             let held = self.held_of(&ring, &optics)?;
             add(&mut positions, Crossed::of(&optics, &held, &self.sextupoles, drives, &kick).curved());
         }

@@ -102,7 +102,7 @@ impl<'m> Signatures<'m> {
         let ring = &machine.ring;
         let optics = Optics::of(ring, Hold::Momentum { delta: machine.hold.delta })?;
         let held = Held::of(ring, &optics, machine.hold)?;
-        let seen = machine.seen(ring)?;
+        let seen = machine.seen_by(ring, &optics)?;
         let kick = machine.kicks(drives);
         let positions = drives.positions(&seen, &kick);
         let (observers, sources) = (optics.read_monitors(), optics.correctors());
