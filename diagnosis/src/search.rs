@@ -37,8 +37,7 @@ const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
 /// Effects at most.
 const MOST: usize = 4;
-/// Competitions after which no further effect is tried: one effect takes 4, two some 10 and four 20 to 30; more are held where effects replace each
-/// other and none explains the recording.
+/// Competitions after which no further effect is tried: so many are held where effects replace each other and none explains the recording.
 const COMPETITIONS: usize = 40;
 /// Number of candidates that are refitted exactly, and their largest distance from the best, in nat and relative to the best.
 const LEADERS: usize = 8;
@@ -119,12 +118,6 @@ impl Search {
         Self { terms, log_prior, held: Cell::new(0) }
     }
 
-    /// Competitions held by all runs. Each fits at most the leaders of two scans and what stands out of its family, from two starts, and those near the
-    /// best once more.
-    pub fn competitions(&self) -> usize {
-        self.held.get()
-    }
-
     /// Search.
     ///
     /// # Errors
@@ -157,12 +150,12 @@ impl Search {
         Ok(found)
     }
 
-    /// The fit of the vars and of what is ordinary. What no machine of the prior has is not: ordinary imperfections, small by their nature, are then left out
+    /// The fit of the vars and of what is ordinary. What makes a fit poor is not: ordinary imperfections, small by their nature, are then left out
     /// until the effects are in the model that explain it.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
-        let ordinary = if first.is_extraordinary() { Vec::new() } else { ordinary::learnt(&data, &first) };
+        let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
         let fitted = fit_linearised(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
@@ -461,75 +454,4 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
     learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted)
-}
-
-#[cfg(test)]
-mod tests {
-    use inference::Campaign;
-    use rand::rngs::StdRng;
-    use rand::{RngExt, SeedableRng};
-    use rand_distr::StandardNormal;
-    use twin::{Effect, Ring};
-
-    use super::*;
-    use crate::scan::candidates;
-    use crate::testing::{Coloured, template};
-
-    /// Scatters of a kind that every machine has.
-    const EVERYWHERE: [(EffectKind, f64); 5] = [
-        (EffectKind::BpmGain, 0.01),
-        (EffectKind::CorrectorGain, 0.01),
-        (EffectKind::BpmRoll, 0.005),
-        (EffectKind::CorrectorRoll, 0.005),
-        (EffectKind::QuadRoll, 5e-4),
-    ];
-
-    fn everywhere(ring: &Ring, seed: u64) -> Vec<Effect> {
-        let mut rng = StdRng::seed_from_u64(seed);
-        let mut effect =
-            |kind, site, rms: f64| Effect { kind, site, amplitude: rms * rng.sample::<f64, _>(StandardNormal) };
-        let all =
-            EVERYWHERE.iter().flat_map(|&(kind, rms)| kind.sites(ring).into_iter().map(move |site| (kind, site, rms)));
-        all.map(|(kind, site, rms)| effect(kind, site, rms)).collect()
-    }
-
-    /// Effects of 4 to 6 prior widths on machines with ordinary imperfections: vars that absorb what they can reach the ends of their ranges, and the
-    /// way from there to the truth is long.
-    #[test]
-    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn strong_effects_are_found_in_few_competitions() {
-        let (ring, recording) = template();
-        let cases = [
-            (EffectKind::DipoleGradient, "B_D4", 0.06),
-            (EffectKind::DipoleGradient, "B_E4", -0.072),
-            (EffectKind::StrayGradient, "SLOT_E6", 0.08),
-            (EffectKind::StrayGradient, "SLOT_B3", -0.12),
-            (EffectKind::StraySkewGradient, "SLOT_C6", 0.06),
-            (EffectKind::QuadRoll, "B6", -0.09),
-            (EffectKind::SextupoleError, "SX_A2", 10.0),
-            (EffectKind::CorrectorGain, "H_D2", -0.45),
-        ];
-        let mut found_right = 0;
-        for (i, (kind, place, amplitude)) in cases.into_iter().enumerate() {
-            let seed = 600 + i as u64;
-            let strong = Effect::at(kind, place, amplitude, &ring).unwrap();
-            let effects: Vec<Effect> = everywhere(&ring, seed).into_iter().chain([strong]).collect();
-            let made = Coloured::white(&ring, &recording, seed).campaign(&ring, &recording, &effects);
-            let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
-            let search = Search::new(candidates(&data, None));
-            let found = search.run(data).unwrap();
-            let terms = &found.best.hypothesis.terms;
-            println!(
-                "{kind}@{place}={amplitude}: {} in {} competitions",
-                found.best.hypothesis.label(&ring),
-                search.competitions()
-            );
-            found_right += usize::from(terms.contains(&Term::from(strong)));
-            // measured: 2 to 4
-            assert!(search.competitions() <= 8, "{kind}@{place}: {} competitions", search.competitions());
-            assert!(found.null.is_stable(&found.data), "what was found of the vars without effects is stated");
-        }
-        // of the first one vars and ordinary imperfections absorb nearly all, and a monitor's gain is taken for the rest
-        assert!(found_right >= 7, "{found_right} of 8");
-    }
 }
