@@ -448,7 +448,7 @@ impl LeftOver {
                 ("measurement", format!("what is left over{places} is of the measurement's side: {numbers}"))
             }
             Verdict::Lattice => ("lattice", format!("what is left over is of the lattice: {numbers}")),
-            Verdict::Neither => ("neither", format!("what is left over is clearly of neither side: {numbers}")),
+            Verdict::Neither => ("neither", format!("what is left over is of neither side alone: {numbers}")),
         };
         Self {
             side,
@@ -457,6 +457,11 @@ impl LeftOver {
             instruments: instruments.into(),
             sentence,
         }
+    }
+
+    /// True where it is of one side.
+    fn is_told(&self) -> bool {
+        self.side != "neither"
     }
 }
 
@@ -480,13 +485,12 @@ impl MatrixDiagnosis {
         findings.extend(is_other_hold(rf, diagnosis).then(|| share(rf, diagnosis)));
         let worst: Vec<&str> = diagnosis.unexplained.iter().take(6).map(|one| one.at.as_str()).collect();
         let left_over = LeftOver::of(&diagnosis.sides, &worst);
-        let is_told = left_over.side != "neither";
         let coupling = lacks_coupling(found).then(|| coupling(&diagnosis.sides));
         let more = findings.len().saturating_sub(SAID);
         let said: Vec<String> = (coupling.into_iter())
             .chain(findings.iter().take(SAID).map(|one| one.sentence.clone()))
             .chain((more > 0).then(|| format!("{more} more are listed")))
-            .chain(is_told.then(|| left_over.sentence.clone()))
+            .chain(left_over.is_told().then(|| left_over.sentence.clone()))
             .collect();
         let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
             (false, _) => ("identified", said.join("; ")),
@@ -665,7 +669,10 @@ impl fmt::Display for MatrixDiagnosis {
         if !self.findings.is_empty() {
             writeln!(f, "{rows}\n")?;
         }
-        writeln!(f, "{}\n", fill(&self.left_over.sentence))?;
+        // a side that is told stands in the sentence
+        if !self.left_over.is_told() {
+            writeln!(f, "{}", fill(&self.left_over.sentence))?;
+        }
         if self.unexplained.is_empty() {
             return Ok(());
         }
