@@ -174,3 +174,28 @@ fn what_a_loco_file_states_is_not_asked_for_nor_taken_twice() {
     let lattice = "recordings/measured/imports/twelve-cells.at.mat";
     assert!(refused(&["import", lattice, "--out", "none"]).contains("is a lattice alone; --out needs --matrix"));
 }
+
+/// A fit is the model that is believed: of the same matrix nothing departs from it, of the later one what changed, and a gain that is taken out is
+/// found again.
+#[test]
+fn what_departs_from_a_believed_model_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("fit.json");
+    let model = model.to_str().unwrap();
+    assert!(orbitcal(&["fit", BEFORE, "--json", model, "--quiet"]).status.success());
+    let places = |arguments: &[&str]| {
+        let result = json(&[&["diagnose"], arguments, &["--model-file", model]].concat());
+        let findings = result["findings"].as_array().unwrap().clone();
+        findings.into_iter().map(|one| (one["at"].as_str().unwrap().to_owned(), one)).collect::<Vec<_>>()
+    };
+    let cables = "x_BPM.22,x_BPM.52";
+    assert!(places(&[BEFORE]).iter().all(|(at, _)| at == cables));
+    let changed: Vec<String> = places(&[AFTER]).into_iter().map(|(at, _)| at).filter(|at| at != cables).collect();
+    assert_eq!(changed, ["QF.24", "QD.64"]);
+    let hidden = places(&[BEFORE, "--without", "y_BPM.52"]);
+    let (_, gain) = hidden.iter().find(|(at, _)| at == "y_BPM.52").expect("its gain is 0.931");
+    assert_eq!(gain["kind"], "bpm_gain");
+    let [amplitude, sigma] = ["amplitude", "sigma"].map(|key| gain[key].as_f64().unwrap());
+    assert!((amplitude + 0.069).abs() < 3.0 * sigma && sigma < 0.02, "{amplitude} ± {sigma}");
+    assert!(refused(&["diagnose", BEFORE, "--model-file", model, "--without", "x_BPM.1"]).contains("no such value"));
+}
