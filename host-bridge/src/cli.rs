@@ -253,7 +253,7 @@ pub struct Fit {
     /// What the machine held while a response matrix was measured; the frequency without it
     #[arg(long, value_enum)]
     pub rf: Option<Rf>,
-    /// The optics of the calibrated ring with error bars, as one page
+    /// The optics of the calibrated ring with error bars, of a matrix its instruments too, as one page
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
     /// Folder for the draws, one CmdStan CSV a chain, as `arviz.from_cmdstan` reads it
@@ -520,6 +520,9 @@ pub struct Compare {
     /// The later one, of the same machine and instruments
     #[arg(value_name = "B")]
     pub after: PathBuf,
+    /// The changes as one page
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,

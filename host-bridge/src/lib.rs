@@ -7,6 +7,7 @@ pub mod export;
 pub mod fit_page;
 pub mod frames_result;
 pub mod import_result;
+pub mod matrix_page;
 pub mod matrix_result;
 pub mod model_file;
 pub mod output;

@@ -460,7 +460,7 @@ impl LeftOver {
     }
 
     /// True where it is of one side.
-    fn is_told(&self) -> bool {
+    pub fn is_told(&self) -> bool {
         self.side != "neither"
     }
 }

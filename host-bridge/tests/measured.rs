@@ -199,3 +199,24 @@ fn what_departs_from_a_believed_model_is_named() {
     assert!((amplitude + 0.069).abs() < 3.0 * sigma && sigma < 0.02, "{amplitude} ± {sigma}");
     assert!(refused(&["diagnose", BEFORE, "--model-file", model, "--without", "x_BPM.1"]).contains("no such value"));
 }
+
+/// The pages hold what their commands say, and the figures that a physicist looks at.
+#[test]
+fn a_matrix_has_its_pages() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = |arguments: &[&str]| {
+        let file = folder.path().join(format!("{}.html", arguments[0]));
+        let run = orbitcal(&[arguments, &["--quiet", "--report", file.to_str().unwrap()]].concat());
+        assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+        std::fs::read_to_string(file).unwrap()
+    };
+    let holds = |page: &str, all: &[&str]| all.iter().for_each(|text| assert!(page.contains(text), "{text}"));
+    let rings =
+        ["What is left over", "Strength factors", "Beta-beat", "Horizontal dispersion", "Gains of the monitors"];
+    let fit = page(&["fit", BEFORE]);
+    holds(&fit, &rings);
+    let found = page(&["diagnose", BEFORE]);
+    holds(&found, &rings);
+    holds(&found, &["before: identified", "x_BPM.22 and x_BPM.52 are exchanged", "Residuals, element by element"]);
+    holds(&page(&["compare", BEFORE, AFTER]), &["before to after", "2 of 24 changed: QF.24 by +1.00", "What changed"]);
+}

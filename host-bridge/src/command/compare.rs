@@ -6,6 +6,7 @@ use measured::departure::clear;
 
 use super::{CommandError, campaign, check_outputs, deliver, machine_with, matrix, recording};
 use crate::cli::Compare;
+use crate::matrix_page;
 use crate::matrix_result::{ChangeOfOne, Comparison, OtherChange};
 use crate::result::FitResult;
 
@@ -14,7 +15,7 @@ use crate::result::FitResult;
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Compare) -> Result<(), CommandError> {
-    check_outputs([options.common.json.as_deref()])?;
+    check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let compared = match [&options.before, &options.after].map(|path| Folder::is_one(path)) {
         [true, true] => of_matrices(options)?,
         [false, false] => Comparison::of(of_recordings(options)?, Vec::new()),
@@ -25,6 +26,11 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
             )));
         }
     };
+    if let Some(path) = &options.report {
+        let names = [&options.before, &options.after]
+            .map(|path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned());
+        matrix::write(path, &matrix_page::page_of(&compared, [&names[0], &names[1]]))?;
+    }
     deliver(&options.common, &compared)
 }
 

@@ -1,12 +1,18 @@
 //! `orbitcal fit` and `orbitcal diagnose` of a measured response matrix.
 
+use std::path::Path;
+
 use indicatif::ProgressBar;
 use measured::{Believed, Fit, Folder, MeasuredError, Model, Settings, Wiring};
+use nalgebra::DVector;
+use report::Page;
 use twin::{Hold, Optics, Rf};
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::{self, Common, Method, Priors};
+use crate::matrix_page::Measured;
 use crate::matrix_result::{Found, MatrixDiagnosis, MatrixFit, StatedModel};
+use crate::output;
 
 impl From<MeasuredError> for CommandError {
     fn from(error: MeasuredError) -> Self {
@@ -31,17 +37,18 @@ pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
     if options.method == Method::Nuts {
         return refused("--method nuts");
     }
-    if options.report.is_some() {
-        return refused("--report");
-    }
     if options.common.machine.is_some() {
         return refused("--machine");
     }
-    check_outputs([options.common.json.as_deref()])?;
+    check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
     let (folder, cables) = measured::straightened(&Folder::read(&options.recording)?, &settings)?;
     let fitted = fitted(&folder, &settings, &options.common)?;
-    deliver(&options.common, &result(&folder, &cables, &fitted, &settings)?)
+    let result = result(&folder, &cables, &fitted, &settings)?;
+    if let Some(path) = &options.report {
+        write(path, &measured_of(&folder, &fitted, &result, &settings)?.page()?)?;
+    }
+    deliver(&options.common, &result)
 }
 
 /// Diagnose it.
@@ -52,13 +59,11 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
     let [path] = options.recordings.as_slice() else {
         return Err(CommandError::Input("one measured matrix at a time; `orbitcal compare A B` compares two".into()));
     };
-    if options.report.is_some() || options.model_out.is_some() {
-        return Err(CommandError::Input(format!(
-            "--report and --model-out are for recordings; {} is a measured matrix",
-            path.display()
-        )));
+    if options.model_out.is_some() {
+        let problem = format!("--model-out is for recordings; {} is a measured matrix", path.display());
+        return Err(CommandError::Input(problem));
     }
-    check_outputs([options.common.json.as_deref()])?;
+    check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
     let believed = believed(options)?;
     let as_measured = Folder::read(path)?;
@@ -72,7 +77,28 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
     let (diagnosis, against) = (found?, against.transpose()?);
     let fit = result(&folder, &cables, &fitted, &settings)?;
     let found = Found { cables: &cables, fitted: &fitted, diagnosis: &diagnosis, against: against.as_ref() };
-    deliver(&options.common, &MatrixDiagnosis::of(&folder, settings.rf, &found, fit))
+    let result = MatrixDiagnosis::of(&folder, settings.rf, &found, fit);
+    if let Some(path) = &options.report {
+        write(path, &measured_of(&folder, &fitted, &result.fit, &settings)?.page_of(&result)?)?;
+    }
+    deliver(&options.common, &result)
+}
+
+/// A fit with its ring and that of the lattice.
+fn measured_of<'r>(
+    folder: &'r Folder,
+    fit: &'r Fit,
+    result: &'r MatrixFit,
+    settings: &Settings,
+) -> Result<Measured<'r>, CommandError> {
+    let model = Model::of(folder, &fit.groups, settings.rf)?;
+    let rings = [model.at(&[], &DVector::zeros(0)), model.at(&fit.unknowns, &fit.values)];
+    Ok(Measured { folder, fit, result, rings })
+}
+
+/// Write a report.
+pub(super) fn write(path: &Path, page: &Page) -> Result<(), CommandError> {
+    Ok(output::bytes(path, page.render().as_bytes())?)
 }
 
 /// The model that is believed, less what is taken out of it.
