@@ -515,7 +515,7 @@ impl Found<'_> {
                 cables.chain(against.departures.iter().map(departure)).chain(terms).collect()
             }
             None => {
-                let cables = self.cables.iter().chain(&self.diagnosis.wiring).map(|one| cable(folder, one));
+                let cables = self.cables.iter().map(|one| cable(folder, one));
                 cables.chain(terms).chain(self.diagnosis.standing.iter().map(stands_out)).collect()
             }
         }

@@ -23,7 +23,6 @@ use crate::model::{Model, Prediction};
 use crate::sides::{Sides, sides};
 use crate::standing::{Standing, standing};
 use crate::unknowns::{Kind, Unknown};
-use crate::wiring::{self, Wiring};
 
 /// Patterns that the term of a held frequency is compared with.
 const SHUFFLES: usize = 99;
@@ -67,8 +66,6 @@ pub struct Unexplained {
 /// What was found.
 #[derive(Debug, Clone)]
 pub struct Diagnosis {
-    /// Cables that the fitted matrix shows to be wrong, and that of the lattice as written did not.
-    pub wiring: Vec<Wiring>,
     /// Of the held frequency.
     pub share: Share,
     /// Of instruments, the worst first.
@@ -93,21 +90,10 @@ pub fn diagnose(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Diagnosis, MeasuredError> {
     let model = Model::of(folder, &fitted.groups, settings.rf)?;
-    // where the fit did not end its magnets are not those of the ring
-    let wiring = match fitted.has_ended {
-        true => wiring::found(folder, &model.without_instruments(&fitted.unknowns, &fitted.values)?),
-        false => Vec::new(),
-    };
     let share = share(folder, fitted, &model, settings, progress)?;
     progress("lattice or instruments");
     let unexplained = unexplained(folder, fitted);
-    Ok(Diagnosis {
-        wiring,
-        share,
-        sides: sides(folder, fitted, &model)?,
-        standing: standing(folder, fitted),
-        unexplained,
-    })
+    Ok(Diagnosis { share, sides: sides(folder, fitted, &model)?, standing: standing(folder, fitted), unexplained })
 }
 
 /// Of an amplitude with a prior standard deviation of 1.
@@ -239,6 +225,6 @@ mod tests {
         assert!(found.share.sigma() < 0.1, "{:?}", found.share);
         let right = diagnosed(&folder, Rf::FixedFrequency);
         assert!((right.share.value - 1.0).abs() < 3.0 * right.share.sigma(), "{:?}", right.share);
-        assert!(right.wiring.is_empty() && right.unexplained.is_empty(), "{:?}", right);
+        assert!(right.unexplained.is_empty(), "{:?}", right);
     }
 }

@@ -28,6 +28,7 @@ pub mod normal;
 pub mod raw;
 pub mod sides;
 pub mod standing;
+pub mod straight;
 #[cfg(test)]
 mod testing;
 pub mod uncertainty;
@@ -44,5 +45,6 @@ pub use fit::{Fit, Settings, fit};
 pub use folder::Folder;
 pub use model::{Model, Prediction};
 pub use raw::RawOrbits;
+pub use straight::Straightened;
 pub use unknowns::{Kind, Unknown};
 pub use wiring::{Wiring, straightened};

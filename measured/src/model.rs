@@ -129,22 +129,7 @@ impl Model {
     /// # Errors
     /// [`MeasuredError::Orbit`]: the ring has no closed orbit.
     pub fn as_written(&self) -> Result<DMatrix<f64>, MeasuredError> {
-        self.without_instruments(&[], &DVector::zeros(0))
-    }
-
-    /// The same with the magnets that were found.
-    ///
-    /// # Errors
-    /// [`MeasuredError::Orbit`].
-    pub fn without_instruments(
-        &self,
-        unknowns: &[Unknown],
-        values: &DVector<f64>,
-    ) -> Result<DMatrix<f64>, MeasuredError> {
-        let is_magnet = |one: &Unknown| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_));
-        let magnets = unknowns.iter().zip(values).filter(|(one, _)| is_magnet(one));
-        let (magnets, values): (Vec<Unknown>, Vec<f64>) = magnets.map(|(one, value)| (*one, *value)).unzip();
-        let matrix = self.predict(&magnets, &DVector::from_vec(values))?.matrix;
+        let matrix = self.predict(&[], &DVector::zeros(0))?.matrix;
         Ok(matrix.columns(0, self.correctors.len()).into_owned())
     }
 

@@ -55,32 +55,53 @@ pub fn straightened(folder: &Folder, settings: &Settings) -> Result<(Folder, Vec
 
 /// The same by a matrix that perfect instruments would measure, or that the same ones have measured before [mm].
 pub fn straightened_by(folder: &Folder, expected: &DMatrix<f64>) -> (Folder, Vec<Wiring>) {
-    let (mut right, mut all) = (folder.clone(), Vec::new());
-    // an exchanged row may be reversed too, which shows at its own place
-    for _ in 0..2 {
-        let more = found(&right, expected);
-        more.iter().for_each(|one| one.put_right(&mut right));
-        all.extend(more);
+    let (mut right, mut all) = exchanged_back(folder, expected);
+    // an exchanged line may be reversed too, which shows at its own place
+    for one in reversed(&right, expected) {
+        one.put_right(&mut right);
+        all.push(one);
     }
     (right, all)
 }
 
-/// What is wrong by the matrix that perfect instruments would measure [mm].
-pub fn found(folder: &Folder, predicted: &DMatrix<f64>) -> Vec<Wiring> {
-    let monitors = judge(&Lines::of_monitors(folder, predicted));
-    let correctors = judge(&Lines::of_correctors(folder, predicted));
+/// The measurement with exchanged rows and columns put back, the clearest first: a row that is at a wrong place is in the way where columns are
+/// judged. What is expected [mm] need not have the right scale in any row or column.
+pub fn exchanged_back(folder: &Folder, expected: &DMatrix<f64>) -> (Folder, Vec<Wiring>) {
+    let (mut right, mut all) = (folder.clone(), Vec::new());
+    // no line is exchanged more than once
+    for _ in 0..folder.monitors.len() + folder.correctors.len() {
+        let Some(one) = clearest_exchange(&right, expected) else { break };
+        one.put_right(&mut right);
+        all.push(one);
+    }
+    (right, all)
+}
+
+/// The exchange that explains most, of rows or of columns.
+fn clearest_exchange(folder: &Folder, predicted: &DMatrix<f64>) -> Option<Wiring> {
+    let monitors = Lines::of_monitors(folder, predicted).exchanges().into_iter();
+    let correctors = Lines::of_correctors(folder, predicted).exchanges().into_iter();
+    monitors
+        .map(|one| (one.better, Wiring::MonitorsExchanged(one.lines)))
+        .chain(correctors.map(|one| (one.better, Wiring::CorrectorsExchanged(one.lines))))
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, wiring)| wiring)
+}
+
+/// What is reversed, once nothing is exchanged.
+fn reversed(folder: &Folder, predicted: &DMatrix<f64>) -> Vec<Wiring> {
+    let monitors = Lines::of_monitors(folder, predicted).reversed();
+    let correctors = Lines::of_correctors(folder, predicted).reversed();
     // where most monitors of a plane are reversed, so are its correctors: it is the sign of the kicks, or of all readings
     let is_reversed = |plane: &Plane| {
         let of_plane = |row: &&usize| folder.monitors[**row].plane == *plane;
         let all = folder.monitors.iter().filter(|one| one.plane == *plane && one.is_used).count();
-        2 * monitors.reversed.iter().filter(of_plane).count() > all
+        2 * monitors.iter().filter(of_plane).count() > all
     };
     let planes: Vec<Plane> = [Plane::X, Plane::Y].into_iter().filter(is_reversed).collect();
-    let rows = monitors.reversed.iter().filter(|&&row| !planes.contains(&folder.monitors[row].plane));
-    let columns = correctors.reversed.iter().filter(|&&column| !planes.contains(&folder.correctors[column].plane));
+    let rows = monitors.iter().filter(|&&row| !planes.contains(&folder.monitors[row].plane));
+    let columns = correctors.iter().filter(|&&column| !planes.contains(&folder.correctors[column].plane));
     (planes.iter().map(|&plane| Wiring::PlaneReversed(plane)))
-        .chain(monitors.exchanged.into_iter().map(Wiring::MonitorsExchanged))
-        .chain(correctors.exchanged.into_iter().map(Wiring::CorrectorsExchanged))
         .chain(rows.map(|&row| Wiring::MonitorReversed(row)))
         .chain(columns.map(|&column| Wiring::CorrectorReversed(column)))
         .collect()
@@ -196,54 +217,62 @@ fn own_plane(folder: &Folder, matrix: &DMatrix<f64>) -> DMatrix<f64> {
     })
 }
 
-/// Lines that are exchanged, and those that are reversed.
-struct Judged {
-    exchanged: Vec<Vec<usize>>,
-    reversed: Vec<usize>,
+/// Lines that are exchanged in a ring.
+struct Exchange {
+    /// Each is that of the next, the last one that of the first.
+    lines: Vec<usize>,
+    /// By how much their unexplained shares fall, geometric mean.
+    better: f64,
 }
 
-fn judge(lines: &Lines) -> Judged {
-    let n = lines.planes.len();
-    let unexplained = DMatrix::from_fn(n, n, |i, j| match lines.planes[i] == lines.planes[j] {
-        true => lines.compared(i, j).map_or(f64::NAN, |one| 1.0 - one.correlation.powi(2)),
-        false => f64::NAN,
-    });
-    // with the right sign, which an exchanged line of a place in antiphase has not
-    let own = |i: usize| lines.compared(i, i).map_or(f64::NAN, |one| 1.0 - one.correlation.max(0.0).powi(2));
-    let own: Vec<f64> = (0..n).map(own).collect();
-    let is_better =
-        |i: usize, j: usize| own[i] > LEAST * unexplained[(i, j)] && unexplained[(i, i)] > unexplained[(i, j)];
-    // the line whose prediction a line suits best
-    let best = |i: usize| {
-        let better = (0..n).filter(|&j| j != i && is_better(i, j));
-        better.min_by(|&a, &b| unexplained[(i, a)].total_cmp(&unexplained[(i, b)]))
-    };
-    let ring = |first: usize| {
-        let mut ring = vec![first];
-        while let Some(next) = best(ring[ring.len() - 1]) {
-            if next == first {
-                return Some(ring);
-            }
-            // the first of a ring is its least, and a ring that does not come back to it is none
-            if next < first || ring.contains(&next) {
-                return None;
-            }
-            ring.push(next);
+impl Lines {
+    /// Lines that are each explained better by the prediction of the next one.
+    fn exchanges(&self) -> Vec<Exchange> {
+        let n = self.planes.len();
+        let unexplained = DMatrix::from_fn(n, n, |i, j| match self.planes[i] == self.planes[j] {
+            true => self.compared(i, j).map_or(f64::NAN, |one| 1.0 - one.correlation.powi(2)),
+            false => f64::NAN,
+        });
+        // with the right sign, which an exchanged line of a place in antiphase has not
+        let own = |i: usize| self.compared(i, i).map_or(f64::NAN, |one| 1.0 - one.correlation.max(0.0).powi(2));
+        let own: Vec<f64> = (0..n).map(own).collect();
+        let is_better =
+            |i: usize, j: usize| own[i] > LEAST * unexplained[(i, j)] && unexplained[(i, i)] > unexplained[(i, j)];
+        // the line whose prediction a line suits best
+        let best = |i: usize| {
+            let better = (0..n).filter(|&j| j != i && is_better(i, j));
+            better.min_by(|&a, &b| unexplained[(i, a)].total_cmp(&unexplained[(i, b)]))
+        };
+        // a noisy line gains less than the others of its ring
+        let better = |ring: &[usize]| {
+            let gains = (0..ring.len()).map(|at| own[ring[at]] / unexplained[(ring[at], ring[(at + 1) % ring.len()])]);
+            gains.product::<f64>().powf(1.0 / ring.len() as f64)
+        };
+        (0..n)
+            .filter_map(|first| ring_from(first, best))
+            .map(|lines| Exchange { better: better(&lines), lines })
+            .filter(|one| one.better > BETTER)
+            .collect()
+    }
+
+    /// Lines that their own prediction explains with the other sign.
+    fn reversed(&self) -> Vec<usize> {
+        let is_reversed = |one: Likeness| one.correlation < -EXPLAINED.sqrt() && one.factor < -ALIVE;
+        (0..self.planes.len()).filter(|&i| self.compared(i, i).is_some_and(is_reversed)).collect()
+    }
+}
+
+/// The ring that begins and ends at a line, if it is the least of it.
+fn ring_from(first: usize, next: impl Fn(usize) -> Option<usize>) -> Option<Vec<usize>> {
+    let mut ring = vec![first];
+    loop {
+        match next(ring[ring.len() - 1])? {
+            next if next == first => return Some(ring),
+            // one that does not come back to its least is none
+            next if next < first || ring.contains(&next) => return None,
+            next => ring.push(next),
         }
-        None
-    };
-    // a noisy line gains less than the others of its ring
-    let gain = |i: usize, j: usize| own[i] / unexplained[(i, j)];
-    let is_clear = |ring: &Vec<usize>| {
-        let gains = (0..ring.len()).map(|at| gain(ring[at], ring[(at + 1) % ring.len()]));
-        gains.product::<f64>() > BETTER.powi(ring.len() as i32)
-    };
-    let exchanged: Vec<Vec<usize>> = (0..n).filter_map(ring).filter(is_clear).collect();
-    let of = |i: usize| exchanged.iter().flatten().any(|&one| one == i);
-    let is_reversed =
-        |i: usize| lines.compared(i, i).is_some_and(|one| one.correlation < -EXPLAINED.sqrt() && one.factor < -ALIVE);
-    let reversed = (0..n).filter(|&i| !of(i) && is_reversed(i)).collect();
-    Judged { exchanged, reversed }
+    }
 }
 
 #[cfg(test)]

@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use measured::departure::beforehand;
 use measured::sides::Verdict;
 use measured::{
-    Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Wiring, against, compare, conceal,
-    diagnose, fit, straightened,
+    Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Straightened, Wiring, against,
+    compare, conceal, diagnose, fit, straightened,
 };
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
@@ -30,6 +30,12 @@ fn ring(name: &str) -> Option<PathBuf> {
         return None;
     }
     Some(folder)
+}
+
+/// A measurement with its cables put right, what was wrong, and its fit.
+fn fitted_with_cables(as_measured: &Folder, settings: &Settings) -> (Folder, Vec<Wiring>, Fit) {
+    let Straightened { folder, cables, fit } = Straightened::of(as_measured, settings, &mut |_| ()).unwrap();
+    (folder, cables, fit)
 }
 
 /// Numbers without names, one line a row.
@@ -120,14 +126,13 @@ fn a_fit_without_coupling_is_no_worse_either() {
 fn the_held_frequency_is_found(name: &str) {
     let Some(path) = ring(name) else { return };
     let settings = Settings { rf: Rf::FixedMomentum, ..Settings::default() };
-    let (folder, _) = straightened(&Folder::read(&path).unwrap(), &settings).unwrap();
-    let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
+    let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
     let found = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap();
     let share = &found.share;
     println!("{name}: {:.3} ± {:.3} ± {:.3}", share.value, share.scatter, share.systematic);
     assert!((share.value - 1.0).abs() < 3.0 * share.sigma(), "{name}: {share:?}");
     // whatever the error bar: nearer to 1 than to 0 by a wide margin
-    assert!((share.value - 1.0).abs() < 0.1 && share.as_good == 0 && found.wiring.is_empty(), "{name}: {share:?}");
+    assert!((share.value - 1.0).abs() < 0.1 && share.as_good == 0, "{name}: {share:?}");
 }
 
 #[test]
@@ -159,19 +164,26 @@ fn at_pls() -> Vec<Wiring> {
     vec![Wiring::MonitorsExchanged(vec![147, 153]), Wiring::MonitorReversed(45)]
 }
 
+/// And two neighbouring correctors, which show beside the fit: 0.83 and 1.28 of the stated kick become 1.11 and 1.00, and what a column leaves
+/// unexplained falls to a fifth and to a ninth.
 #[test]
 #[ignore = "make measured"]
 fn cables_that_were_wrong_are_found_and_the_fit_is_better() {
     let Some(path) = ring("pls_2009") else { return };
-    let (folder, found) = straightened(&Folder::read(&path).unwrap(), &Settings::default()).unwrap();
-    assert_eq!(found, at_pls());
-    let fitted = fit(&folder, &Settings::default(), &mut |_| ()).unwrap();
-    let gain =
-        |row: usize| fitted.values[fitted.unknowns.iter().position(|one| one.kind == Kind::MonitorGain(row)).unwrap()];
+    let as_measured = Folder::read(&path).unwrap();
+    let settings = Settings::default();
+    let before = fit(&straightened(&as_measured, &settings).unwrap().0, &settings, &mut |_| ()).unwrap();
+    let (_, found, fitted) = fitted_with_cables(&as_measured, &settings);
+    assert_eq!(found, [at_pls(), vec![Wiring::CorrectorsExchanged(vec![23, 24])]].concat());
+    let gain = |kind: Kind| fitted.values[fitted.unknowns.iter().position(|one| one.kind == kind).unwrap()];
     // nobody tells the fit what the gains are: a prior of 1 ± 0.2
-    assert!([45, 147, 153].into_iter().all(|row| (0.7..1.3).contains(&gain(row))), "{:?}", [45, 147, 153].map(gain));
-    println!("pls_2009, cables put right: {:.1}", fitted.chi2_loco);
-    assert!(fitted.chi2_loco < 440.0, "{}", fitted.chi2_loco);
+    let gains = [45, 147, 153].map(|row| gain(Kind::MonitorGain(row)));
+    assert!(gains.into_iter().all(|gain| (0.7..1.3).contains(&gain)), "{gains:?}");
+    let gains = [23, 24].map(|column| gain(Kind::CorrectorGain(column)));
+    assert!(gains.into_iter().all(|gain| (0.85..1.15).contains(&gain)), "{gains:?}");
+    println!("pls_2009, cables put right: {:.1}, then {:.1}", before.chi2_loco, fitted.chi2_loco);
+    // 5 % of all squares were in 2 of 170 columns
+    assert!(before.chi2_loco < 440.0 && fitted.chi2_loco < 0.96 * before.chi2_loco, "{}", fitted.chi2_loco);
 }
 
 /// Two monitors of a measured ring exchanged, one reversed: seen before the fit, on each ring.
@@ -199,8 +211,7 @@ fn wrong_cables_are_found_in_measured_data() {
 fn changes_that_were_put_in(name: &str, size: f64) {
     let Some(path) = ring(name) else { return };
     let settings = Settings::default();
-    let (one, _) = straightened(&Folder::read(&path).unwrap(), &settings).unwrap();
-    let fitted = fit(&one, &settings, &mut |_| ()).unwrap();
+    let (one, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
     let model = Model::of(&one, &fitted.groups, settings.rf).unwrap();
     let mut random = StdRng::seed_from_u64(16);
     let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
@@ -387,8 +398,7 @@ enum Answer {
 /// was measured: what each could gain at most [nat], and what was said.
 fn injected(name: &str, seeds: u64) -> Option<Vec<(Concealed, Answer)>> {
     let settings = Settings::default();
-    let (one, cables) = straightened(&Folder::read(&ring(name)?).unwrap(), &settings).unwrap();
-    let fitted = fit(&one, &settings, &mut |_| ()).unwrap();
+    let (one, cables, fitted) = fitted_with_cables(&Folder::read(&ring(name)?).unwrap(), &settings);
     let answer = |seed: u64| {
         let (mut other, hidden) = conceal(&one, &fitted, &settings, seed).unwrap();
         let mut random = StdRng::seed_from_u64(1000 + seed);
@@ -456,8 +466,7 @@ fn effects_put_into_measured_data_are_named() {
 fn hidden(path: PathBuf) -> [[usize; 2]; 4] {
     let settings = Settings::default();
     let as_measured = Folder::read(&path).unwrap();
-    let (folder, cables) = straightened(&as_measured, &settings).unwrap();
-    let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
+    let (folder, cables, fitted) = fitted_with_cables(&as_measured, &settings);
     let whole = Believed::of(&as_measured, &cables, &fitted);
     let mut random = StdRng::seed_from_u64(8);
     let named = |kind: Kind| measured::unknowns::name(&folder, &fitted.groups, kind);
@@ -564,10 +573,9 @@ fn hidden_values_are_found_again_at_sps() {
 #[test]
 #[ignore = "make measured"]
 fn hidden_values_are_found_again_at_larger_rings() {
-    // known at PLS: three false ones in each of two runs, among them the gains of two neighbouring correctors
-    for (name, most_false) in [("spear3_example", 0), ("pls_2009", 6), ("als_2005_topoff", 0)] {
+    for name in ["spear3_example", "pls_2009", "als_2005_topoff"] {
         if let Some(path) = ring(name) {
-            hidden_values_are_found_again(path, 0.9, most_false);
+            hidden_values_are_found_again(path, 0.9, 0);
         }
     }
 }
@@ -577,8 +585,7 @@ fn hidden_values_are_found_again_at_larger_rings() {
 fn what_remains_at_sps_is_of_the_measurement() {
     let Some(path) = ring("sps_2007") else { return };
     let settings = Settings::default();
-    let (folder, _) = straightened(&Folder::read(&path).unwrap(), &settings).unwrap();
-    let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
+    let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
     let found = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap();
     println!("sps_2007: {:?}", found.sides);
     assert_eq!(found.sides.verdict(), Verdict::Measurement, "{:?}", found.sides);

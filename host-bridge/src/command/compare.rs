@@ -1,8 +1,8 @@
 //! `orbitcal compare`: what changed between two measurements of one machine.
 
 use inference::{BatchFit, TuneUse};
-use measured::Folder;
 use measured::departure::clear;
+use measured::{Folder, Straightened};
 
 use super::{CommandError, campaign, check_outputs, deliver, machine_with, matrix, recording};
 use crate::cli::Compare;
@@ -36,11 +36,10 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
 
 fn of_matrices(options: &Compare) -> Result<Comparison, CommandError> {
     let settings = matrix::settings(None, &options.priors)?;
-    let (before, cables) = measured::straightened(&Folder::read(&options.before)?, &settings)?;
-    let after = Folder::read(&options.after)?;
-    let fitted = matrix::fitted(&before, &settings, &options.common)?;
+    let (as_measured, after) = (Folder::read(&options.before)?, Folder::read(&options.after)?);
+    let Straightened { folder: before, cables, fit } = matrix::fitted(&as_measured, &settings, &options.common)?;
     let spinner = matrix::spinner(&options.common);
-    let changes = measured::compare((&before, &cables, &fitted), &after, &settings, &mut |what| {
+    let changes = measured::compare((&before, &cables, &fit), &after, &settings, &mut |what| {
         spinner.set_message(format!("{}: {what}", after.name))
     });
     spinner.finish_and_clear();

@@ -63,9 +63,9 @@ fn into_recording(options: &Conceal) -> Result<Value, CommandError> {
 fn into_matrix(options: &Conceal) -> Result<Value, CommandError> {
     let settings = measured::Settings::default();
     // what is put in is all that is wrong with its cables
-    let (folder, _) = measured::straightened(&Folder::read(&options.data)?, &settings)?;
-    let fitted = matrix::fitted(&folder, &settings, &options.common)?;
-    let (concealed, effect) = measured::conceal(&folder, &fitted, &settings, options.seed)?;
+    let measured::Straightened { folder, fit, .. } =
+        matrix::fitted(&Folder::read(&options.data)?, &settings, &options.common)?;
+    let (concealed, effect) = measured::conceal(&folder, &fit, &settings, options.seed)?;
     measured::conceal::write(&options.data, &concealed, &options.out)?;
     let effects = json!([{"kind": effect.kind, "at": effect.at, "amplitude": effect.amplitude, "gain": effect.gain}]);
     Ok(json!({"seed": options.seed, "effects": effects}))

@@ -2,7 +2,7 @@
 
 use inference::recording::{BelievedRf, Format, Header, Ramp, Recording, Row};
 use measured::named::named;
-use measured::{Calibrated, Fit, Folder, Model, RawOrbits, calibrated, unknowns};
+use measured::{Calibrated, Fit, Folder, Model, RawOrbits, Straightened, calibrated, unknowns};
 use training::extended;
 use twin::{Plane, Rf, Ring};
 
@@ -30,9 +30,8 @@ pub fn run(options: &Frames) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
     let (as_read, raw) = read(options, settings.rf)?;
-    let (folder, cables) = measured::straightened(&as_read, &settings)?;
+    let Straightened { folder, cables, fit: fitted } = fitted(&as_read, &settings, &options.common)?;
     let raw = raw.with_cables(&folder, &cables);
-    let fitted = fitted(&folder, &settings, &options.common)?;
     let calibrated = Calibrated::of(&folder, &fitted);
     let ring = Ring::parse(&calibrated.machine.to_string(), &folder.name)?;
     let recording = recording(&ring, &calibrated, &raw, settings.rf)?;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use indicatif::ProgressBar;
-use measured::{Believed, Fit, Folder, MeasuredError, Model, Settings, Wiring};
+use measured::{Believed, Fit, Folder, MeasuredError, Model, Settings, Straightened, Wiring};
 use nalgebra::DVector;
 use report::Page;
 use twin::{Hold, Optics, Rf};
@@ -42,8 +42,8 @@ pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
     }
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
-    let (folder, cables) = measured::straightened(&Folder::read(&options.recording)?, &settings)?;
-    let fitted = fitted(&folder, &settings, &options.common)?;
+    let Straightened { folder, cables, fit: fitted } =
+        fitted(&Folder::read(&options.recording)?, &settings, &options.common)?;
     let result = result(&folder, &cables, &fitted, &settings)?;
     if let Some(path) = &options.report {
         write(path, &measured_of(&folder, &fitted, &result, &settings)?.page()?)?;
@@ -67,8 +67,7 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
     let settings = settings(options.rf, &options.priors)?;
     let believed = believed(options)?;
     let as_measured = Folder::read(path)?;
-    let (folder, cables) = measured::straightened(&as_measured, &settings)?;
-    let fitted = fitted(&folder, &settings, &options.common)?;
+    let Straightened { folder, cables, fit: fitted } = fitted(&as_measured, &settings, &options.common)?;
     let spinner = spinner(&options.common);
     let mut say = |what: &str| spinner.set_message(what.to_owned());
     let found = measured::diagnose(&folder, &fitted, &settings, &mut say);
@@ -124,10 +123,11 @@ pub(super) fn settings(rf: Option<cli::Rf>, priors: &Priors) -> Result<Settings,
     Ok(settings)
 }
 
-/// The fit of a matrix, with what it does on a terminal.
-pub(super) fn fitted(folder: &Folder, settings: &Settings, common: &Common) -> Result<Fit, CommandError> {
+/// A matrix with its cables put right, and its fit, with what is done on a terminal.
+pub(super) fn fitted(folder: &Folder, settings: &Settings, common: &Common) -> Result<Straightened, CommandError> {
     let spinner = spinner(common);
-    let fitted = measured::fit(folder, settings, &mut |what| spinner.set_message(format!("{}: {what}", folder.name)));
+    let mut say = |what: &str| spinner.set_message(format!("{}: {what}", folder.name));
+    let fitted = Straightened::of(folder, settings, &mut say);
     spinner.finish_and_clear();
     Ok(fitted?)
 }
