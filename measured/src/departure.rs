@@ -16,6 +16,7 @@ use crate::descent::descend;
 use crate::error::MeasuredError;
 use crate::fit::{Learnt, with_model_error};
 use crate::model::Model;
+use crate::released::{Held, Released};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Unknown, Widths};
 
@@ -58,12 +59,18 @@ impl Departures {
             held.map(|(one, &mean)| Unknown { mean, width: beforehand(one.kind), ..*one }).collect();
         loop {
             let start = descend(model, &unknowns, &data.measured, &data.stated(), expected.clone())?;
-            let Learnt { here, uncertainty, .. } = with_model_error(model, &unknowns, data, start, progress)?;
-            let off = |at: usize| without_prior(here.values[at] - expected[at], &unknowns[at], &uncertainty, at);
-            let is_held = |at: &usize| unknowns[*at].width < fitted[*at].width;
-            let clear = (0..unknowns.len()).filter(is_held).filter(|&at| off(at) > clear(unknowns.len()));
-            match clear.max_by(|&a, &b| off(a).total_cmp(&off(b))) {
-                Some(clearest) => unknowns[clearest].width = fitted[clearest].width,
+            let Learnt { here, missed, uncertainty } = with_model_error(model, &unknowns, data, start, progress)?;
+            let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &missed), &uncertainty.independent);
+            let clear = clear(unknowns.len());
+            let off =
+                |at: usize, free: Released| (free.value - expected[at]).abs() / free.sigma.hypot(unknowns[at].width);
+            let off = (0..unknowns.len())
+                .filter(|&at| unknowns[at].width < fitted[at].width)
+                .filter(|&at| off(at, held.about(at, expected[at])) > clear / 2.0)
+                .map(|at| (at, off(at, held.released(at, fitted[at].width))))
+                .filter(|(_, off)| *off > clear);
+            match off.max_by(|a, b| a.1.total_cmp(&b.1)) {
+                Some((clearest, _)) => unknowns[clearest].width = fitted[clearest].width,
                 None => return Ok(Self { unknowns, values: here.values, uncertainty }),
             }
         }
@@ -101,16 +108,6 @@ impl Departures {
         let (change, sigma) = (self.values[at] - self.unknowns[at].mean, self.uncertainty.sigma[at]);
         0.5 * (change / sigma).powi(2) - (self.unknowns[at].width / sigma).ln()
     }
-}
-
-/// How far off an unknown's change is by the data alone, over what these and its prior allow: of a posterior `m ± s` with a prior `0 ± w` the data
-/// say `m/s^2/(1/s^2 - 1/w^2)`.
-fn without_prior(change: f64, unknown: &Unknown, uncertainty: &Uncertainty, at: usize) -> f64 {
-    let independent = uncertainty.independent[(at, at)];
-    let left = (1.0 - independent / unknown.width.powi(2)).max(f64::EPSILON);
-    // the data's variance, wider where errors are alike
-    let variance = independent / left * (uncertainty.sigma[at].powi(2) / independent);
-    (change / left).abs() / (variance + unknown.width.powi(2)).sqrt()
 }
 
 /// Standard deviation of a departure beforehand.

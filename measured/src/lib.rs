@@ -26,6 +26,7 @@ pub mod model;
 pub mod named;
 pub mod normal;
 pub mod raw;
+mod released;
 pub mod sides;
 pub mod standing;
 pub mod straight;

@@ -89,7 +89,8 @@ mod tests {
             cable.put_right(&mut folder);
             assert_eq!(straightened(&folder, &Settings::default()).unwrap().1, []);
             let found = of(&folder);
-            assert_eq!((found.cables, found.folder.matrix), (vec![cable], plain.matrix));
+            assert_eq!(found.cables, [cable]);
+            assert!(found.folder.matrix == plain.matrix);
         }
     }
 }

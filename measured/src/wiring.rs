@@ -4,9 +4,8 @@
 //! Of a monitor's row the elements with correctors of its own plane count, of a corrector's column those of its own plane. `u(i, j)` is the share of
 //! measured row `i` that predicted row `j` leaves unexplained at the scale that suits it best, `1 - corr^2`. Rows are exchanged, in a ring of two or
 //! more, where each is explained better by the next one's prediction than by its own at a positive scale, four times on average and twice at least, and
-//! better than by its own at any;
-//! a row is reversed where most of it is explained with a negative scale. Neither
-//! needs the strengths to be right: errors of them change all rows alike.
+//! better than by its own at any. A row that no prediction explains is dead, and closes the ring that it stands in. A row is reversed where most of
+//! it is explained with a negative scale. Neither needs the strengths to be right: errors of them change all rows alike.
 
 use nalgebra::DMatrix;
 use twin::Plane;
@@ -40,7 +39,7 @@ const BETTER: f64 = 4.0;
 const LEAST: f64 = 2.0;
 /// Elements that a row or column must have to be judged.
 const ENOUGH: usize = 8;
-/// A reversed row is explained to this share ...
+/// A row is dead that nothing explains to this share; a reversed one is explained to it ...
 const EXPLAINED: f64 = 0.5;
 /// ... at a scale beyond this: the sign of a dead monitor says nothing.
 const ALIVE: f64 = 0.2;
@@ -201,6 +200,11 @@ impl Lines {
         Self { measured, predicted, planes }
     }
 
+    /// Measured elements of a line.
+    fn counted(&self, i: usize) -> usize {
+        self.measured.row(i).iter().filter(|one| one.is_finite()).count()
+    }
+
     /// Measured line `i` beside predicted line `j`; `None` where too few elements count.
     fn compared(&self, i: usize, j: usize) -> Option<Likeness> {
         let pairs = self.measured.row(i).into_iter().copied().zip(self.predicted.row(j).into_iter().copied());
@@ -243,13 +247,18 @@ impl Lines {
             let better = (0..n).filter(|&j| j != i && is_better(i, j));
             better.min_by(|&a, &b| unexplained[(i, a)].total_cmp(&unexplained[(i, b)]))
         };
+        let best: Vec<Option<usize>> = (0..n).map(best).collect();
+        // what a dead one measures is of no line: it closes the ring that it stands in
+        let is_dead = |i: usize| self.counted(i) >= ENOUGH && !(0..n).any(|j| unexplained[(i, j)] < EXPLAINED);
+        let next = |i: usize| best[i].or_else(|| if is_dead(i) { first_before(&best, i) } else { None });
         // a noisy line gains less than the others of its ring
+        let gain = |i: usize, j: usize| if is_dead(i) { 1.0 } else { own[i] / unexplained[(i, j)] };
         let better = |ring: &[usize]| {
-            let gains = (0..ring.len()).map(|at| own[ring[at]] / unexplained[(ring[at], ring[(at + 1) % ring.len()])]);
+            let gains = (0..ring.len()).map(|at| gain(ring[at], ring[(at + 1) % ring.len()]));
             gains.product::<f64>().powf(1.0 / ring.len() as f64)
         };
         (0..n)
-            .filter_map(|first| ring_from(first, best))
+            .filter_map(|first| ring_from(first, next))
             .map(|lines| Exchange { better: better(&lines), lines })
             .filter(|one| one.better > BETTER)
             .collect()
@@ -260,6 +269,15 @@ impl Lines {
         let is_reversed = |one: Likeness| one.correlation < -EXPLAINED.sqrt() && one.factor < -ALIVE;
         (0..self.planes.len()).filter(|&i| self.compared(i, i).is_some_and(is_reversed)).collect()
     }
+}
+
+/// Where the lines begin that each measure what belongs to the next, and end at this one; `None` where none does.
+fn first_before(next: &[Option<usize>], last: usize) -> Option<usize> {
+    let mut chain = vec![last];
+    while let Some(before) = (0..next.len()).find(|&i| next[i] == chain.last().copied() && !chain.contains(&i)) {
+        chain.push(before);
+    }
+    chain.pop().filter(|&first| first != last)
 }
 
 /// The ring that begins and ends at a line, if it is the least of it.
@@ -278,7 +296,7 @@ fn ring_from(first: usize, next: impl Fn(usize) -> Option<usize>) -> Option<Vec<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{NOISE, machine, measured, ring};
+    use crate::testing::{NOISE, machine, measured, normal, ring};
 
     fn found(change: impl FnOnce(&mut Folder)) -> (Folder, Folder, Vec<Wiring>) {
         let ring = ring();
@@ -327,6 +345,25 @@ mod tests {
         let (plain, right, found) = found(|folder| wrong.iter().rev().for_each(|one| one.put_right(folder)));
         assert_eq!(found, wrong);
         assert_eq!(right.matrix, plain.matrix);
+    }
+
+    /// Monitor 5 has the cable of a dead one, which is at its own place.
+    #[test]
+    fn a_cable_that_is_exchanged_with_that_of_a_dead_monitor_is_found() {
+        let ring = ring();
+        let mut plain = measured(&ring, &machine(&ring, 12), NOISE, 1);
+        let mut normal = normal(3);
+        plain.matrix.row_mut(9).iter_mut().for_each(|element| *element = NOISE * normal());
+        for rows in [vec![5, 9], vec![9, 11], vec![3, 9, 11]] {
+            let (mut folder, cable) = (plain.clone(), Wiring::MonitorsExchanged(rows));
+            // a ring of three is undone by going round it twice more
+            let times = if matches!(&cable, Wiring::MonitorsExchanged(rows) if rows.len() == 3) { 2 } else { 1 };
+            (0..times).for_each(|_| cable.put_right(&mut folder));
+            let (right, found) = straightened(&folder, &Settings::default()).unwrap();
+            assert_eq!(found, [cable]);
+            assert!(right.matrix == plain.matrix);
+        }
+        assert_eq!(straightened(&plain, &Settings::default()).unwrap().1, []);
     }
 
     #[test]

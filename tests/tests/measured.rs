@@ -158,10 +158,10 @@ fn the_held_frequency_is_found_at_als() {
     the_held_frequency_is_found("als_2005_topoff");
 }
 
-/// Cables of PLS that were wrong in 2009: two monitors read each other's vertical orbit, one of them the horizontal one with the other sign.
-/// With its own row each has a gain of -0.77 to -1.96; exchanged and turned, 0.80 to 0.94, as others have.
+/// Cables of PLS that were wrong in 2009: two monitors read each other's vertical orbit, and one of them the horizontal orbit of a third, whose own
+/// cable is dead.
 fn at_pls() -> Vec<Wiring> {
-    vec![Wiring::MonitorsExchanged(vec![147, 153]), Wiring::MonitorReversed(45)]
+    vec![Wiring::MonitorsExchanged(vec![147, 153]), Wiring::MonitorsExchanged(vec![45, 57])]
 }
 
 /// And two neighbouring correctors, which show beside the fit: 0.83 and 1.28 of the stated kick become 1.11 and 1.00, and what a column leaves
@@ -176,14 +176,14 @@ fn cables_that_were_wrong_are_found_and_the_fit_is_better() {
     let (_, found, fitted) = fitted_with_cables(&as_measured, &settings);
     assert_eq!(found, [at_pls(), vec![Wiring::CorrectorsExchanged(vec![23, 24])]].concat());
     let gain = |kind: Kind| fitted.values[fitted.unknowns.iter().position(|one| one.kind == kind).unwrap()];
-    // nobody tells the fit what the gains are: a prior of 1 ± 0.2
-    let gains = [45, 147, 153].map(|row| gain(Kind::MonitorGain(row)));
-    assert!(gains.into_iter().all(|gain| (0.7..1.3).contains(&gain)), "{gains:?}");
+    // nobody tells the fit what the gains are: a prior of 1 ± 0.2, and with the wrong cables -1.96 to 0.83
+    let gains = [57, 147, 153].map(|row| gain(Kind::MonitorGain(row)));
+    assert!(gains.into_iter().all(|gain| (0.8..1.2).contains(&gain)), "{gains:?}");
     let gains = [23, 24].map(|column| gain(Kind::CorrectorGain(column)));
     assert!(gains.into_iter().all(|gain| (0.85..1.15).contains(&gain)), "{gains:?}");
     println!("pls_2009, cables put right: {:.1}, then {:.1}", before.chi2_loco, fitted.chi2_loco);
-    // 5 % of all squares were in 2 of 170 columns
-    assert!(before.chi2_loco < 440.0 && fitted.chi2_loco < 0.96 * before.chi2_loco, "{}", fitted.chi2_loco);
+    // a fifth of all squares was in 5 of 384 lines
+    assert!(before.chi2_loco < 400.0 && fitted.chi2_loco < 0.96 * before.chi2_loco, "{}", fitted.chi2_loco);
 }
 
 /// Two monitors of a measured ring exchanged, one reversed: seen before the fit, on each ring.
@@ -460,10 +460,10 @@ fn effects_put_into_measured_data_are_named() {
     }
 }
 
-/// Of a measured ring the gains of ten instruments that an oracle would gain 25 nat from, ten pairs of monitors and all skew gradients are taken out of the fitted model, five
-/// gains and five pairs at a time, and looked for in the measurement: how many of each
-/// were named, of how many, and what was said of other places.
-fn hidden(path: PathBuf) -> [[usize; 2]; 4] {
+/// Of a measured ring the gains of ten instruments that an oracle would gain 25 nat from, ten pairs of monitors and all skew gradients are taken
+/// out of the fitted model, gains and pairs in some runs, and looked for in the measurement: how many of each were named, of how many, and what
+/// was said of other places.
+fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
     let settings = Settings::default();
     let as_measured = Folder::read(&path).unwrap();
     let (folder, cables, fitted) = fitted_with_cables(&as_measured, &settings);
@@ -507,13 +507,13 @@ fn hidden(path: PathBuf) -> [[usize; 2]; 4] {
         .map(|pair| vec![pair[0].min(pair[1]), pair[0].max(pair[1])])
         .collect();
     let [mut of_gains, mut of_pairs, mut of_skews, mut wrong] = [[0, 0]; 4];
-    for half in 0..2 {
+    for run in 0..runs {
         let mut model = whole.clone();
-        let out: Vec<Kind> = gains.iter().skip(half).step_by(2).copied().collect();
+        let out: Vec<Kind> = gains.iter().skip(run).step_by(runs).copied().collect();
         out.iter()
             .for_each(|&kind| assert_eq!(model.take_out(&format!("{} {}", kind.word(), named(kind))).unwrap(), 1));
         let exchanged: Vec<Wiring> =
-            pairs.iter().skip(half).step_by(2).cloned().map(Wiring::MonitorsExchanged).collect();
+            pairs.iter().skip(run).step_by(runs).cloned().map(Wiring::MonitorsExchanged).collect();
         let mut measured = as_measured.clone();
         exchanged.iter().for_each(|one| one.put_right(&mut measured));
         let found = against(&measured, &fitted, &model, &settings, &mut |_| ()).unwrap();
@@ -548,35 +548,33 @@ fn hidden(path: PathBuf) -> [[usize; 2]; 4] {
     [of_gains, of_pairs, of_skews, wrong]
 }
 
-/// Nothing false is said but a known number; of cables, and of gains where the ring tells them, nine of ten are named.
-fn hidden_values_are_found_again(path: PathBuf, least: f64, most_false: usize) {
-    let [gains, pairs, skews, wrong] = hidden(path);
-    let share = gains[0] as f64 / gains[1] as f64;
-    assert!(share >= least && 10 * pairs[0] >= 9 * pairs[1], "{gains:?} {pairs:?}");
+/// Nothing false is said; of cables and of gains nine of ten are named.
+fn hidden_values_are_found_again(path: PathBuf, runs: usize) {
+    let [gains, pairs, skews, wrong] = hidden(path, runs);
+    assert!(10 * gains[0] >= 9 * gains[1] && 10 * pairs[0] >= 9 * pairs[1], "{gains:?} {pairs:?}");
     // an oracle knows all others; of skew gradients that are all unknown some follow each other
-    assert!(10 * skews[0] >= 9 * skews[1] && wrong[0] <= most_false, "{skews:?} {wrong:?}");
+    assert!(10 * skews[0] >= 9 * skews[1] && wrong[0] == 0, "{skews:?} {wrong:?}");
 }
 
 #[test]
 fn hidden_values_are_found_again_in_twelve_cells() {
-    hidden_values_are_found_again(repository("recordings/measured/twelve-cells/before"), 0.9, 0);
+    hidden_values_are_found_again(repository("recordings/measured/twelve-cells/before"), 2);
 }
 
 #[test]
 fn hidden_values_are_found_again_at_sps() {
-    if let Some(path) = ring("sps_2007") {
-        // residuals of 100 um hide gains that are 5 % off: three of eight
-        hidden_values_are_found_again(path, 0.3, 0);
-    }
+    let Some(path) = ring("sps_2007") else { return };
+    hidden_values_are_found_again(path.clone(), 10);
+    // of 37 rows ten are exchanged at a time, and four gains are off: one of eight is not found
+    let [gains, pairs, _, wrong] = hidden(path, 2);
+    assert!(8 * gains[0] >= 7 * gains[1] && 10 * pairs[0] >= 9 * pairs[1] && wrong[0] == 0, "{gains:?} {pairs:?}");
 }
 
 #[test]
 #[ignore = "make measured"]
 fn hidden_values_are_found_again_at_larger_rings() {
-    for name in ["spear3_example", "pls_2009", "als_2005_topoff"] {
-        if let Some(path) = ring(name) {
-            hidden_values_are_found_again(path, 0.9, 0);
-        }
+    for path in ["spear3_example", "pls_2009", "als_2005_topoff"].into_iter().filter_map(ring) {
+        hidden_values_are_found_again(path, 2);
     }
 }
 
