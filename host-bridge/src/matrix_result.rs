@@ -7,6 +7,7 @@ use measured::believed::{Believed, Departure, Value};
 use measured::diagnose::Diagnosis;
 use measured::sides::{Gain, Sides, Term, Verdict};
 use measured::standing::Standing;
+use measured::straight::DEAD;
 use measured::unknowns::name;
 use measured::{Against, Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
@@ -190,9 +191,6 @@ fn model_error(fit: &Fit) -> Vec<BlockError> {
     };
     (0..measured::data::BLOCKS.len()).filter_map(of_block).collect()
 }
-
-/// A monitor that reads less than this share of the orbit is dead.
-const DEAD: f64 = 0.2;
 
 /// State of each monitor: dead where it is not used or reads nothing, noisy where its rows are explained worse than others.
 fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
@@ -605,6 +603,8 @@ fn cable(folder: &Folder, wiring: &Wiring) -> MatrixFinding {
         Wiring::MonitorsExchanged(_) | Wiring::CorrectorsExchanged(_) => format!("{places} are exchanged"),
         Wiring::MonitorReversed(_) => format!("{places} reads with the other sign"),
         Wiring::CorrectorReversed(_) => format!("{places} kicks with the other sign"),
+        Wiring::MonitorsDead(_) => format!("{places}: dead, and left out"),
+        Wiring::CorrectorsDead(_) => format!("{places}: without a kick, and left out"),
         Wiring::PlaneReversed(_) => format!("all kicks of plane {places} have the other sign, or all its readings"),
     };
     MatrixFinding {

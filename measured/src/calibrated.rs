@@ -15,6 +15,7 @@ use twin::Plane;
 use crate::fit::Fit;
 use crate::folder::Folder;
 use crate::lattice;
+use crate::straight::DEAD;
 use crate::unknowns::Kind;
 
 /// A monitor's plane.
@@ -58,8 +59,6 @@ pub struct Calibrated {
     pub correctors: Vec<Corrector>,
 }
 
-/// A gain below this is that of a dead monitor: what it reads is nearly all noise.
-const DEAD: f64 = 0.1;
 /// Strengths are estimated within this range: wider than any error that the fit's prior of 3 % leaves likely.
 const RANGE: [f64; 2] = [0.85, 1.15];
 

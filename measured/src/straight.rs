@@ -1,7 +1,8 @@
 //! A measurement with its cables put right, and its fit.
 //!
 //! The lattice as it is written down shows most wrong cables. Neighbours whose patterns differ by less than the errors of the strengths and of the
-//! monitors' gains show only beside a fit, so each fit is asked again. What it says counts where the next fit is the better for it.
+//! monitors' gains show only beside a fit, so each fit is asked again. What it says is exchanged counts where the next fit is the better for it.
+//! Last, instruments are left out that read or kick nothing: what the model misses is not learnt from them.
 
 use nalgebra::DMatrix;
 
@@ -11,6 +12,9 @@ use crate::folder::Folder;
 use crate::model::Model;
 use crate::unknowns::Kind;
 use crate::wiring::{Wiring, exchanged_back, straightened};
+
+/// A gain below this is that of a dead instrument.
+pub const DEAD: f64 = 0.2;
 
 /// A measurement with its cables put right, and its fit.
 #[derive(Debug, Clone)]
@@ -38,7 +42,30 @@ impl Straightened {
         while let Some(better) = here.once_more(settings, progress)? {
             here = better;
         }
-        Ok(here)
+        here.without_dead(settings, progress)
+    }
+
+    /// Without the instruments that the fit finds dead, which their cables may have been exchanged with.
+    fn without_dead(mut self, settings: &Settings, progress: &mut dyn FnMut(&str)) -> Result<Self, MeasuredError> {
+        let dead = self.fit.unknowns.iter().zip(&self.fit.values).filter(|(_, gain)| gain.abs() < DEAD);
+        let (mut rows, mut columns) = (Vec::new(), Vec::new());
+        for (unknown, _) in dead {
+            match unknown.kind {
+                Kind::MonitorGain(row) if self.folder.monitors[row].is_used => rows.push(row),
+                Kind::CorrectorGain(column) if self.folder.correctors[column].is_used => columns.push(column),
+                _ => {}
+            }
+        }
+        let monitors = (!rows.is_empty()).then_some(Wiring::MonitorsDead(rows));
+        let correctors = (!columns.is_empty()).then_some(Wiring::CorrectorsDead(columns));
+        let dead: Vec<Wiring> = monitors.into_iter().chain(correctors).collect();
+        if !self.fit.has_ended || dead.is_empty() {
+            return Ok(self);
+        }
+        dead.iter().for_each(|one| one.put_right(&mut self.folder));
+        self.fit = fit(&self.folder, settings, progress)?;
+        self.cables.extend(dead);
+        Ok(self)
     }
 
     /// With the cables that the fit shows to be exchanged put right, if there are any and the fit is the better for it.
@@ -72,10 +99,23 @@ fn expected(folder: &Folder, fit: &Fit, settings: &Settings) -> Result<DMatrix<f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{NOISE, machine, measured, ring};
+    use crate::testing::{NOISE, machine, measured, normal, ring};
 
     fn of(folder: &Folder) -> Straightened {
         Straightened::of(folder, &Settings::default(), &mut |_| ()).unwrap()
+    }
+
+    #[test]
+    fn dead_instruments_are_left_out() {
+        let ring = ring();
+        let mut folder = measured(&ring, &machine(&ring, 12), NOISE, 1);
+        let mut normal = normal(5);
+        folder.matrix.row_mut(7).iter_mut().for_each(|element| *element = 10.0 * NOISE * normal());
+        folder.matrix.column_mut(20).iter_mut().for_each(|element| *element = NOISE * normal());
+        let found = of(&folder);
+        assert_eq!(found.cables, [Wiring::MonitorsDead(vec![7]), Wiring::CorrectorsDead(vec![20])]);
+        assert!(!found.folder.monitors[7].is_used && !found.folder.correctors[20].is_used);
+        assert_eq!(found.fit.elements, 23 * 23 + 23);
     }
 
     /// Of 2500 exchanges of two correctors in 19 rings ten do not show by the lattice as written; beside a fit all do.

@@ -28,6 +28,10 @@ pub enum Wiring {
     MonitorReversed(usize),
     /// A corrector kicks with the other sign: its column.
     CorrectorReversed(usize),
+    /// Monitors read nothing of the orbit, and are left out.
+    MonitorsDead(Vec<usize>),
+    /// Correctors kick nothing, and are left out.
+    CorrectorsDead(Vec<usize>),
     /// All kicks of a plane have the other sign, or all its readings: nobody can tell which.
     PlaneReversed(Plane),
 }
@@ -117,6 +121,8 @@ impl Wiring {
             Self::CorrectorsExchanged(columns) => ("corrector_swap", all(columns, Folder::corrector)),
             Self::MonitorReversed(row) => ("bpm_reversed", folder.monitor(*row)),
             Self::CorrectorReversed(column) => ("corrector_reversed", folder.corrector(*column)),
+            Self::MonitorsDead(rows) => ("bpm_dead", all(rows, Folder::monitor)),
+            Self::CorrectorsDead(columns) => ("corrector_dead", all(columns, Folder::corrector)),
             Self::PlaneReversed(Plane::X) => ("plane_reversed", "x".into()),
             Self::PlaneReversed(Plane::Y) => ("plane_reversed", "y".into()),
         }
@@ -139,13 +145,15 @@ impl Wiring {
             ("corrector_swap", _) => Self::CorrectorsExchanged(columns()?),
             ("bpm_reversed", _) => Self::MonitorReversed(rows()?[0]),
             ("corrector_reversed", _) => Self::CorrectorReversed(columns()?[0]),
+            ("bpm_dead", _) => Self::MonitorsDead(rows()?),
+            ("corrector_dead", _) => Self::CorrectorsDead(columns()?),
             ("plane_reversed", "x") => Self::PlaneReversed(Plane::X),
             ("plane_reversed", "y") => Self::PlaneReversed(Plane::Y),
             _ => return Err(unlike()),
         })
     }
 
-    /// Exchange or turn rows or columns: puts a wrong cable right, and a right one wrong.
+    /// Exchange or turn rows or columns, which puts a wrong cable right and a right one wrong; leave out what is dead.
     pub fn put_right(&self, folder: &mut Folder) {
         match self {
             Self::MonitorsExchanged(rows) => {
@@ -172,6 +180,10 @@ impl Wiring {
                 }
             }
             Self::CorrectorReversed(column) => folder.matrix.column_mut(*column).neg_mut(),
+            Self::MonitorsDead(rows) => rows.iter().for_each(|&row| folder.monitors[row].is_used = false),
+            Self::CorrectorsDead(columns) => {
+                columns.iter().for_each(|&column| folder.correctors[column].is_used = false);
+            }
             Self::PlaneReversed(plane) => {
                 for (column, _) in folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == *plane) {
                     folder.matrix.column_mut(column).neg_mut();

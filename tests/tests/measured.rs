@@ -38,6 +38,11 @@ fn fitted_with_cables(as_measured: &Folder, settings: &Settings) -> (Folder, Vec
     (folder, cables, fit)
 }
 
+/// True of an instrument that is left out.
+fn is_dead(cable: &&Wiring) -> bool {
+    matches!(cable, Wiring::MonitorsDead(_) | Wiring::CorrectorsDead(_))
+}
+
 /// Numbers without names, one line a row.
 fn table(path: PathBuf) -> DMatrix<f64> {
     let text = std::fs::read_to_string(path).unwrap();
@@ -174,7 +179,12 @@ fn cables_that_were_wrong_are_found_and_the_fit_is_better() {
     let settings = Settings::default();
     let before = fit(&straightened(&as_measured, &settings).unwrap().0, &settings, &mut |_| ()).unwrap();
     let (_, found, fitted) = fitted_with_cables(&as_measured, &settings);
-    assert_eq!(found, [at_pls(), vec![Wiring::CorrectorsExchanged(vec![23, 24])]].concat());
+    let (dead, cables): (Vec<Wiring>, Vec<Wiring>) = found.into_iter().partition(|one| is_dead(&one));
+    assert_eq!(cables, [at_pls(), vec![Wiring::CorrectorsExchanged(vec![23, 24])]].concat());
+    println!("pls_2009: {dead:?}");
+    // monitor 45 has the dead cable now
+    let [Wiring::MonitorsDead(rows)] = &dead[..] else { panic!("{dead:?}") };
+    assert!(rows.contains(&45) && rows.len() == 10, "{dead:?}");
     let gain = |kind: Kind| fitted.values[fitted.unknowns.iter().position(|one| one.kind == kind).unwrap()];
     // nobody tells the fit what the gains are: a prior of 1 ± 0.2, and with the wrong cables -1.96 to 0.83
     let gains = [57, 147, 153].map(|row| gain(Kind::MonitorGain(row)));
@@ -182,8 +192,10 @@ fn cables_that_were_wrong_are_found_and_the_fit_is_better() {
     let gains = [23, 24].map(|column| gain(Kind::CorrectorGain(column)));
     assert!(gains.into_iter().all(|gain| (0.85..1.15).contains(&gain)), "{gains:?}");
     println!("pls_2009, cables put right: {:.1}, then {:.1}", before.chi2_loco, fitted.chi2_loco);
-    // a fifth of all squares was in 5 of 384 lines
-    assert!(before.chi2_loco < 400.0 && fitted.chi2_loco < 0.96 * before.chi2_loco, "{}", fitted.chi2_loco);
+    // a fifth of all squares was in these lines; ten that are dead are left out at last, which have fewer than others
+    assert!(before.chi2_loco < 400.0, "{}", before.chi2_loco);
+    let squares = |one: &Fit| one.chi2_loco * one.elements as f64;
+    assert!(squares(&fitted) < 0.96 * squares(&before), "{}", fitted.chi2_loco);
 }
 
 /// Two monitors of a measured ring exchanged, one reversed: seen before the fit, on each ring.
@@ -291,7 +303,9 @@ impl LeftOut {
 /// Every instrument of a side left out of one of some fits. Its own gain and coupling are fitted to its own row or column, since nothing else tells
 /// them: least squares first, then with the weights of the tails.
 fn left_out(name: &str, folds: usize, side: Side) -> Option<Vec<LeftOut>> {
-    let (folder, _) = straightened(&Folder::read(&ring(name)?).unwrap(), &Settings::default()).unwrap();
+    let (as_measured, settings) = (Folder::read(&ring(name)?).unwrap(), Settings::default());
+    let (mut folder, _) = straightened(&as_measured, &settings).unwrap();
+    fitted_with_cables(&as_measured, &settings).1.iter().filter(is_dead).for_each(|one| one.put_right(&mut folder));
     let is_used: Vec<bool> = match side {
         Side::Monitors => folder.monitors.iter().map(|one| one.is_used).collect(),
         Side::Correctors => folder.correctors.iter().map(|one| one.is_used).collect(),
@@ -338,17 +352,20 @@ fn of_instrument(folder: &Folder, fitted: &Fit, at: &Prediction, side: Side, one
     };
     let (scale, freedom): (Vec<f64>, Vec<f64>) = elements.iter().map(scale).unzip();
     let n = elements.len();
+    // the reference did not fit couplings of the instruments at PLS
+    let coupled = fitted.unknowns.iter().any(|one| matches!(one.kind, Kind::MonitorCoupling(_)));
+    let numbers = if coupled { 2 } else { 1 };
     let mut off = vec![0.0; n];
     for _ in 0..5 {
         let root = |r: usize| match freedom[r].is_finite() {
             true => ((freedom[r] + 1.0) / (freedom[r] + off[r] * off[r])).sqrt() / scale[r],
             false => scale[r].recip(),
         };
-        let own = DMatrix::from_fn(n, 2, |r, k| by[k][elements[r]] * root(r));
+        let own = DMatrix::from_fn(n, numbers, |r, k| by[k][elements[r]] * root(r));
         let seen = DVector::from_fn(n, |r, _| folder.matrix[elements[r]] * root(r));
-        let normal = own.tr_mul(&own) + DMatrix::identity(2, 2) * 1e-12;
-        let numbers = normal.cholesky().unwrap().solve(&own.tr_mul(&seen));
-        let predicted = |r: usize| (0..2).map(|k| by[k][elements[r]] * numbers[k]).sum::<f64>();
+        let normal = own.tr_mul(&own) + DMatrix::identity(numbers, numbers) * 1e-12;
+        let solved = normal.cholesky().unwrap().solve(&own.tr_mul(&seen));
+        let predicted = |r: usize| (0..numbers).map(|k| by[k][elements[r]] * solved[k]).sum::<f64>();
         off = (0..n).map(|r| (folder.matrix[elements[r]] - predicted(r)) / scale[r]).collect();
     }
     (0..n).map(|r| LeftOut { residual: off[r] * scale[r], off: off[r], freedom: freedom[r] }).collect()
@@ -368,9 +385,7 @@ fn are_predicted_within_the_learnt_error(side: Side) {
             all.len(),
             1e3 * rms
         );
-        // monitors of PLS are predicted better than their bands say: 76 %, as nine that are dead have widened them
-        let most = if name == "pls_2009" && matches!(side, Side::Monitors) { 0.79 } else { 0.73 };
-        assert!((0.63..most).contains(&low) && (0.92..0.98).contains(&high), "{name}");
+        assert!((0.63..0.73).contains(&low) && (0.92..0.98).contains(&high), "{name}");
     }
 }
 
@@ -590,4 +605,19 @@ fn what_remains_at_sps_is_of_the_measurement() {
     // y monitors 1 and 17, counted from 1, and V corrector 3 or 4 are among them
     let has = |name: String| found.unexplained.iter().any(|one| one.at == name);
     assert!(has("y_BPM.3".into()) && has("y_BPM.169".into()) && has("V_CORV.58".into()), "{:?}", found.unexplained);
+}
+
+/// What remains of the others is of the lattice: gradients and skew gradients gain thousands of nat where they were not learnt.
+#[test]
+#[ignore = "make measured"]
+fn what_remains_at_larger_rings_is_of_the_lattice() {
+    let settings = Settings::default();
+    for name in ["spear3_example", "pls_2009", "als_2005_topoff"] {
+        let Some(path) = ring(name) else { continue };
+        let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
+        let sides = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap().sides;
+        let [lattice, skew, instruments] = [sides.lattice, sides.skew, sides.instruments].map(|one| one.log_likelihood);
+        println!("{name}: lattice {lattice:.0}, of these skew {skew:.0}, instruments {instruments:.0} nat");
+        assert_eq!(sides.verdict(), Verdict::Lattice, "{name}: {lattice} {instruments}");
+    }
 }
