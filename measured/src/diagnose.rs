@@ -93,7 +93,9 @@ pub fn diagnose(
     let share = share(folder, fitted, &model, settings, progress)?;
     progress("lattice or instruments");
     let unexplained = unexplained(folder, fitted);
-    Ok(Diagnosis { share, sides: sides(folder, fitted, &model)?, standing: standing(folder, fitted), unexplained })
+    // where the fit did not end its values are not those of the ring
+    let standing = if fitted.has_ended { standing(folder, fitted) } else { Vec::new() };
+    Ok(Diagnosis { share, sides: sides(folder, fitted, &model)?, standing, unexplained })
 }
 
 /// Of an amplitude with a prior standard deviation of 1.

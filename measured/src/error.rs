@@ -34,6 +34,22 @@ pub enum MeasuredError {
     /// Two measurements are not of the same machine, or not of the same instruments.
     #[error("{0}")]
     Unlike(String),
+    /// No element of the matrix counts.
+    #[error(
+        "{name}: no element of the matrix counts: of {monitors} monitors {reading} are in use, of {correctors} correctors {kicking}"
+    )]
+    Empty {
+        /// Measurement.
+        name: String,
+        /// Rows.
+        monitors: usize,
+        /// Of these in use.
+        reading: usize,
+        /// Columns.
+        correctors: usize,
+        /// Of these in use.
+        kicking: usize,
+    },
     /// The normal equations are singular, though every unknown has a prior: a number is not finite.
     #[error("the normal equations are singular after {0} steps")]
     Singular(usize),

@@ -88,6 +88,15 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     let coupling = settings.coupling.unwrap_or(of_reference);
     let unknowns = unknowns(folder, [&groups[0], &groups[1]].map(Vec::len), coupling, &settings.widths);
     let mut data = Data::of(folder);
+    if data.elements() == 0 {
+        return Err(MeasuredError::Empty {
+            name: folder.name.clone(),
+            monitors: folder.monitors.len(),
+            reading: folder.monitors.iter().filter(|one| one.is_used).count(),
+            correctors: folder.correctors.len(),
+            kicking: folder.correctors.iter().filter(|one| one.is_used).count(),
+        });
+    }
     let values = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.mean));
     let start = model.predict(&unknowns, &values)?;
     let chi2_start = data.chi2(&start) / data.elements() as f64;

@@ -197,6 +197,9 @@ fn yes<'de, D: serde::Deserializer<'de>>(from: D) -> Result<bool, D::Error> {
     Ok(u8::deserialize(from)? != 0)
 }
 
+/// No beam pipe is wider [mm].
+const WIDEST: f64 = 1e3;
+
 impl Folder {
     /// True of a folder that holds a measured matrix.
     pub fn is_one(path: &Path) -> bool {
@@ -230,7 +233,7 @@ impl Folder {
         Ok(folder)
     }
 
-    /// Places that are named exist, and noise is above zero.
+    /// Places that are named exist and have one instrument each, noise is above zero, correctors kick, and no orbit is outside every beam pipe.
     fn check(&self, path: &Path) -> Result<(), MeasuredError> {
         let last = self.lattice.len();
         let mut places = (self.monitors.iter().map(|one| ("bpms.csv", one.at)))
@@ -244,7 +247,36 @@ impl Folder {
                 return Err(table(&path.join("bpms.csv"), problem));
             }
         }
-        Ok(())
+        for (row, one) in self.correctors.iter().enumerate().filter(|(_, one)| one.is_used) {
+            if one.kick == 0.0 || !one.kick.is_finite() {
+                let problem =
+                    format!("row {row}: nominal_kick_mrad {}, expected one where the corrector is used", one.kick);
+                return Err(table(&path.join("correctors.csv"), problem));
+            }
+        }
+        let twice = |file: &str, places: Vec<(Plane, usize)>| {
+            let pairs = (0..places.len()).find_map(|j| (0..j).find(|&i| places[i] == places[j]).map(|i| (i, j)));
+            pairs.map(|(i, j)| {
+                let plane = if places[i].0 == Plane::X { "x" } else { "y" };
+                let problem =
+                    format!("rows {i} and {j} are both {plane} at lattice_index {}, expected one", places[i].1);
+                table(&path.join(file), problem)
+            })
+        };
+        let monitors = twice("bpms.csv", self.monitors.iter().map(|one| (one.plane, one.at)).collect());
+        let correctors = || twice("correctors.csv", self.correctors.iter().map(|one| (one.plane, one.at)).collect());
+        if let Some(error) = monitors.or_else(correctors) {
+            return Err(error);
+        }
+        let (rows, columns) = self.matrix.shape();
+        match (0..rows * columns).map(|k| (k % rows, k / rows)).find(|&at| self.matrix[at].abs() > WIDEST) {
+            Some((i, j)) => {
+                let (at, by) = (self.monitor(i), self.corrector(j));
+                let problem = format!("{at} by {by}: {} mm, expected {WIDEST} mm at most", self.matrix[(i, j)]);
+                Err(table(&path.join("orm_measured_mm.csv"), problem))
+            }
+            None => Ok(()),
+        }
     }
 
     /// Name of a row of the lattice: that of its family and its number.
@@ -369,5 +401,17 @@ mod tests {
             "orm_measured_mm.csv: expected 2 rows, one a monitor of bpms.csv, found 1"
         );
         assert!(refused("meta.json", "{}").contains("circumference_m"));
+        assert_eq!(
+            refused("correctors.csv", &CORRECTORS.replace("0.1", "0")),
+            "correctors.csv: row 0: nominal_kick_mrad 0, expected one where the corrector is used"
+        );
+        assert_eq!(
+            refused("bpms.csv", &MONITORS.replace(",y,", ",x,")),
+            "bpms.csv: rows 0 and 1 are both x at lattice_index 0, expected one"
+        );
+        assert_eq!(
+            refused("orm_measured_mm.csv", &MATRIX.replace("0.25", "-1e300")),
+            format!("orm_measured_mm.csv: x_BPM.0 by H_COR.1: {} mm, expected 1000 mm at most", -1e300)
+        );
     }
 }

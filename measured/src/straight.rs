@@ -118,6 +118,18 @@ mod tests {
         assert_eq!(found.fit.elements, 23 * 23 + 23);
     }
 
+    #[test]
+    fn a_measurement_that_tells_nothing_is_refused() {
+        let ring = ring();
+        let mut folder = measured(&ring, &machine(&ring, 12), NOISE, 1);
+        folder.monitors.iter_mut().skip(2).for_each(|one| one.is_used = false);
+        let of = |folder: &Folder| Straightened::of(folder, &Settings::default(), &mut |_| ());
+        assert!(of(&folder).is_ok());
+        folder.monitors[..2].iter_mut().for_each(|one| one.is_used = false);
+        let refused = of(&folder).unwrap_err().to_string();
+        assert_eq!(refused, "ring: no element of the matrix counts: of 24 monitors 0 are in use, of 24 correctors 24");
+    }
+
     /// Of 2500 exchanges of two correctors in 19 rings ten do not show by the lattice as written; beside a fit all do.
     #[test]
     fn what_only_a_fit_shows_is_put_right() {
