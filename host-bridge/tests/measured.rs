@@ -220,3 +220,28 @@ fn a_matrix_has_its_pages() {
     holds(&found, &["before: identified", "x_BPM.22 and x_BPM.52 are exchanged", "Residuals, element by element"]);
     holds(&page(&["compare", BEFORE, AFTER]), &["before to after", "2 of 24 changed: QF.24 by +1.00", "What changed"]);
 }
+
+/// The skew quadrupoles of the ring, which its fit does not know: as they are, and 0.01 /m stronger.
+#[test]
+fn coupling_that_the_model_lacks_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let before = measured::Folder::read(&repository().join(BEFORE)).unwrap();
+    let skews = [5, 27, 49, 71].map(|row| vec![row]).to_vec();
+    let model = measured::Model::of(&before, &[Vec::new(), skews], twin::Rf::FixedFrequency).unwrap();
+    let unknown = |group| measured::Unknown { kind: measured::Kind::Skew(group), mean: 0.0, width: 0.01 };
+    let unknowns: Vec<measured::Unknown> = (0..4).map(unknown).collect();
+    let at = |size: f64| model.predict(&unknowns, &nalgebra::DVector::from_vec(vec![size, -size, size, size])).unwrap();
+    let (nothing, coupled) = (at(0.0).matrix, at(0.01).matrix);
+    let mut stronger = before.clone();
+    stronger.matrix += (coupled - nothing).columns(0, before.correctors.len());
+    for (name, measurement, expected) in [("as-it-is", &before, false), ("stronger", &stronger, true)] {
+        let out = folder.path().join(name);
+        measured::conceal::write(&repository().join(BEFORE), measurement, &out).unwrap();
+        let mut meta: Value = serde_json::from_slice(&std::fs::read(out.join("meta.json")).unwrap()).unwrap();
+        let groups = meta["reference_fit"]["fit_parameters"].as_array_mut().unwrap();
+        groups.retain(|one| one["field"] == "K");
+        std::fs::write(out.join("meta.json"), meta.to_string()).unwrap();
+        let sentence = json(&["diagnose", out.to_str().unwrap()])["sentence"].to_string();
+        assert_eq!(sentence.contains("coupling in the ring is missing"), expected, "{name}: {sentence}");
+    }
+}

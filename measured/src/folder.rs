@@ -1,4 +1,4 @@
-//! A measurement as a folder of tables, docs/measured.md.
+//! A measurement as a folder of tables, docs/real-rings.md.
 //!
 //! `lattice.csv` has one row an element, `bpms.csv` and `correctors.csv` one row a monitor or corrector and plane, `orm_measured_mm.csv` the
 //! change of the orbit [mm] from minus to plus half a corrector's kick, `meta.json` what else was written down.
