@@ -10,7 +10,7 @@ use crate::matrix_result::{Comparison, MatrixDiagnosis, MatrixFinding, MatrixFit
 
 /// Elements of a matrix up to which each is drawn: more are too small to be seen.
 const DRAWN: usize = 2500;
-/// Instruments with the largest residuals that are marked.
+/// Places that are marked of what was found, and of the instruments with the largest residuals.
 const MARKED: usize = 6;
 /// Standard deviations at which the colours of a map end.
 const COLOURS: f64 = 4.0;
@@ -58,7 +58,13 @@ impl Measured<'_> {
     pub fn page_of(&self, found: &MatrixDiagnosis) -> Result<Page, OrbitError> {
         let page = self.page()?;
         let worst = found.unexplained.iter().take(MARKED).map(|one| one.at.clone());
-        let places: Vec<String> = found.findings.iter().filter_map(|one| one.at.clone()).chain(worst).collect();
+        let found_at = found.findings.iter().filter_map(|one| one.at.as_deref()).flat_map(|at| at.split(','));
+        let mut places: Vec<String> = Vec::new();
+        for place in found_at.map(str::to_owned).take(MARKED).chain(worst) {
+            if !places.contains(&place) {
+                places.push(place);
+            }
+        }
         let first = [findings(found), self.left_over(&places)];
         // what is left over was its first section
         let sections = first.into_iter().chain(page.sections.into_iter().skip(1));
@@ -297,10 +303,8 @@ impl Measured<'_> {
         let magnets = (0..rows.len())
             .filter_map(|row| Some(Magnet { symbol: symbol(row)?, s: rows[row].s, length: rows[row].length }));
         let is_at = |row: usize, place: &str| {
-            place.split(',').any(|one| {
-                one == self.folder.element(row)
-                    || one.split_once('_').is_some_and(|(_, of)| of == self.folder.element(row))
-            })
+            let at = self.folder.element(row);
+            place == at || place.split_once('_').is_some_and(|(_, of)| of == at)
         };
         let marks = marked.iter().flat_map(|place| {
             let here = (0..rows.len()).filter(move |&row| is_at(row, place));

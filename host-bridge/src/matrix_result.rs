@@ -216,7 +216,8 @@ impl fmt::Display for MatrixFit {
         let Self { recording, elements, rejected_elements, chi2_loco, chi2_loco_start, .. } = self;
         writeln!(f, "{recording}: {elements} elements of the response matrix, {rejected_elements} set aside\n")?;
         for Cable { kind, at } in &self.wiring {
-            writeln!(f, "put right before the fit: {kind} at {at}\n")?;
+            let done = if kind.ends_with("dead") { "left out of" } else { "put right before" };
+            writeln!(f, "{}\n", fill(&format!("{done} the fit: {kind} at {}", at.replace(',', ", "))))?;
         }
         if !self.has_ended {
             let doubt = "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units.";

@@ -48,7 +48,8 @@ impl Strip {
         let mut ends: Vec<f64> = Vec::new();
         for mark in marks {
             let (x, half) = (at(mark.s), 0.5 * text_width(&mark.label, SMALL));
-            let x_label = x.clamp(half + 2.0, sheet - half - 2.0);
+            // one that is wider than the sheet begins at its left edge
+            let x_label = x.min(sheet - half - 2.0).max(half + 2.0);
             let row = ends.iter().position(|end| x_label - half > end + APART).unwrap_or(ends.len());
             ends.resize(ends.len().max(row + 1), 0.0);
             ends[row] = x_label + half;
@@ -151,7 +152,8 @@ mod tests {
         let mark = |label: &str, s| Spotted { label: label.into(), s, look: Look::Finding };
         let strip = Strip {
             magnets: vec![magnet(Symbol::Bend, 2.0), magnet(Symbol::Sextupole, 40.0)],
-            marks: vec![mark("SLOT_B6", 5.0), mark("elsewhere", 50.0)],
+            // the last one is wider than the sheet
+            marks: vec![mark("SLOT_B6", 5.0), mark("elsewhere", 50.0), mark(&"x_BPM.63 ".repeat(40), 9.0)],
         };
         let line = Series::line("l", vec![0.0, 10.0], vec![0.0, 1.0]);
         let figure = |strip: Option<Strip>| {
