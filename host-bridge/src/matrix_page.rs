@@ -323,10 +323,11 @@ fn findings(found: &MatrixDiagnosis) -> Section {
             (true, _) => format!("{:.4} ± {:.4}", one.amplitude, one.sigma),
         };
         let gain = one.log_evidence_gain.map_or(String::new(), |gain| format!("{gain:.1}"));
-        vec![one.kind.to_owned(), one.at.clone().unwrap_or_default(), amplitude, gain, one.sentence.clone()]
+        let at = one.at.as_deref().unwrap_or_default().replace(',', ", ");
+        vec![one.kind.to_owned(), at, amplitude, gain, one.sentence.clone()]
     };
     let table = Table {
-        caption: "Gain: ln Bayes factor [nat]; cables have none, they are seen before anything is fitted.".into(),
+        caption: "Gain: ln Bayes factor [nat]; cables and dead instruments have none, they come first.".into(),
         header: ["missing", "at", "amplitude", "gain [nat]", "in words"].map(str::to_owned).to_vec(),
         rows: found.findings.iter().map(row).collect(),
     };

@@ -392,7 +392,7 @@ pub struct MatrixFinding {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub systematic: Option<f64>,
     pub unit: &'static str,
-    /// Nat; cables have none, they are seen before anything is fitted.
+    /// Nat; cables and dead instruments have none, they come first.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_evidence_gain: Option<f64>,
     /// Shuffled patterns that gain as much, and how many were tried.

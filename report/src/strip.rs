@@ -12,6 +12,8 @@ use super::ring_map::{Look, Magnet, Spotted, Symbol};
 const MAGNETS: f64 = 46.0;
 const KEY: f64 = 20.0;
 const LABEL: f64 = 15.0;
+/// Rows of labels; a mark that would need another one is a line alone.
+const ROWS: usize = 5;
 /// Space between two labels of one row [px].
 const APART: f64 = 10.0;
 
@@ -30,7 +32,7 @@ pub struct Strip {
 impl Strip {
     /// Height on a sheet of a width [px].
     pub(super) fn height(&self, sheet: f64) -> f64 {
-        let labels = if self.marks.is_empty() { 0.0 } else { LABEL * self.marks.len().min(3) as f64 };
+        let labels = if self.marks.is_empty() { 0.0 } else { LABEL * self.marks.len().min(ROWS) as f64 };
         MAGNETS + labels + key_rows(sheet).len() as f64 * KEY
     }
 
@@ -56,6 +58,9 @@ impl Strip {
             let pen = if mark.look == Look::Finding { Pen::nth(1) } else { Pen::reference() };
             for ends in [plot.heights(), [px(away), px(away + MAGNETS)]] {
                 pen.bar(plot.sheet, ends.map(|y| (px(x), y)), 1.2)?;
+            }
+            if row >= ROWS {
+                continue;
             }
             let height = away + MAGNETS + LABEL * (row as f64 + 0.5);
             write(plot.sheet, &mark.label, (x_label, height), &bold(SMALL, HPos::Center))?;
