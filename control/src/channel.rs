@@ -10,11 +10,24 @@ pub trait Control {
     /// [`ControlError::Process`]; a channel that is not there is no error.
     fn describe(&mut self, names: &[&str]) -> Result<Vec<Channel>, ControlError>;
 
+    /// Present value of each of some channels, in their order, or what the control system says instead.
+    ///
+    /// # Errors
+    /// [`ControlError::Process`].
+    fn sample(&mut self, names: &[&str]) -> Result<Vec<Result<Sample, String>>, ControlError>;
+
     /// Present values of some channels, in their order.
     ///
     /// # Errors
     /// [`ControlError::Silent`] if one has none.
-    fn read(&mut self, names: &[&str]) -> Result<Vec<Sample>, ControlError>;
+    fn read(&mut self, names: &[&str]) -> Result<Vec<Sample>, ControlError> {
+        let sampled = self.sample(names)?;
+        let others = sampled.iter().filter(|one| one.is_err()).count().saturating_sub(1);
+        let silent = |(name, one): (&&str, Result<Sample, String>)| {
+            one.map_err(|why| ControlError::Silent { channel: (*name).into(), others, why })
+        };
+        names.iter().zip(sampled).map(silent).collect()
+    }
 
     /// Write one number.
     ///

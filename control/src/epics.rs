@@ -110,21 +110,13 @@ impl Control for Epics {
         expect_all(names, reply.channels)
     }
 
-    fn read(&mut self, names: &[&str]) -> Result<Vec<Sample>, ControlError> {
+    fn sample(&mut self, names: &[&str]) -> Result<Vec<Result<Sample, String>>, ControlError> {
         let sampled = expect_all(names, self.ask(json!({"do": "read", "channels": names}))?.samples)?;
-        let mut samples = Vec::with_capacity(names.len());
-        let mut silent: Option<(String, usize, String)> = None;
-        for (name, sampled) in names.iter().zip(sampled) {
-            match (sampled, &mut silent) {
-                (Sampled::Value(sample), _) => samples.push(sample),
-                (Sampled::Error { .. }, Some((_, others, _))) => *others += 1,
-                (Sampled::Error { error }, None) => silent = Some(((*name).to_owned(), 0, error)),
-            }
-        }
-        match silent {
-            Some((channel, others, why)) => Err(ControlError::Silent { channel, others, why }),
-            None => Ok(samples),
-        }
+        let one = |sampled| match sampled {
+            Sampled::Value(sample) => Ok(sample),
+            Sampled::Error { error } => Err(error),
+        };
+        Ok(sampled.into_iter().map(one).collect())
     }
 
     fn write(&mut self, name: &str, value: f64) -> Result<(), ControlError> {

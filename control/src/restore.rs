@@ -1,6 +1,8 @@
 //! The machine put back as it was.
 
-use crate::channel::{Control, ControlError};
+use core::fmt::{self, Display};
+
+use crate::channel::{Control, ControlError, Sample};
 use crate::journal::{Journal, JournalError, Setting};
 
 /// Why the machine may not be as it was.
@@ -10,6 +12,9 @@ pub enum RestoreError {
     /// Some set points could not be written.
     #[error("not put back: {}", .0.join("; "))]
     Left(Vec<String>),
+    /// The control system is out of reach.
+    #[error("not put back: {0}")]
+    Control(#[from] ControlError),
     /// The journal cannot be kept.
     #[error(transparent)]
     Journal(#[from] JournalError),
@@ -24,22 +29,25 @@ const RETRY: f64 = 0.2;
 /// Set points that are as they were are not touched.
 ///
 /// # Errors
-/// [`RestoreError::Left`] with channel, present and original value, if that takes longer than `timeout` [s].
+/// [`RestoreError::Left`] with channel, present and original value, if that takes longer than `timeout` [s]; [`RestoreError::Control`].
 pub fn restore(control: &mut impl Control, journal: &mut Journal, timeout: f64) -> Result<usize, RestoreError> {
     let Some(original) = journal.pending().map(<[Setting]>::to_vec) else { return Ok(0) };
     let deadline = control.now() + timeout;
     let mut written = 0;
     loop {
-        let left = differing(control, &original);
+        let left = differing(control, &original)?;
         if left.is_empty() {
             journal.restored()?;
             return Ok(written);
         }
-        let tried: Vec<Result<(), ControlError>> =
-            left.iter().map(|left| control.write(&left.setting.channel, left.setting.value)).collect();
-        written += tried.iter().filter(|tried| tried.is_ok()).count();
-        if control.now() > deadline || matches!(tried.first(), Some(Err(ControlError::Process(_)))) {
-            let left = differing(control, &original);
+        for Left { setting, found } in &left {
+            // what has no value at present cannot be written either
+            if found.is_ok() && control.write(&setting.channel, setting.value).is_ok() {
+                written += 1;
+            }
+        }
+        if control.now() > deadline {
+            let left = differing(control, &original)?;
             if !left.is_empty() {
                 return Err(RestoreError::Left(left.iter().map(Left::to_string).collect()));
             }
@@ -51,33 +59,27 @@ pub fn restore(control: &mut impl Control, journal: &mut Journal, timeout: f64) 
 /// A set point that is not as it was.
 struct Left<'s> {
     setting: &'s Setting,
-    found: Result<Option<f64>, ControlError>,
+    /// What it is at, if it is there; no number is none.
+    found: Result<Option<f64>, String>,
 }
 
-impl Left<'_> {
-    fn to_string(left: &Self) -> String {
-        let Setting { channel, value } = left.setting;
-        match &left.found {
-            Ok(Some(found)) => format!("{channel} is at {found}, was at {value}"),
-            Ok(None) => format!("{channel} holds no number, was at {value}"),
-            Err(why) => format!("{channel} was at {value}: {why}"),
+impl Display for Left<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let Setting { channel, value } = self.setting;
+        match &self.found {
+            Ok(Some(found)) => write!(f, "{channel} is at {found}, was at {value}"),
+            Ok(None) => write!(f, "{channel} holds no number, was at {value}"),
+            Err(why) => write!(f, "{channel} was at {value}: {why}"),
         }
     }
 }
 
-fn differing<'s>(control: &mut impl Control, original: &'s [Setting]) -> Vec<Left<'s>> {
+fn differing<'s>(control: &mut impl Control, original: &'s [Setting]) -> Result<Vec<Left<'s>>, ControlError> {
     let names: Vec<&str> = original.iter().map(|setting| setting.channel.as_str()).collect();
-    let found: Vec<Result<Option<f64>, ControlError>> = match control.read(&names) {
-        Ok(samples) => samples.iter().map(|sample| Ok(sample.value.first().copied().flatten())).collect(),
-        Err(error @ ControlError::Process(_)) => names.iter().map(|_| Err(error.clone())).collect(),
-        // some have no value: which ones
-        Err(_) => {
-            names.iter().map(|name| control.read(&[name]).map(|s| s[0].value.first().copied().flatten())).collect()
-        }
-    };
     let same = |found: &Result<Option<f64>, _>, value: f64| matches!(found, Ok(Some(found)) if (found - value).abs() <= SAME * value.abs().max(1e-3));
-    let differs = |(setting, found): (&'s Setting, Result<Option<f64>, ControlError>)| {
+    let of = |(setting, sampled): (&'s Setting, Result<Sample, String>)| {
+        let found = sampled.map(|sample| sample.value.first().copied().flatten());
         (!same(&found, setting.value)).then_some(Left { setting, found })
     };
-    original.iter().zip(found).filter_map(differs).collect()
+    Ok(original.iter().zip(control.sample(&names)?).filter_map(of).collect())
 }

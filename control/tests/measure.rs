@@ -156,8 +156,8 @@ impl Control for Killed<'_> {
         self.ask()?.describe(names)
     }
 
-    fn read(&mut self, names: &[&str]) -> Result<Vec<Sample>, ControlError> {
-        self.ask()?.read(names)
+    fn sample(&mut self, names: &[&str]) -> Result<Vec<Result<Sample, String>>, ControlError> {
+        self.ask()?.sample(names)
     }
 
     fn write(&mut self, name: &str, value: f64) -> Result<(), ControlError> {

@@ -18,6 +18,8 @@ pub struct SimulatedControl {
 
 /// What the time stamps begin at [s since 1970].
 const BEGAN: f64 = 1.8e9;
+/// What is said of a channel that there is none of.
+const NONE: &str = "no such channel";
 
 impl SimulatedControl {
     /// A machine with a cycle every `period` seconds; the first one is over.
@@ -32,10 +34,6 @@ impl SimulatedControl {
     /// What every set point is at.
     pub fn set_points(&self) -> &BTreeMap<String, f64> {
         &self.set
-    }
-
-    fn lacks(channel: &str) -> ControlError {
-        ControlError::Silent { channel: channel.into(), others: 0, why: "no such channel".into() }
     }
 }
 
@@ -54,12 +52,12 @@ impl Control for SimulatedControl {
         Ok(names.iter().map(of).collect())
     }
 
-    fn read(&mut self, names: &[&str]) -> Result<Vec<Sample>, ControlError> {
+    fn sample(&mut self, names: &[&str]) -> Result<Vec<Result<Sample, String>>, ControlError> {
         let of = |name: &&str| match self.set.get(*name) {
             Some(&value) => Ok(Sample { value: vec![Some(value)], time_s: BEGAN + self.now, invalid: false }),
-            None => self.samples.get(*name).cloned().ok_or_else(|| Self::lacks(name)),
+            None => self.samples.get(*name).cloned().ok_or_else(|| NONE.into()),
         };
-        names.iter().map(of).collect()
+        Ok(names.iter().map(of).collect())
     }
 
     fn write(&mut self, name: &str, value: f64) -> Result<(), ControlError> {
@@ -71,7 +69,7 @@ impl Control for SimulatedControl {
                 let why = format!("its limits are {low} to {high}");
                 return Err(ControlError::Refused { channel: name.into(), value, why });
             }
-            None => return Err(Self::lacks(name)),
+            None => return Err(ControlError::Refused { channel: name.into(), value, why: NONE.into() }),
         }
         Ok(())
     }
