@@ -10,7 +10,7 @@ use crate::journal::{Journal, JournalError, Setting};
 #[non_exhaustive]
 pub enum RestoreError {
     /// Some set points could not be written.
-    #[error("not put back: {}", .0.join("; "))]
+    #[error("not put back: {}", few(.0))]
     Left(Vec<String>),
     /// The control system is out of reach.
     #[error("not put back: {0}")]
@@ -18,6 +18,13 @@ pub enum RestoreError {
     /// The journal cannot be kept.
     #[error(transparent)]
     Journal(#[from] JournalError),
+}
+
+/// The first few of many lines.
+fn few(lines: &[String]) -> String {
+    const FEW: usize = 3;
+    let shown = lines[..lines.len().min(FEW)].join("; ");
+    if lines.len() > FEW { format!("{shown}; and {} more", lines.len() - FEW) } else { shown }
 }
 
 /// Relative difference of a set point that is none: control systems may keep single precision.

@@ -17,7 +17,7 @@ pub enum SessionError {
     Interrupted,
     /// A device does not do what it is told.
     #[error(
-        "{step}: {channel} was set to {wanted}, read-back {read} is at {found} after {after} s, expected within {tolerance}"
+        "{step}: {channel} was set to {wanted}, read-back {read} {found} after {after} s, expected within {tolerance}"
     )]
     NotFollowing {
         /// The setting.
@@ -217,7 +217,8 @@ impl<C: Control> Session<'_, C> {
                     channel: set.write.into(),
                     wanted,
                     read: set.read.into(),
-                    found: found.map_or_else(|why| why, |value| value.to_string()),
+                    found: found
+                        .map_or_else(|why| format!("cannot be read ({why})"), |value| format!("is at {value:.6}")),
                     after: self.plan.timeout,
                     tolerance: set.tolerance,
                 });

@@ -59,14 +59,19 @@ async def read(request):
 
 def sample(value):
     if not value.ok:
-        return {"error": str(value)}
+        return {"error": why(value)}
     return {"value": numbers(value), "time_s": value.timestamp, "invalid": value.severity >= INVALID}
+
+
+def why(failed):
+    """What the library says, without the name of the channel."""
+    return str(failed).removeprefix(f"{failed.name}: ")
 
 
 async def write(request):
     [name] = request["channels"]
     done = await aioca.caput(name, request["value"], wait=True, timeout=min(request["timeout_s"], WRITE_S), throw=False)
-    return {} if done.ok else {"error": str(done)}
+    return {} if done.ok else {"error": why(done)}
 
 
 DO = {"describe": describe, "read": read, "write": write}

@@ -44,7 +44,7 @@ FAST = {
     "match_window_s = 0.5": "match_window_s = 0.01",
 }
 # what operators have set, so that "as it was" is not 0
-STEERED = {"BOOSTER:A4:SET": 1.5, "BOOSTER:D3:SET": -0.75}
+STEERED = {f"BOOSTER:{cell}{n}:SET": 0.25 * n * (-1) ** n for cell in "ABCDEF" for n in range(1, 9)}
 BIN = Path(sys.executable).parent
 LOOP = asyncio.new_event_loop()  # channels live in one
 
@@ -105,7 +105,7 @@ class Story:
             time.sleep(4.0)
             ioc.kill()
             _, said = process.communicate(timeout=120)
-        assert process.returncode == 1 and "no value of BOOSTER:" in said and "--restore" in said, said
+        assert process.returncode == 1 and "not put back: BOOSTER:" in said and "--restore" in said, said
         with self.booster():  # a restarted IOC, at what its own start sets; then as the journal says
             LOOP.run_until_complete(aioca_put({channel: 0.0 for channel in STEERED}))
             self.restored("away")
@@ -127,7 +127,7 @@ class Story:
         with self.booster("--fault", "drop_out@x_E4=0.1"):
             for _ in range(KILLS):
                 process = self.take("killed")
-                time.sleep(self.random.uniform(0.3, 3.0))
+                time.sleep(self.random.uniform(0.3, 3.5))
                 assert process.poll() is None, process.communicate()
                 process.kill()
                 process.communicate()
@@ -140,7 +140,7 @@ class Story:
             assert_as_it_was()
         result = json.loads((self.folder / "killed.json").read_text())
         print(f"killed {KILLS} times, {moved} of them with a set point moved; {result['frames']} frames", flush=True)
-        assert moved >= KILLS / 4
+        assert moved >= KILLS / 2
         assert result["frames"] == 342 and not (self.folder / "killed.journal").exists()
 
     def fitted(self):
@@ -166,18 +166,17 @@ async def aioca_put(values):
 
 
 async def found():
-    names = [f"BOOSTER:{cell}{number}:SET" for cell in "ABCDEF" for number in range(1, 9)]
-    values = await aioca.caget(names, timeout=10)
-    return dict(zip(names, map(float, values)))
+    values = await aioca.caget(list(STEERED), timeout=10)
+    return dict(zip(STEERED, map(float, values)))
 
 
 def as_it_was():
-    return all(value == STEERED.get(name, 0.0) for name, value in LOOP.run_until_complete(found()).items())
+    return LOOP.run_until_complete(found()) == STEERED
 
 
 def assert_as_it_was():
     values = LOOP.run_until_complete(found())
-    wrong = {name: value for name, value in values.items() if value != STEERED.get(name, 0.0)}
+    wrong = {name: value for name, value in values.items() if value != STEERED[name]}
     assert not wrong, f"not as it was: {wrong}"
 
 

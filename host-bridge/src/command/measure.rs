@@ -107,7 +107,7 @@ fn campaign(
     });
     bar.finish_and_clear();
     ended.map_err(|error| {
-        let again = if journal.pending().is_some() {
+        let again = if journal.pending().is_some() && !second_try(options, plan, &mut journal) {
             format!("put it back with `orbitcal measure --restore {}`", path.display())
         } else {
             let done = plan.steps.iter().filter(|step| journal.has(step)).count();
@@ -120,6 +120,16 @@ fn campaign(
     write(&measured, ring, out)?;
     journal.remove().map_err(CommandError::other)?;
     deliver(&options.common, &MeasureResult::of(&measured, ring, plan, out))
+}
+
+/// Put the machine back through another process, in case the first one is gone.
+fn second_try(options: &Measure, plan: &Plan, journal: &mut Journal) -> bool {
+    let epics = Epics::start(&options.epics, plan.timeout);
+    let back = epics.is_ok_and(|mut epics| restore(&mut epics, journal, plan.timeout).is_ok());
+    if back {
+        output::warn("the machine is back at its settings at the second try");
+    }
+    back
 }
 
 /// The folder appears whole or not at all.
