@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short control control-env soft-ioc gateway docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -104,6 +104,9 @@ exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the sch
 control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the gateway seen by three EPICS clients; four minutes
 	.venv-control/bin/python control/epics/tests/measure.py $(ORBITCAL)
 	.venv-control/bin/python control/gateway/tests/clients.py $(ORBITCAL)
+
+booster: build .venv-control ## the simulated Booster with a concealed effect, measured through EPICS, diagnosed, measured again: target/booster.json; five minutes
+	.venv-control/bin/python control/epics/tests/booster.py $(ORBITCAL)
 
 control-env: .venv-control ## what speaks EPICS: orbitcal-epics, orbitcal-soft-ioc and orbitcal-gateway, in .venv-control
 

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::file::why;
 use crate::frame::Frame;
 use crate::plan::{Channels, Plan};
 use crate::step::Step;
@@ -25,7 +26,7 @@ pub struct Setting {
 #[serde(rename_all = "snake_case")]
 enum Entry {
     /// The measurement that this is the journal of.
-    Plan { header: String, channels: Channels },
+    Plan { header: String, channels: Box<Channels> },
     /// What the machine was set to before the writes that follow.
     Original(Vec<Setting>),
     /// Frames of a setting, complete.
@@ -39,7 +40,7 @@ enum Entry {
 #[non_exhaustive]
 pub enum JournalError {
     /// The system does not let it be used.
-    #[error("{}: {}", .0.display(), .1.kind())]
+    #[error("{}: {}", .0.display(), why(.1))]
     File(PathBuf, io::Error),
     /// Another process is at it.
     #[error("{}: in use by another measurement", .0.display())]
@@ -83,9 +84,9 @@ impl Journal {
         let other = |what| Err(JournalError::Other { file: path.into(), what });
         match journal.entries.first() {
             Some(Entry::Plan { header: known, .. }) if known != header => return other("header"),
-            Some(Entry::Plan { channels: known, .. }) if known != channels => return other("table of channels"),
+            Some(Entry::Plan { channels: known, .. }) if **known != *channels => return other("table of channels"),
             Some(Entry::Plan { .. }) => {}
-            _ => journal.append(Entry::Plan { header: header.clone(), channels: channels.clone() })?,
+            _ => journal.append(Entry::Plan { header: header.clone(), channels: Box::new(channels.clone()) })?,
         }
         Ok(journal)
     }

@@ -10,6 +10,7 @@
 
 mod channel;
 mod epics;
+mod file;
 mod frame;
 mod journal;
 mod measure;
@@ -28,5 +29,5 @@ pub use measure::{MeasureError, measure, recording};
 pub use plan::{Channels, Plan, PlanError, Waveform};
 pub use preflight::{PreflightError, preflight};
 pub use restore::{RestoreError, restore};
-pub use session::{Progress, SessionError};
+pub use session::{NotFollowing, Progress, SessionError};
 pub use step::Step;

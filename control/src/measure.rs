@@ -15,10 +15,10 @@ use crate::session::{Progress, Session, SessionError};
 pub enum MeasureError {
     /// It ended early; the machine is as it was.
     #[error("{0}; the machine is back at its settings")]
-    Ended(SessionError),
+    Ended(Box<SessionError>),
     /// It ended early, and the machine may not be as it was.
     #[error("{0}; {1}")]
-    Left(SessionError, RestoreError),
+    Left(Box<SessionError>, RestoreError),
     /// All frames were taken, and the machine may not be as it was.
     #[error("all frames are taken; {0}")]
     NotBack(#[from] RestoreError),
@@ -40,8 +40,8 @@ pub fn measure(
     match (taken, session.put_back()) {
         (Ok(()), Ok(_)) => Ok(()),
         (Ok(()), Err(left)) => Err(left.into()),
-        (Err(ended), Ok(_)) => Err(MeasureError::Ended(ended)),
-        (Err(ended), Err(left)) => Err(MeasureError::Left(ended, left)),
+        (Err(ended), Ok(_)) => Err(MeasureError::Ended(ended.into())),
+        (Err(ended), Err(left)) => Err(MeasureError::Left(ended.into(), left)),
     }
 }
 

@@ -16,25 +16,8 @@ pub enum SessionError {
     #[error("interrupted")]
     Interrupted,
     /// A device does not do what it is told.
-    #[error(
-        "{step}: {channel} was set to {wanted}, read-back {read} {found} after {after} s, expected within {tolerance}"
-    )]
-    NotFollowing {
-        /// The setting.
-        step: Step,
-        /// Channel that was written.
-        channel: String,
-        /// What was written.
-        wanted: f64,
-        /// Channel that did not follow.
-        read: String,
-        /// Its value, or why there is none.
-        found: String,
-        /// How long was waited [s].
-        after: f64,
-        /// Largest distance.
-        tolerance: f64,
-    },
+    #[error(transparent)]
+    NotFollowing(Box<NotFollowing>),
     /// No frame came.
     #[error("{step}: no frame in {after} s: {why}")]
     NoFrame {
@@ -86,6 +69,26 @@ pub enum SessionError {
     /// The journal cannot be kept.
     #[error(transparent)]
     Journal(#[from] JournalError),
+}
+
+/// A device that does not do what it is told.
+#[derive(Debug, thiserror::Error)]
+#[error("{step}: {channel} was set to {wanted}, read-back {read} {found} after {after} s, expected within {tolerance}")]
+pub struct NotFollowing {
+    /// The setting.
+    pub step: Step,
+    /// Channel that was written.
+    pub channel: String,
+    /// What was written.
+    pub wanted: f64,
+    /// Channel that did not follow.
+    pub read: String,
+    /// Its value, or why there is none.
+    pub found: String,
+    /// How long was waited [s].
+    pub after: f64,
+    /// Largest distance.
+    pub tolerance: f64,
 }
 
 /// How far a measurement is.
@@ -212,7 +215,7 @@ impl<C: Control> Session<'_, C> {
                 _ => there = None,
             }
             if there.is_none() && now - start > self.plan.timeout {
-                return Err(SessionError::NotFollowing {
+                let problem = NotFollowing {
                     step: step.clone(),
                     channel: set.write.into(),
                     wanted,
@@ -221,7 +224,8 @@ impl<C: Control> Session<'_, C> {
                         .map_or_else(|why| format!("cannot be read ({why})"), |value| format!("is at {value:.6}")),
                     after: self.plan.timeout,
                     tolerance: set.tolerance,
-                });
+                };
+                return Err(SessionError::NotFollowing(Box::new(problem)));
             }
             self.control.pause(POLL);
         }

@@ -1,6 +1,6 @@
 //! The published measurement on a simulated Booster within the process: what is recorded, what fails, what is put back.
 
-use std::cell::Cell;
+use core::cell::Cell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -122,7 +122,7 @@ fn an_interrupted_measurement_goes_on_and_equals_an_uninterrupted_one() {
         let mut journal = Journal::open(&path, &plan).unwrap();
         match measure(&mut control, &plan, &mut journal, &stop, |_| ()) {
             Ok(()) => break written(&plan, &ring, &journal, &folder),
-            Err(MeasureError::Ended(SessionError::Interrupted)) => interruptions += 1,
+            Err(MeasureError::Ended(why)) if matches!(*why, SessionError::Interrupted) => interruptions += 1,
             Err(error) => panic!("{error}"),
         }
         assert_eq!(control.set_points(), &before);

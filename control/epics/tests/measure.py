@@ -52,6 +52,7 @@ LOOP = asyncio.new_event_loop()  # channels live in one
 class Story:
     def __init__(self, orbitcal, seed, folder):
         self.orbitcal, self.random, self.folder = orbitcal, random.Random(seed), folder
+        self.epics = ["--epics", BIN / "orbitcal-epics"]
         text = Path("config/measure-booster.toml").read_text()
         for old, new in FAST.items():
             assert old in text, old
@@ -74,9 +75,13 @@ class Story:
             process.terminate()
             process.wait()
 
-    def measure(self, *more, **how):
-        command = [self.orbitcal, "measure", *more, "--epics", BIN / "orbitcal-epics"]
-        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **how)
+    def run(self, *command):
+        """A command to its good end."""
+        subprocess.run([self.orbitcal, *command], check=True)
+
+    def measure(self, *more):
+        command = [self.orbitcal, "measure", *more, *self.epics]
+        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
     def take(self, out):
         return self.measure(self.plan, "--out", self.folder / out, "--json", self.folder / f"{out}.json")
@@ -107,7 +112,7 @@ class Story:
             _, said = process.communicate(timeout=120)
         assert process.returncode == 1 and "not put back: BOOSTER:" in said and "--restore" in said, said
         with self.booster():  # a restarted IOC, at what its own start sets; then as the journal says
-            LOOP.run_until_complete(aioca_put({channel: 0.0 for channel in STEERED}))
+            LOOP.run_until_complete(aioca_put({f"BOOSTER:{name}:SET": 0.0 for name in ("A2", "A4", "F7")}))
             self.restored("away")
         print(f"goes away: {said.strip()}", flush=True)
 
@@ -146,7 +151,7 @@ class Story:
     def fitted(self):
         for command in ("check", "fit"):
             json_file = self.folder / f"{command}.json"
-            subprocess.run([self.orbitcal, command, self.folder / "killed", "--quiet", "--json", json_file], check=True)
+            self.run(command, self.folder / "killed", "--quiet", "--json", json_file)
         fit = json.loads((self.folder / "fit.json").read_text())
         error = np.array([var["mean"] - self.truth[var["name"]] for var in fit["vars"]])
         nees = error @ np.linalg.solve(np.array(fit["covariance"]), error) / len(error)
