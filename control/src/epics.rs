@@ -28,6 +28,9 @@ pub struct Epics {
 /// How much longer than a request may take the process is waited for: Python and its libraries start within a second or two [s].
 const GRACE: f64 = 20.0;
 
+/// How long the process may take to end by itself.
+const END: Duration = Duration::from_secs(5);
+
 #[derive(Deserialize)]
 struct Reply {
     id: u64,
@@ -101,6 +104,11 @@ impl Epics {
 impl Drop for Epics {
     fn drop(&mut self) {
         drop(self.requests.take()); // the end of its input is the end of the process
+        let deadline = Instant::now() + END;
+        while matches!(self.process.try_wait(), Ok(None)) && Instant::now() < deadline {
+            thread::sleep(Duration::from_millis(10));
+        }
+        let _ = self.process.kill();
         let _ = self.process.wait();
     }
 }

@@ -80,15 +80,12 @@ impl Plan {
     pub fn set_points(&self) -> Vec<SetPoint<'_>> {
         let mut all: Vec<SetPoint> = Vec::new();
         for step in &self.steps {
-            let Some(mut set) = self.set_point(step) else { continue };
+            let Some(set) = self.set_point(step) else { continue };
             match all.iter_mut().find(|known| known.write == set.write) {
                 Some(known) => {
                     known.range = [known.range[0].min(set.range[0]), known.range[1].max(set.range[1])];
                 }
-                None => {
-                    set.range = [set.range[0].min(set.range[1]), set.range[1]];
-                    all.push(set);
-                }
+                None => all.push(set),
             }
         }
         all

@@ -69,8 +69,6 @@ def main():
         print(f"orbitcal-gateway: {error}", file=sys.stderr)
         sys.exit(2)
     stop = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.append(True))
     gateway = Gateway(config)
     for number in (signal.SIGINT, signal.SIGTERM):  # iceoryx2 takes them when its node is made
         signal.signal(number, lambda *_: stop.append(True))

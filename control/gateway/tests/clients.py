@@ -180,8 +180,25 @@ def see(*clients):
         subprocess.run([sys.executable, __file__, "--see", client.__name__], check=True, env=os.environ)
 
 
+def misconfigured(folder):
+    """All that is wrong is told at once."""
+    file = folder / "wrong.toml"
+    file.write_text('prefix = 3\nsigma_minor = -1\nmean_alarm = [2, 1]\nsetpoint = []\n')
+    run = subprocess.run([BIN / "orbitcal-gateway", file], capture_output=True, text=True)
+    assert run.returncode == 2, run
+    for part in (
+        "prefix: expected str, found 3",
+        "sigma_minor: expected a positive number, found -1",
+        "mean_alarm: expected two rising numbers, found [2, 1]",
+        "setpoint: unknown, expected one of prefix, service",
+    ):
+        assert part in run.stderr, run.stderr
+    print("configuration: four wrong values told at once", flush=True)
+
+
 def main(orbitcal):
     with tempfile.TemporaryDirectory() as folder:
+        misconfigured(Path(folder))
         with gateway(folder, CONFIG):
             with replay(orbitcal, "--rate", "10"):
                 see(by_pyepics, by_caproto, by_p4p)
