@@ -1,4 +1,5 @@
-"""The whole story: the simulated Booster with a concealed effect, measured through EPICS, diagnosed, measured again with the model that was found.
+"""The whole story: the simulated Booster with a concealed effect, measured through EPICS, diagnosed, and the model that was found judged on one
+more measurement.
 
 Usage: booster.py ORBITCAL [SEED], in the repository, with the Python that has orbitcal-epics. Writes target/booster.json. The effect is drawn here;
 orbitcal is told nothing of it. Exit status 0 if kind and place are found.
@@ -22,6 +23,9 @@ CONCEALED = [
 ]
 
 
+MOST = 3  # campaigns that are taken to tell what is missing
+
+
 def effect(seed):
     pick = random.Random(seed)
     kind, places, amplitudes = pick.choice(CONCEALED)
@@ -40,29 +44,32 @@ def main(orbitcal, seed="1"):
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     story, truth = Story(Path(orbitcal).resolve(), int(seed), folder.resolve()), effect(int(seed))
+    model, page = folder / "model.bin", folder / "diagnosis.html"
     with story.booster("--effect", "{kind}@{at}={amplitude}".format(**truth)):
-        print("measuring", flush=True)
-        story.run("measure", story.plan, "--out", folder / "first", *story.epics)
-        print("diagnosing", flush=True)
-        model, page = folder / "model.bin", folder / "diagnosis.html"
-        found = run(story, "diagnose", folder / "first", "--model-out", model, "--report", page)
-        print(found["sentence"], flush=True)
-        print("measuring again", flush=True)
-        story.run("measure", story.plan, "--out", folder / "second", *story.epics)
-    streamed = ["replay", folder / "second", "--no-publish"]
+        for campaigns in range(1, MOST + 1):
+            story.run("measure", story.plan, "--out", folder / f"campaign-{campaigns}", *story.epics)
+            measured = [folder / f"campaign-{number}" for number in range(1, campaigns + 1)]
+            found = run(story, "diagnose", *measured, "--model-out", model, "--report", page)
+            print(found["sentence"], flush=True)
+            if found["verdict"] != "ambiguous":
+                break
+            print(f"the data cannot tell yet: {found['next_measurement']}; measured once more, with the same settings", flush=True)
+        story.run("measure", story.plan, "--out", folder / "judge", *story.epics)
+    streamed = ["replay", folder / "judge", "--no-publish"]
     before = run(story, *streamed)["chi2_per_dof"]
     after = run(story, *streamed, "--model-file", model)["chi2_per_dof"] if model.exists() else before
     result = {
         "truth": [truth],
         "findings": found["findings"],
         "verdict": found["verdict"],
+        "campaigns": campaigns,
         "chi2_per_dof_before": before,
         "chi2_per_dof_after": after,
         "seconds": time.monotonic() - began,
     }
     Path("target/booster.json").write_text(json.dumps(result, indent=2) + "\n")
     print(f"concealed: {truth['kind']} at {truth['at']}, {truth['amplitude']}")
-    print(f"second measurement in the core: chi2/dof {before:.3f} with the design's model, {after:.3f} with what was found")
+    print(f"one more measurement, in the core: chi2/dof {before:.3f} with the design's model, {after:.3f} with what was found")
     print(f"{result['seconds']:.0f} s; target/booster.json, {page}")
     first = (found["findings"] or [{}])[0]
     return 0 if (first.get("kind"), first.get("at")) == (truth["kind"], truth["at"]) else 1
