@@ -101,11 +101,11 @@ exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the sch
 	.venv-control/bin/pip install --quiet -e control/epics -e 'control/gateway[test]'
 	touch .venv-control
 
-control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the gateway seen by three EPICS clients; four minutes
+control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the gateway seen by three EPICS clients; three minutes
 	.venv-control/bin/python control/epics/tests/measure.py $(ORBITCAL)
 	.venv-control/bin/python control/gateway/tests/clients.py $(ORBITCAL)
 
-booster: build .venv-control ## the simulated Booster with a concealed effect, measured through EPICS, diagnosed, measured again: target/booster.json; five minutes
+booster: build .venv-control ## the simulated Booster with a concealed effect, measured through EPICS, diagnosed, judged on one more measurement: target/booster.json; two minutes
 	.venv-control/bin/python control/epics/tests/booster.py $(ORBITCAL)
 
 control-env: .venv-control ## what speaks EPICS: orbitcal-epics, orbitcal-soft-ioc and orbitcal-gateway, in .venv-control

@@ -14,14 +14,13 @@ from pathlib import Path
 
 from measure import Story
 
-# effects of an ordinary size, each at several places: kind, places, amplitudes
+# Kind, places, amplitudes: about twice what `diagnose` states as the median detection limit of one such campaign
+# (8.6 % of a monitor's gain, 7.4 % of a corrector's, 4.4 mrad of a quadrupole's roll)
 CONCEALED = [
-    ("quad_roll", ["B4", "D8", "F2", "C3"], [0.012, -0.015]),
-    ("bpm_gain", ["x_E4", "x_B6", "y_D3"], [0.1, -0.08]),
-    ("corrector_gain", ["H_C4", "H_E6", "V_F1"], [0.08, -0.06]),
-    ("stray_skew_gradient", ["SLOT_B6", "SLOT_D3"], [0.01, -0.012]),
+    ("quad_roll", ["B4", "D8", "F2", "C3"], [0.009, -0.009]),
+    ("bpm_gain", ["x_E4", "x_B6", "y_D3"], [0.17, -0.17]),
+    ("corrector_gain", ["H_C4", "H_E6", "V_F1"], [0.15, -0.15]),
 ]
-
 
 MOST = 3  # campaigns that are taken to tell what is missing
 
