@@ -21,6 +21,15 @@ def of_mean(config, estimate, i):
     return max(of_sigma(config, estimate.sigma[i]), of_mismatch(estimate), key=lambda one: one[0])
 
 
+def of_row(config, estimate, i):
+    """What the record of the mean shows, its limits included."""
+    if not estimate.usable(i):
+        return INVALID
+    low, high = config.mean_alarm
+    beyond = estimate.mean[i] <= low or estimate.mean[i] >= high
+    return MAJOR if beyond else of_mean(config, estimate, i)[0]
+
+
 def of_mismatch(estimate):
     """The readings do not fit the model: nothing that follows from it can be relied on."""
     return (MAJOR, SOFT) if estimate.mismatch == 1 else (NO_ALARM, NONE)

@@ -17,7 +17,7 @@ class Table:
 
     def show(self, config, estimate):
         def row(i):
-            worst, _ = severity.of_mean(config, estimate, i) if estimate.usable(i) else (severity.INVALID, 0)
+            worst = severity.of_row(config, estimate, i)
             return {"name": estimate.vars[i], "mean": estimate.mean[i], "sigma": estimate.sigma[i], "severity": worst}
 
         self.pv.post([row(i) for i in range(len(estimate.vars))], timestamp=estimate.published_s)
