@@ -16,6 +16,7 @@ from .records import Records
 from .table import Table
 
 BEAT_S = 1.0
+GLANCE_S = 0.2  # between two looks at whether to stop
 ACCESS = Path(__file__).with_name("access.acf")
 
 
@@ -38,7 +39,7 @@ class Gateway:
         heard = due = time.monotonic()
         stale = False
         while not stopped():
-            estimate = self.subscriber.newest(max(0.01, due - time.monotonic()))
+            estimate = self.subscriber.newest(min(GLANCE_S, max(0.01, due - time.monotonic())))
             now = time.monotonic()
             if estimate is not None and self.records is None:
                 self.begin(estimate)
