@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -96,6 +96,26 @@ exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the sch
 	python3 -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet numpyro==0.22.0 blackjax==1.7.1 'jax[cpu]==0.10.2' 'arviz==0.23.*'
 
+.venv-control: control/epics/pyproject.toml control/gateway/pyproject.toml
+	python3 -m venv .venv-control
+	.venv-control/bin/pip install --quiet -e control/epics -e 'control/gateway[test]'
+	touch .venv-control
+
+control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the gateway seen by three EPICS clients; three minutes
+	.venv-control/bin/python control/epics/tests/measure.py $(ORBITCAL)
+	.venv-control/bin/python control/gateway/tests/clients.py $(ORBITCAL)
+
+booster: build .venv-control ## the simulated Booster with a concealed effect, measured through EPICS, diagnosed, judged on one more measurement: target/booster.json; two minutes
+	.venv-control/bin/python control/epics/tests/booster.py $(ORBITCAL)
+
+control-env: .venv-control ## what speaks EPICS: orbitcal-epics, orbitcal-soft-ioc and orbitcal-gateway, in .venv-control
+
+soft-ioc: build .venv-control ## the simulated Booster behind a soft IOC, on CA and PVA, a cycle a second
+	.venv-control/bin/orbitcal-soft-ioc --period-s 1 $(ORBITCAL) simulate config/measure-booster.toml
+
+gateway: .venv-control ## published estimates as EPICS records and an NTTable, as config/gateway.toml says
+	.venv-control/bin/orbitcal-gateway config/gateway.toml
+
 validate: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
 	$(ORBITCAL) validate recordings/paper-vars --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
 
@@ -111,4 +131,4 @@ fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv .venv-peers .venv-export
+	rm -rf .venv .venv-peers .venv-export .venv-control

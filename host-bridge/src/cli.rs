@@ -54,6 +54,10 @@ pub enum Command {
     Validate(Validate),
     /// Publish the estimates of a device
     Serve(Serve),
+    /// Measure a campaign through the control system, and put the machine back
+    Measure(Measure),
+    /// Simulate the machine of a plan, one cycle a line, for a soft IOC
+    Simulate(Simulate),
     /// Surrogates and their measured errors
     Surrogate(Surrogate),
 }
@@ -228,6 +232,55 @@ pub struct Response {
     /// What the machine holds
     #[arg(long, value_enum, default_value_t = Rf::FixedMomentum)]
     pub rf: Rf,
+}
+
+/// `orbitcal measure`.
+#[derive(Debug, Args)]
+pub struct Measure {
+    /// What is measured, by which channels, within which limits
+    #[arg(value_name = "PLAN.toml", required_unless_present = "restore")]
+    pub plan: Option<PathBuf>,
+    /// Folder of the recording that is made; DIR.journal beside it is there until it is finished
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["dry_run", "restore"])]
+    pub out: Option<PathBuf>,
+    /// Check the plan and all channels, say what would be done, and write nothing
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Put the machine back as the journal of a killed measurement says
+    #[arg(long, value_name = "JOURNAL", conflicts_with_all = ["plan", "out", "dry_run"])]
+    pub restore: Option<PathBuf>,
+    /// The program that speaks EPICS
+    #[arg(long, value_name = "PROGRAM", default_value = ".venv-control/bin/orbitcal-epics")]
+    pub epics: PathBuf,
+    #[command(flatten)]
+    #[allow(missing_docs)] // flattened options carry their own docs
+    pub common: Common,
+}
+
+/// `orbitcal simulate`.
+#[derive(Debug, Args)]
+pub struct Simulate {
+    /// The plan whose machine and channels are simulated
+    #[arg(value_name = "PLAN.toml")]
+    pub plan: PathBuf,
+    /// Machine file; the built-in AGS Booster without it
+    #[arg(long, value_name = "FILE")]
+    pub machine: Option<PathBuf>,
+    /// Fixes the vars, the misalignments and the noise
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub seed: u64,
+    /// Quadrupole factors, such as {"D8": 0.958}, the others 1; without it they are drawn
+    #[arg(long, value_name = "FILE.json")]
+    pub vars: Option<PathBuf>,
+    /// What the machine has that the design has not, KIND[@PLACE][=AMPLITUDE], repeatable
+    #[arg(long = "effect", value_name = "EFFECT")]
+    pub effects: Vec<EffectText>,
+    /// What fails, repeatable: drop_out@MONITOR=SHARE, freeze@x=CYCLE, stick@CORRECTOR=CYCLE
+    #[arg(long = "fault", value_name = "FAULT")]
+    pub faults: Vec<String>,
+    /// Time constant of the correctors' supplies [s]
+    #[arg(long, value_name = "S", default_value_t = 0.3)]
+    pub settling_s: f64,
 }
 
 /// `orbitcal fit`.

@@ -7,8 +7,8 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, replay, response, serve,
-    study, surrogate, validate, watch,
+    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, measure, replay, response,
+    serve, simulate, study, surrogate, validate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -39,6 +39,8 @@ fn main() -> ExitCode {
         Command::Export(options) => export::run(options),
         Command::Validate(options) => validate::run(options),
         Command::Serve(options) => serve::run(options),
+        Command::Measure(options) => measure::run(options),
+        Command::Simulate(options) => simulate::run(options),
         Command::Surrogate(options) => surrogate::run(options),
     };
     match done {

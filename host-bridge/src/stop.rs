@@ -6,7 +6,7 @@ use std::io;
 use std::sync::Arc;
 use std::time::Instant;
 
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 
 /// Longest sleep without a look at the question.
@@ -28,6 +28,19 @@ impl Stop {
             flag::register_conditional_default(signal, stop.0.clone())?;
             flag::register(signal, stop.0.clone())?;
         }
+        Ok(stop)
+    }
+
+    /// From now on signals, a closed terminal's among them, only set what is asked here: the process ends by itself when what has to be
+    /// done before is done.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn until_done() -> io::Result<Self> {
+        let stop = Self::default();
+        [SIGINT, SIGTERM, SIGHUP]
+            .into_iter()
+            .try_for_each(|signal| flag::register(signal, stop.0.clone()).map(drop))?;
         Ok(stop)
     }
 

@@ -1,10 +1,11 @@
 //! Simulated campaigns: the settings, read-backs and gaps of a recording, with readings made by the twin at known vars.
 //!
 //! [`like`] is the machine of the estimator's model: linear optics, constant baselines, no other effects.
-//! [`campaign()`] is one of exact orbits, with any effects; [`conceal()`] puts effects into a recording that was measured.
+//! [`campaign()`] is one of exact orbits, with any effects, and [`Live`] the same machine one cycle at a time; [`conceal()`] puts effects into a recording that was measured.
 
 mod campaign;
 mod conceal;
+mod live;
 
 use nalgebra::DVector;
 use rand::rngs::StdRng;
@@ -19,6 +20,7 @@ use crate::recording::Recording;
 
 pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
 pub use conceal::conceal;
+pub use live::Live;
 
 /// What the simulated monitors do.
 #[derive(Debug, Clone)]

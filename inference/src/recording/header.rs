@@ -142,6 +142,16 @@ enum PerName {
 const DEFAULT: &str = "default";
 
 impl Header {
+    /// Read the header of a campaign that is still to be taken.
+    ///
+    /// # Errors
+    /// [`RecordingError`], the first fault met.
+    pub fn read(file: &Path, ring: &Ring) -> Result<Self, RecordingError> {
+        let text = super::text(file)?;
+        let ring = super::powered(ring, format(file, &text)?);
+        Self::parse(file, &text, &ring, &Names::of(&ring))
+    }
+
     pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
         let text = Text { file, text };
         text.check_name(ring)?;

@@ -22,7 +22,7 @@ use twin::Ring;
 pub use error::{Mismatch, Part, Place, RecordingError};
 pub use frames::Row;
 pub use header::{BelievedRf, Format, Header, at_energy};
-use names::Names;
+pub use names::Names;
 pub use ramp::{At, Ramp};
 
 /// One campaign: what it was taken with, and one row a machine cycle.

@@ -10,7 +10,7 @@ pub(super) const FOCUSING: [&str; 2] = ["qh", "qv"];
 
 /// Monitors, correctors and supplies of a ring by the names that a recording may use for them.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Names {
+pub struct Names {
     /// Monitors with their plane, `x_A6` [B].
     pub monitors: Vec<String>,
     /// Correctors, `A2` [C].

@@ -115,7 +115,7 @@ pub fn campaign(
 }
 
 /// Shift every quadrupole.
-fn misalign(ring: &mut Ring, sigma: [f64; 2], random: &mut StdRng) {
+pub(super) fn misalign(ring: &mut Ring, sigma: [f64; 2], random: &mut StdRng) {
     for quadrupole in &ring.quadrupoles {
         let misalignment = &mut ring.elements[quadrupole.element].misalignment;
         (misalignment.dx, misalignment.dy) = (sigma[0] * normal(random), sigma[1] * normal(random));
@@ -124,27 +124,29 @@ fn misalign(ring: &mut Ring, sigma: [f64; 2], random: &mut StdRng) {
 
 /// What drove each frame.
 fn cycles(template: &Recording, ring: &Ring) -> Vec<Cycle> {
-    let of = |(row, time): (&Row, f64)| {
-        let drive = Drive::of(&template.header, row);
-        let factors = ring.strengths(&[], drive.strength.as_slice());
-        let strength = factors.iter().map(|factor| factor.ln()).collect();
-        Cycle { kick: drive.kick.iter().copied().collect(), strength, rf_offset: drive.rf_offset, time }
-    };
-    template.rows.iter().zip(template.times()).map(of).collect()
+    template.rows.iter().zip(template.times()).map(|(row, time)| cycle(template, ring, row, time)).collect()
+}
+
+/// What drove one frame, at a time within the campaign.
+pub(super) fn cycle(template: &Recording, ring: &Ring, row: &Row, time: f64) -> Cycle {
+    let drive = Drive::of(&template.header, row);
+    let factors = ring.strengths(&[], drive.strength.as_slice());
+    let strength = factors.iter().map(|factor| factor.ln()).collect();
+    Cycle { kick: drive.kick.iter().copied().collect(), strength, rf_offset: drive.rf_offset, time }
 }
 
 impl Hardware {
-    fn offset(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
+    pub(super) fn offset(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
         readings.column_iter_mut().for_each(|mut column| column.add_scalar_mut(self.offset * normal(random)));
     }
 
-    fn add_noise(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
+    pub(super) fn add_noise(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
         for (mut column, noise) in readings.column_iter_mut().zip(&self.noise) {
             column.apply(|reading| *reading += noise * normal(random));
         }
     }
 
-    fn jump(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
+    pub(super) fn jump(&self, readings: &mut DMatrix<f64>, random: &mut StdRng) {
         for jumps in &self.jumps {
             for reading in &mut readings.column_mut(jumps.monitor) {
                 let sign = if random.random_bool(0.5) { 1.0 } else { -1.0 };
@@ -155,7 +157,7 @@ impl Hardware {
     }
 
     /// The meter's reading of each tune: its fractional part.
-    fn meter(&self, tunes: &[Tunes], random: &mut StdRng) -> Vec<[f64; 2]> {
+    pub(super) fn meter(&self, tunes: &[Tunes], random: &mut StdRng) -> Vec<[f64; 2]> {
         let mut read = |tune: f64| (tune + self.tune_noise * normal(random)).rem_euclid(1.0);
         tunes.iter().map(|tunes| [read(tunes.x), read(tunes.y)]).collect()
     }
