@@ -42,10 +42,10 @@ struct Reply {
 }
 
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(rename_all = "snake_case")]
 enum Sampled {
-    Value(Sample),
-    Error { error: String },
+    Sample(Sample),
+    Error(String),
 }
 
 impl Epics {
@@ -122,8 +122,8 @@ impl Control for Epics {
     fn sample(&mut self, names: &[&str]) -> Result<Vec<Result<Sample, String>>, ControlError> {
         let sampled = expect_all(names, self.ask(json!({"do": "read", "channels": names}))?.samples)?;
         let one = |sampled| match sampled {
-            Sampled::Value(sample) => Ok(sample),
-            Sampled::Error { error } => Err(error),
+            Sampled::Sample(sample) => Ok(sample),
+            Sampled::Error(error) => Err(error),
         };
         Ok(sampled.into_iter().map(one).collect())
     }

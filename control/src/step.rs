@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// One setting; everything that it does not name is as it was before the measurement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(rename_all = "snake_case")]
 pub enum Step {
     /// A corrector is set.
     Corrector {

@@ -60,7 +60,8 @@ async def read(request):
 def sample(value):
     if not value.ok:
         return {"error": why(value)}
-    return {"value": numbers(value), "time_s": value.timestamp, "invalid": value.severity >= INVALID}
+    taken = {"value": numbers(value), "time_s": value.timestamp, "invalid": value.severity >= INVALID}
+    return {"sample": taken}
 
 
 def why(failed):
