@@ -211,6 +211,9 @@ fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
     (0..folder.monitors.len()).map(state).collect()
 }
 
+const DOUBT: &str =
+    "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units";
+
 impl fmt::Display for MatrixFit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { recording, elements, rejected_elements, chi2_loco, chi2_loco_start, .. } = self;
@@ -220,8 +223,7 @@ impl fmt::Display for MatrixFit {
             writeln!(f, "{}\n", fill(&format!("{done} the fit: {kind} at {}", at.replace(',', ", "))))?;
         }
         if !self.has_ended {
-            let doubt = "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units.";
-            writeln!(f, "{}\n", fill(doubt))?;
+            writeln!(f, "{}\n", fill(&format!("{DOUBT}.")))?;
         }
         let line = format!(
             "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; 68 % of the residuals are within: {}",
@@ -486,15 +488,17 @@ impl MatrixDiagnosis {
         let left_over = LeftOver::of(&diagnosis.sides, &worst);
         let coupling = lacks_coupling(found).then(|| coupling(&diagnosis.sides));
         let more = findings.len().saturating_sub(SAID);
-        let said: Vec<String> = (coupling.into_iter())
+        // what was found of a fit that did not end is of no ring
+        let doubt = (!fit.has_ended).then(|| DOUBT.to_owned());
+        let said: Vec<String> = (doubt.into_iter().chain(coupling))
             .chain(findings.iter().take(SAID).map(|one| one.sentence.clone()))
             .chain((more > 0).then(|| format!("{more} more are listed")))
             .chain(left_over.is_told().then(|| left_over.sentence.clone()))
             .collect();
         let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
-            (false, _) => ("identified", said.join("; ")),
-            (true, false) => ("unexplained", said.join("; ")),
-            (true, true) => ("consistent", "nothing was found beside the learnt error of the model".into()),
+            (false, _) if fit.has_ended => ("identified", said.join("; ")),
+            (_, false) => ("unexplained", said.join("; ")),
+            (_, true) => ("consistent", "nothing was found beside the learnt error of the model".into()),
         };
         let unexplained = diagnosis.unexplained.iter();
         let unexplained =

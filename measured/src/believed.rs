@@ -115,6 +115,8 @@ impl Believed {
             };
             match fitted.unknowns.iter().position(|unknown| is_it(unknown.kind)) {
                 Some(at) => values[at] = one.value,
+                // what is dead by now tells nothing
+                None if is_instrument(folder, &one.at) => {}
                 None => {
                     let what = format!("the model has {} at {}, {} has none", one.kind, one.at, folder.name);
                     return Err(MeasuredError::Unlike(what));
@@ -123,6 +125,22 @@ impl Believed {
         }
         Ok(values)
     }
+}
+
+fn is_instrument(folder: &Folder, name: &str) -> bool {
+    (0..folder.monitors.len()).any(|row| folder.monitor(row) == name)
+        || (0..folder.correctors.len()).any(|column| folder.corrector(column) == name)
+}
+
+/// Instruments in use that a fit has left out.
+fn dead(folder: &Folder, fitted: &Fit) -> Vec<Wiring> {
+    let is_left_out = |kind: Kind| !fitted.unknowns.iter().any(|one| one.kind == kind);
+    let rows = (0..folder.monitors.len()).filter(|&row| folder.monitors[row].is_used);
+    let rows: Vec<usize> = rows.filter(|&row| is_left_out(Kind::MonitorGain(row))).collect();
+    let columns = (0..folder.correctors.len()).filter(|&column| folder.correctors[column].is_used);
+    let columns: Vec<usize> = columns.filter(|&column| is_left_out(Kind::CorrectorGain(column))).collect();
+    let monitors = (!rows.is_empty()).then_some(Wiring::MonitorsDead(rows));
+    monitors.into_iter().chain((!columns.is_empty()).then_some(Wiring::CorrectorsDead(columns))).collect()
 }
 
 /// What a measurement, as it was measured and as it was fitted by itself, says against a model.
@@ -141,9 +159,12 @@ pub fn against(
     for [kind, at] in &believed.cables {
         Wiring::of_name(&folder, kind, at)?.put_right(&mut folder);
     }
+    let dead = dead(&folder, fitted);
+    dead.iter().for_each(|one| one.put_right(&mut folder));
     let model = Model::of(&folder, &fitted.groups, settings.rf)?;
     let expected = model.predict(&fitted.unknowns, &values)?.matrix;
-    let (folder, wiring) = straightened_by(&folder, &expected.columns(0, folder.correctors.len()).into_owned());
+    let (folder, mut wiring) = straightened_by(&folder, &expected.columns(0, folder.correctors.len()).into_owned());
+    wiring.extend(dead);
     let mut data = Data::of(&folder);
     fitted.outliers.iter().for_each(|&[row, column]| data.sigma[(row, column)] = f64::INFINITY);
     let found = Departures::of(&model, &fitted.unknowns, &values, &data, progress)?;
@@ -163,6 +184,7 @@ pub fn against(
 mod tests {
     use super::*;
     use crate::fit::fit;
+    use crate::straight::Straightened;
     use crate::testing::{NOISE, machine, measured, ring};
 
     #[test]
@@ -201,6 +223,20 @@ mod tests {
         }
         assert!(found.departures.iter().any(|one| one.kind == row), "{found:?}");
         assert!(found.departures.iter().filter(|one| matches!(one.kind, Kind::Skew(_))).count() > 1, "{found:?}");
+    }
+
+    #[test]
+    fn a_monitor_that_has_died_is_said() {
+        let ring = ring();
+        let before = measured(&ring, &machine(&ring, 21), NOISE, 3);
+        let settings = Settings::default();
+        let model = Believed::of(&before, &[], &fit(&before, &settings, &mut |_| ()).unwrap());
+        let mut now = before.clone();
+        now.matrix.row_mut(5).fill(0.0);
+        let straightened = Straightened::of(&now, &settings, &mut |_| ()).unwrap();
+        let found = against(&now, &straightened.fit, &model, &settings, &mut |_| ()).unwrap();
+        assert_eq!(found.wiring, [Wiring::MonitorsDead(vec![5])]);
+        assert_eq!(found.departures, []);
     }
 
     #[test]

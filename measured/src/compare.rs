@@ -86,7 +86,7 @@ pub fn compare(
     };
     for j in 0..data.sigma.ncols() {
         for i in 0..data.sigma.nrows() {
-            let both = first.sigma[(i, j)].hypot(data.sigma[(i, j)]);
+            let both = (first.sigma[(i, j)] * per_kick(j)).hypot(data.sigma[(i, j)]);
             let counts = both.is_finite();
             data.sigma[(i, j)] = if counts { both } else { f64::INFINITY };
             data.measured[(i, j)] =

@@ -52,14 +52,14 @@ impl Share {
     }
 }
 
-/// An instrument whose readings the model explains worse than its block's.
+/// An instrument whose readings the model explains worse than those of the others.
 #[derive(Debug, Clone)]
 pub struct Unexplained {
     /// Its name.
     pub at: String,
     /// Rms of its residuals [mm].
     pub rms: f64,
-    /// Its mean square over that of its block's other elements, by their weights.
+    /// Its mean square over that of all other elements, by their weights.
     pub ratio: f64,
 }
 
@@ -160,6 +160,9 @@ fn dispersion_missed(folder: &Folder, at: &Prediction) -> f64 {
     let scale = product / squares;
     let mut off: Vec<f64> = pairs.iter().map(|(m, p)| (m - scale * p).abs()).collect();
     off.sort_by(f64::total_cmp);
+    if pairs.is_empty() || squares == 0.0 {
+        return 0.0;
+    }
     let rms = scale.abs() * (squares / pairs.len() as f64).sqrt();
     1.4826 * off.get(off.len() / 2).copied().unwrap_or(0.0) / rms
 }

@@ -86,6 +86,31 @@ impl Particle {
     }
 }
 
+impl Meta {
+    /// Frequency and circumference are those of a ring, and groups of the reference fit are of elements of the lattice, which has so many.
+    fn check(&self, elements: usize) -> Result<(), String> {
+        for (name, value) in [("circumference_m", self.circumference), ("rf_Hz", self.rf)] {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(format!("{name} {value}, expected above 0"));
+            }
+        }
+        let groups = self.reference_fit.iter().flat_map(|fit| &fit.fit_parameters);
+        for (number, group) in groups.enumerate() {
+            let place = format!("reference_fit, fit_parameters {number}");
+            if !["K", "PolynomA"].contains(&group.field.as_str()) {
+                let field = &group.field;
+                return Err(format!("{place}: field {field}, expected K (gradients) or PolynomA (skew gradients)"));
+            }
+            match group.elements.iter().find(|row| **row >= elements) {
+                Some(row) => return Err(format!("{place}: element {row}, lattice.csv has rows 0 to {}", elements - 1)),
+                None if group.elements.is_empty() => return Err(format!("{place}: expected elements, found none")),
+                None => {}
+            }
+        }
+        Ok(())
+    }
+}
+
 /// The parameters of another fit to the same matrix.
 #[derive(Debug, Clone, Deserialize, Serialize)]
 pub struct ReferenceFit {
@@ -236,6 +261,10 @@ impl Folder {
     /// Places that are named exist and have one instrument each, noise is above zero, correctors kick, and no orbit is outside every beam pipe.
     fn check(&self, path: &Path) -> Result<(), MeasuredError> {
         let last = self.lattice.len();
+        if last == 0 {
+            return Err(table(&path.join("lattice.csv"), "expected elements, found none".into()));
+        }
+        self.meta.check(last).map_err(|problem| table(&path.join("meta.json"), problem))?;
         let mut places = (self.monitors.iter().map(|one| ("bpms.csv", one.at)))
             .chain(self.correctors.iter().map(|one| ("correctors.csv", one.at)));
         if let Some((file, at)) = places.find(|(_, at)| *at >= last) {
@@ -273,7 +302,19 @@ impl Folder {
             Some((i, j)) => {
                 let (at, by) = (self.monitor(i), self.corrector(j));
                 let problem = format!("{at} by {by}: {} mm, expected {WIDEST} mm at most", self.matrix[(i, j)]);
-                Err(table(&path.join("orm_measured_mm.csv"), problem))
+                return Err(table(&path.join("orm_measured_mm.csv"), problem));
+            }
+            None => {}
+        }
+        let Some(dispersion) = &self.dispersion else { return Ok(()) };
+        let file = path.join("dispersion_orbit_mm.csv");
+        if self.meta.delta_rf == 0.0 {
+            return Err(table(&file, "the orbit of a step of 0 Hz (delta_rf_Hz of meta.json)".into()));
+        }
+        match dispersion.iter().position(|one| one.abs() > WIDEST) {
+            Some(row) => {
+                let problem = format!("{}: {} mm, expected {WIDEST} mm at most", self.monitor(row), dispersion[row]);
+                Err(table(&file, problem))
             }
             None => Ok(()),
         }
@@ -401,6 +442,24 @@ mod tests {
             "orm_measured_mm.csv: expected 2 rows, one a monitor of bpms.csv, found 1"
         );
         assert!(refused("meta.json", "{}").contains("circumference_m"));
+        assert_eq!(refused("meta.json", &META.replace("5e8", "0")), "meta.json: rf_Hz 0, expected above 0");
+        let header = LATTICE.lines().next().unwrap();
+        assert_eq!(refused("lattice.csv", header), "lattice.csv: expected elements, found none");
+        let flags = r#""flags": {"Coupling": "Yes", "Dispersion": "No"}"#;
+        for (group, problem) in [
+            (r#"{"elements": [7], "field": "K"}"#, "element 7, lattice.csv has rows 0 to 1"),
+            (r#"{"elements": [], "field": "K"}"#, "expected elements, found none"),
+            (
+                r#"{"elements": [1], "field": "PolynomB"}"#,
+                "field PolynomB, expected K (gradients) or PolynomA (skew gradients)",
+            ),
+        ] {
+            let fit = format!(r#", "reference_fit": {{"fit_parameters": [{group}], {flags}}}}}"#);
+            assert_eq!(
+                refused("meta.json", &META.replace('}', &fit)),
+                format!("meta.json: reference_fit, fit_parameters 0: {problem}")
+            );
+        }
         assert_eq!(
             refused("correctors.csv", &CORRECTORS.replace("0.1", "0")),
             "correctors.csv: row 0: nominal_kick_mrad 0, expected one where the corrector is used"

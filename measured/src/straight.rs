@@ -10,7 +10,7 @@ use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings, fit};
 use crate::folder::Folder;
 use crate::model::Model;
-use crate::unknowns::Kind;
+use crate::unknowns::{Kind, groups};
 use crate::wiring::{Wiring, exchanged_back, straightened};
 
 /// A gain below this is that of a dead instrument.
@@ -38,6 +38,7 @@ impl Straightened {
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
         let (folder, cables) = straightened(as_measured, settings)?;
+        expect_unit(&folder, settings)?;
         let mut here = Self { fit: fit(&folder, settings, progress)?, folder, cables };
         while let Some(better) = here.once_more(settings, progress)? {
             here = better;
@@ -84,6 +85,32 @@ impl Straightened {
     }
 }
 
+/// The matrix is about as large as that of the lattice as written: in another unit its instruments look dead.
+fn expect_unit(folder: &Folder, settings: &Settings) -> Result<(), MeasuredError> {
+    let written = Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?;
+    let counts = |&(i, j): &(usize, usize)| {
+        let (monitor, corrector) = (&folder.monitors[i], &folder.correctors[j]);
+        monitor.plane == corrector.plane && monitor.is_used && corrector.is_used && folder.matrix[(i, j)].is_finite()
+    };
+    let (rows, columns) = folder.matrix.shape();
+    let elements: Vec<(usize, usize)> = (0..rows * columns).map(|k| (k % rows, k / rows)).filter(counts).collect();
+    let median = |matrix: &DMatrix<f64>| {
+        let mut sizes: Vec<f64> = elements.iter().map(|&at| matrix[at].abs()).collect();
+        sizes.sort_by(f64::total_cmp);
+        sizes.get(sizes.len() / 2).copied().unwrap_or_default()
+    };
+    let [measured, expected] = [&folder.matrix, &written].map(median);
+    // a dead measurement is said as such
+    if measured == 0.0 || (DEAD * expected..expected / DEAD).contains(&measured) {
+        return Ok(());
+    }
+    Err(MeasuredError::Convention(format!(
+        "{}: elements of the matrix are {measured:.2e} mm, those of the lattice as written {expected:.2e} mm (medians of their sizes): the unit of \
+         the matrix or of the kicks is another one",
+        folder.name
+    )))
+}
+
 /// What the instruments of a fit would measure, all with one sign [mm]: one that reads another's orbit may have a negative gain.
 fn expected(folder: &Folder, fit: &Fit, settings: &Settings) -> Result<DMatrix<f64>, MeasuredError> {
     let mut values = fit.values.clone();
@@ -128,6 +155,18 @@ mod tests {
         folder.monitors[..2].iter_mut().for_each(|one| one.is_used = false);
         let refused = of(&folder).unwrap_err().to_string();
         assert_eq!(refused, "ring: no element of the matrix counts: of 24 monitors 0 are in use, of 24 correctors 24");
+    }
+
+    #[test]
+    fn a_matrix_in_another_unit_is_refused() {
+        let ring = ring();
+        let plain = measured(&ring, &machine(&ring, 12), NOISE, 1);
+        for unit in [0.01, 10.0, 1000.0] {
+            let mut folder = plain.clone();
+            folder.matrix *= unit;
+            let refused = Straightened::of(&folder, &Settings::default(), &mut |_| ()).unwrap_err().to_string();
+            assert!(refused.contains("the unit of the matrix or of the kicks is another one"), "{refused}");
+        }
     }
 
     /// Of 2500 exchanges of two correctors in 19 rings ten do not show by the lattice as written; beside a fit all do.

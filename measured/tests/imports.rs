@@ -268,6 +268,13 @@ fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
     assert!(refused(&path).contains("element cor: field k0 0.11 /m bends by 0.11 rad, the reference orbit by 0.1 rad"));
 }
 
+#[test]
+fn a_replica_of_itself_is_refused() {
+    let line = r#"{"element_names": ["a"], "elements": {"a": {"__class__": "Replica", "parent_name": "b"}, "b": {"__class__": "Replica", "parent_name": "a"}}}"#;
+    let (_folder, path) = file("ring.json", line);
+    assert!(refused(&path).contains("element a of element_names, or what it replicates, is not among the elements"));
+}
+
 /// As Tao writes: `L`, `pc_ref`, and a dipole's numbers among `ParticleP`.
 const BY_TAO: &str = "PALS:
   facility:

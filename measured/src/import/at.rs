@@ -13,7 +13,7 @@ use crate::error::MeasuredError;
 use crate::folder::Particle;
 
 /// More periods than any ring has.
-const MOST_PERIODS: f64 = 10_000.0;
+const MOST_PERIODS: f64 = 1_000.0;
 /// Classes without a field that matters here.
 const FIELD_FREE: [&str; 14] = [
     "Drift",

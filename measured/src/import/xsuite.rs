@@ -5,7 +5,7 @@
 //!
 //! Source: xtrack 0.118, `Line.to_dict` and the fields of its elements.
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::element::{Element, Format, Lattice, Role};
 use super::fields::{Fields, NONE, Strengths, give};
@@ -26,17 +26,25 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
     };
     for name in names {
         let name = name.as_str().unwrap_or_default();
-        let mut found = elements.get(name);
-        // a replica is another element again
-        while let Some(parent) = found.filter(|one| class(one) == "Replica").and_then(|one| one.get("parent_name")) {
-            found = elements.get(parent.as_str().unwrap_or_default());
-        }
-        let Some(value) = found else {
-            return lattice.refuse(format!("element {name} of element_names is not among the elements"));
+        let Some(value) = original(elements, name) else {
+            return lattice
+                .refuse(format!("element {name} of element_names, or what it replicates, is not among the elements"));
         };
         element(&mut lattice, &Fields { file, name, value })?;
     }
     Ok(lattice)
+}
+
+/// An element, or the one that a replica is of, which may be a replica again; none that come back to themselves.
+fn original<'v>(elements: &'v Map<String, Value>, name: &str) -> Option<&'v Value> {
+    let mut found = elements.get(name)?;
+    for _ in 0..elements.len() {
+        if class(found) != "Replica" {
+            return Some(found);
+        }
+        found = elements.get(found.get("parent_name")?.as_str()?)?;
+    }
+    None
 }
 
 fn class(value: &Value) -> &str {
