@@ -298,13 +298,11 @@ impl Folder {
             return Err(error);
         }
         let (rows, columns) = self.matrix.shape();
-        match (0..rows * columns).map(|k| (k % rows, k / rows)).find(|&at| self.matrix[at].abs() > WIDEST) {
-            Some((i, j)) => {
-                let (at, by) = (self.monitor(i), self.corrector(j));
-                let problem = format!("{at} by {by}: {} mm, expected {WIDEST} mm at most", self.matrix[(i, j)]);
-                return Err(table(&path.join("orm_measured_mm.csv"), problem));
-            }
-            None => {}
+        let mut elements = (0..rows * columns).map(|k| (k % rows, k / rows));
+        if let Some((i, j)) = elements.find(|&at| self.matrix[at].abs() > WIDEST) {
+            let (at, by) = (self.monitor(i), self.corrector(j));
+            let problem = format!("{at} by {by}: {} mm, expected {WIDEST} mm at most", self.matrix[(i, j)]);
+            return Err(table(&path.join("orm_measured_mm.csv"), problem));
         }
         let Some(dispersion) = &self.dispersion else { return Ok(()) };
         let file = path.join("dispersion_orbit_mm.csv");
