@@ -374,10 +374,16 @@ impl<'d> Problem<'d> {
         self.data.units.len() + self.unknowns.len() - self.ordinary.start.len()
     }
 
-    /// Whitened residuals.
-    fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
+    /// The same point with the ordinary imperfections at their start: the machine about which they are of first order.
+    fn held(&self, u: &DVector<f64>) -> DVector<f64> {
         let mut held = u.clone();
         held.rows_range_mut(self.others()..).copy_from(&self.ordinary.start);
+        held
+    }
+
+    /// Whitened residuals.
+    fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
+        let held = self.held(u);
         let moved = u.rows_range(self.others()..) - &self.ordinary.start;
         let left = self.data.stacked(|campaign, own| {
             let (machine, drives) = machine_at(self.data, self.hypothesis, campaign, &held)?;
@@ -389,8 +395,9 @@ impl<'d> Problem<'d> {
     /// Derivative of the predicted numbers with respect to the others.
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
+        let held = self.held(u);
         let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
-            let (machine, drives) = machine_at(data, self.hypothesis, campaign, u)?;
+            let (machine, drives) = machine_at(data, self.hypothesis, campaign, &held)?;
             let machine = machine.on_orbit(&drives.orbit);
             let of_vars = Signatures::of(&machine, &drives)?.of_vars().into_iter().zip(&data.units.sigma);
             own.signatures::<EffectError>(vars, of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma))))

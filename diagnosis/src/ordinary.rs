@@ -246,7 +246,8 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
     families
 }
 
-/// The member of each learnt family that stands out most of it: it may have made the family as wide as it is, and then hide in it.
+/// The member of each learnt family that stands out most of it: it may have made the family as wide as it is, and then hide in it. An instrument
+/// whose gain does may be reversed, which a gain of -2 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     let members: Vec<(Term, f64)> = (unknowns.iter())
@@ -260,7 +261,18 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
         let own = members.iter().filter(|(term, u)| term.kind == family.kind && *u > STANDS_OUT);
         own.max_by(|(_, one), (_, other)| one.total_cmp(other)).map(|(term, _)| *term)
     };
-    fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most).collect()
+    let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
+    stands_out.flat_map(|term| [Some(term), reversed(term)]).flatten().collect()
+}
+
+/// The reversed instrument of a gain.
+fn reversed(gain: Term) -> Option<Term> {
+    let kind = match gain.kind {
+        EffectKind::BpmGain => EffectKind::BpmPolarity,
+        EffectKind::CorrectorGain => EffectKind::CorrectorPolarity,
+        _ => return None,
+    };
+    Some(Term { kind, ..gain })
 }
 
 /// The sizes of the ordinary imperfections in a fit, of several recordings those of the first where each has its own. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's

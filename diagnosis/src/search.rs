@@ -407,7 +407,8 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
         guess[fitted.params.len() + at] = candidate.amplitude;
     }
     let mut guesses = vec![guess];
-    if fitted.is_gross() {
+    // what is ordinary may have gone where a reversed or exchanged instrument leaves it
+    if fitted.is_gross() || candidate.term.kind.is_switch() {
         guesses.push(DVector::zeros(fitted.params.len()));
     }
     let fits = guesses.iter().filter_map(|guess| Fitted::against(data, &hypothesis, guess, least).ok());
