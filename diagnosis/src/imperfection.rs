@@ -46,15 +46,26 @@ impl Imperfection {
 
     /// As a row of a table: what it is, its size, what is ordinary, and a remark.
     pub fn row(&self) -> [String; 4] {
-        let Self { name, at, measure, measured, unit, ordinary, .. } = *self;
-        let what = if at == "all" { name.to_owned() } else { format!("{name}, {at}") };
-        let size = match measure {
+        let remark = if self.is_large() { "large" } else { "" };
+        let ordinary = if self.ordinary == 0.0 { "none".to_owned() } else { self.unit.rounded(self.ordinary) };
+        [self.what(), self.size(), ordinary, remark.to_owned()]
+    }
+
+    /// In a sentence: what it is and its size.
+    pub fn said(&self) -> String {
+        format!("{} {}", self.what(), self.size())
+    }
+
+    fn what(&self) -> String {
+        if self.at == "all" { self.name.to_owned() } else { format!("{}, {}", self.name, self.at) }
+    }
+
+    fn size(&self) -> String {
+        let Self { measured, unit, .. } = self;
+        match self.measure {
             Measure::Mean => format!("{} {}", measured.signed(unit.factor), unit.shown),
             Measure::Scatter => format!("{} {} rms", measured.size(unit.factor), unit.shown),
-        };
-        let remark = if self.is_large() { "large" } else { "" };
-        let ordinary = if ordinary == 0.0 { "none".to_owned() } else { unit.rounded(ordinary) };
-        [what, size, ordinary, remark.to_owned()]
+        }
     }
 }
 
@@ -74,6 +85,7 @@ mod tests {
             ordinary: 0.02,
         };
         assert_eq!(one(0.05).row(), ["gains of monitors", "5.00 ± 0.40 % rms", "2.0 %", "large"]);
+        assert_eq!(one(0.05).said(), "gains of monitors 5.00 ± 0.40 % rms");
         assert!(!one(0.03).is_large() && one(0.03).is_seen() && !one(0.007).is_seen());
     }
 }

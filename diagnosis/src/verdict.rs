@@ -10,7 +10,9 @@ use super::error::FitError;
 use super::experiment::Menu;
 use super::heldout::{Block, Score, VALIDATED, gain_of_choice, reduced};
 use super::hypothesis::Term;
+use super::imperfection::Imperfection;
 use super::limits::Limits;
+use super::ordinary;
 use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
 use super::scan::separations;
@@ -382,6 +384,9 @@ pub fn sentence(
         .map(|(_, name)| name)
         .collect();
     let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
+    let large: Vec<String> =
+        ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
+    let large = if large.is_empty() { String::new() } else { format!("; larger than ordinary: {}", large.join(", ")) };
     let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
     let of_one = |one: &Contradiction| match data.is_joint() {
         true => format!("; in {} {one}", one.recording),
@@ -392,7 +397,7 @@ pub fn sentence(
         true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
         false => String::new(),
     };
-    capitalised(&format!("{text}{contradicted}{noise}{faulty}{together}"))
+    capitalised(&format!("{text}{contradicted}{large}{noise}{faulty}{together}"))
 }
 
 /// What is missing and not in the library.
