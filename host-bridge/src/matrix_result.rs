@@ -99,6 +99,7 @@ pub struct StatedModel {
 struct StatedVar {
     name: String,
     mean: f64,
+    sigma: f64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -106,6 +107,7 @@ struct StatedOther {
     kind: String,
     at: String,
     mean: f64,
+    sigma: f64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -116,9 +118,9 @@ struct StatedCable {
 
 impl From<StatedModel> for Believed {
     fn from(stated: StatedModel) -> Self {
-        let vars = stated.vars.into_iter().map(|one| ("quadrupole_gradient".to_owned(), one.name, one.mean));
-        let others = stated.other.into_iter().map(|one| (one.kind, one.at, one.mean));
-        let values = vars.chain(others).map(|(kind, at, value)| Value { kind, at, value });
+        let vars = stated.vars.into_iter().map(|one| ("quadrupole_gradient".to_owned(), one.name, one.mean, one.sigma));
+        let others = stated.other.into_iter().map(|one| (one.kind, one.at, one.mean, one.sigma));
+        let values = vars.chain(others).map(|(kind, at, value, sigma)| Value { kind, at, value, sigma });
         let cables = stated.wiring.into_iter().map(|one| [one.kind, one.at]);
         Self { values: values.collect(), cables: cables.collect() }
     }

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use crate::data::Data;
-use crate::departure::Departures;
+use crate::departure::{Departures, Expected};
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
@@ -75,8 +75,7 @@ pub fn compare(
     expect_alike(one, other)?;
     let mut other = other.clone();
     cables.iter().for_each(|cable| cable.put_right(&mut other));
-    let before = fitted.data.measured.columns(0, one.correctors.len()).into_owned();
-    let (other, wiring) = straightened_by(&other, &before);
+    let (other, wiring) = straightened_by(&other, &one.matrix);
     let model = Model::of(one, &fitted.groups, settings.rf)?.with_kicks(&other);
     let (first, mut data) = (&fitted.data, Data::of(&other));
     // what is left over grows with the kick
@@ -93,7 +92,9 @@ pub fn compare(
                 if counts { data.measured[(i, j)] - fitted.residual[(i, j)] * per_kick(j) } else { 0.0 };
         }
     }
-    let found = Departures::of(&model, &fitted.unknowns, &fitted.values, &data, progress)?;
+    // the errors of the first stand in the elements
+    let expected = Expected { values: fitted.values.clone(), covariance: None };
+    let found = Departures::of(&model, &fitted.unknowns, &expected, &data, progress)?;
     Ok(Changes { gradients: gradients(one, fitted, &found), others: others(one, fitted, &found), wiring })
 }
 

@@ -8,7 +8,7 @@
 //!
 //! Source: J. M. Dickey, Ann. Math. Stat. 42 (1971) 204, the ratio of posterior and prior density where nothing departs.
 
-use nalgebra::DVector;
+use nalgebra::{DMatrix, DVector};
 use statrs::distribution::{ContinuousCDF, Normal};
 
 use crate::data::Data;
@@ -31,6 +31,14 @@ pub fn clear(unknowns: usize) -> f64 {
     -Normal::standard().inverse_cdf(0.5 / (FALSE * unknowns.max(1) as f64))
 }
 
+/// Values that are expected of the unknowns.
+pub struct Expected {
+    /// The values.
+    pub values: DVector<f64>,
+    /// Covariance of their errors, none where they count as exact.
+    pub covariance: Option<DMatrix<f64>>,
+}
+
 /// Values that are found beside those that are expected.
 pub struct Departures {
     /// Unknowns with their expected values, and the priors that they had at the end.
@@ -39,6 +47,8 @@ pub struct Departures {
     pub values: DVector<f64>,
     /// How well they are known.
     pub uncertainty: Uncertainty,
+    /// Covariance of the departures that the errors of the expected values make, none where these count as exact.
+    of_expected: Option<DMatrix<f64>>,
 }
 
 impl Departures {
@@ -50,28 +60,33 @@ impl Departures {
     pub fn of(
         model: &Model,
         fitted: &[Unknown],
-        expected: &DVector<f64>,
+        expected: &Expected,
         data: &Data,
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
-        let held = fitted.iter().zip(expected);
+        let held = fitted.iter().zip(&expected.values);
         let mut unknowns: Vec<Unknown> =
             held.map(|(one, &mean)| Unknown { mean, width: beforehand(one.kind), ..*one }).collect();
         loop {
-            let start = descend(model, &unknowns, &data.measured, &data.stated(), expected.clone())?;
+            let start = descend(model, &unknowns, &data.measured, &data.stated(), expected.values.clone())?;
             let Learnt { here, missed, uncertainty } = with_model_error(model, &unknowns, data, start, progress)?;
             let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &missed), &uncertainty.independent);
             let clear = clear(unknowns.len());
-            let off =
-                |at: usize, free: Released| (free.value - expected[at]).abs() / free.sigma.hypot(unknowns[at].width);
+            let of_expected = expected.covariance.as_ref().map(|errors| followed(&uncertainty, &unknowns, errors));
+            let off = |at: usize, free: Released| {
+                // without its prior an unknown follows the data the further by this
+                let left = (1.0 - uncertainty.independent[(at, at)] / unknowns[at].width.powi(2)).max(f64::EPSILON);
+                let of_expected = of_expected.as_ref().map_or(0.0, |one| one[(at, at)].sqrt() / left);
+                (free.value - expected.values[at]).abs() / free.sigma.hypot(unknowns[at].width).hypot(of_expected)
+            };
             let off = (0..unknowns.len())
                 .filter(|&at| unknowns[at].width < fitted[at].width)
-                .filter(|&at| off(at, held.about(at, expected[at])) > clear / 2.0)
+                .filter(|&at| off(at, held.about(at, expected.values[at])) > clear / 2.0)
                 .map(|at| (at, off(at, held.released(at, fitted[at].width))))
                 .filter(|(_, off)| *off > clear);
             match off.max_by(|a, b| a.1.total_cmp(&b.1)) {
                 Some((clearest, _)) => unknowns[clearest].width = fitted[clearest].width,
-                None => return Ok(Self { unknowns, values: here.values, uncertainty }),
+                None => return Ok(Self { unknowns, values: here.values, uncertainty, of_expected }),
             }
         }
     }
@@ -83,7 +98,7 @@ impl Departures {
         let gain = match self.unknowns[at].kind {
             Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
             Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-            Kind::Skew(_) => return (after - before, self.uncertainty.sigma[at]),
+            Kind::Skew(_) => return (after - before, self.sigma(at)),
             _ => None,
         };
         match gain.and_then(|gain| self.unknowns.iter().position(|one| one.kind == gain)) {
@@ -91,11 +106,23 @@ impl Departures {
                 let share = after / self.values[gain];
                 let mut combination = DVector::zeros(self.values.len());
                 (combination[at], combination[gain]) = (1.0, -share);
-                let sigma = self.uncertainty.variance(&combination).sqrt() / self.values[gain].abs();
+                let sigma = self.variance(&combination).sqrt() / self.values[gain].abs();
                 (share - before / self.unknowns[gain].mean, sigma)
             }
-            None => (after / before - 1.0, (self.uncertainty.sigma[at] / before).abs()),
+            None => (after / before - 1.0, (self.sigma(at) / before).abs()),
         }
+    }
+
+    /// Standard deviation of the departure of an unknown.
+    fn sigma(&self, at: usize) -> f64 {
+        let of_expected = self.of_expected.as_ref().map_or(0.0, |one| one[(at, at)]);
+        (self.uncertainty.sigma[at].powi(2) + of_expected).sqrt()
+    }
+
+    /// Variance of the departure of a combination of unknowns.
+    fn variance(&self, combination: &DVector<f64>) -> f64 {
+        let of_expected = self.of_expected.as_ref().map_or(0.0, |one| combination.dot(&(one * combination)));
+        self.uncertainty.variance(combination) + of_expected
     }
 
     /// True where a departure is too large for chance.
@@ -105,9 +132,18 @@ impl Departures {
 
     /// `ln` Bayes factor of an unknown's departure against none [nat].
     pub fn log_evidence_gain(&self, at: usize) -> f64 {
-        let (change, sigma) = (self.values[at] - self.unknowns[at].mean, self.uncertainty.sigma[at]);
+        let (change, sigma) = (self.values[at] - self.unknowns[at].mean, self.sigma(at));
         0.5 * (change / sigma).powi(2) - (self.unknowns[at].width / sigma).ln()
     }
+}
+
+/// Covariance of the departures where the expected values have errors and nothing departs: with the precision `P` of the prior about them,
+/// `values - expected = (1 - C P) (true - expected)`.
+fn followed(uncertainty: &Uncertainty, unknowns: &[Unknown], errors: &DMatrix<f64>) -> DMatrix<f64> {
+    let held = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width.powi(-2)));
+    let by_data =
+        DMatrix::identity(unknowns.len(), unknowns.len()) - &uncertainty.independent * DMatrix::from_diagonal(&held);
+    &by_data * errors * by_data.transpose()
 }
 
 /// Standard deviation of a departure beforehand.

@@ -4,9 +4,13 @@
 //! Of a combination `d` of the unknowns with covariance `C`, an element with derivative `J` and slope `s` of its `ln` likelihood says
 //! `d C J^T s`. What each row and each column says, squared and added, less what stands in both, is the variance of the combination:
 //!
-//! `sum_rows (sum d C J^T s)^2 + sum_columns (sum d C J^T s)^2 - sum (d C J^T s)^2`, at least that of independent errors `d C d`.
+//! `sum_rows (sum d C J^T s)^2 + sum_columns (sum d C J^T s)^2 - sum (d C J^T s)^2 + d C P C d`,
 //!
-//! Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8.
+//! the last term of the prior of precision `P`: of independent errors of the learnt size all are `C (J^T W J + P) C = C`. It is at least `d C d` and at least
+//! `sum (d C J^T s)^2 + d C P C d`, that of independent errors of unequal size: the fit of an instrument's own gain leaves nothing in the sum over its line.
+//!
+//! Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8; H. White,
+//! Econometrica 48 (1980) 817.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -28,6 +32,8 @@ pub struct Uncertainty {
     together: DMatrix<f64>,
     /// `J^T s s J` of all elements.
     alone: DMatrix<f64>,
+    /// Precision of the prior.
+    prior: DVector<f64>,
 }
 
 impl Uncertainty {
@@ -44,21 +50,31 @@ impl Uncertainty {
         let independent = covariance(unknowns, at, &data.information(missed))?;
         let together = together(&places, at, &slope, unknowns.len());
         let alone = Normal::of(&places, at, &nothing, &squares, unknowns.len()).matrix;
-        let (of_lines, of_elements) = (together.tr_mul(&independent), &alone * &independent);
-        let sigma = DVector::from_fn(unknowns.len(), |i, _| {
-            let variance = of_lines.column(i).norm_squared() - independent.column(i).dot(&of_elements.column(i));
-            variance.max(independent[(i, i)]).sqrt()
+        let prior = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width.powi(-2)));
+        let mut all = Self { independent, sigma: DVector::zeros(unknowns.len()), together, alone, prior };
+        let (of_lines, of_elements) = (all.together.tr_mul(&all.independent), &all.alone * &all.independent);
+        all.sigma = DVector::from_fn(unknowns.len(), |i, _| {
+            let direction = all.independent.column(i);
+            let of_prior = direction.component_mul(&direction).dot(&all.prior);
+            let (lines, elements) = (of_lines.column(i).norm_squared(), direction.dot(&of_elements.column(i)));
+            variance(lines, elements, of_prior, all.independent[(i, i)]).sqrt()
         });
-        Ok(Self { independent, sigma, together, alone })
+        Ok(all)
     }
 
     /// Variance of a combination of the unknowns.
     pub fn variance(&self, combination: &DVector<f64>) -> f64 {
         let direction = &self.independent * combination;
-        let together = self.together.tr_mul(&direction).norm_squared();
-        let alone = direction.dot(&(&self.alone * &direction));
-        (together - alone).max(combination.dot(&direction))
+        let of_prior = direction.component_mul(&direction).dot(&self.prior);
+        let (lines, elements) =
+            (self.together.tr_mul(&direction).norm_squared(), direction.dot(&(&self.alone * &direction)));
+        variance(lines, elements, of_prior, combination.dot(&direction))
     }
+}
+
+/// From the sums of squares over lines and over elements, what the prior adds, and the variance with independent errors of the learnt size.
+fn variance(lines: f64, elements: f64, of_prior: f64, independent: f64) -> f64 {
+    (lines - elements).max(elements).max(independent - of_prior) + of_prior
 }
 
 /// What each row, then each column says of the unknowns, `J^T s`.

@@ -3,8 +3,10 @@
 //! The measurements have no licence and are not part of the repository. They are looked for in `ORBITCAL_MEASURED`, then in
 //! `../shared/recordings/real` beside the checkout; a test that finds none says so and passes.
 
+use core::f64::consts::SQRT_2;
 use std::path::PathBuf;
 
+use measured::data::Data;
 use measured::departure::beforehand;
 use measured::sides::Verdict;
 use measured::{
@@ -475,10 +477,39 @@ fn effects_put_into_measured_data_are_named() {
     }
 }
 
+/// A measurement with some of the stated noise in addition: with `sqrt(2)` of it, it differs from the first by as much as two measurements do.
+fn measured_again(folder: &Folder, share: f64, seed: u64) -> Folder {
+    let sigma = Data::of(folder).sigma.map(|sigma| if sigma.is_finite() { sigma } else { 0.0 });
+    let mut random = StdRng::seed_from_u64(900 + seed);
+    let noise =
+        sigma.map(|sigma| sigma * share * <StandardNormal as Distribution<f64>>::sample(&StandardNormal, &mut random));
+    let columns = folder.correctors.len();
+    let mut again = folder.clone();
+    again.matrix += noise.columns(0, columns);
+    if let Some(dispersion) = &mut again.dispersion {
+        *dispersion += noise.column(columns);
+    }
+    again
+}
+
+/// Variance of each unknown by the data alone, everything else departing as far as it may.
+fn by_data(fitted: &Fit) -> DVector<f64> {
+    let independent = &fitted.uncertainty.independent;
+    let mut precision = independent.clone().try_inverse().unwrap();
+    let width = |at: usize| beforehand(fitted.unknowns[at].kind);
+    (0..fitted.unknowns.len())
+        .for_each(|at| precision[(at, at)] += width(at).powi(-2) - fitted.unknowns[at].width.powi(-2));
+    let held = precision.try_inverse().unwrap();
+    DVector::from_fn(fitted.unknowns.len(), |at, _| {
+        let alike = fitted.sigma(at).powi(2) / independent[(at, at)];
+        alike / (held[(at, at)].recip() - width(at).powi(-2)).max(f64::EPSILON)
+    })
+}
+
 /// Of a measured ring the gains of ten instruments that an oracle would gain 25 nat from, ten pairs of monitors and all skew gradients are taken
 /// out of the fitted model, gains and pairs in some runs, and looked for in the measurement: how many of each were named, of how many, and what
 /// was said of other places.
-fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
+fn hidden(path: PathBuf, noise: f64, runs: usize) -> [[usize; 2]; 4] {
     let settings = Settings::default();
     let as_measured = Folder::read(&path).unwrap();
     let (folder, cables, fitted) = fitted_with_cables(&as_measured, &settings);
@@ -486,17 +517,10 @@ fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
     let mut random = StdRng::seed_from_u64(8);
     let named = |kind: Kind| measured::unknowns::name(&folder, &fitted.groups, kind);
     let value = |kind: Kind| fitted.values[fitted.unknowns.iter().position(|one| one.kind == kind).unwrap()];
-    // what kind and place alone could gain [nat], everything else adapting as far as it may depart
-    let independent = &fitted.uncertainty.independent;
-    let mut precision = independent.clone().try_inverse().unwrap();
-    let width = |at: usize| beforehand(fitted.unknowns[at].kind);
-    (0..fitted.unknowns.len())
-        .for_each(|at| precision[(at, at)] += width(at).powi(-2) - fitted.unknowns[at].width.powi(-2));
-    let held = precision.try_inverse().unwrap();
-    let oracle = |at: usize, nothing: f64| {
-        let alike = fitted.sigma(at).powi(2) / independent[(at, at)];
-        0.5 * (fitted.values[at] - nothing).powi(2) * (held[(at, at)].recip() - width(at).powi(-2)) / alike
-    };
+    // what kind and place alone could gain [nat] in a second measurement, everything else adapting as far as it may depart
+    let (_, _, again) = fitted_with_cables(&measured_again(&as_measured, noise, 99), &settings);
+    let [by_first, by_second] = [&fitted, &again].map(by_data);
+    let oracle = |at: usize, nothing: f64| 0.5 * (fitted.values[at] - nothing).powi(2) / (by_first[at] + by_second[at]);
     let is_known = |at: &usize| {
         let is_gain = matches!(fitted.unknowns[*at].kind, Kind::MonitorGain(_) | Kind::CorrectorGain(_));
         is_gain && oracle(*at, 1.0) > 25.0
@@ -529,9 +553,10 @@ fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
             .for_each(|&kind| assert_eq!(model.take_out(&format!("{} {}", kind.word(), named(kind))).unwrap(), 1));
         let exchanged: Vec<Wiring> =
             pairs.iter().skip(run).step_by(runs).cloned().map(Wiring::MonitorsExchanged).collect();
-        let mut measured = as_measured.clone();
+        let mut measured = measured_again(&as_measured, noise, run as u64);
         exchanged.iter().for_each(|one| one.put_right(&mut measured));
-        let found = against(&measured, &fitted, &model, &settings, &mut |_| ()).unwrap();
+        let (_, _, by_itself) = fitted_with_cables(&measured, &settings);
+        let found = against(&measured, &by_itself, &model, &settings, &mut |_| ()).unwrap();
         let right = found.departures.iter().filter(|one| out.contains(&one.kind)).count();
         let cables = found.wiring.iter().filter(|one| exchanged.contains(one)).count();
         for one in &found.departures {
@@ -551,7 +576,9 @@ fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
     }
     let mut model = whole;
     if model.take_out("skew_gradient *").is_ok() {
-        let found = against(&as_measured, &fitted, &model, &settings, &mut |_| ()).unwrap();
+        let measured = measured_again(&as_measured, noise, 100);
+        let (_, _, by_itself) = fitted_with_cables(&measured, &settings);
+        let found = against(&measured, &by_itself, &model, &settings, &mut |_| ()).unwrap();
         let is_skew = |kind: Kind| matches!(kind, Kind::Skew(_));
         let skews = fitted.unknowns.iter().enumerate().filter(|(_, one)| is_skew(one.kind));
         of_skews[1] = skews.filter(|(at, _)| oracle(*at, 0.0) > 25.0).count();
@@ -564,8 +591,8 @@ fn hidden(path: PathBuf, runs: usize) -> [[usize; 2]; 4] {
 }
 
 /// Nothing false is said; of cables and of gains nine of ten are named.
-fn hidden_values_are_found_again(path: PathBuf, runs: usize) {
-    let [gains, pairs, skews, wrong] = hidden(path, runs);
+fn hidden_values_are_found_again(path: PathBuf, noise: f64, runs: usize) {
+    let [gains, pairs, skews, wrong] = hidden(path, noise, runs);
     assert!(10 * gains[0] >= 9 * gains[1] && 10 * pairs[0] >= 9 * pairs[1], "{gains:?} {pairs:?}");
     // an oracle knows all others; of skew gradients that are all unknown some follow each other
     assert!(10 * skews[0] >= 9 * skews[1] && wrong[0] == 0, "{skews:?} {wrong:?}");
@@ -573,23 +600,23 @@ fn hidden_values_are_found_again(path: PathBuf, runs: usize) {
 
 #[test]
 fn hidden_values_are_found_again_in_twelve_cells() {
-    hidden_values_are_found_again(repository("recordings/measured/twelve-cells/before"), 2);
+    hidden_values_are_found_again(repository("recordings/measured/twelve-cells/before"), SQRT_2, 2);
 }
 
 #[test]
 fn hidden_values_are_found_again_at_sps() {
     let Some(path) = ring("sps_2007") else { return };
-    hidden_values_are_found_again(path.clone(), 10);
-    // of 37 rows ten are exchanged at a time, and four gains are off: one of eight is not found
-    let [gains, pairs, _, wrong] = hidden(path, 2);
-    assert!(8 * gains[0] >= 7 * gains[1] && 10 * pairs[0] >= 9 * pairs[1] && wrong[0] == 0, "{gains:?} {pairs:?}");
+    // as noisy as the model is wrong, so that no gain is seen where the noise comes twice again: without that, each by itself
+    hidden_values_are_found_again(path.clone(), 0.0, 10);
+    let [_, pairs, _, wrong] = hidden(path, SQRT_2, 10);
+    assert!(10 * pairs[0] >= 7 * pairs[1] && wrong[0] == 0, "{pairs:?} {wrong:?}");
 }
 
 #[test]
 #[ignore = "make measured"]
 fn hidden_values_are_found_again_at_larger_rings() {
     for path in ["spear3_example", "pls_2009", "als_2005_topoff"].into_iter().filter_map(ring) {
-        hidden_values_are_found_again(path, 2);
+        hidden_values_are_found_again(path, SQRT_2, 2);
     }
 }
 
