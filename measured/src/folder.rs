@@ -3,6 +3,7 @@
 //! `lattice.csv` has one row an element, `bpms.csv` and `correctors.csv` one row a monitor or corrector and plane, `orm_measured_mm.csv` the
 //! change of the orbit [mm] from minus to plus half a corrector's kick, `meta.json` what else was written down.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
@@ -95,6 +96,7 @@ impl Meta {
             }
         }
         let groups = self.reference_fit.iter().flat_map(|fit| &fit.fit_parameters);
+        let mut fitted = BTreeMap::new();
         for (number, group) in groups.enumerate() {
             let place = format!("reference_fit, fit_parameters {number}");
             if !["K", "PolynomA"].contains(&group.field.as_str()) {
@@ -105,6 +107,14 @@ impl Meta {
                 Some(row) => return Err(format!("{place}: element {row}, lattice.csv has rows 0 to {}", elements - 1)),
                 None if group.elements.is_empty() => return Err(format!("{place}: expected elements, found none")),
                 None => {}
+            }
+            for row in &group.elements {
+                if let Some(other) = fitted.insert((&group.field, row), number).filter(|other| *other != number) {
+                    return Err(format!(
+                        "{place}: element {row} with {} is in fit_parameters {other} too",
+                        group.field
+                    ));
+                }
             }
         }
         Ok(())
@@ -255,7 +265,30 @@ impl Folder {
             dispersion: dispersion.map(|one| one.column(0).into_owned()),
         };
         folder.check(path)?;
+        folder.expect_names(&path.join("orm_measured_mm.csv"))?;
         Ok(folder)
+    }
+
+    /// Names of the matrix that say where an instrument is, such as `x12`, are those of the instruments in their order.
+    fn expect_names(&self, file: &Path) -> Result<(), MeasuredError> {
+        let text = text(file)?;
+        let mut reader = csv::Reader::from_reader(text.as_bytes());
+        let refused = |error: csv::Error| table(file, error.to_string());
+        let columns = reader.headers().map_err(refused)?.clone();
+        let expect = |place: String, found: &str, expected: String| match is_label(found) && found != expected {
+            true => Err(table(
+                file,
+                format!("{place} is named {found}, expected {expected} as in the table of instruments"),
+            )),
+            false => Ok(()),
+        };
+        for (j, (found, one)) in columns.iter().skip(1).zip(&self.correctors).enumerate() {
+            expect(format!("column {}", j + 2), found.trim(), label(one.plane, one.at))?;
+        }
+        for (i, (record, one)) in reader.records().zip(&self.monitors).enumerate() {
+            expect(format!("line {}", i + 2), record.map_err(refused)?[0].trim(), label(one.plane, one.at))?;
+        }
+        Ok(())
     }
 
     /// Places that are named exist and have one instrument each, noise is above zero, correctors kick, and no orbit is outside every beam pipe.
@@ -350,6 +383,16 @@ fn rows<T: DeserializeOwned>(file: &Path) -> Result<Vec<T>, MeasuredError> {
     reader.deserialize().collect::<Result<_, _>>().map_err(|error: csv::Error| table(file, error.to_string()))
 }
 
+/// What an instrument is called in a table: its plane and its row of the lattice.
+fn label(plane: Plane, at: usize) -> String {
+    format!("{}{at}", if plane == Plane::X { "x" } else { "y" })
+}
+
+/// True of a name such as `x12`, which says where an instrument is.
+fn is_label(name: &str) -> bool {
+    name.strip_prefix(['x', 'y']).is_some_and(|at| !at.is_empty() && at.bytes().all(|one| one.is_ascii_digit()))
+}
+
 /// Numbers below a line of names, each row with its own name first; an empty field was not measured.
 fn matrix(file: &Path, rows: usize, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
     let text = text(file)?;
@@ -389,7 +432,7 @@ mod tests {
     const MONITORS: &str = "row,plane,lattice_index,sigma_mm,used_by_reference_fit\n0,x,0,0.01,1\n1,y,0,0.01,0\n";
     const CORRECTORS: &str = "col,plane,lattice_index,nominal_kick_mrad,used_by_reference_fit\n0,x,1,0.1,1\n";
     const META: &str = r#"{"circumference_m": 10.0, "energy_GeV": null, "rf_Hz": 5e8, "delta_rf_Hz": 1000.0}"#;
-    const MATRIX: &str = ",x1\nx0,0.25\ny0,\n";
+    const MATRIX: &str = ",x1\nx0,0.25\nsecond,\n";
 
     /// Tables with one of them changed.
     fn read(name: &str, text: &str) -> Result<Folder, MeasuredError> {
@@ -458,6 +501,19 @@ mod tests {
                 format!("meta.json: reference_fit, fit_parameters 0: {problem}")
             );
         }
+        let twice = r#", "reference_fit": {"fit_parameters": [{"elements": [1], "field": "K"}, {"elements": [1], "field": "K"}], "flags": {"Coupling": "Yes", "Dispersion": "No"}}}"#;
+        assert_eq!(
+            refused("meta.json", &META.replace('}', twice)),
+            "meta.json: reference_fit, fit_parameters 1: element 1 with K is in fit_parameters 0 too"
+        );
+        assert_eq!(
+            refused("orm_measured_mm.csv", &MATRIX.replace("second", "y1")),
+            "orm_measured_mm.csv: line 3 is named y1, expected y0 as in the table of instruments"
+        );
+        assert_eq!(
+            refused("orm_measured_mm.csv", &MATRIX.replace("x1", "x7")),
+            "orm_measured_mm.csv: column 2 is named x7, expected x1 as in the table of instruments"
+        );
         assert_eq!(
             refused("correctors.csv", &CORRECTORS.replace("0.1", "0")),
             "correctors.csv: row 0: nominal_kick_mrad 0, expected one where the corrector is used"

@@ -114,6 +114,11 @@ impl Sides {
 /// # Errors
 /// [`MeasuredError`].
 pub fn sides(folder: &Folder, fitted: &Fit, model: &Model) -> Result<Sides, MeasuredError> {
+    // what the unknowns can follow as they like tells nothing
+    if fitted.elements <= fitted.unknowns.len() {
+        let none = Gain { log_likelihood: 0.0, share: 0.0 };
+        return Ok(Sides { lattice: none, skew: none, instruments: none, terms: Vec::new() });
+    }
     let rows: Vec<usize> = magnets(folder);
     let left = Left::of(folder, fitted, model, &rows)?;
     let (lattice, skew) = (left.held_out([true, true]), left.held_out([false, true]));
