@@ -52,7 +52,7 @@ pub enum Command {
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns, count how often the result is right
     Validate(Validate),
-    /// Publish the estimates of a device
+    /// Run the daemon of a configuration, or publish the estimates of a device
     Serve(Serve),
     /// Measure a campaign through the control system, and put the machine back
     Measure(Measure),
@@ -161,9 +161,15 @@ pub struct Replay {
 /// `orbitcal serve`.
 #[derive(Debug, Args)]
 pub struct Serve {
+    /// Configuration of the daemon, such as config/booster.toml: the core here, fed by raw frames
+    #[arg(value_name = "CONFIG.toml", required_unless_present = "source", conflicts_with = "source")]
+    pub config: Option<PathBuf>,
+    /// Say everything that is wrong with the configuration, and start nothing
+    #[arg(long, requires = "config")]
+    pub check: bool,
     /// Where the device is: tcp://HOST:PORT, unix:PATH or serial:PATH[@BAUD]
     #[arg(long)]
-    pub source: Address,
+    pub source: Option<Address>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,

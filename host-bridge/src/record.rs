@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use estimator::{MonitorState, Remarks};
 use inference::stream::Estimate;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use twin::Ring;
 
 /// Whose numbers a record holds.
@@ -39,7 +39,7 @@ pub enum ReadingUse {
 }
 
 /// How many frames each remark was made of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Remarked {
     /// No beam, or one that the model does not know: nothing in the frame was used.
     pub put_aside_frames: u32,
@@ -86,7 +86,7 @@ pub struct EstimateRecord {
     pub rejected_frames: u32,
     /// What is to be said of this frame as a whole.
     pub remarks: Remarks,
-    /// How often each of that was said, this frame included, since [`crate::serve::serve`] began to count.
+    /// How often each of that was said, this frame included: since [`crate::serve::serve`] began to count, or since the first start of what was resumed.
     pub remarked: Remarked,
     /// The model was relinearised since the last estimate.
     pub linearised: bool,

@@ -4,6 +4,7 @@ pub mod challenge;
 pub mod check;
 pub mod compare;
 pub mod conceal;
+pub mod daemon;
 pub mod diagnose;
 pub mod export;
 pub mod fit;

@@ -1,0 +1,90 @@
+//! `orbitcal serve CONFIG.toml`: the core in this process beside a machine, for months.
+
+use std::path::Path;
+
+use estimator::wire::packet;
+use inference::stream::{self, Core};
+use training::rooms::large;
+use twin::Ring;
+
+use super::{CommandError, machine, recording, tables};
+use crate::checkpoint::Keeper;
+use crate::cli::CoreModel;
+use crate::config::{Config, ConfigError};
+use crate::output::{self, warn};
+use crate::record::Names;
+use crate::serve::serve;
+use crate::sink::Sinks;
+use crate::sink::shared_memory::Publisher;
+use crate::source::feed;
+use crate::source::queue::{Faults, Queue};
+use crate::source::raw::{self, Raw};
+use crate::stop::Stop;
+
+impl From<ConfigError> for CommandError {
+    fn from(error: ConfigError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+/// Say everything that is wrong with a configuration, the machine's files included; nothing is started.
+///
+/// # Errors
+/// [`CommandError::Input`].
+pub fn check(file: &Path) -> Result<(), CommandError> {
+    let config = Config::read(file)?;
+    let (ring, core) = build(&config)?;
+    let sizes = core.tables.sizes();
+    output::say(format_args!(
+        "{}: good; {}, {} monitors, {} vars, frames from {}",
+        file.display(),
+        ring.name,
+        sizes.monitors.iter().sum::<u16>(),
+        sizes.params,
+        config.source.address
+    ))?;
+    Ok(())
+}
+
+/// Run it until a signal comes.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(file: &Path) -> Result<(), CommandError> {
+    let config = Config::read(file)?;
+    let (ring, mut core) = build(&config)?;
+    let stop = Stop::on_signals().map_err(CommandError::other)?;
+    let names = Names::of(&ring);
+    let publisher = Publisher::try_new(&config.publish.service, &config.publish.name, &names);
+    let mut sinks = Sinks::default().with(Some(publisher.map_err(CommandError::other)?));
+    let model = raw::model_of(&mut core).map_err(CommandError::other)?;
+    let checkpoint = &config.checkpoint;
+    let resumed = checkpoint.file.as_deref().and_then(|path| raw::resume(&mut core, path, &model));
+    if let Some(head) = &resumed {
+        warn(format_args!("resumed after frame {}: {} frames, {} s ago", head.sequence, head.frames, head.age()));
+    }
+    let queue = Queue::new(config.source.buffer_frames, resumed.as_ref().map_or(Faults::default(), |head| head.faults));
+    let keeper = checkpoint.file.as_deref().map(|path| Keeper::start(path, &queue));
+    let keeper = keeper.transpose().map_err(CommandError::other)?;
+    let most = packet::wire_bytes(large::Frame::MAX_BYTES);
+    feed::start(&config.source, most, &queue, &stop)
+        .map_err(|error| CommandError::Other(format!("{}: {error}", config.source.address)))?;
+    let mut source = Raw::new(core, &names, queue, model, resumed.as_ref())
+        .with_checkpoints(keeper, checkpoint.checkpoint_every_frames);
+    let ended = serve(&mut source, &mut sinks, &stop, || {}).map(drop).map_err(CommandError::other);
+    let saved = source.finish().map_err(CommandError::other);
+    let finished = sinks.finish().map_err(CommandError::other);
+    ended.and(saved).and(finished)
+}
+
+/// The ring, and a core for it at its prior.
+fn build(config: &Config) -> Result<(Ring, Core), CommandError> {
+    let machine_file = &config.machine;
+    let ring = machine(machine_file.file.as_deref())?;
+    let recording = recording(&machine_file.recording, &ring)?;
+    let powered = recording.powered(&ring);
+    let tables = tables(CoreModel::Green, &powered, machine_file.model_file.as_deref())?;
+    let setup = stream::setup(&powered, &recording, config.walk.into())?;
+    let core = Core::with_tables(tables, setup)?;
+    Ok((ring, core))
+}

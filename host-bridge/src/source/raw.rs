@@ -1,0 +1,218 @@
+//! The core in this process, fed by raw frames from a socket, and its checkpoints.
+
+use core::time::Duration;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+use crc::{CRC_32_ISO_HDLC, Crc};
+use estimator::{IngestError, Prepared, StateError, Tables as _};
+use inference::stream::Core;
+use training::LINE;
+
+use super::queue::{Faults, Queue};
+use super::{Next, Source, SourceError};
+use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Keeper, Model};
+use crate::output::warn;
+use crate::record::{EstimateRecord, Names, Remarked};
+
+/// Longest wait for a frame before somebody's wish to stop is looked at.
+const GLANCE: Duration = Duration::from_millis(100);
+/// Faults are said no more often than this.
+const PAUSE: Duration = Duration::from_secs(10);
+
+/// Of what a core's state is.
+///
+/// # Errors
+/// What JSON has to say of the setup.
+pub fn model_of(core: &mut Core) -> Result<Model, serde_json::Error> {
+    let setup = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&serde_json::to_vec(&core.setup.on_wire())?);
+    Ok(Model { tables: core.tables.digest::<LINE>(), setup, layout: core.state_layout() })
+}
+
+/// Go on at the last checkpoint, or at the one before; one that is not loaded is set aside. Returns what it is of.
+pub fn resume(core: &mut Core, path: &Path, model: &Model) -> Option<Head> {
+    [path.to_owned(), checkpoint::previous(path)].iter().find_map(|path| {
+        let loaded = checkpoint::read(path, model).and_then(|found| {
+            let Some(Checkpoint { head, state }) = found else { return Ok(None) };
+            core.load(&state).map_err(CheckpointError::from)?;
+            Ok(Some(head))
+        });
+        loaded.unwrap_or_else(|error| {
+            let aside = match checkpoint::set_aside(path) {
+                Ok(name) => format!("set aside as {}", name.display()),
+                Err(error) => format!("and it cannot be set aside: {error}"),
+            };
+            warn(format_args!("{}: not loaded: {error}; {aside}", path.display()));
+            None
+        })
+    })
+}
+
+/// Checkpoints of a running core.
+struct Checkpoints {
+    keeper: Keeper,
+    every: u32,
+    /// Frames since the last one.
+    since: u32,
+}
+
+/// The core, the frames that wait for it, and its checkpoints.
+pub struct Raw {
+    core: Core,
+    names: Arc<Names>,
+    queue: Queue,
+    model: Model,
+    checkpoints: Option<Checkpoints>,
+    /// Last frame of the checkpoint, until the first frame says what was lost.
+    resumed: Option<u32>,
+    /// Nothing is left to do before the next frame.
+    is_prepared: bool,
+    /// Number of the last frame, and of all frames.
+    last: Option<[u32; 2]>,
+    remarked: Remarked,
+    said: (Faults, Instant),
+}
+
+impl Raw {
+    /// Frames of a queue through a core, of this model, which is at its prior or was resumed.
+    pub fn new(core: Core, names: &Arc<Names>, queue: Queue, model: Model, resumed: Option<&Head>) -> Self {
+        let said = (queue.faults(), Instant::now());
+        Self {
+            core,
+            names: names.clone(),
+            queue,
+            model,
+            checkpoints: None,
+            resumed: resumed.map(|head| head.sequence),
+            is_prepared: false,
+            last: None,
+            remarked: resumed.map_or(Remarked::default(), |head| head.remarked),
+            said,
+        }
+    }
+
+    /// From now on with a checkpoint every so many frames.
+    #[must_use]
+    pub fn with_checkpoints(mut self, keeper: Option<Keeper>, every: u32) -> Self {
+        self.checkpoints = keeper.map(|keeper| Checkpoints { keeper, every, since: 0 });
+        self
+    }
+
+    /// The end: a last checkpoint, and what went wrong.
+    ///
+    /// # Errors
+    /// [`StateError`].
+    pub fn finish(mut self) -> Result<(), StateError> {
+        if let (Some(last), Some(mut checkpoints)) = (self.last, self.checkpoints.take()) {
+            let file = self.file(last)?;
+            checkpoints.keeper.finish(file);
+        }
+        self.say_faults(Duration::ZERO);
+        Ok(())
+    }
+
+    /// Work between two frames: a checkpoint if one is due, else slices of what prepares for the next frame, one at least, and
+    /// more until that frame waits.
+    fn between(&mut self) -> Result<(), StateError> {
+        if let (Some(last), Some(mut checkpoints)) = (self.last, self.checkpoints.take()) {
+            if checkpoints.since >= checkpoints.every {
+                checkpoints.keeper.offer(self.file(last)?);
+                checkpoints.since = 0;
+            }
+            self.checkpoints = Some(checkpoints);
+        }
+        while !self.is_prepared {
+            self.is_prepared = self.core.slice() == Prepared::Nothing;
+            if !self.queue.is_empty() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// The core as a checkpoint; what it has begun between frames is finished first.
+    fn file(&mut self, last: [u32; 2]) -> Result<Vec<u8>, StateError> {
+        self.core.prepare();
+        self.is_prepared = true;
+        let mut state = Vec::new();
+        self.core.save(&mut state)?;
+        Ok(Checkpoint { head: Head::new(self.model, last, self.remarked, self.queue.faults()), state }.encode())
+    }
+
+    fn take(&mut self, mut frame: Vec<u8>) -> Next {
+        let estimate = match self.core.ingest(&mut frame) {
+            Ok(estimate) => estimate,
+            Err(error) => {
+                self.queue.count(|faults| match error {
+                    IngestError::Frame(_) => faults.damaged += 1,
+                    _ => faults.refused += 1,
+                });
+                return Next::Nothing;
+            }
+        };
+        let mismatch = self.core.fit_quality().is_mismatch();
+        let record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
+        self.is_prepared = false;
+        self.last = Some([record.sequence, record.frames]);
+        self.remarked.add(&record.remarks);
+        self.checkpoints.iter_mut().for_each(|checkpoints| checkpoints.since += 1);
+        if let Some(before) = self.resumed.take() {
+            warn(lost(before, record.sequence));
+        }
+        Next::Estimate(Box::new(record))
+    }
+
+    /// Say what went wrong since it was said last, if that is long enough ago.
+    fn say_faults(&mut self, pause: Duration) {
+        let faults = self.queue.faults();
+        if faults != self.said.0 && self.said.1.elapsed() >= pause {
+            warn(format_args!("so far {faults}"));
+            self.said = (faults, Instant::now());
+        }
+    }
+}
+
+/// What was lost between the last frame of a checkpoint and the first frame after it.
+fn lost(before: u32, first: u32) -> String {
+    match first.wrapping_sub(before) {
+        1 => format!("frame {first} follows the checkpoint: nothing was lost"),
+        gap @ 2..=0x7fff_ffff => format!(
+            "frames {} to {} were lost since the checkpoint: {}",
+            before.wrapping_add(1),
+            first.wrapping_sub(1),
+            gap - 1
+        ),
+        _ => format!(
+            "frame {first} is of another epoch than the checkpoint's frame {before}: how many were lost is not known"
+        ),
+    }
+}
+
+impl Source for Raw {
+    fn next(&mut self) -> Result<Next, SourceError> {
+        self.between()?;
+        self.say_faults(PAUSE);
+        Ok(match self.queue.pop(GLANCE) {
+            Some(frame) => self.take(frame),
+            None => Next::Nothing,
+        })
+    }
+
+    fn remarked(&self) -> Remarked {
+        self.remarked
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_lost_is_said_in_numbers() {
+        assert_eq!(lost(7, 8), "frame 8 follows the checkpoint: nothing was lost");
+        assert_eq!(lost(7, 11), "frames 8 to 10 were lost since the checkpoint: 3");
+        assert_eq!(lost(u32::MAX, 1), "frames 0 to 0 were lost since the checkpoint: 1");
+        assert!(lost(7, 3).contains("another epoch"));
+    }
+}
