@@ -115,12 +115,12 @@ impl Raw {
     /// Work between two frames: a checkpoint if one is due, else slices of what prepares for the next frame, one at least, and
     /// more until that frame waits.
     fn between(&mut self) -> Result<(), StateError> {
-        if let (Some(last), Some(mut checkpoints)) = (self.last, self.checkpoints.take()) {
-            if checkpoints.since >= checkpoints.every {
-                checkpoints.keeper.offer(self.file(last)?);
+        if let Some(last) = self.last.filter(|_| self.is_due()) {
+            let file = self.file(last)?;
+            if let Some(checkpoints) = &mut self.checkpoints {
+                checkpoints.keeper.offer(file);
                 checkpoints.since = 0;
             }
-            self.checkpoints = Some(checkpoints);
         }
         while !self.is_prepared {
             self.is_prepared = self.core.slice() == Prepared::Nothing;
@@ -129,6 +129,10 @@ impl Raw {
             }
         }
         Ok(())
+    }
+
+    fn is_due(&self) -> bool {
+        self.checkpoints.as_ref().is_some_and(|checkpoints| checkpoints.since >= checkpoints.every)
     }
 
     /// The core as a checkpoint; what it has begun between frames is finished first.
