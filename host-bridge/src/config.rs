@@ -10,7 +10,8 @@ use serde::Deserialize;
 use toml::de::DeTable;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
-use crate::source::address::Address;
+use crate::source::Rate;
+use crate::source::origin::Origin;
 
 /// The daemon's configuration.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -53,15 +54,29 @@ pub enum Role {
     Listen,
 }
 
+/// What is done with a frame for which the buffer has no room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WhenFull {
+    /// The oldest in the buffer is dropped: estimates are of now.
+    Drop,
+    /// Whoever sends it waits: no frame is lost.
+    Wait,
+}
+
 /// `[source]`
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Source {
-    /// The socket.
-    #[serde(deserialize_with = "address")]
-    pub address: Address,
-    /// Who connects.
+    /// Line, recording or shared memory.
+    #[serde(deserialize_with = "origin")]
+    pub address: Origin,
+    /// Who connects a socket.
+    #[serde(default = "default_role")]
     pub role: Role,
+    /// Frames a second of a recording; 0 is as fast as possible [Hz].
+    #[serde(default)]
+    rate_hz: f64,
     /// Silence after which a connection is given up [ms].
     #[serde(default = "default_timeout_ms")]
     timeout_ms: u64,
@@ -71,9 +86,20 @@ pub struct Source {
     /// Longest wait between two attempts [ms].
     #[serde(default = "default_backoff_most_ms")]
     backoff_most_ms: u64,
-    /// Frames that wait for the core; beyond them the oldest is dropped.
+    /// Frames that wait for the core.
     #[serde(default = "default_buffer_frames")]
     pub buffer_frames: usize,
+    /// What is done with one for which there is no room.
+    #[serde(default = "default_when_full")]
+    pub when_full: WhenFull,
+}
+
+fn default_role() -> Role {
+    Role::Connect
+}
+
+fn default_when_full() -> WhenFull {
+    WhenFull::Drop
 }
 
 fn default_timeout_ms() -> u64 {
@@ -96,6 +122,11 @@ impl Source {
     /// Silence after which a connection is given up.
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
+    }
+
+    /// How fast a recording is replayed.
+    pub fn rate(&self) -> Rate {
+        if self.rate_hz == 0.0 { Rate::Max } else { Rate::Hertz(self.rate_hz) }
     }
 
     /// First and longest wait between two attempts to connect.
@@ -158,7 +189,7 @@ impl Default for Checkpoint {
     }
 }
 
-fn address<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Address, D::Error> {
+fn origin<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Origin, D::Error> {
     String::deserialize(value)?.parse().map_err(serde::de::Error::custom)
 }
 
@@ -202,9 +233,13 @@ impl Config {
         let parsed = std::fs::read_to_string(file).map_err(unread).and_then(|text| Self::parse(&text));
         let mut config = parsed.map_err(|problems| ConfigError { file: file.to_owned(), problems })?;
         let folder = file.parent().unwrap_or(Path::new(""));
-        let Self { machine, checkpoint, .. } = &mut config;
+        let Self { machine, source, checkpoint, .. } = &mut config;
+        let replayed = match &mut source.address {
+            Origin::Recording(path) => Some(path),
+            Origin::Line(_) | Origin::SharedMemory(_) => None,
+        };
         let optional = [&mut machine.file, &mut machine.model_file, &mut checkpoint.file];
-        let paths = optional.into_iter().flatten().chain([&mut machine.recording]);
+        let paths = optional.into_iter().flatten().chain([&mut machine.recording]).chain(replayed);
         paths.for_each(|path| *path = folder.join(&*path));
         Ok(config)
     }
@@ -238,7 +273,7 @@ mod tests {
 
     const EXAMPLE: &str = include_str!("../../config/booster.toml");
     const DOCS: &str = include_str!("../../docs/daemon.md");
-    const LEAST: &str = "[machine]\nrecording = \"night\"\n[source]\naddress = \"tcp://:5000\"\nrole = \"listen\"\n";
+    const LEAST: &str = "[machine]\nrecording = \"night\"\n[source]\naddress = \"tcp://:5000\"\n";
 
     fn said(text: &str) -> Vec<String> {
         let problems = Config::parse(text).unwrap_err();
@@ -247,15 +282,16 @@ mod tests {
 
     #[test]
     fn every_wrong_value_is_said_at_once_with_key_range_and_line() {
-        let text = "[machine]\nfile = 3\n[source]\naddress = \"serial:/dev/ttyS0\"\nrole = \"both\"\ntimeout_ms = 0\n\
+        let text = "[machine]\nfile = 3\n[source]\naddress = \"serial:\"\nrole = \"both\"\ntimeout_ms = 0\n\
                     buffer_frame = 7\n[walk]\nparams_per_root_second = nan\n[publish]\nservice = \"\"\n[logs]\nlevel = 1\n";
         assert_eq!(
             said(text),
             [
                 "0: machine.recording is missing: Recording whose header states calibration, noise and ramp, a path",
                 "2: machine.file = 3: expected a path",
-                "4: source.address = \"serial:/dev/ttyS0\": expected tcp://HOST:PORT or unix:PATH",
-                "5: source.role = \"both\": expected \"connect\" or \"listen\"",
+                "4: source.address = \"serial:\": expected tcp://HOST:PORT, unix:PATH, serial:PATH[@BAUD], replay:RECORDING or \
+                 iceoryx2:SERVICE",
+                "5: source.role = \"both\": expected \"connect\" or \"listen\"; default \"connect\"",
                 "6: source.timeout_ms = 0: expected a whole number from 100 to 600000 (ms); default 5000",
                 "7: source.buffer_frame: no such key",
                 "9: walk.params_per_root_second = nan: expected a number from 0 to 0.1 (1/sqrt(s)); default 1.5e-4",
@@ -270,8 +306,8 @@ mod tests {
     fn text_that_is_no_toml_is_said_with_its_line() {
         let problems = said("[machine]\nrecording = \n");
         assert!(problems[0].starts_with("2: "), "{problems:?}");
-        assert_eq!(said("machine = 3\n[source]\n")[3], "1: machine = 3: expected a section");
-        assert_eq!(said("").len(), 3);
+        assert_eq!(said("machine = 3\n[source]\n")[2], "1: machine = 3: expected a section");
+        assert_eq!(said("").len(), 2);
     }
 
     #[test]
@@ -286,7 +322,7 @@ mod tests {
             .collect();
         let required = written
             .replace("[machine]\n", "[machine]\nrecording = \"night\"\n")
-            .replace("[source]\n", "[source]\naddress = \"tcp://:5000\"\nrole = \"listen\"\n");
+            .replace("[source]\n", "[source]\naddress = \"tcp://:5000\"\n");
         assert_eq!(Config::parse(&required), Config::parse(LEAST));
         assert!(Config::parse(LEAST).is_ok());
         let walk = Config::parse(LEAST).unwrap().walk;

@@ -4,9 +4,12 @@ pub mod address;
 pub mod device;
 pub mod feed;
 pub mod link;
+pub mod origin;
 pub mod queue;
 pub mod raw;
+pub mod rehearsal;
 pub mod replay;
+pub mod shared;
 pub mod splitter;
 
 use core::str::FromStr;

@@ -10,15 +10,16 @@ use twin::Ring;
 use super::{CommandError, machine, recording, tables};
 use crate::checkpoint::Keeper;
 use crate::cli::CoreModel;
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, ConfigError, Source};
 use crate::output::{self, warn};
 use crate::record::Names;
 use crate::serve::serve;
 use crate::sink::Sinks;
 use crate::sink::shared_memory::Publisher;
-use crate::source::feed;
+use crate::source::origin::Origin;
 use crate::source::queue::{Faults, Queue};
 use crate::source::raw::{self, Raw};
+use crate::source::{feed, rehearsal, shared};
 use crate::stop::Stop;
 
 impl From<ConfigError> for CommandError {
@@ -34,6 +35,9 @@ impl From<ConfigError> for CommandError {
 pub fn check(file: &Path) -> Result<(), CommandError> {
     let config = Config::read(file)?;
     let (ring, core) = build(&config)?;
+    if let Origin::Recording(path) = &config.source.address {
+        recording(path, &ring)?;
+    }
     let sizes = core.tables.sizes();
     output::say(format_args!(
         "{}: good; {}, {} monitors, {} vars, frames from {}",
@@ -66,15 +70,25 @@ pub fn run(file: &Path) -> Result<(), CommandError> {
     let queue = Queue::new(config.source.buffer_frames, resumed.as_ref().map_or(Faults::default(), |head| head.faults));
     let keeper = checkpoint.file.as_deref().map(|path| Keeper::start(path, &queue));
     let keeper = keeper.transpose().map_err(CommandError::other)?;
-    let most = packet::wire_bytes(large::Frame::MAX_BYTES);
-    feed::start(&config.source, most, &queue, &stop)
-        .map_err(|error| CommandError::Other(format!("{}: {error}", config.source.address)))?;
+    start(&config.source, &ring, &queue, &stop)?;
+    warn(format_args!("publishes on {}, takes frames from {}", config.publish.service, config.source.address));
     let mut source = Raw::new(core, &names, queue, model, resumed.as_ref())
         .with_checkpoints(keeper, checkpoint.checkpoint_every_frames);
     let ended = serve(&mut source, &mut sinks, &stop, || {}).map(drop).map_err(CommandError::other);
     let saved = source.finish().map_err(CommandError::other);
     let finished = sinks.finish().map_err(CommandError::other);
     ended.and(saved).and(finished)
+}
+
+/// Begin to put frames into the queue.
+fn start(source: &Source, ring: &Ring, queue: &Queue, stop: &Stop) -> Result<(), CommandError> {
+    let most = packet::wire_bytes(large::Frame::MAX_BYTES);
+    match &source.address {
+        Origin::Line(address) => feed::start(source, address, most, queue, stop),
+        Origin::Recording(path) => rehearsal::start(recording(path, ring)?, source.rate(), queue, stop),
+        Origin::SharedMemory(service) => shared::start(service, most, queue, stop),
+    }
+    .map_err(|error| CommandError::Other(format!("{}: {error}", source.address)))
 }
 
 /// The ring, and a core for it at its prior.

@@ -4,7 +4,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::{Problem, line};
-use crate::source::address::Address;
+use crate::source::origin::Origin;
 
 /// A key.
 #[derive(Debug)]
@@ -61,20 +61,29 @@ pub const KEYS: &[Key] = &[
     Key {
         section: "source",
         name: "address",
-        doc: "Socket on which raw frames come",
-        range: "tcp://HOST:PORT or unix:PATH",
+        doc: "Where raw frames come from: a socket, a serial line, a recording or shared memory",
+        range: "tcp://HOST:PORT, unix:PATH, serial:PATH[@BAUD], replay:RECORDING or iceoryx2:SERVICE",
         default: None,
         is_required: true,
-        kind: Kind::Text(is_socket),
+        kind: Kind::Text(is_origin),
     },
     Key {
         section: "source",
         name: "role",
-        doc: "Whether the daemon connects to the front end, or listens for it",
+        doc: "Whether the daemon connects to the front end's socket, or listens for it",
         range: "\"connect\" or \"listen\"",
-        default: None,
-        is_required: true,
+        default: Some("\"connect\""),
+        is_required: false,
         kind: Kind::Text(|word| ["connect", "listen"].contains(&word)),
+    },
+    Key {
+        section: "source",
+        name: "rate_hz",
+        doc: "Rate at which a recording is replayed; 0 is as fast as the core takes its frames",
+        range: "a number from 0 to 1000000 (Hz)",
+        default: Some("0.0"),
+        is_required: false,
+        kind: Kind::Number(0.0, 1e6),
     },
     Key {
         section: "source",
@@ -106,11 +115,20 @@ pub const KEYS: &[Key] = &[
     Key {
         section: "source",
         name: "buffer_frames",
-        doc: "Frames that may wait for the core; beyond them the oldest is dropped and counted",
+        doc: "Frames that may wait for the core",
         range: "a whole number from 1 to 100000 (frames)",
         default: Some("1000"),
         is_required: false,
         kind: Kind::Whole(1, 100_000),
+    },
+    Key {
+        section: "source",
+        name: "when_full",
+        doc: "With a full buffer, the oldest frame of a line is dropped and counted, or the sender waits",
+        range: "\"drop\" or \"wait\"",
+        default: Some("\"drop\""),
+        is_required: false,
+        kind: Kind::Text(|word| ["drop", "wait"].contains(&word)),
     },
     Key {
         section: "walk",
@@ -174,8 +192,11 @@ fn is_path(text: &str) -> bool {
     !text.is_empty()
 }
 
-fn is_socket(text: &str) -> bool {
-    matches!(text.parse(), Ok(Address::Tcp(_) | Address::Unix(_)))
+fn is_origin(text: &str) -> bool {
+    match text.parse::<Origin>() {
+        Ok(Origin::SharedMemory(service)) => is_name(&service),
+        origin => origin.is_ok(),
+    }
 }
 
 fn is_name(text: &str) -> bool {

@@ -3,6 +3,7 @@
 //! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
 //! killed leaves shared memory behind, which the next process that joins any service clears away. Layout: [`layout`].
 
+mod frames;
 pub mod layout;
 mod services;
 mod subscriber;
@@ -17,6 +18,7 @@ use iceoryx2::prelude::ipc;
 
 use super::{Sink, SinkError};
 use crate::record::{EstimateRecord, Names};
+pub use frames::{FrameReader, FrameWriter};
 use layout::{Header, Stamp};
 use services::{Services, join};
 pub use subscriber::{Published, Subscriber};
@@ -64,6 +66,14 @@ pub enum PublishError {
         service: String,
         /// Sequence number of its frame.
         sequence: u32,
+        /// Why.
+        reason: String,
+    },
+    /// A raw frame was not sent.
+    #[error("service {service}: a frame was not sent: {reason}")]
+    SendFrame {
+        /// The service.
+        service: String,
         /// Why.
         reason: String,
     },

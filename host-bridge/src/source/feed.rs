@@ -1,4 +1,4 @@
-//! Raw frames from a TCP or unix socket, on a thread of its own: it connects or listens, again and again, and reads into a [`Queue`].
+//! Raw frames from a TCP or unix socket or a serial line, on a thread of its own: it connects or listens, again and again, and reads into a [`Queue`].
 
 use core::time::Duration;
 use std::fs;
@@ -10,10 +10,12 @@ use std::path::Path;
 use std::thread;
 use std::time::Instant;
 
+use serialport::SerialPort;
+
 use super::address::Address;
 use super::queue::Queue;
 use super::splitter::Splitter;
-use crate::config::{Role, Source};
+use crate::config::{Role, Source, WhenFull};
 use crate::output::warn;
 use crate::stop::Stop;
 
@@ -24,7 +26,7 @@ const CONNECT: Duration = Duration::from_millis(500);
 /// Bytes of one read.
 const READ: usize = 64 << 10;
 
-/// A connected socket.
+/// A connected line.
 trait Stream: Read + Send {
     /// A read waits so long at most.
     fn glance(&self) -> io::Result<()>;
@@ -44,6 +46,13 @@ impl Stream for UnixStream {
     }
 }
 
+impl Stream for Box<dyn SerialPort> {
+    fn glance(&self) -> io::Result<()> {
+        // it was opened with this time
+        Ok(())
+    }
+}
+
 /// Where connections come from.
 enum Door {
     Connect(Address),
@@ -52,9 +61,12 @@ enum Door {
 }
 
 impl Door {
-    fn open(source: &Source) -> io::Result<Self> {
-        match (source.role, &source.address) {
-            (Role::Connect, address) => Ok(Self::Connect(address.clone())),
+    fn open(role: Role, address: &Address) -> io::Result<Self> {
+        match (role, address) {
+            // a serial line is opened, whoever is at its other end
+            (Role::Connect, address) | (Role::Listen, address @ Address::Serial(..)) => {
+                Ok(Self::Connect(address.clone()))
+            }
             (Role::Listen, Address::Tcp(address)) => {
                 let listener = TcpListener::bind(address)?;
                 listener.set_nonblocking(true)?;
@@ -65,7 +77,6 @@ impl Door {
                 listener.set_nonblocking(true)?;
                 Ok(Self::Unix(listener))
             }
-            (Role::Listen, Address::Serial(..)) => Err(ErrorKind::Unsupported.into()),
         }
     }
 
@@ -74,7 +85,7 @@ impl Door {
         let stream: io::Result<Box<dyn Stream>> = match self {
             Self::Connect(Address::Tcp(address)) => connect(address).map(|stream| Box::new(stream) as _),
             Self::Connect(Address::Unix(path)) => UnixStream::connect(path).map(|stream| Box::new(stream) as _),
-            Self::Connect(Address::Serial(..)) => Err(ErrorKind::Unsupported.into()),
+            Self::Connect(Address::Serial(path, baud)) => serial(path, *baud).map(|line| Box::new(line) as _),
             Self::Tcp(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
             Self::Unix(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
         };
@@ -96,6 +107,10 @@ fn bind(path: &Path) -> io::Result<UnixListener> {
     UnixListener::bind(path)
 }
 
+fn serial(path: &str, baud: u32) -> io::Result<Box<dyn SerialPort>> {
+    Ok(serialport::new(path, baud).timeout(GLANCE).open()?)
+}
+
 fn connect(address: &str) -> io::Result<TcpStream> {
     let mut last = io::Error::new(ErrorKind::NotFound, "the name has no address");
     for address in address.to_socket_addrs()? {
@@ -111,9 +126,9 @@ fn connect(address: &str) -> io::Result<TcpStream> {
 ///
 /// # Errors
 /// What the system says of a socket on which the daemon is to listen.
-pub fn start(source: &Source, most: usize, queue: &Queue, stop: &Stop) -> io::Result<()> {
+pub fn start(source: &Source, address: &Address, most: usize, queue: &Queue, stop: &Stop) -> io::Result<()> {
     let reader = Reader {
-        door: Door::open(source)?,
+        door: Door::open(source.role, address)?,
         source: source.clone(),
         splitter: Splitter::new(most),
         queue: queue.clone(),
@@ -176,7 +191,10 @@ impl Reader {
                     heard = Instant::now();
                     let long = self.splitter.push(&bytes[..length], |frame| {
                         had_frames = true;
-                        self.queue.push(frame);
+                        match self.source.when_full {
+                            WhenFull::Drop => self.queue.push(frame),
+                            WhenFull::Wait => self.queue.push_patiently(frame, &self.stop),
+                        }
                     });
                     self.queue.count(|faults| faults.damaged += long);
                 }

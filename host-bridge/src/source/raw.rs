@@ -1,4 +1,4 @@
-//! The core in this process, fed by raw frames from a socket, and its checkpoints.
+//! The core in this process, fed by raw frames, and its checkpoints.
 
 use core::time::Duration;
 use std::path::Path;
@@ -199,6 +199,7 @@ impl Source for Raw {
         self.say_faults(PAUSE);
         Ok(match self.queue.pop(GLANCE) {
             Some(frame) => self.take(frame),
+            None if self.queue.is_over() => Next::End,
             None => Next::Nothing,
         })
     }
