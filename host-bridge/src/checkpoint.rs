@@ -13,6 +13,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
+use crate::health::Health;
 use crate::record::Remarked;
 use crate::source::queue::Faults;
 
@@ -50,6 +51,8 @@ pub struct Head {
     pub remarked: Remarked,
     /// What went wrong.
     pub faults: Faults,
+    /// Of monitors and correctors.
+    pub health: Health,
 }
 
 /// A checkpoint in memory.
@@ -108,8 +111,9 @@ pub enum CheckpointError {
 
 impl Head {
     /// Of a state after a frame, made now.
-    pub fn new(model: Model, [sequence, frames]: [u32; 2], remarked: Remarked, faults: Faults) -> Self {
-        Self { version: VERSION, model, sequence, frames, saved: now(), remarked, faults }
+    pub fn new(model: Model, last: [u32; 2], remarked: Remarked, faults: Faults, health: Health) -> Self {
+        let [sequence, frames] = last;
+        Self { version: VERSION, model, sequence, frames, saved: now(), remarked, faults, health }
     }
 
     /// Age [s].
@@ -230,7 +234,8 @@ mod tests {
     const MODEL: Model = Model { tables: 1, setup: 2, layout: 3 };
 
     fn checkpoint(sequence: u32) -> Checkpoint {
-        let head = Head::new(MODEL, [sequence, sequence + 1], Remarked::default(), Faults::default());
+        let head =
+            Head::new(MODEL, [sequence, sequence + 1], Remarked::default(), Faults::default(), Health::new(&[1e-4], 1));
         Checkpoint { head, state: vec![10, 0, 10, 255] }
     }
 

@@ -8,6 +8,7 @@ pub mod config;
 pub mod export;
 pub mod fit_page;
 pub mod frames_result;
+pub mod health;
 pub mod import_result;
 pub mod matrix_page;
 pub mod matrix_result;

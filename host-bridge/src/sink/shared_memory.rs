@@ -4,6 +4,7 @@
 //! killed leaves shared memory behind, which the next process that joins any service clears away. Layout: [`layout`].
 
 mod frames;
+mod health;
 pub mod layout;
 mod services;
 mod subscriber;
@@ -19,6 +20,7 @@ use iceoryx2::prelude::ipc;
 use super::{Sink, SinkError};
 use crate::record::{EstimateRecord, Names};
 pub use frames::{FrameReader, FrameWriter};
+pub use health::{HealthReader, HealthWriter};
 use layout::{Header, Stamp};
 use services::{Services, join};
 pub use subscriber::{Published, Subscriber};

@@ -13,8 +13,10 @@ use training::LINE;
 use super::queue::{Faults, Queue};
 use super::{Next, Source, SourceError};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Keeper, Model};
+use crate::health::{Health, Reporter};
 use crate::output::warn;
 use crate::record::{EstimateRecord, Names, Remarked};
+use crate::sink::shared_memory::HealthWriter;
 
 /// Longest wait for a frame before somebody's wish to stop is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
@@ -64,6 +66,7 @@ pub struct Raw {
     queue: Queue,
     model: Model,
     checkpoints: Option<Checkpoints>,
+    reporter: Reporter,
     /// Last frame of the checkpoint, until the first frame says what was lost.
     resumed: Option<u32>,
     /// Nothing is left to do before the next frame.
@@ -78,12 +81,17 @@ impl Raw {
     /// Frames of a queue through a core, of this model, which is at its prior or was resumed.
     pub fn new(core: Core, names: &Arc<Names>, queue: Queue, model: Model, resumed: Option<&Head>) -> Self {
         let said = (queue.faults(), Instant::now());
+        let sizes = core.tables.sizes();
+        let correctors = sizes.correctors.iter().sum::<u16>().into();
+        let kept = resumed.map(|head| head.health.clone()).filter(|kept| kept.is_of(names.monitors.len(), correctors));
+        let health = kept.unwrap_or_else(|| Health::new(&core.setup.noise, correctors));
         Self {
             core,
             names: names.clone(),
             queue,
             model,
             checkpoints: None,
+            reporter: Reporter::new(health, sizes),
             resumed: resumed.map(|head| head.sequence),
             is_prepared: false,
             last: None,
@@ -96,6 +104,13 @@ impl Raw {
     #[must_use]
     pub fn with_checkpoints(mut self, keeper: Option<Keeper>, every: u32) -> Self {
         self.checkpoints = keeper.map(|keeper| Checkpoints { keeper, every, since: 0 });
+        self
+    }
+
+    /// From now on with its health published.
+    #[must_use]
+    pub fn with_health(mut self, writer: HealthWriter) -> Self {
+        self.reporter.writer = Some(writer);
         self
     }
 
@@ -112,9 +127,13 @@ impl Raw {
         Ok(())
     }
 
-    /// Work between two frames: a checkpoint if one is due, else slices of what prepares for the next frame, one at least, and
+    /// Work between two frames: health and a checkpoint if they are due, then slices of what prepares for the next frame, one at least, and
     /// more until that frame waits.
     fn between(&mut self) -> Result<(), StateError> {
+        if let Some(last) = self.last.filter(|_| self.reporter.is_due()) {
+            let fit = self.core.fit_quality();
+            self.reporter.publish(last, fit);
+        }
         if let Some(last) = self.last.filter(|_| self.is_due()) {
             let file = self.file(last)?;
             if let Some(checkpoints) = &mut self.checkpoints {
@@ -141,11 +160,13 @@ impl Raw {
         self.is_prepared = true;
         let mut state = Vec::new();
         self.core.save(&mut state)?;
-        Ok(Checkpoint { head: Head::new(self.model, last, self.remarked, self.queue.faults()), state }.encode())
+        let health = self.reporter.health.clone();
+        let head = Head::new(self.model, last, self.remarked, self.queue.faults(), health);
+        Ok(Checkpoint { head, state }.encode())
     }
 
-    fn take(&mut self, mut frame: Vec<u8>) -> Next {
-        let estimate = match self.core.ingest(&mut frame) {
+    fn take(&mut self, frame: Vec<u8>) -> Next {
+        let estimate = match self.core.ingest(&mut frame.clone()) {
             Ok(estimate) => estimate,
             Err(error) => {
                 self.queue.count(|faults| match error {
@@ -157,6 +178,7 @@ impl Raw {
         };
         let mismatch = self.core.fit_quality().is_mismatch();
         let record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
+        self.reporter.learn(&record, &frame);
         self.is_prepared = false;
         self.last = Some([record.sequence, record.frames]);
         self.remarked.add(&record.remarks);

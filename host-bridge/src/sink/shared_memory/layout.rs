@@ -152,7 +152,7 @@ fn said(remarks: &Remarks) -> u32 {
 }
 
 /// Up to four bytes as a word; those that are missing are zero.
-fn word(bytes: &[u8]) -> u32 {
+pub(super) fn word(bytes: &[u8]) -> u32 {
     let mut all = [0; 4];
     all[..bytes.len()].copy_from_slice(bytes);
     u32::from_le_bytes(all)
