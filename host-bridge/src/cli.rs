@@ -54,6 +54,8 @@ pub enum Command {
     Validate(Validate),
     /// Run the daemon of a configuration, or publish the estimates of a device
     Serve(Serve),
+    /// Ask a running daemon for a snapshot, a reset, or another model
+    Request(Request),
     /// Measure a campaign through the control system, and put the machine back
     Measure(Measure),
     /// Simulate the machine of a plan, one cycle a line, for a soft IOC
@@ -201,6 +203,36 @@ pub struct Serve {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub publishing: Publishing,
+}
+
+/// `orbitcal request`.
+#[derive(Debug, Args)]
+pub struct Request {
+    /// What is asked
+    #[command(subcommand)]
+    pub ask: Ask,
+    /// Name of the shared-memory service of the daemon's estimates
+    #[arg(long, value_name = "SERVICE", default_value = SERVICE, global = true)]
+    pub service: String,
+}
+
+/// What is asked of a daemon.
+#[derive(Debug, Subcommand)]
+pub enum Ask {
+    /// A checkpoint of now, into a file
+    Snapshot {
+        /// The file
+        #[arg(value_name = "FILE")]
+        out: PathBuf,
+    },
+    /// The core back to its prior
+    Reset,
+    /// Tables of a machine with the physics that a diagnosis found
+    Model {
+        /// The file
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
 }
 
 /// `orbitcal watch`.

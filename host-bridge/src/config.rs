@@ -27,6 +27,9 @@ pub struct Config {
     /// Where estimates go.
     #[serde(default)]
     pub publish: Publish,
+    /// What may be asked of the running daemon.
+    #[serde(default)]
+    pub requests: Requests,
     /// What a restart begins with.
     #[serde(default)]
     pub checkpoint: Checkpoint,
@@ -173,6 +176,24 @@ impl Default for Publish {
     }
 }
 
+/// `[requests]`
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Requests {
+    /// A checkpoint may be asked for: that changes nothing.
+    pub snapshot: bool,
+    /// The core may be put back to its prior.
+    pub reset: bool,
+    /// The tables may be changed.
+    pub model: bool,
+}
+
+impl Default for Requests {
+    fn default() -> Self {
+        Self { snapshot: true, reset: false, model: false }
+    }
+}
+
 /// `[checkpoint]`
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -312,7 +333,7 @@ mod tests {
 
     #[test]
     fn what_is_left_out_has_the_default_that_is_stated() {
-        let written: String = ["machine", "source", "walk", "publish", "checkpoint"]
+        let written: String = ["machine", "source", "walk", "publish", "requests", "checkpoint"]
             .iter()
             .map(|section| {
                 let own = keys::KEYS.iter().filter(|key| key.section == *section);

@@ -1,6 +1,7 @@
 //! Where estimates come from: the core in this process fed by a recording or by raw frames, or a device on a line.
 
 pub mod address;
+pub mod desk;
 pub mod device;
 pub mod feed;
 pub mod link;

@@ -13,6 +13,7 @@ pub mod import;
 pub mod matrix;
 pub mod measure;
 pub mod replay;
+pub mod request;
 pub mod response;
 pub mod serve;
 pub mod simulate;

@@ -27,6 +27,7 @@ enum Kind {
     Whole(i64, i64),
     Number(f64, f64),
     Text(fn(&str) -> bool),
+    Flag,
 }
 
 /// All of them, in the order of `config/booster.toml`.
@@ -167,6 +168,33 @@ pub const KEYS: &[Key] = &[
         kind: Kind::Text(is_name),
     },
     Key {
+        section: "requests",
+        name: "snapshot",
+        doc: "Whether a checkpoint of now may be asked for, which changes nothing",
+        range: "true or false",
+        default: Some("true"),
+        is_required: false,
+        kind: Kind::Flag,
+    },
+    Key {
+        section: "requests",
+        name: "reset",
+        doc: "Whether the core may be put back to its prior",
+        range: "true or false",
+        default: Some("false"),
+        is_required: false,
+        kind: Kind::Flag,
+    },
+    Key {
+        section: "requests",
+        name: "model",
+        doc: "Whether the daemon's tables may be changed for those of a file",
+        range: "true or false",
+        default: Some("false"),
+        is_required: false,
+        kind: Kind::Flag,
+    },
+    Key {
         section: "checkpoint",
         name: "file",
         doc: "Checkpoint; without it, every start is at the prior",
@@ -216,6 +244,7 @@ impl Kind {
             (Self::Number(low, high), DeValue::Float(number)) => {
                 number.as_str().parse().is_ok_and(|v: f64| (*low..=*high).contains(&v))
             }
+            (Self::Flag, DeValue::Boolean(_)) => true,
             (Self::Text(is_right), DeValue::String(text)) => is_right(text),
             _ => false,
         }

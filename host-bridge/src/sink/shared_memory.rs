@@ -6,6 +6,7 @@
 mod frames;
 mod health;
 pub mod layout;
+mod requests;
 mod services;
 mod subscriber;
 
@@ -22,6 +23,7 @@ use crate::record::{EstimateRecord, Names};
 pub use frames::{FrameReader, FrameWriter};
 pub use health::{HealthReader, HealthWriter};
 use layout::{Header, Stamp};
+pub use requests::{Asked, Reply, Request, RequestClient, RequestServer};
 use services::{Services, join};
 pub use subscriber::{Published, Subscriber};
 

@@ -6,17 +6,19 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
+use estimator::surrogate::Unstable;
 use estimator::{IngestError, Prepared, StateError, Tables as _};
 use inference::stream::Core;
-use training::LINE;
+use training::{LINE, Tables};
 
+use super::desk::{Desk, Wish, reply};
 use super::queue::{Faults, Queue};
 use super::{Next, Source, SourceError};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Keeper, Model};
 use crate::health::{Health, Reporter};
 use crate::output::warn;
 use crate::record::{EstimateRecord, Names, Remarked};
-use crate::sink::shared_memory::HealthWriter;
+use crate::sink::shared_memory::{HealthWriter, Reply};
 
 /// Longest wait for a frame before somebody's wish to stop is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
@@ -67,6 +69,7 @@ pub struct Raw {
     model: Model,
     checkpoints: Option<Checkpoints>,
     reporter: Reporter,
+    desk: Option<Desk>,
     /// Last frame of the checkpoint, until the first frame says what was lost.
     resumed: Option<u32>,
     /// Nothing is left to do before the next frame.
@@ -92,6 +95,7 @@ impl Raw {
             model,
             checkpoints: None,
             reporter: Reporter::new(health, sizes),
+            desk: None,
             resumed: resumed.map(|head| head.sequence),
             is_prepared: false,
             last: None,
@@ -111,6 +115,13 @@ impl Raw {
     #[must_use]
     pub fn with_health(mut self, writer: HealthWriter) -> Self {
         self.reporter.writer = Some(writer);
+        self
+    }
+
+    /// From now on open to requests.
+    #[must_use]
+    pub fn with_requests(mut self, desk: Desk) -> Self {
+        self.desk = Some(desk);
         self
     }
 
@@ -150,6 +161,47 @@ impl Raw {
         Ok(())
     }
 
+    /// Do what operators ask for, one request at a time.
+    fn obey(&mut self) {
+        let Some((wish, asked)) = self.desk.as_mut().and_then(Desk::next) else { return };
+        let done = match wish {
+            Wish::Snapshot => self.snapshot(),
+            Wish::Reset => self.reset(),
+            Wish::Model(tables) => self.adopt(*tables),
+        };
+        reply(asked, &done.map_or_else(Reply::Refused, Reply::Done));
+    }
+
+    fn snapshot(&mut self) -> Result<Vec<u8>, String> {
+        let last = self.last.ok_or("no frame has come yet")?;
+        self.file(last).map_err(|error| error.to_string())
+    }
+
+    fn reset(&mut self) -> Result<Vec<u8>, String> {
+        let (tables, setup) = (self.core.tables.clone(), self.core.setup.clone());
+        self.core = Core::with_tables(tables, setup).map_err(|error| error.to_string())?;
+        self.begin_anew("the core is at its prior");
+        self.last = None;
+        Ok(b"the core is at its prior".to_vec())
+    }
+
+    fn adopt(&mut self, tables: Tables) -> Result<Vec<u8>, String> {
+        self.core.prepare();
+        let adopted = self.core.adopt(tables);
+        adopted.map_err(|Unstable| "with these tables the ring is not stable at the vars at hand".to_owned())?;
+        self.model = model_of(&mut self.core).map_err(|error| error.to_string())?;
+        let said = format!("the tables are now {:08x}", self.model.tables);
+        self.begin_anew(&said);
+        Ok(said.into_bytes())
+    }
+
+    /// What was filtered is of another posterior.
+    fn begin_anew(&mut self, why: &str) {
+        warn(format_args!("asked for: {why}"));
+        self.reporter.restart();
+        self.is_prepared = false;
+    }
+
     fn is_due(&self) -> bool {
         self.checkpoints.as_ref().is_some_and(|checkpoints| checkpoints.since >= checkpoints.every)
     }
@@ -177,7 +229,8 @@ impl Raw {
             }
         };
         let mismatch = self.core.fit_quality().is_mismatch();
-        let record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
+        let mut record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
+        record.tables = Some(self.model.tables);
         self.reporter.learn(&record, &frame);
         self.is_prepared = false;
         self.last = Some([record.sequence, record.frames]);
@@ -217,6 +270,7 @@ fn lost(before: u32, first: u32) -> String {
 
 impl Source for Raw {
     fn next(&mut self) -> Result<Next, SourceError> {
+        self.obey();
         self.between()?;
         self.say_faults(PAUSE);
         Ok(match self.queue.pop(GLANCE) {

@@ -3,4 +3,5 @@
 mod faults;
 mod kills;
 mod place;
+mod requests;
 mod sources;
