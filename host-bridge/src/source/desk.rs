@@ -35,8 +35,8 @@ impl Desk {
     }
 
     /// The next wish that is allowed, and who has it; others are refused here.
-    pub fn next(&mut self) -> Option<(Wish, Asked)> {
-        let asked = self.server.next().unwrap_or_else(|error| {
+    pub fn receive(&mut self) -> Option<(Wish, Asked)> {
+        let asked = self.server.receive().unwrap_or_else(|error| {
             warn(error);
             None
         })?;

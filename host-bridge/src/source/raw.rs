@@ -163,7 +163,7 @@ impl Raw {
 
     /// Do what operators ask for, one request at a time.
     fn obey(&mut self) {
-        let Some((wish, asked)) = self.desk.as_mut().and_then(Desk::next) else { return };
+        let Some((wish, asked)) = self.desk.as_mut().and_then(Desk::receive) else { return };
         let done = match wish {
             Wish::Snapshot => self.snapshot(),
             Wish::Reset => self.reset(),

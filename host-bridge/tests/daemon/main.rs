@@ -4,4 +4,5 @@ mod faults;
 mod kills;
 mod place;
 mod requests;
+mod soak;
 mod sources;

@@ -55,6 +55,13 @@ impl Place {
         Daemon(command.spawn().unwrap())
     }
 
+    /// Another reader of its estimates.
+    pub fn watch(&self) -> Daemon {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_orbitcal"));
+        command.args(["watch", "--quiet", "--service", &self.service]).stdin(Stdio::null()).stdout(Stdio::null());
+        Daemon(command.spawn().unwrap())
+    }
+
     pub fn said(&self) -> String {
         fs::read_to_string(self.path("said")).unwrap()
     }
@@ -144,4 +151,9 @@ pub fn connected<S>(connect: impl Fn() -> std::io::Result<S>) -> S {
         }
         thread::sleep(Duration::from_millis(5));
     }
+}
+
+/// Numbers as their bits: a comparison that sees the sign of a zero.
+pub fn bits(values: &[&Vec<f32>]) -> Vec<u32> {
+    values.iter().copied().flatten().map(|value| value.to_bits()).collect()
 }

@@ -141,7 +141,7 @@ impl RequestServer {
     ///
     /// # Errors
     /// [`PublishError::Receive`].
-    pub fn next(&mut self) -> Result<Option<Asked>, PublishError> {
+    pub fn receive(&mut self) -> Result<Option<Asked>, PublishError> {
         let active = self.server.receive().map_err(|e| self.service.wrong(&e))?;
         Ok(active.map(|active| Asked { request: Request::decode(active.payload()), active }))
     }
@@ -215,7 +215,7 @@ mod tests {
                 || RequestClient::try_new(&name).unwrap().ask(&Request::Snapshot, Duration::from_secs(10)).unwrap();
             let asked = scope.spawn(ask);
             let request = loop {
-                if let Some(request) = server.next().unwrap() {
+                if let Some(request) = server.receive().unwrap() {
                     break request;
                 }
             };
