@@ -168,11 +168,13 @@ pub struct Publish {
     pub service: String,
     /// Publisher, which `orbitcal watch` shows.
     pub name: String,
+    /// Shared-memory service of the raw frames that were taken; none, and they are not published.
+    pub frames: Option<String>,
 }
 
 impl Default for Publish {
     fn default() -> Self {
-        Self { service: SERVICE.into(), name: PUBLISHER.into() }
+        Self { service: SERVICE.into(), name: PUBLISHER.into(), frames: None }
     }
 }
 
@@ -272,10 +274,24 @@ impl Config {
             problems = keys::check(text, table.get_ref());
         }
         if problems.is_empty() {
-            return toml::from_str(text).map_err(|error| vec![of_toml(text, &error)]);
+            let config: Self = toml::from_str(text).map_err(|error| vec![of_toml(text, &error)])?;
+            return config.expect_no_circle();
         }
         problems.sort();
         Err(problems)
+    }
+}
+
+impl Config {
+    /// Frames that are published do not come back as those of a front end.
+    fn expect_no_circle(self) -> Result<Self, Vec<Problem>> {
+        match (&self.source.address, &self.publish.frames) {
+            (Origin::SharedMemory(from), Some(to)) if from == to => {
+                let what = format!("publish.frames = {to:?}: the frames of source.address come from there");
+                Err(vec![Problem { line: 0, what }])
+            }
+            _ => Ok(self),
+        }
     }
 }
 
@@ -321,6 +337,13 @@ mod tests {
                 "12: logs: no such section",
             ]
         );
+    }
+
+    #[test]
+    fn frames_do_not_go_where_they_come_from() {
+        let text = LEAST.replace("tcp://:5000", "iceoryx2:a") + "[publish]\nframes = \"a\"\n";
+        assert_eq!(said(&text), ["0: publish.frames = \"a\": the frames of source.address come from there"]);
+        assert!(Config::parse(&text.replace("frames = \"a\"", "frames = \"b\"")).is_ok());
     }
 
     #[test]

@@ -15,7 +15,7 @@ use crate::output::{self, warn};
 use crate::record::Names;
 use crate::serve::serve;
 use crate::sink::Sinks;
-use crate::sink::shared_memory::{HealthWriter, Publisher, RequestServer};
+use crate::sink::shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer};
 use crate::source::desk::Desk;
 use crate::source::origin::Origin;
 use crate::source::queue::{Faults, Queue};
@@ -63,6 +63,8 @@ pub fn run(file: &Path) -> Result<(), CommandError> {
     let publisher = Publisher::try_new(&config.publish.service, &config.publish.name, &names);
     let health = HealthWriter::try_new(&config.publish.service, &config.publish.name, &names, &ring.corrector_names());
     let health = health.map_err(CommandError::other)?;
+    let frames = config.publish.frames.as_deref().map(|service| FrameWriter::try_new(service, &config.publish.name));
+    let frames = frames.transpose().map_err(CommandError::other)?;
     let server = RequestServer::try_new(&config.publish.service, &config.publish.name).map_err(CommandError::other)?;
     let recording = recording(&config.machine.recording, &ring)?;
     let desk = Desk::new(server, config.requests, recording.powered(&ring).into_owned());
@@ -81,6 +83,7 @@ pub fn run(file: &Path) -> Result<(), CommandError> {
     let mut source = Raw::new(core, &names, queue, model, resumed.as_ref())
         .with_health(health)
         .with_requests(desk)
+        .with_frames(frames)
         .with_checkpoints(keeper, checkpoint.checkpoint_every_frames);
     let ended = serve(&mut source, &mut sinks, &stop, || {}).map(drop).map_err(CommandError::other);
     let saved = source.finish().map_err(CommandError::other);

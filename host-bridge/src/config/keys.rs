@@ -168,6 +168,15 @@ pub const KEYS: &[Key] = &[
         kind: Kind::Text(is_name),
     },
     Key {
+        section: "publish",
+        name: "frames",
+        doc: "Shared-memory service of the raw frames that were taken; without it, they are not published",
+        range: NAME,
+        default: None,
+        is_required: false,
+        kind: Kind::Text(is_name),
+    },
+    Key {
         section: "requests",
         name: "snapshot",
         doc: "Whether a checkpoint of now may be asked for, which changes nothing",

@@ -18,7 +18,7 @@ use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Keeper, Model};
 use crate::health::{Health, Reporter};
 use crate::output::warn;
 use crate::record::{EstimateRecord, Names, Remarked};
-use crate::sink::shared_memory::{HealthWriter, Reply};
+use crate::sink::shared_memory::{FrameWriter, HealthWriter, Reply};
 
 /// Longest wait for a frame before somebody's wish to stop is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
@@ -70,6 +70,9 @@ pub struct Raw {
     checkpoints: Option<Checkpoints>,
     reporter: Reporter,
     desk: Option<Desk>,
+    frames: Option<FrameWriter>,
+    /// Taken, and not published yet.
+    taken: Option<Vec<u8>>,
     /// Last frame of the checkpoint, until the first frame says what was lost.
     resumed: Option<u32>,
     /// Nothing is left to do before the next frame.
@@ -96,6 +99,8 @@ impl Raw {
             checkpoints: None,
             reporter: Reporter::new(health, sizes),
             desk: None,
+            frames: None,
+            taken: None,
             resumed: resumed.map(|head| head.sequence),
             is_prepared: false,
             last: None,
@@ -125,11 +130,19 @@ impl Raw {
         self
     }
 
+    /// From now on with its frames published.
+    #[must_use]
+    pub fn with_frames(mut self, writer: Option<FrameWriter>) -> Self {
+        self.frames = writer;
+        self
+    }
+
     /// The end: a last checkpoint, and what went wrong.
     ///
     /// # Errors
     /// [`StateError`].
     pub fn finish(mut self) -> Result<(), StateError> {
+        self.pass_on();
         if let (Some(last), Some(mut checkpoints)) = (self.last, self.checkpoints.take()) {
             let file = self.file(last)?;
             checkpoints.keeper.finish(file);
@@ -138,9 +151,10 @@ impl Raw {
         Ok(())
     }
 
-    /// Work between two frames: health and a checkpoint if they are due, then slices of what prepares for the next frame, one at least, and
+    /// Work between two frames: the frame, health and a checkpoint if they are due, then slices of what prepares for the next frame, one at least, and
     /// more until that frame waits.
     fn between(&mut self) -> Result<(), StateError> {
+        self.pass_on();
         if let Some(last) = self.last.filter(|_| self.reporter.is_due()) {
             let fit = self.core.fit_quality();
             self.reporter.publish(last, fit);
@@ -159,6 +173,15 @@ impl Raw {
             }
         }
         Ok(())
+    }
+
+    /// Publish the last frame; a failure is said, and ends that.
+    fn pass_on(&mut self) {
+        let Some(frame) = self.taken.take() else { return };
+        if let Some(Err(error)) = self.frames.as_mut().map(|writer| writer.send(&frame)) {
+            warn(format_args!("{error}; frames are not published any more"));
+            self.frames = None;
+        }
     }
 
     /// Do what operators ask for, one request at a time.
@@ -232,6 +255,7 @@ impl Raw {
         let mut record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
         record.tables = Some(self.model.tables);
         self.reporter.learn(&record, &frame);
+        self.taken = self.frames.is_some().then_some(frame);
         self.is_prepared = false;
         self.last = Some([record.sequence, record.frames]);
         self.remarked.add(&record.remarks);

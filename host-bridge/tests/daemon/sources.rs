@@ -56,6 +56,29 @@ fn frames_in_shared_memory_are_read_and_their_publisher_may_start_again() {
     daemon.stop();
 }
 
+/// The second daemon takes the frames that the first one has taken and published.
+#[test]
+fn a_daemon_takes_the_frames_of_another() {
+    let (port, service) = (port(), format!("orbitcal/test/{}/passed-on", std::process::id()));
+    let first = Place::new("first", &format!("tcp://127.0.0.1:{port}"), "listen", "");
+    let config = first.path("config.toml");
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replacen("[checkpoint]", &format!("frames = {service:?}\n[checkpoint]"), 1)).unwrap();
+    let second = Place::new("second", &format!("iceoryx2:{service}"), "connect", "");
+    let [mut one, mut two] = [&first, &second].map(|place| Subscriber::try_new(&place.service).unwrap());
+    let mut daemons = [second.start(), first.start()];
+    second.hear("takes frames from iceoryx2:");
+    let (frames, mut heard) = (Frames::new(), Vec::new());
+    let mut line = connected(|| TcpStream::connect(("127.0.0.1", port)));
+    for sequence in 1..=20 {
+        line.write_all(&frames.wire(sequence)).unwrap();
+        listening(&mut one, 1);
+        heard.extend(listening(&mut two, 1));
+    }
+    expect_those_of_a_core_here(&frames, &heard);
+    daemons.iter_mut().for_each(|daemon| _ = daemon.stop());
+}
+
 /// With room for two frames, a recording waits for the core, and the daemon ends after it.
 #[test]
 fn a_recording_is_replayed_to_its_end_without_a_loss() {

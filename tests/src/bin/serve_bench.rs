@@ -1,9 +1,9 @@
 //! `make serve-bench`: how fast the daemon is, from a TCP source on loopback to a subscriber of the shared memory: frames lost and late at
 //! 10 kHz, latency at 1 kHz. Numbers of the machine at hand; no test asserts them.
 
+use core::error::Error;
 use core::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
-use std::error::Error;
 use std::fs;
 use std::io::Write;
 use std::net::{TcpListener, TcpStream};
