@@ -1,4 +1,4 @@
-//! What an operator may change of the daemon: one TOML file. `config/booster.toml` shows every key; [`keys`] holds their ranges.
+//! What an operator may change of the daemon: one TOML file. `config/booster.toml` shows every key; `config/keys.rs` their ranges.
 
 mod keys;
 

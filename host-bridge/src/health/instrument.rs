@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn rare_surprises_are_jumps_and_steady_ones_are_a_dead_instrument() {
         let mut corrector = healthy();
-        let every_fifth = |i: u32| if i % 5 == 0 { Sample::Surprise } else { Sample::Scatter(1.0) };
+        let every_fifth = |i: u32| if i.is_multiple_of(5) { Sample::Surprise } else { Sample::Scatter(1.0) };
         (0..1000).for_each(|i| _ = corrector.add(every_fifth(i), &LIMITS));
         assert_eq!(corrector.state(), State::Jumps);
         until(&mut corrector, Sample::Surprise, State::Dead);
