@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -60,6 +60,15 @@ loops: ## many closed loops in pairs of runs, estimated response against the des
 
 drift: ## a stream that drifts, and how soon steps of vars are found: docs/drift.md with its figure; minutes
 	cargo run --locked --release -p system-tests --bin drift
+
+serve-bench: build ## the daemon from a TCP source on loopback to a subscriber: lost and late at 10 kHz for a minute, latency at 1 kHz
+	cargo run --locked --release -p system-tests --bin serve_bench
+
+serve-kill: toolchain ## kill -9 of the daemon and of a reader, 100 times at random moments: restarts, leaks, frames lost; a minute
+	cargo test --locked --release -p host-bridge --test daemon -- --ignored --exact kills::serve_kill --nocapture
+
+serve-soak: toolchain ## two million frames with 5 % faults of every kind through the daemon, beside a core in process: estimates bit for bit, memory; ten minutes
+	cargo test --locked --release -p host-bridge --test daemon -- --ignored --exact soak::serve_soak --nocapture
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check

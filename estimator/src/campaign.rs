@@ -10,6 +10,7 @@ use heapless::Vec;
 use crate::drive::Drive;
 use crate::monitor::Gate;
 use crate::ramp::is_same_time;
+use crate::state::{Blank, Bytes, State, StateError, state};
 use crate::wire::{PositionCode, RfCode};
 
 /// The setting that a frame repeats: at most one corrector moved from a reference drive, or the RF moved.
@@ -28,6 +29,8 @@ pub struct Setting {
     /// Time in the cycle [us].
     pub cycle_time: u32,
 }
+
+state!([] Setting { reference, corrector, kick, tolerance, rf_offset, cycle_time });
 
 /// Kicks this close belong to the same setting, as a share of the kick: 1/16.
 const SAME_KICK: i32 = 16;
@@ -108,6 +111,12 @@ pub fn move_mean(mean: &mut i32, value: i32, n: u32) {
 #[derive(Debug, Clone, Copy)]
 struct Last(i32);
 
+impl State for Last {
+    fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+        self.0.pass(bytes)
+    }
+}
+
 impl Last {
     /// None so far.
     const NONE: Self = Self(i32::MIN);
@@ -147,8 +156,15 @@ pub struct Cell<const B: usize, const C: usize, const F: usize> {
     last: [Last; B],
 }
 
+state!([const B: usize, const C: usize, const F: usize] Cell<B, C, F> { setting, frames, kick, strength, rf_offset, reading, count, last });
+
+impl<const B: usize, const C: usize, const F: usize> Blank for Cell<B, C, F> {
+    const BLANK: Self =
+        Self::open(Setting { reference: 0, corrector: None, kick: 0, tolerance: 0, rf_offset: 0, cycle_time: 0 });
+}
+
 impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
-    fn open(setting: Setting) -> Self {
+    const fn open(setting: Setting) -> Self {
         Self {
             setting,
             frames: 0,
@@ -305,6 +321,8 @@ pub enum Verdict {
 pub struct Campaign<const B: usize, const C: usize, const F: usize, const S: usize> {
     cells: Vec<Cell<B, C, F>, S>,
 }
+
+state!([const B: usize, const C: usize, const F: usize, const S: usize] Campaign<B, C, F, S> { cells });
 
 impl<const B: usize, const C: usize, const F: usize, const S: usize> Campaign<B, C, F, S> {
     /// Nothing so far.

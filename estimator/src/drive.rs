@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::beyond::Beyond;
 use crate::ramp::Ramp;
+use crate::state::state;
 use crate::wire::{CurrentCode, Frame};
 
 /// A number that holds for all of `L` things, or one for each.
@@ -70,6 +71,13 @@ pub struct Drive<const C: usize, const F: usize> {
     pub strength: [f32; F],
     /// Relative offset of the RF frequency.
     pub rf_offset: f32,
+}
+
+state!([const C: usize, const F: usize] Drive<C, F> { kick, strength, rf_offset });
+
+impl<const C: usize, const F: usize> Drive<C, F> {
+    /// Nothing drives the beam.
+    pub const NONE: Self = Self { kick: [0.0; C], strength: [0.0; F], rf_offset: 0.0 };
 }
 
 /// Largest kick of all correctors together [rad], 25 times that of one: beyond it first-order optics says nothing.

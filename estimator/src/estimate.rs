@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::mask::Mask;
 use crate::prior::{Marginal, Prior};
+use crate::state::{Bytes, State, StateError};
 
 /// State of a monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -31,6 +32,15 @@ impl MonitorState {
             3 => Some(Self::Dead),
             _ => None,
         }
+    }
+}
+
+impl State for MonitorState {
+    fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+        let mut code = *self as u8;
+        code.pass(bytes)?;
+        *self = Self::from_code(code).ok_or(StateError::Value { what: "a monitor's state", got: code.into() })?;
+        Ok(())
     }
 }
 

@@ -37,6 +37,7 @@ use crate::surrogate::{Prediction, Surrogate, Unstable};
 use crate::tune::{TuneMeter, wrapped};
 use crate::wire::{Frame, FrameError, PositionCode};
 
+use crate::state::{self, Blank, Bytes, State, StateError, state};
 use anew::Anew;
 pub use anew::Prepared;
 pub use laplace::FitQuality;
@@ -151,6 +152,8 @@ struct Tangent<L, const F: usize> {
     is_new: bool,
 }
 
+state!([L: State, const F: usize] Tangent<L, F> { linearised, supplies, ripple, chromatic, is_new });
+
 impl<L, const F: usize> Tangent<L, F> {
     /// Measured minus predicted tune at `ln` of the supplies' factors.
     fn tune_innovation<G: Surrogate<B, C, F, N, Linearised = L>, const B: usize, const C: usize, const N: usize>(
@@ -196,6 +199,15 @@ struct Predicted<const B: usize, const F: usize, const N: usize> {
     first_channel: usize,
 }
 
+state!([const B: usize, const F: usize, const N: usize] Predicted<B, F, N> {
+    prediction,
+    at_mean_drive,
+    strength,
+    off_mean,
+    rf_offset,
+    first_channel,
+});
+
 /// All frames so far, in the form in which they can be linearised anew.
 #[derive(Debug, Clone)]
 struct Past<
@@ -217,6 +229,14 @@ struct Past<
     /// All of it has to be weighted anew.
     stale: bool,
 }
+
+state!([const B: usize, const C: usize, const F: usize, const N: usize, const S: usize, const K: usize, const T: usize, const W: usize] Past<B, C, F, N, S, K, T, W> {
+    campaign,
+    reference,
+    recent,
+    loose,
+    stale,
+});
 
 /// Why a frame was refused. The posterior is as it was.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -271,6 +291,13 @@ struct Loose<const B: usize, const C: usize, const F: usize, const W: usize> {
     accepted: Mask<W>,
     /// First channel of its baselines.
     first_channel: u16,
+}
+
+state!([const B: usize, const C: usize, const F: usize, const W: usize] Loose<B, C, F, W> { drive, reading, accepted, first_channel });
+
+impl<const B: usize, const C: usize, const F: usize, const W: usize> Blank for Loose<B, C, F, W> {
+    const BLANK: Self =
+        Self { drive: Drive::NONE, reading: [PositionCode::ZERO; B], accepted: Mask::NONE, first_channel: 0 };
 }
 
 /// Prior standard deviation of a monitor's baseline [m]: offsets reach 10 mm.
@@ -826,6 +853,31 @@ impl<
         self.posterior.step_evidence(|i| prior_of::<G, B, C, F, N>(model, i))
     }
 
+    /// Write all that frames have made of the posterior, between two frames and with nothing left to [`Estimator::prepare`];
+    /// returns how many bytes it takes.
+    ///
+    /// # Errors
+    /// [`StateError::Truncated`] without room for it, [`StateError::UnderWay`].
+    pub fn save(&mut self, to: &mut [u8]) -> Result<usize, StateError> {
+        if self.anew.under_way { Err(StateError::UnderWay) } else { state::save(self, to) }
+    }
+
+    /// Go on where another one with the same model was saved, to the bit.
+    ///
+    /// # Errors
+    /// [`StateError`]; it is then to be restarted.
+    pub fn load(&mut self, from: &[u8]) -> Result<(), StateError> {
+        self.anew.under_way = false;
+        let loaded = state::load(self, from);
+        self.started &= loaded.is_ok();
+        loaded
+    }
+
+    /// CRC-32 of the names and lengths of what is saved: a program that saves other things has another one.
+    pub fn state_layout(&mut self) -> u32 {
+        state::layout(self)
+    }
+
     /// Frames taken in so far, those that were put aside included.
     pub fn frames(&self) -> u32 {
         self.sequence.frames
@@ -834,6 +886,59 @@ impl<
     /// Covariance of two params `theta = ln var`.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
         if i < N && j < N { self.posterior.solution.covariance(i, j) as f32 } else { 0.0 }
+    }
+}
+
+/// All but the work between frames, which is finished or begun anew.
+impl<
+    G: Surrogate<B, C, F, N>,
+    const B: usize,
+    const C: usize,
+    const F: usize,
+    const N: usize,
+    const S: usize,
+    const K: usize,
+    const T: usize,
+    const U: usize,
+    const W: usize,
+> State for Estimator<G, B, C, F, N, S, K, T, U, W>
+{
+    fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+        let Self {
+            started,
+            sequence,
+            times,
+            looked,
+            slices,
+            tangent,
+            design_chromatic,
+            anew: _,
+            predicted,
+            monitors,
+            following,
+            peers,
+            tunes,
+            past,
+            posterior,
+            whole,
+            nis,
+        } = self;
+        State::pass(started, bytes)?;
+        State::pass(sequence, bytes)?;
+        State::pass(times, bytes)?;
+        State::pass(looked, bytes)?;
+        State::pass(slices, bytes)?;
+        State::pass(tangent, bytes)?;
+        State::pass(design_chromatic, bytes)?;
+        State::pass(predicted, bytes)?;
+        State::pass(monitors, bytes)?;
+        State::pass(following, bytes)?;
+        State::pass(peers, bytes)?;
+        State::pass(tunes, bytes)?;
+        State::pass(past, bytes)?;
+        State::pass(posterior, bytes)?;
+        State::pass(whole, bytes)?;
+        State::pass(nis, bytes)
     }
 }
 

@@ -9,6 +9,8 @@
 //! Each frame takes one Gauss-Seidel sweep of these equations. Ripples of different supplies are all but independent, so that a
 //! sweep leaves a small part of an error which is itself a small part of the noise.
 
+use crate::state::state;
+
 /// What repeats have shown of one monitor: the scatter, and how its baseline follows `F` supplies.
 #[derive(Debug, Clone, Copy)]
 pub struct Following<const F: usize> {
@@ -23,6 +25,8 @@ pub struct Following<const F: usize> {
     /// Change of the baseline per `ln` of each supply's factor, `u` [m].
     slope: [f32; F],
 }
+
+state!([const F: usize] Following<F> { repeats, scatter, ripple, along, slope });
 
 /// What is known beforehand: the standard deviation of each `u` [m], and the variance of a reading [m^2].
 #[derive(Debug, Clone, Copy)]

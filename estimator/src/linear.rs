@@ -4,10 +4,12 @@
 use core::iter::Sum;
 use core::ops::{Add, AddAssign, Mul};
 
+use crate::state::State;
+
 use nalgebra::{ArrayStorage, SMatrix};
 
 /// `f32` or `f64`.
-pub trait Real: Copy + PartialEq + Add<Output = Self> + AddAssign + Mul<Output = Self> + Sum + 'static {
+pub trait Real: Copy + PartialEq + Add<Output = Self> + AddAssign + Mul<Output = Self> + Sum + State + 'static {
     /// 0.
     const ZERO: Self;
 

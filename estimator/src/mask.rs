@@ -1,8 +1,16 @@
 //! One bit for each monitor, or for each param, however many there are.
 
+use crate::state::{Bytes, State, StateError};
+
 /// `32 W` bits, all 0 at first; bit `i` is that of monitor, or param, `i`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const W: usize>([u32; W]);
+
+impl<const W: usize> State for Mask<W> {
+    fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+        self.0.pass(bytes)
+    }
+}
 
 /// Words of 32 bits that hold so many bits.
 pub const fn words(bits: usize) -> usize {

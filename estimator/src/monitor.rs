@@ -11,6 +11,7 @@ use micromath::F32Ext;
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::{Health, MonitorState};
+use crate::state::state;
 use crate::wire::PositionCode;
 
 /// Decides whether two readings, or a reading and its prediction, agree.
@@ -74,6 +75,8 @@ pub struct Noise {
     total: u32,
     histogram: [u16; BINS],
 }
+
+state!([] Noise { expected, sigma, total, histogram });
 
 impl Noise {
     /// Memory for one, all zero.
@@ -191,6 +194,20 @@ pub struct Monitor {
     last_code: i32,
 }
 
+state!([] Monitor {
+    noise,
+    state,
+    jumps,
+    silent,
+    unchanged,
+    flat,
+    flatness,
+    reported,
+    refused,
+    rejected,
+    last_code,
+});
+
 impl Monitor {
     /// Memory for one, all zero.
     pub const BLANK: Self = Self {
@@ -297,6 +314,8 @@ pub struct Peers {
     /// By how much more than expected, as a share of that.
     excess: f32,
 }
+
+state!([] Peers { excess });
 
 impl Peers {
     /// As expected; all zero.

@@ -4,6 +4,8 @@
 //! fault. Moved baselines leave every reading off by the same amount whatever the correctors do; a beam that is not there
 //! leaves the readings where they are.
 
+use crate::state::state;
+
 /// Frames that must agree before the baselines have moved.
 const ENOUGH: u32 = 10;
 /// Frames in a row after which the model is at fault, and not the beam.
@@ -19,6 +21,8 @@ struct Spread {
     mean: f32,
     squares: f32,
 }
+
+state!([] Spread { mean, squares });
 
 impl Spread {
     const NONE: Self = Self { mean: 0.0, squares: 0.0 };
@@ -40,6 +44,8 @@ struct Said {
     reading: Spread,
 }
 
+state!([] Said { number, surprise, reading });
+
 /// How far a baseline has moved.
 #[derive(Debug, Clone, Copy)]
 pub struct Shift {
@@ -60,6 +66,8 @@ pub struct Quarantine<const B: usize> {
     frames: u32,
     said: [Said; B],
 }
+
+state!([const B: usize] Quarantine<B> { frames, said });
 
 impl<const B: usize> Quarantine<B> {
     /// None.

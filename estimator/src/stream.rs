@@ -7,6 +7,7 @@ use crate::estimate::Estimate;
 use crate::estimator::{Estimator, FitQuality, IngestError, Model, Prepared, Setup};
 use crate::judged::Judged;
 use crate::sizes::Sizes;
+use crate::state::StateError;
 use crate::steer::{Feedback, Steer, Steered};
 use crate::surrogate::{Steerable, Surrogate, Tables, Unstable};
 use crate::wire::link::{Answer, Correction, Setpoints, Short};
@@ -49,6 +50,9 @@ pub trait Core: Sized {
     fn adopt(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> Result<(), Unstable>;
     fn fit_quality(&mut self, tables: &Self::Tables, setup: &Self::Setup) -> FitQuality;
     fn forget_sequence(&mut self);
+    fn save(&mut self, to: &mut [u8]) -> Result<usize, StateError>;
+    fn load(&mut self, from: &[u8]) -> Result<(), StateError>;
+    fn state_layout(&mut self) -> u32;
     fn frames(&self) -> u32;
     fn covariance(&self, i: usize, j: usize) -> f32;
     /// Number of the frame that an estimate is of.
@@ -144,6 +148,18 @@ impl<
 
     fn forget_sequence(&mut self) {
         self.forget_sequence();
+    }
+
+    fn save(&mut self, to: &mut [u8]) -> Result<usize, StateError> {
+        self.save(to)
+    }
+
+    fn load(&mut self, from: &[u8]) -> Result<(), StateError> {
+        self.load(from)
+    }
+
+    fn state_layout(&mut self) -> u32 {
+        self.state_layout()
     }
 
     fn frames(&self) -> u32 {

@@ -1,10 +1,17 @@
 //! Symmetric and triangular matrices, packed: a lower triangle row by row, half the memory of a square.
 
 use crate::linear::{Real, add, add_four, add_four_to_each, combine, dot};
+use crate::state::{Bytes, State, StateError};
 
 /// Lower triangle of an `N x N` matrix; `T = N (N + 1)/2` entries, row `i` holds columns `0..=i`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Triangle<const N: usize, const T: usize, R = f32>([R; T]);
+
+impl<const N: usize, const T: usize, R: State> State for Triangle<N, T, R> {
+    fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+        self.0.pass(bytes)
+    }
+}
 
 impl<const N: usize, const T: usize, R: Real> Triangle<N, T, R> {
     const FITS: () = assert!(T == N * (N + 1) / 2, "T entries make a triangle of N");

@@ -5,6 +5,7 @@
 
 use crate::campaign::{move_mean, ratio, ratio_steps};
 use crate::monitor::{Gate, Noise};
+use crate::state::state;
 use crate::wire::TuneCode;
 
 /// Order of magnitude of its noise [1]; what is learnt reaches from 3e-5 to 0.1.
@@ -27,6 +28,8 @@ pub struct TuneMeter<const F: usize> {
     scatter: f64,
     last: Option<(TuneCode, [f32; F])>,
 }
+
+state!([const F: usize] TuneMeter<F> { noise, mean, count, strength, scatter, last });
 
 impl<const F: usize> TuneMeter<F> {
     /// Memory for one.

@@ -52,8 +52,10 @@ pub enum Command {
     Challenge(Challenge),
     /// Diagnose simulated blind campaigns, count how often the result is right
     Validate(Validate),
-    /// Publish the estimates of a device
+    /// Run the daemon of a configuration, or publish the estimates of a device
     Serve(Serve),
+    /// Ask a running daemon for a snapshot, a reset, or another model
+    Request(Request),
     /// Measure a campaign through the control system, and put the machine back
     Measure(Measure),
     /// Simulate the machine of a plan, one cycle a line, for a soft IOC
@@ -161,9 +163,15 @@ pub struct Replay {
 /// `orbitcal serve`.
 #[derive(Debug, Args)]
 pub struct Serve {
+    /// Configuration of the daemon, such as config/booster.toml: the core here, fed by raw frames
+    #[arg(value_name = "CONFIG.toml", required_unless_present = "source", conflicts_with = "source")]
+    pub config: Option<PathBuf>,
+    /// Say everything that is wrong with the configuration, and start nothing
+    #[arg(long, requires = "config")]
+    pub check: bool,
     /// Where the device is: tcp://HOST:PORT, unix:PATH or serial:PATH[@BAUD]
     #[arg(long)]
-    pub source: Address,
+    pub source: Option<Address>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
@@ -195,6 +203,36 @@ pub struct Serve {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub publishing: Publishing,
+}
+
+/// `orbitcal request`.
+#[derive(Debug, Args)]
+pub struct Request {
+    /// What is asked
+    #[command(subcommand)]
+    pub ask: Ask,
+    /// Name of the shared-memory service of the daemon's estimates
+    #[arg(long, value_name = "SERVICE", default_value = SERVICE, global = true)]
+    pub service: String,
+}
+
+/// What is asked of a daemon.
+#[derive(Debug, Subcommand)]
+pub enum Ask {
+    /// A checkpoint of now, into a file
+    Snapshot {
+        /// The file
+        #[arg(value_name = "FILE")]
+        out: PathBuf,
+    },
+    /// The core back to its prior
+    Reset,
+    /// Tables of a machine with the physics that a diagnosis found
+    Model {
+        /// The file
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
 }
 
 /// `orbitcal watch`.

@@ -1,11 +1,14 @@
 //! The host's side of orbitcal. Estimates come from a [`source`] (the core fed by a recording, a device), pass the loop
 //! [`serve`], and go to every [`sink`] (shared memory, trace); a [`result`] is what a command prints. `main.rs` joins these parts.
 
+pub mod checkpoint;
 pub mod cli;
 pub mod command;
+pub mod config;
 pub mod export;
 pub mod fit_page;
 pub mod frames_result;
+pub mod health;
 pub mod import_result;
 pub mod matrix_page;
 pub mod matrix_result;

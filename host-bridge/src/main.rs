@@ -7,8 +7,8 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, measure, replay, response,
-    serve, simulate, study, surrogate, validate, watch,
+    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, measure, replay, request,
+    response, serve, simulate, study, surrogate, validate, watch,
 };
 use host_bridge::output::{self, OutputError};
 
@@ -38,6 +38,7 @@ fn main() -> ExitCode {
         Command::Import(options) => import::run(options),
         Command::Export(options) => export::run(options),
         Command::Validate(options) => validate::run(options),
+        Command::Request(options) => request::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Measure(options) => measure::run(options),
         Command::Simulate(options) => simulate::run(options),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use estimator::{MonitorState, Remarks};
 use inference::stream::Estimate;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use twin::Ring;
 
 /// Whose numbers a record holds.
@@ -39,7 +39,7 @@ pub enum ReadingUse {
 }
 
 /// How many frames each remark was made of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Remarked {
     /// No beam, or one that the model does not know: nothing in the frame was used.
     pub put_aside_frames: u32,
@@ -86,8 +86,10 @@ pub struct EstimateRecord {
     pub rejected_frames: u32,
     /// What is to be said of this frame as a whole.
     pub remarks: Remarks,
-    /// How often each of that was said, this frame included, since [`crate::serve::serve`] began to count.
+    /// How often each of that was said, this frame included: since [`crate::serve::serve`] began to count, or since the first start of what was resumed.
     pub remarked: Remarked,
+    /// Digest of the tables that predict; none where that is not known.
+    pub tables: Option<u32>,
     /// The model was relinearised since the last estimate.
     pub linearised: bool,
     /// The readings are further off than noise explains; none where that was not asked.
@@ -145,6 +147,7 @@ impl EstimateRecord {
             rejected_frames: estimate.rejected_frames,
             remarks: estimate.remarks,
             remarked: Remarked::default(),
+            tables: None,
             linearised: estimate.linearised,
             mismatch,
             nis: estimate.nis,
@@ -177,6 +180,14 @@ impl EstimateRecord {
     pub fn nis_per_reading(&self) -> Option<f32> {
         let readings = self.readings(ReadingUse::Used) + self.tune_innovation.iter().flatten().count();
         (readings > 0).then(|| self.nis / readings as f32)
+    }
+
+    /// Whether somebody may act on it: means and error bars are numbers, this frame had a solution and was not put aside, and
+    /// readings and model are not known to disagree.
+    pub fn is_usable(&self) -> bool {
+        let is_number = |(mean, sigma): (&f32, &f32)| mean.is_finite() && sigma.is_finite() && *sigma > 0.0;
+        let has_solution = !self.remarks.unsolved && !self.remarks.put_aside;
+        has_solution && self.mismatch != Some(true) && self.mean.iter().zip(&self.sigma).all(is_number)
     }
 
     /// The remarks of this frame in words.
@@ -233,6 +244,7 @@ pub(crate) mod tests {
             rejected_frames: 0,
             remarks: Remarks::default(),
             remarked: Remarked::default(),
+            tables: None,
             linearised: false,
             mismatch: Some(false),
             nis: 0.0,
@@ -258,6 +270,21 @@ pub(crate) mod tests {
         record.covariance[4] = 0.5; // after (0,0) (1,0) (1,1) (2,0)
         assert_eq!([record.covariance_of(2, 1), record.covariance_of(1, 2)], [0.5, 0.5]);
         assert_eq!(record.covariance_of(3, 3), record.sigma[3] * record.sigma[3]);
+    }
+
+    #[test]
+    fn what_is_no_number_or_does_not_fit_is_not_usable() {
+        let is_usable = |change: fn(&mut EstimateRecord)| {
+            let mut record = record(2, 1);
+            change(&mut record);
+            record.is_usable()
+        };
+        assert!(is_usable(|_| ()) && is_usable(|record| record.mismatch = None));
+        assert!(!is_usable(|record| record.mismatch = Some(true)));
+        assert!(!is_usable(|record| record.mean[1] = f32::NAN));
+        assert!(!is_usable(|record| record.sigma[0] = 0.0));
+        assert!(!is_usable(|record| record.remarks.unsolved = true));
+        assert!(!is_usable(|record| record.remarks.put_aside = true));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The loop: every estimate of a source into every sink.
 
-use crate::record::{EstimateRecord, Remarked};
+use crate::record::EstimateRecord;
 use crate::sink::{SinkError, Sinks};
 use crate::source::{Next, Source, SourceError};
 use crate::stop::Stop;
@@ -28,7 +28,7 @@ pub fn serve(
     stop: &Stop,
     mut heard: impl FnMut(),
 ) -> Result<Option<Box<EstimateRecord>>, ServeError> {
-    let (mut last, mut remarked) = (None, Remarked::default());
+    let (mut last, mut remarked) = (None, source.remarked());
     while !stop.is_requested() {
         match source.next().map_err(ServeError::Source)? {
             Next::Estimate(mut record) => {
@@ -54,7 +54,7 @@ mod tests {
     use twin::Ring;
 
     use super::*;
-    use crate::record::Names;
+    use crate::record::{Names, Remarked};
     use crate::result::FitResult;
     use crate::source::replay::Replay;
     use crate::source::{Clock, Rate};

@@ -1,9 +1,17 @@
-//! Where estimates come from: the core in this process fed by a recording, or a device on a line.
+//! Where estimates come from: the core in this process fed by a recording or by raw frames, or a device on a line.
 
 pub mod address;
+pub mod desk;
 pub mod device;
+pub mod feed;
 pub mod link;
+pub mod origin;
+pub mod queue;
+pub mod raw;
+pub mod rehearsal;
 pub mod replay;
+pub mod shared;
+pub mod splitter;
 
 use core::str::FromStr;
 use core::time::Duration;
@@ -11,7 +19,7 @@ use std::time::Instant;
 
 use estimator::Prepared;
 
-use crate::record::EstimateRecord;
+use crate::record::{EstimateRecord, Remarked};
 use crate::result::Timing;
 use crate::stop::Stop;
 
@@ -35,6 +43,11 @@ pub trait Source {
     /// # Errors
     /// Whatever ends the stream before its end.
     fn next(&mut self) -> Result<Next, SourceError>;
+
+    /// What was remarked of the frames before the next one, where others than those that were given here count.
+    fn remarked(&self) -> Remarked {
+        Remarked::default()
+    }
 }
 
 /// Frames a second.

@@ -9,7 +9,7 @@ use core::fmt;
 use estimator::surrogate::Unstable;
 use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
-    Prepared, Prior, RfCode, Sizes, TuneCode,
+    Prepared, Prior, RfCode, Sizes, StateError, TuneCode,
 };
 use training::rooms::{large, ramped};
 use training::{Tables, in_room, in_spare_room};
@@ -182,6 +182,27 @@ impl Core {
         self.stream.fit_quality()
     }
 
+    /// Write all that frames have made of the posterior; no work between frames is under way, see [`Core::prepare`].
+    ///
+    /// # Errors
+    /// [`StateError::UnderWay`].
+    pub fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError> {
+        self.stream.save(to)
+    }
+
+    /// Go on where a core with the same tables and setup was saved, to the bit.
+    ///
+    /// # Errors
+    /// [`StateError`]; the core is then at its prior.
+    pub fn load(&mut self, from: &[u8]) -> Result<(), StateError> {
+        self.stream.load(from)
+    }
+
+    /// CRC-32 of the names and lengths of what is saved: a program that saves other things has another one.
+    pub fn state_layout(&mut self) -> u32 {
+        self.stream.state_layout()
+    }
+
     /// Covariance of two params `theta = ln var`.
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
         self.stream.covariance(i, j)
@@ -308,6 +329,54 @@ mod tests {
         let mut row = recording.rows[0].clone();
         change(&mut row);
         wire(&recording, &row).err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_core_that_was_loaded_goes_on_to_the_bit() {
+        let ring = Ring::booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let recording = Recording::read(&folder, &ring).unwrap();
+        for walk in [Walk::NONE, FOLLOW] {
+            let mut whole = estimator(&ring, &recording, walk).unwrap();
+            let mut core = whole.clone();
+            let mut state = Vec::new();
+            for (i, row) in recording.rows.iter().enumerate() {
+                // from a core that has seen others, and from one at its prior
+                if i % 40 == 7 {
+                    whole.prepare();
+                    core.prepare();
+                    whole.save(&mut state).unwrap();
+                    core = if i % 80 == 7 { estimator(&ring, &recording, walk).unwrap() } else { core };
+                    core.load(&state).unwrap();
+                }
+                let (mut wire, slices) = (wire(&recording, row).unwrap(), i % 4);
+                for core in [&mut whole, &mut core] {
+                    (0..slices).for_each(|_| _ = core.slice());
+                }
+                let (one, two) = (whole.ingest(&mut wire.clone()), core.ingest(&mut wire));
+                assert_eq!(format!("{one:?}"), format!("{two:?}"), "frame {i}");
+                assert_eq!(whole.covariance(30, 7).to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
+            }
+            let quality = [whole.fit_quality(), core.fit_quality()];
+            assert_eq!(quality[0], quality[1]);
+        }
+    }
+
+    #[test]
+    fn a_core_that_cannot_be_loaded_is_at_its_prior() {
+        let ring = Ring::booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let recording = Recording::read(&folder, &ring).unwrap();
+        let (fresh, mut state) = (estimator(&ring, &recording, FOLLOW).unwrap(), Vec::new());
+        let mut core = fresh.clone();
+        core.ingest(&mut wire(&recording, &recording.rows[0]).unwrap()).unwrap();
+        core.prepare();
+        core.save(&mut state).unwrap();
+        assert_eq!(core.state_layout(), fresh.clone().state_layout());
+        let got = core.load(&state[..state.len() - 1]).unwrap_err();
+        assert_eq!(got, StateError::Truncated { bytes: state.len() - 1 });
+        let next = |core: &mut Core| core.ingest(&mut wire(&recording, &recording.rows[1]).unwrap()).unwrap();
+        assert_eq!(format!("{:?}", next(&mut core)), format!("{:?}", next(&mut fresh.clone())));
     }
 
     #[test]

@@ -30,14 +30,16 @@ class Header(ctypes.Structure):
         ("put_aside_frames", ctypes.c_uint32),
         ("baselines_moved", ctypes.c_uint32),
         ("unsolved_frames", ctypes.c_uint32),
+        ("tables", ctypes.c_uint32),
+        ("usable", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name():
-        return "orbitcal.Estimate.v3"
+        return "orbitcal.Estimate.v4"
 
 
-assert ctypes.sizeof(Header) == 88
+assert ctypes.sizeof(Header) == 96
 
 
 class Estimate:

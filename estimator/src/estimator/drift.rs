@@ -20,6 +20,7 @@
 //! Changes (1993), ch. 7.
 
 use crate::gaussian::{Covariance, Gaussian, Solution};
+use crate::state::state;
 
 /// Frames after which the score of one has lost all but 1/e of its weight: a step that the tunes show, and one that only orbits do.
 const WINDOWS: [f32; 2] = [8.0, 48.0];
@@ -35,12 +36,16 @@ pub(super) struct Drift<const N: usize> {
     windows: [[Score; N]; WINDOWS.len()],
 }
 
+state!([const N: usize] Drift<N> { mean, information, windows });
+
 /// Sum of the scores of a param, and its variance.
 #[derive(Debug, Clone, Copy)]
 struct Score {
     sum: f32,
     variance: f32,
 }
+
+state!([] Score { sum, variance });
 
 /// A step that was found.
 #[derive(Debug, Clone, Copy)]

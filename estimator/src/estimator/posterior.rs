@@ -6,6 +6,7 @@ use super::drift::Drift;
 use crate::gaussian::{Correlated, Gaussian, Solution};
 use crate::prior::Prior;
 use crate::sizes::Layout;
+use crate::state::state;
 
 /// How far a baseline may be moved by the step of a var [m]: the orbit passes quadrupoles some millimetres off their centres, and 2 %
 /// of such a deflection moves it by 0.1 mm.
@@ -64,6 +65,20 @@ pub(super) struct Posterior<const K: usize, const N: usize, const T: usize, cons
     /// The Gaussian was not positive since the last estimate.
     pub unsolved: bool,
 }
+
+state!([const K: usize, const N: usize, const T: usize, const U: usize, const W: usize] Posterior<K, N, T, U, W> {
+    gaussian,
+    solution,
+    orbit,
+    walked,
+    owed,
+    stepped,
+    let_loose,
+    drift,
+    log_determinant,
+    narrowed,
+    unsolved,
+});
 
 impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: usize> Posterior<K, N, T, U, W> {
     /// Channels of the monitors; those of the tune meter follow.

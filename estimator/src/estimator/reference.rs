@@ -8,6 +8,7 @@ use crate::campaign::{Setting, is_moved};
 use crate::drive::Drive;
 use crate::gaussian::Reading;
 use crate::linear::column;
+use crate::state::state;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -25,6 +26,8 @@ pub(super) struct Reference<const C: usize> {
     /// Frames of no setting since it was last looked for.
     waited: u16,
 }
+
+state!([const C: usize] Reference<C> { number, kick, waited });
 
 impl<const C: usize> Reference<C> {
     /// All correctors at 0 A.

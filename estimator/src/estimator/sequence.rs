@@ -1,6 +1,7 @@
 //! Which frames have come, and how much time has passed between them.
 
 use super::IngestError;
+use crate::state::{Blank, state};
 use crate::wire::Frame;
 
 /// Numbers up to this much larger are later ones; what is further ahead is behind, since numbers wrap.
@@ -16,6 +17,12 @@ struct Cycle {
     epoch: u32,
     sequence: u32,
     time_us: u64,
+}
+
+state!([] Cycle { epoch, sequence, time_us });
+
+impl Blank for Cycle {
+    const BLANK: Self = Self { epoch: 0, sequence: 0, time_us: 0 };
 }
 
 impl Cycle {
@@ -43,6 +50,8 @@ pub(super) struct Sequence {
     /// Time from one cycle to the next, once the clock has told [s].
     period: Option<f32>,
 }
+
+state!([] Sequence { last, frames, rejected, period });
 
 impl Sequence {
     /// None so far.

@@ -7,6 +7,7 @@ use heapless::Vec;
 use super::{Estimator, IngestError, Model};
 use crate::beyond::Beyond;
 use crate::ramp::{TIMES, is_same_time, milliseconds};
+use crate::state::state;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -18,6 +19,8 @@ pub(super) struct Times {
     /// Root of their number, less 1, so that none is all zero.
     root_less_1: f32,
 }
+
+state!([] Times { known, root_less_1 });
 
 impl Times {
     /// None so far.

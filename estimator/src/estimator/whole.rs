@@ -7,6 +7,7 @@ use crate::judged::{Expected, Judged, is_surprising};
 use crate::mask::Mask;
 use crate::monitor::Monitor;
 use crate::quarantine::{Quarantine, Shift};
+use crate::state::state;
 use crate::surrogate::Surrogate;
 use crate::wire::Frame;
 
@@ -44,6 +45,8 @@ pub(super) struct WholeFrames<const B: usize> {
     /// Largest beam intensity lately, in steps.
     most_intense: i32,
 }
+
+state!([const B: usize] WholeFrames<B> { quarantine, most_intense });
 
 impl<const B: usize> WholeFrames<B> {
     /// None so far.

@@ -3,10 +3,11 @@
 use core::marker::PhantomData;
 
 use crate::linear::{Real, add, add_four_to_each, dot};
+use crate::state::{State, state};
 use crate::triangle::Triangle;
 
 /// Covariance of the baselines, params given [m^2].
-pub trait Covariance<const B: usize>: Copy {
+pub trait Covariance<const B: usize>: Copy + State {
     /// Precision of the slopes by which baselines follow the params.
     type Slope: Real;
 
@@ -95,12 +96,16 @@ pub struct Independent<const B: usize, R> {
     slope: PhantomData<R>,
 }
 
+state!([const B: usize, R] Independent<B, R> { variance, slope });
+
 /// That of baselines which a walk of the params has correlated; `U` entries make a triangle of `B`.
 #[derive(Debug, Clone, Copy)]
 pub struct Correlated<const B: usize, const U: usize> {
     matrix: Triangle<B, U, f64>,
     walked: bool,
 }
+
+state!([const B: usize, const U: usize] Correlated<B, U> { matrix, walked });
 
 impl<const B: usize, R: Real> Covariance<B> for Independent<B, R> {
     type Slope = R;

@@ -29,6 +29,7 @@ use crate::prior::Prior;
 use crate::quarantine::Shift;
 use crate::triangle::Triangle;
 
+use crate::state::state;
 pub use baselines::{Correlated, Covariance, Independent};
 use baselines::{Gain, Moves};
 pub use pool::{Line, Pool, Repeats};
@@ -68,6 +69,17 @@ pub struct Gaussian<const B: usize, const N: usize, const T: usize, V: Covarianc
     /// `ln` of the product of all variances, those of readings times `2 pi`.
     volume: f64,
 }
+
+state!([const B: usize, const N: usize, const T: usize, V: Covariance<B>] Gaussian<B, N, T, V> {
+    origin,
+    information,
+    vector,
+    baseline,
+    slope,
+    covariance,
+    cost,
+    volume,
+});
 
 impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<B, N, T, V> {
     /// Memory for one, all zero; [`Gaussian::reset`] makes it a distribution.

@@ -4,6 +4,7 @@ use super::{Covariance, Gaussian, square};
 use crate::linear::{add, dot};
 use crate::mask::Mask;
 use crate::prior::Prior;
+use crate::state::state;
 use crate::triangle::Triangle;
 
 /// Shares by which the information's diagonal is enlarged until it is positive: rounding of a sum of 48 squares is 1e-14 of it.
@@ -29,6 +30,17 @@ pub struct Solution<const N: usize, const T: usize, const W: usize> {
     /// Inverse of the information's lower Cholesky factor, `P = X^T X`.
     factor: Triangle<N, T, f64>,
 }
+
+state!([const N: usize, const T: usize, const W: usize] Solution<N, T, W> {
+    delta,
+    map_params,
+    sigma,
+    clipped,
+    cost,
+    log_evidence,
+    log_determinant,
+    factor,
+});
 
 impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
     /// Memory for one, all zero.

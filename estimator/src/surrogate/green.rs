@@ -23,6 +23,7 @@ use super::{Block, LowRank, Prediction, Steerable, Surrogate, SymmetricBlock, Un
 use crate::drive::Drive;
 use crate::linear::{add, add_four_to_each, dot};
 use crate::sizes::Sizes;
+use crate::state::state;
 use crate::triangle::Triangle;
 
 /// In place of the number of a param or of a supply: none.
@@ -112,6 +113,14 @@ struct PlaneLinearised<const B: usize, const C: usize, const M: usize, const Q: 
     tune_slope: [f32; M],
 }
 
+state!([const B: usize, const C: usize, const M: usize, const Q: usize] PlaneLinearised<B, C, M, Q> {
+    seen,
+    driven,
+    response,
+    tune,
+    tune_slope,
+});
+
 /// The surrogate at given strengths.
 #[derive(Debug, Clone)]
 pub struct GreenLinearised<
@@ -133,6 +142,15 @@ pub struct GreenLinearised<
     /// Slip factor `compaction - 1/gamma^2` [1].
     slip: f32,
 }
+
+state!([const BX: usize, const BY: usize, const CX: usize, const CY: usize, const M: usize, const Q: usize] GreenLinearised<BX, BY, CX, CY, M, Q> {
+    x,
+    y,
+    slope,
+    monitor_dispersion,
+    node_dispersion,
+    slip,
+});
 
 impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
     const BLANK: Self = Self {

@@ -15,6 +15,7 @@ use nalgebra::SMatrix;
 use crate::drive::Drive;
 use crate::linear::zeros;
 use crate::sizes::{Layout, Sizes};
+use crate::state::{State, state};
 use crate::wire::{Parcel, ParcelError};
 
 /// The orbit at the monitors, and its derivative with respect to every param and `ln` of every supply's factor.
@@ -27,6 +28,8 @@ pub struct Prediction<const B: usize, const F: usize, const N: usize> {
     /// Derivative with respect to `ln` of each supply's factor [m] [B][F].
     pub by_supply: [[f32; F]; B],
 }
+
+state!([const B: usize, const F: usize, const N: usize] Prediction<B, F, N> { reading, jacobian, by_supply });
 
 impl<const B: usize, const F: usize, const N: usize> Prediction<B, F, N> {
     /// Memory for one, all zero.
@@ -73,7 +76,7 @@ pub trait Tables {
 /// params.
 pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usize>: Tables {
     /// The result of one linearisation.
-    type Linearised;
+    type Linearised: State;
 
     /// Memory for a linearisation, all zero.
     const UNLINEARISED: Self::Linearised;

@@ -1,5 +1,6 @@
 //! Matrices in 16-bit codes with one scale.
 
+use crate::state::state;
 use crate::triangle::start;
 
 /// A matrix `[R][C]` of codes, stored by columns; the value is `scale * code`, off by half a step, `max/65534`, at most.
@@ -28,6 +29,8 @@ pub struct Column<const R: usize> {
     /// The codes.
     pub codes: [i16; R],
 }
+
+state!([const R: usize] Column<R> { scale, codes });
 
 impl<const R: usize> Column<R> {
     /// All zero.

@@ -13,6 +13,7 @@ use super::packet::{self, LENGTH, VARINT_32, VARINT_64};
 use super::{FrameError, listed};
 use crate::mask::Mask;
 use crate::sizes::Layout;
+use crate::state::{Blank, Bytes, State, StateError};
 
 macro_rules! code {
     ($(#[$doc:meta])* $name:ident, $unit:ident = $lsb:literal, limit $limit:literal) => {
@@ -25,6 +26,9 @@ macro_rules! code {
             pub const $unit: f32 = $lsb;
             /// Largest magnitude, in steps.
             pub const LIMIT: i32 = $limit;
+
+            /// No step.
+            pub const ZERO: Self = Self(0);
 
             /// The code of this many steps, if it is within the limit.
             pub const fn try_new(steps: i32) -> Option<Self> {
@@ -46,6 +50,20 @@ macro_rules! code {
             pub fn value(self) -> f32 {
                 self.0 as f32 * Self::$unit
             }
+        }
+
+        impl State for $name {
+            fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
+                let mut steps = self.0;
+                steps.pass(bytes)?;
+                let error = StateError::Value { what: stringify!($name), got: steps as u32 };
+                *self = Self::try_new(steps).ok_or(error)?;
+                Ok(())
+            }
+        }
+
+        impl Blank for $name {
+            const BLANK: Self = Self::ZERO;
         }
     };
 }

@@ -1,4 +1,5 @@
-//! `orbitcal serve`: a device's estimates into shared memory, as `replay` publishes those of the core in process.
+//! `orbitcal serve`: the daemon of a configuration, or a device's estimates into shared memory, as `replay` publishes those of the
+//! core in process.
 
 use estimator::Tables as _;
 use inference::{Recording, stream};
@@ -6,13 +7,15 @@ use training::{LINE, Tables};
 use twin::Ring;
 
 use super::{
-    CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables, warn_if_not_modelled,
+    CommandError, check_outputs, daemon, deliver, machine, progress, recording, sinks, stream_all, tables,
+    warn_if_not_modelled,
 };
 use crate::cli::Serve;
 use crate::record::Names;
 use crate::result::FitResult;
 use crate::serve::serve;
 use crate::source::Clock;
+use crate::source::address::Address;
 use crate::source::device::{Fed, Overheard};
 use crate::source::link::{Line, Link};
 use crate::stop::Stop;
@@ -22,6 +25,15 @@ use crate::stop::Stop;
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Serve) -> Result<(), CommandError> {
+    match (&options.config, &options.source) {
+        (Some(config), _) if options.check => daemon::check(config),
+        (Some(config), _) => daemon::run(config),
+        (None, Some(source)) => relay(options, source),
+        (None, None) => Err(CommandError::Input("a configuration or --source is needed".into())),
+    }
+}
+
+fn relay(options: &Serve, source: &Address) -> Result<(), CommandError> {
     if options.common.json.is_some() && options.feed.is_none() {
         return Err(CommandError::Input(
             "--json needs --feed: the result is that of a recording; --trace takes each estimate".into(),
@@ -33,7 +45,7 @@ pub fn run(options: &Serve) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let recording = options.feed.as_ref().map(|path| recording(path, &ring)).transpose()?;
-    let link = Link::open(&options.source).map_err(CommandError::other)?;
+    let link = Link::open(source).map_err(CommandError::other)?;
     match recording {
         Some(recording) => feed(options, &ring, &recording, link),
         None => listen(options, &ring, link),

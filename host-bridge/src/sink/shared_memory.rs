@@ -3,7 +3,10 @@
 //! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
 //! killed leaves shared memory behind, which the next process that joins any service clears away. Layout: [`layout`].
 
+mod frames;
+mod health;
 pub mod layout;
+mod requests;
 mod services;
 mod subscriber;
 
@@ -17,7 +20,10 @@ use iceoryx2::prelude::ipc;
 
 use super::{Sink, SinkError};
 use crate::record::{EstimateRecord, Names};
+pub use frames::{FrameReader, FrameWriter};
+pub use health::{HealthReader, HealthWriter};
 use layout::{Header, Stamp};
+pub use requests::{Asked, Reply, Request, RequestClient, RequestServer};
 use services::{Services, join};
 pub use subscriber::{Published, Subscriber};
 
@@ -64,6 +70,14 @@ pub enum PublishError {
         service: String,
         /// Sequence number of its frame.
         sequence: u32,
+        /// Why.
+        reason: String,
+    },
+    /// A raw frame was not sent.
+    #[error("service {service}: a frame was not sent: {reason}")]
+    SendFrame {
+        /// The service.
+        service: String,
         /// Why.
         reason: String,
     },

@@ -3,7 +3,7 @@
 use core::fmt;
 
 use estimator::surrogate::{Surrogate, Unstable};
-use estimator::{Core, Estimator, FitQuality, IngestError, Prepared};
+use estimator::{Core, Estimator, FitQuality, IngestError, Prepared, StateError};
 use training::{Tables, with_stack};
 
 use super::{Estimate, Setup};
@@ -15,6 +15,9 @@ pub trait Stream: fmt::Debug + Send + Sync {
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable>;
     fn fit_quality(&mut self) -> FitQuality;
     fn covariance(&self, i: usize, j: usize) -> f32;
+    fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError>;
+    fn load(&mut self, from: &[u8]) -> Result<(), StateError>;
+    fn state_layout(&mut self) -> u32;
     fn boxed_clone(&self) -> Box<dyn Stream>;
 }
 
@@ -116,6 +119,26 @@ where
 
     fn covariance(&self, i: usize, j: usize) -> f32 {
         self.core.covariance(i, j)
+    }
+
+    fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError> {
+        // no number takes more room there than here, and those that say how long a list is take less than what ends it here
+        to.resize(size_of::<E>(), 0);
+        let length = self.core.save(to)?;
+        to.truncate(length);
+        Ok(())
+    }
+
+    fn load(&mut self, from: &[u8]) -> Result<(), StateError> {
+        let loaded = self.core.load(from);
+        if loaded.is_err() {
+            on_its_stack::<E, _>(|| self.core.restart(&self.tables, &self.setup)).expect("it has started before");
+        }
+        loaded
+    }
+
+    fn state_layout(&mut self) -> u32 {
+        on_its_stack::<E, _>(|| self.core.state_layout())
     }
 
     fn boxed_clone(&self) -> Box<dyn Stream> {

@@ -12,7 +12,7 @@ use crate::record::{EstimateRecord, Names, ReadingUse, Remarked};
 /// What holds for a whole record; see the module's first table.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("orbitcal.Estimate.v3")]
+#[type_name("orbitcal.Estimate.v4")]
 #[allow(missing_docs)] // the table
 pub struct Header {
     pub time_us: u64,
@@ -36,6 +36,8 @@ pub struct Header {
     pub put_aside_frames: u32,
     pub baselines_moved: u32,
     pub unsolved_frames: u32,
+    pub tables: u32,
+    pub usable: u32,
 }
 
 /// Who published a record, and when.
@@ -124,6 +126,8 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         put_aside_frames: record.remarked.put_aside_frames,
         baselines_moved: record.remarked.baselines_moved,
         unsolved_frames: record.remarked.unsolved_frames,
+        tables: record.tables.unwrap_or_default(),
+        usable: u32::from(record.is_usable()),
     };
     let mut payload = Vec::with_capacity(words(record.mean.len(), record.reading.len(), text.len()));
     let params = [&record.map_params, &record.centre, &record.params_sigma];
@@ -152,7 +156,7 @@ fn said(remarks: &Remarks) -> u32 {
 }
 
 /// Up to four bytes as a word; those that are missing are zero.
-fn word(bytes: &[u8]) -> u32 {
+pub(super) fn word(bytes: &[u8]) -> u32 {
     let mut all = [0; 4];
     all[..bytes.len()].copy_from_slice(bytes);
     u32::from_le_bytes(all)
@@ -190,6 +194,7 @@ pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp
             baselines_moved: header.baselines_moved,
             unsolved_frames: header.unsolved_frames,
         },
+        tables: Some(header.tables).filter(|digest| *digest != 0),
         linearised: header.linearised != 0,
         mismatch: [Some(false), Some(true)].get(header.mismatch as usize).copied().flatten(),
         nis: header.nis,
@@ -271,7 +276,7 @@ mod tests {
 
     #[test]
     fn the_header_is_the_documented_one() {
-        assert_eq!((size_of::<Header>(), align_of::<Header>()), (88, 8));
+        assert_eq!((size_of::<Header>(), align_of::<Header>()), (96, 8));
         macro_rules! stands_at {
             ($($field:ident $offset:literal)*) => {
                 $(assert_eq!(offset_of!(Header, $field), $offset, stringify!($field));)*
@@ -280,7 +285,7 @@ mod tests {
         stands_at! {
             time_us 0 started_ns 8 published_ns 16 sequence 24 frames 28 rejected_frames 32 linearised 36
             mismatch 40 nis 44 log_evidence 48 tune_innovation 52 vars 60 monitors 64 text_bytes 68
-            remarks 72 put_aside_frames 76 baselines_moved 80 unsolved_frames 84
+            remarks 72 put_aside_frames 76 baselines_moved 80 unsolved_frames 84 tables 88 usable 92
         }
     }
 
@@ -303,6 +308,7 @@ mod tests {
             _ => unreachable!("the fields above"),
         };
         assert_eq!((header.remarks, header.put_aside_frames), (0b101, 12));
+        assert_eq!((header.tables, header.usable), (0, 0), "without a solution");
         assert_eq!(payload[at("mean")], 1.0_f32.to_bits());
         assert_eq!(payload[at("clipped")..][..3], [0, 0, 1]);
         assert_eq!(payload[at("covariance") + 2 * 3 / 2 + 1], 4.0_f32.to_bits(), "row 2, column 1");
@@ -321,6 +327,7 @@ mod tests {
         for (vars, monitors) in [(0, 0), (1, 2), (20, 20), (48, 33), (260, 500)] {
             let mut record = record(vars, monitors);
             (record.mismatch, record.linearised, record.nis, record.time_us) = (None, true, 2.5, 1 << 40);
+            record.tables = Some(0xfeed);
             record.tune_innovation = [None, Some(-1e-3)];
             (record.remarks.baselines_moved, record.remarked.unsolved_frames) = (true, 7);
             let (header, payload) = encode(&record, &stamp());

@@ -11,7 +11,7 @@ use super::layout::Header;
 use super::{BUFFER, HISTORY, PUBLISHERS, PublishError, SUBSCRIBERS};
 
 /// Processes at a time: every reader and writer, and some that look on.
-const NODES: usize = SUBSCRIBERS + PUBLISHERS + 4;
+pub(super) const NODES: usize = SUBSCRIBERS + PUBLISHERS + 4;
 
 /// A service of estimates: samples of words of any number.
 type Estimates = publish_subscribe::PortFactory<ipc::Service, [u32], Header>;
@@ -28,15 +28,21 @@ pub(super) struct Services {
 impl Services {
     /// Join the service `name` as the process `who`.
     pub(super) fn try_join(name: &str, who: &str) -> Result<Self, PublishError> {
-        set_log_level_from_env_or(LogLevel::Error); // no word on absent configuration files
-        let wrong = |_| PublishError::Name { name: name.to_owned() };
-        let service = ServiceName::new(name).map_err(wrong)?;
-        let node = NodeName::new(who).map_err(|_| PublishError::Name { name: who.to_owned() })?;
-        let node = NodeBuilder::new().name(&node).create::<ipc::Service>().map_err(|e| join(name, "node", &e))?;
+        let (node, service) = joined(name, who)?;
         let estimates = estimates(&node, &service).map_err(|e| join(name, "estimates", &e))?;
         let news = news(&node, &service).map_err(|e| join(name, "event", &e))?;
         Ok(Self { name: name.to_owned(), estimates, news, _node: node })
     }
+}
+
+/// The process `who` among those of the shared memory, and the name of a service.
+pub(super) fn joined(name: &str, who: &str) -> Result<(Node<ipc::Service>, ServiceName), PublishError> {
+    set_log_level_from_env_or(LogLevel::Error); // no word on absent configuration files
+    let wrong = |_| PublishError::Name { name: name.to_owned() };
+    let service = ServiceName::new(name).map_err(wrong)?;
+    let node = NodeName::new(who).map_err(|_| PublishError::Name { name: who.to_owned() })?;
+    let node = NodeBuilder::new().name(&node).create::<ipc::Service>().map_err(|e| join(name, "node", &e))?;
+    Ok((node, service))
 }
 
 fn estimates(node: &Node<ipc::Service>, name: &ServiceName) -> Result<Estimates, PublishSubscribeOpenOrCreateError> {
@@ -52,7 +58,7 @@ fn estimates(node: &Node<ipc::Service>, name: &ServiceName) -> Result<Estimates,
         .open_or_create()
 }
 
-fn news(
+pub(super) fn news(
     node: &Node<ipc::Service>,
     name: &ServiceName,
 ) -> Result<event::PortFactory<ipc::Service>, EventOpenOrCreateError> {

@@ -1,0 +1,76 @@
+//! What operators may ask of the running daemon, by its configuration.
+
+use std::path::Path;
+
+use training::Tables;
+use twin::Ring;
+
+use crate::config::Requests;
+use crate::model_file;
+use crate::output::warn;
+use crate::sink::shared_memory::{Asked, Reply, Request, RequestServer};
+
+/// What is to be done, once it is allowed.
+pub enum Wish {
+    /// A checkpoint of now.
+    Snapshot,
+    /// The core back to its prior.
+    Reset,
+    /// These tables.
+    Model(Box<Tables>),
+}
+
+/// Takes requests.
+pub struct Desk {
+    server: RequestServer,
+    allowed: Requests,
+    /// As its supplies are recorded.
+    ring: Ring,
+}
+
+impl Desk {
+    /// For the daemon of a ring.
+    pub fn new(server: RequestServer, allowed: Requests, ring: Ring) -> Self {
+        Self { server, allowed, ring }
+    }
+
+    /// The next wish that is allowed, and who has it; others are refused here.
+    pub fn receive(&mut self) -> Option<(Wish, Asked)> {
+        let asked = self.server.receive().unwrap_or_else(|error| {
+            warn(error);
+            None
+        })?;
+        match self.judge(asked.request.as_ref()) {
+            Ok(wish) => Some((wish, asked)),
+            Err(why) => {
+                warn(format_args!("request refused: {why}"));
+                reply(asked, &Reply::Refused(why));
+                None
+            }
+        }
+    }
+
+    fn judge(&self, request: Option<&Request>) -> Result<Wish, String> {
+        let Requests { snapshot, reset, model } = self.allowed;
+        let not_allowed = |key: &str| Err(format!("requests.{key} is false in the configuration"));
+        match request {
+            Some(Request::Snapshot) if snapshot => Ok(Wish::Snapshot),
+            Some(Request::Snapshot) => not_allowed("snapshot"),
+            Some(Request::Reset) if reset => Ok(Wish::Reset),
+            Some(Request::Reset) => not_allowed("reset"),
+            Some(Request::Model(path)) if model => {
+                let tables = model_file::read(Path::new(path), &self.ring);
+                Ok(Wish::Model(Box::new(tables.map_err(|error| error.to_string())?)))
+            }
+            Some(Request::Model(_)) => not_allowed("model"),
+            None => Err("the bytes are no request".to_owned()),
+        }
+    }
+}
+
+/// Reply; whoever asked may be gone, which changes nothing here.
+pub fn reply(asked: Asked, reply: &Reply) {
+    if let Err(error) = asked.reply(reply) {
+        warn(format_args!("a reply was not sent: {error}"));
+    }
+}
