@@ -887,6 +887,11 @@ impl<
     pub fn covariance(&self, i: usize, j: usize) -> f32 {
         if i < N && j < N { self.posterior.solution.covariance(i, j) as f32 } else { 0.0 }
     }
+
+    /// Covariance of a param `theta = ln var` with each, several times as fast as one by one; zeros if there is no such param.
+    pub fn covariance_row(&self, i: usize) -> [f32; N] {
+        self.posterior.solution.covariance_row(i)
+    }
 }
 
 /// All but the work between frames, which is finished or begun anew.

@@ -126,11 +126,11 @@ pub struct EstimateRecord {
 }
 
 impl EstimateRecord {
-    /// What a core says after a frame, with the covariance of two `ln var` and its mismatch alarm.
+    /// What a core says after a frame, with the covariance of each `ln var` with those up to itself, or with more, and its mismatch alarm.
     pub fn of(
         names: &Arc<Names>,
         estimate: &Estimate,
-        of_params: impl Fn(usize, usize) -> f32,
+        of_params: impl Fn(usize) -> Vec<f32>,
         mismatch: Option<bool>,
     ) -> Self {
         let reading = |(accepted, rejected): (&bool, &bool)| match (accepted, rejected) {
@@ -159,7 +159,7 @@ impl EstimateRecord {
             centre: estimate.centre.clone(),
             params_sigma: estimate.params_sigma.clone(),
             clipped: estimate.clipped.clone(),
-            covariance: triangle(mean.len(), |i, j| mean[i] * mean[j] * of_params(i, j)),
+            covariance: of_vars(mean, of_params),
             reading: estimate.accepted.iter().zip(&estimate.rejected).map(reading).collect(),
             monitor_state: health.iter().map(|health| health.state).collect(),
             monitor_sigma: health.iter().map(|health| health.noise).collect(),
@@ -221,9 +221,13 @@ impl EstimateRecord {
     }
 }
 
-/// A symmetric matrix as its lower triangle, row by row.
-fn triangle(n: usize, entry: impl Fn(usize, usize) -> f32) -> Vec<f32> {
-    (0..n).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| entry(i, j)).collect()
+/// The covariance of vars from that of their logarithms: its lower triangle, row by row.
+fn of_vars(mean: &[f32], of_params: impl Fn(usize) -> Vec<f32>) -> Vec<f32> {
+    let mut entries = Vec::with_capacity(mean.len() * (mean.len() + 1) / 2);
+    for (i, own) in mean.iter().enumerate() {
+        entries.extend(of_params(i).iter().zip(&mean[..=i]).map(|(entry, other)| own * other * entry));
+    }
+    entries
 }
 
 #[cfg(test)]
@@ -256,7 +260,9 @@ pub(crate) mod tests {
             centre: vec![0.0; vars],
             params_sigma: vec![0.01; vars],
             clipped: vec![false; vars],
-            covariance: triangle(vars, |i, j| if i == j { 0.01 * 0.01 } else { 0.0 }),
+            covariance: of_vars(&vec![1.0; vars], |i| {
+                (0..=i).map(|j| if i == j { 0.01 * 0.01 } else { 0.0 }).collect()
+            }),
             reading: vec![ReadingUse::Used; monitors],
             monitor_state: vec![MonitorState::Ok; monitors],
             monitor_sigma: vec![0.15e-3; monitors],
@@ -295,7 +301,7 @@ pub(crate) mod tests {
         let mut core = inference::stream::estimator(&ring, &recording, Walk::NONE).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
-        let record = EstimateRecord::of(&Names::of(&ring), &estimate, |i, j| core.covariance(i, j), None);
+        let record = EstimateRecord::of(&Names::of(&ring), &estimate, |i| core.covariance_row(i), None);
         assert_eq!(record.mean, estimate.mean);
         assert_eq!((record.sequence, record.frames), (estimate.sequence, 1));
         for (i, j) in [(0, 0), (30, 7), (7, 30), (47, 47)] {

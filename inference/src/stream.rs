@@ -208,6 +208,11 @@ impl Core {
         self.stream.covariance(i, j)
     }
 
+    /// Covariance of a param `theta = ln var` with each, those that the room has beyond the ring's included.
+    pub fn covariance_row(&self, i: usize) -> Vec<f32> {
+        self.stream.covariance_row(i)
+    }
+
     /// Prior of a param.
     ///
     /// # Panics
@@ -356,6 +361,8 @@ mod tests {
                 let (one, two) = (whole.ingest(&mut wire.clone()), core.ingest(&mut wire));
                 assert_eq!(format!("{one:?}"), format!("{two:?}"), "frame {i}");
                 assert_eq!(whole.covariance(30, 7).to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
+                assert_eq!(whole.covariance_row(30)[7].to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
+                assert_eq!(whole.covariance_row(7)[30].to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
             }
             let quality = [whole.fit_quality(), core.fit_quality()];
             assert_eq!(quality[0], quality[1]);

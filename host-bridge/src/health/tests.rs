@@ -43,7 +43,7 @@ impl Machine {
             assert_eq!(currents.len(), 48);
             let estimate = self.core.ingest(&mut wire).unwrap();
             self.core.prepare();
-            let record = EstimateRecord::of(&names, &estimate, |_, _| 0.0, None);
+            let record = EstimateRecord::of(&names, &estimate, |i| vec![0.0; i + 1], None);
             self.health.learn(&record, &currents);
         }
     }

@@ -16,7 +16,7 @@ impl Heard {
     /// What it says to every sink.
     pub fn record(&self, names: &Arc<Names>) -> Box<EstimateRecord> {
         // the alarm is a question of its own, which the line has no time for in every cycle
-        Box::new(EstimateRecord::of(names, &self.estimate, |i, j| self.covariance(i, j), None))
+        Box::new(EstimateRecord::of(names, &self.estimate, |i| (0..=i).map(|j| self.covariance(i, j)).collect(), None))
     }
 }
 

@@ -252,7 +252,7 @@ impl Raw {
             }
         };
         let mismatch = self.core.fit_quality().is_mismatch();
-        let mut record = EstimateRecord::of(&self.names, &estimate, |i, j| self.core.covariance(i, j), Some(mismatch));
+        let mut record = EstimateRecord::of(&self.names, &estimate, |i| self.core.covariance_row(i), Some(mismatch));
         record.tables = Some(self.model.tables);
         self.reporter.learn(&record, &frame);
         self.taken = self.frames.is_some().then_some(frame);

@@ -15,6 +15,7 @@ pub trait Stream: fmt::Debug + Send + Sync {
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable>;
     fn fit_quality(&mut self) -> FitQuality;
     fn covariance(&self, i: usize, j: usize) -> f32;
+    fn covariance_row(&self, i: usize) -> Vec<f32>;
     fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError>;
     fn load(&mut self, from: &[u8]) -> Result<(), StateError>;
     fn state_layout(&mut self) -> u32;
@@ -119,6 +120,10 @@ where
 
     fn covariance(&self, i: usize, j: usize) -> f32 {
         self.core.covariance(i, j)
+    }
+
+    fn covariance_row(&self, i: usize) -> Vec<f32> {
+        self.core.covariance_row(i).as_ref().to_vec()
     }
 
     fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError> {
