@@ -1,50 +1,48 @@
 //! How often chance alone gives the search as much as it found: a parametric bootstrap of this recording.
 //!
 //! Recordings of the same machine with nothing missing are drawn, to first order: whitened noise, and unknowns from their priors. Noise, settings
-//! and monitors are those of this recording, since they are in the whitening. Each is scored as the search scores the recording's own.
+//! and monitors are those of this recording, since they are in the whitening. Of each only the pulls of the candidates count, which are
+//! normal with the covariance `d_i P d_j`; they are scored as the search scores the recording's own.
 //!
 //! Source: A. C. Davison and D. V. Hinkley, Bootstrap Methods and their Application (1997), ch. 4.2, eq. 4.11.
 
-use nalgebra::{DMatrix, DVector, DVectorView};
+use inference::Factor;
+use nalgebra::{DMatrix, DVectorView};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::StandardNormal;
 
-use super::data::Data;
+use super::choice::Choice;
 use super::error::FitError;
-use super::fit::Fitted;
-use super::hypothesis::Term;
-use super::scan::{Projection, SignatureScore, signatures};
+use super::scan::SignatureScore;
 
 /// Recordings drawn: a probability of 1 % is then known to a half.
 const DRAWS: usize = 499;
 const SEED: u64 = 1;
+/// Share of its power by which a signature differs from all others at least.
+const ROUNDING: f64 = 1e-9;
 
-/// Probability that the best of some terms is at least as much better than its penalty as in this recording, were none of them there. `penalty`: of
-/// each term the `ln` Bayes factor that pays for the search.
+/// Probability that the best of the candidates is at least as much better than its penalty as in this recording, were none of them there.
 ///
 /// # Errors
-/// [`FitError`].
-pub fn of_search(data: &Data, without: &Fitted, terms: &[Term], penalty: &[f64]) -> Result<f64, FitError> {
-    let columns = signatures(data, without, terms)?;
-    let scored = Projection::of(without).score(columns.clone());
-    let best = |pulls: DVectorView<f64>| {
-        let weight = |i: usize| {
-            let score = SignatureScore { pull: pulls[i], ..scored.scores[i] };
-            score.log_bayes(terms[i].kind.is_switch()) - penalty[i]
-        };
-        (0..terms.len()).map(weight).fold(f64::NEG_INFINITY, f64::max)
-    };
-    let own = DVector::from_iterator(terms.len(), scored.scores.iter().map(|score| score.pull));
-    let own = best(own.as_view());
+/// [`FitError::Degenerate`].
+pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
+    let scores = || choice.scores.iter().copied();
+    let best =
+        |scores: &mut dyn Iterator<Item = SignatureScore>| choice.log_weights(scores).fold(f64::NEG_INFINITY, f64::max);
+    let own = best(&mut scores());
+    let mut covariance = choice.columns.transpose() * &choice.left;
+    // alike signatures leave no more than rounding between them
+    (0..covariance.nrows()).for_each(|i| covariance[(i, i)] *= 1.0 + ROUNDING);
+    let factor = Factor::of(covariance).ok_or(FitError::Degenerate)?;
     let mut rng = StdRng::seed_from_u64(SEED);
-    let mut normal = |rows: usize| DMatrix::<f64>::from_fn(rows, DRAWS, |_, _| rng.sample(StandardNormal));
-    // noise, and what the unknowns make
-    let mut drawn = normal(columns.nrows());
-    drawn += &without.jacobian * normal(without.u.len());
-    let left = columns - &without.jacobian * &scored.taken;
-    let pulls = left.transpose() * drawn; // nalgebra's `tr_mul` is several times slower
-    let exceeding = pulls.column_iter().filter(|pulls| best(pulls.as_view()) >= own).count();
+    let normal = DMatrix::<f64>::from_fn(choice.scores.len(), DRAWS, |_, _| rng.sample(StandardNormal));
+    let pulls = factor.lower() * normal;
+    let drawn = |pulls: DVectorView<f64>| {
+        let of = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
+        best(&mut scores().zip(pulls.iter()).map(of))
+    };
+    let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= own).count();
     Ok((1 + exceeding) as f64 / (1 + DRAWS) as f64)
 }
 
@@ -53,6 +51,7 @@ mod tests {
     use inference::Campaign;
 
     use super::*;
+    use crate::data::Data;
     use crate::heldout::{gain_of_choice, reduced};
     use crate::scan::candidates;
     use crate::search::{Found, Search, corrections};
@@ -68,10 +67,8 @@ mod tests {
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
         let fitted = if best.hypothesis.terms.is_empty() { null } else { reduced(&data, &best, 0).unwrap() };
         let penalty = corrections(&terms);
-        (
-            of_search(&data, &fitted, &terms, &penalty).unwrap(),
-            gain_of_choice(&data, &fitted, &terms, &penalty).unwrap(),
-        )
+        let choice = Choice::of(&data, &fitted, &terms, &penalty).unwrap();
+        (of_search(&choice).unwrap(), gain_of_choice(&choice).unwrap())
     }
 
     #[test]

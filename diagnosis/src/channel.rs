@@ -9,7 +9,7 @@
 use nalgebra::{DMatrix, DVector, DVectorViewMut};
 
 use super::memory::Memory;
-use super::triangle::solve_lower_mut;
+use inference::factor::solve_lower_mut;
 
 /// A monitor's or a tune's readings.
 #[derive(Debug, Clone)]

@@ -16,8 +16,11 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
+use core::ops::Range;
+
 use estimator::MonitorState;
-use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
+use inference::Factor;
+use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Plane, Signatures};
 
 use super::data::Data;
@@ -67,7 +70,7 @@ const POWERS: usize = 5;
 struct Sums {
     /// `E^T S^-1 E`.
     gram: DMatrix<f64>,
-    /// `E^T S^(-1/2) J`, rows groups.
+    /// `C = E^T S^(-1/2) J L^-T`, rows groups, with `L L^T = 1 + J^T J`: what the fit's unknowns absorb of the Gram matrix is `C C^T`.
     cross: DMatrix<f64>,
     /// `E^T S^(-1/2) r`.
     pull: DVector<f64>,
@@ -88,12 +91,15 @@ const FEW: usize = 64;
 /// Residuals and derivatives of a fit, as the sums of one monitor's numbers need them.
 struct Seen {
     residual: DVector<f64>,
+    /// `J L^-T`.
     jacobian: DMatrix<f64>,
 }
 
 /// A fit, linearised at its best point.
 struct Linearised<'f> {
     fitted: &'f Fitted,
+    /// `L^-1 (J^T r - u)`.
+    slope: DVector<f64>,
 }
 
 /// Try every place in turn.
@@ -114,12 +120,8 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
 /// Every place in one of several recordings.
 fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = all.campaign(campaign);
-    let linearised = Linearised { fitted };
-    let rows = all.parts().swap_remove(campaign);
-    let own = Seen {
-        residual: fitted.residual.rows_range(rows.clone()).into_owned(),
-        jacobian: fitted.jacobian.rows_range(rows).into_owned(),
-    };
+    let linearised = Linearised::of(fitted);
+    let own = Seen::by(fitted, all.parts().swap_remove(campaign));
     let settings = Settings::of(&data.drives);
     let monitors = data.monitors();
     let seen = Seen::of(data, &own);
@@ -184,12 +186,15 @@ fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {
     monitors.iter().map(|&b| &sums[b]).collect()
 }
 
-impl Linearised<'_> {
+impl<'f> Linearised<'f> {
+    fn of(fitted: &'f Fitted) -> Self {
+        Self { fitted, slope: fitted.free.whiten(&fitted.slope) }
+    }
+
     /// Projected pull and Gram matrix of some amplitudes.
     fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
-        let taken = self.fitted.free.solve(&sums.cross.transpose());
-        let pull = &sums.pull - taken.tr_mul(&self.fitted.slope);
-        (pull, &sums.gram - &sums.cross * taken)
+        let pull = &sums.pull - &sums.cross * &self.slope;
+        (pull, &sums.gram - &sums.cross * sums.cross.transpose())
     }
 
     fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
@@ -199,9 +204,9 @@ impl Linearised<'_> {
     }
 
     /// The same of one amplitude for each monitor and each of some settings. As many as there are readings, they are taken monitor by
-    /// monitor: with `D = 1 + omega^2 Z^T Z` of one, `A = 1 + J^T J` and `C = Z^T J`,
+    /// monitor: with `D = 1 + omega^2 Z^T Z` of one, and `C = Z^T J L^-T`,
     ///
-    /// `1 + omega^2 G = D - omega^2 C A^-1 C^T`, whose determinant is `det D det B/det A`, `B = A - omega^2 C^T D^-1 C`,
+    /// `1 + omega^2 G = D - omega^2 C C^T`, whose determinant is `det D det B`, `B = 1 - omega^2 C^T D^-1 C`,
     ///
     /// and whose inverse `D^-1 + omega^2 D^-1 C B^-1 C^T D^-1`; `D`, `C^T D^-1 C` and the like are sums over the monitors.
     ///
@@ -214,25 +219,23 @@ impl Linearised<'_> {
     }
 
     fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
-        let taken = self.fitted.free.solve(&self.fitted.slope);
         let sides: Vec<DMatrix<f64>> =
-            each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &taken))).collect();
+            each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &self.slope))).collect();
         let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
         self.conclude(Discrepancy::of(at, logs, sites), &each.iter().collect::<Vec<_>>())
     }
 
     /// `ln` Bayes factor of one size; `sides` are `(C, g)` of each monitor.
     fn marginal_apart(&self, sides: &[DMatrix<f64>], apart: &[Apart], size: f64) -> Option<f64> {
-        let (variance, p) = (size * size, self.fitted.slope.len());
+        let (variance, p) = (size * size, self.slope.len());
         let (mut log_det, mut sum) = (0.0, DMatrix::zeros(p + 1, p + 1));
         for (sides, apart) in sides.iter().zip(apart) {
             let (of_one, inner) = apart.grown(variance, sides)?;
             log_det += of_one;
             sum += inner;
         }
-        let before = self.fitted.free.l();
-        let after = (&before * before.transpose() - sum.view((0, 0), (p, p)) * variance).cholesky()?;
-        log_det += log_det_of(&after) - log_det_of(&self.fitted.free);
+        let after = Factor::of(DMatrix::identity(p, p) - sum.view((0, 0), (p, p)) * variance)?;
+        log_det += after.log_determinant();
         let with_pull = sum.view((0, p), (p, 1));
         let pull = sum[(p, p)] + variance * with_pull.dot(&after.solve(&with_pull));
         Some(0.5 * (variance * pull - log_det))
@@ -253,20 +256,23 @@ impl Linearised<'_> {
         Discrepancy { adapted, ..found }
     }
 
-    /// With `C = Z^T J` and `K = (Z^T Z + 1/omega^2)^-1`: covariance `(1 + J^T J - sum of C^T K C)^-1`, step `-cov sum of C^T K Z^T r`.
+    /// With `C = Z^T J` and `K = (Z^T Z + 1/omega^2)^-1`: covariance `(1 + J^T J - sum of C^T K C)^-1`, step `-cov sum of C^T K Z^T r`;
+    /// the sums are taken with `J L^-T` for `J`.
     fn adapted(&self, each: &[&Sums], size: f64) -> Option<Adapted> {
-        let lower = self.fitted.factor.l();
-        let mut information = &lower * lower.transpose();
-        // all vars are free here, since one at a bound may leave it
-        let mut slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u;
+        let unknowns = self.slope.len();
+        let (mut taken, mut pull) = (DMatrix::zeros(unknowns, unknowns), DVector::zeros(unknowns));
         for sums in each {
             let mut gram = sums.gram.clone();
             (0..gram.ncols()).for_each(|i| gram[(i, i)] += 1.0 / (size * size));
-            let factor = gram.cholesky()?;
-            information -= sums.cross.transpose() * factor.solve(&sums.cross);
-            slope -= sums.cross.tr_mul(&factor.solve(&sums.pull));
+            let factor = Factor::of(gram)?;
+            let whitened = factor.whiten(&sums.cross);
+            pull += whitened.tr_mul(&factor.whiten(&sums.pull));
+            taken += whitened.transpose() * whitened;
         }
-        let factor = information.cholesky()?;
+        let lower = self.fitted.free.lower();
+        // all vars are free here, since one at a bound may leave it
+        let slope = self.fitted.jacobian.tr_mul(&self.fitted.residual) - &self.fitted.u - &lower * pull;
+        let factor = Factor::of(self.fitted.factor.matrix() - &lower * taken * lower.transpose())?;
         Some(Adapted { step: factor.solve(&slope), covariance: factor.inverse() })
     }
 }
@@ -287,13 +293,8 @@ fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
     let variance = size * size;
     let mut grown = gram * variance;
     (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
-    let Some(factor) = grown.cholesky() else { return f64::NEG_INFINITY };
-    0.5 * (variance * pull.dot(&factor.solve(pull)) - log_det_of(&factor))
-}
-
-/// `ln` of the determinant of what is factorised.
-fn log_det_of(factor: &Cholesky<f64, Dyn>) -> f64 {
-    2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
+    let Some(factor) = Factor::of(grown) else { return f64::NEG_INFINITY };
+    0.5 * (variance * factor.whiten(pull).norm_squared() - factor.log_determinant())
 }
 
 /// Steps at the edges of the stretches of time: rows pools, columns edges.
@@ -409,6 +410,13 @@ impl Data {
 }
 
 impl Seen {
+    /// Some rows of a fit.
+    fn by(fitted: &Fitted, rows: Range<usize>) -> Self {
+        let residual = fitted.residual.rows_range(rows.clone()).into_owned();
+        let whitened = fitted.free.whiten(&fitted.jacobian.rows_range(rows).transpose());
+        Self { residual, jacobian: whitened.transpose() }
+    }
+
     fn of(data: &Data, own: &Self) -> Self {
         let residual = DMatrix::from_columns(core::slice::from_ref(&own.residual));
         let residual = data.taken_back(&residual).column(0).into_owned();
@@ -474,8 +482,9 @@ impl Apart {
         if let Some(gram) = &self.whole {
             let mut grown = gram * variance;
             (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
-            let factor = grown.cholesky()?;
-            return Some((log_det_of(&factor), sides.tr_mul(&factor.solve(sides))));
+            let factor = Factor::of(grown)?;
+            let whitened = factor.whiten(sides);
+            return Some((factor.log_determinant(), whitened.transpose() * whitened));
         }
         let diagonal = self.alone.map(|alone| 1.0 + variance * alone);
         let over = |columns: &DMatrix<f64>| {
@@ -484,9 +493,10 @@ impl Apart {
             over
         };
         let (common, across) = (self.common.tr_mul(&over(&self.common)), self.common.tr_mul(&over(sides)));
-        let rest = (DMatrix::identity(common.nrows(), common.ncols()) - common * variance).cholesky()?;
-        let log_det = diagonal.iter().map(|d| d.ln()).sum::<f64>() + log_det_of(&rest);
-        Some((log_det, sides.tr_mul(&over(sides)) + across.tr_mul(&rest.solve(&across)) * variance))
+        let rest = Factor::of(DMatrix::identity(common.nrows(), common.ncols()) - common * variance)?;
+        let log_det = diagonal.iter().map(|d| d.ln()).sum::<f64>() + rest.log_determinant();
+        let whitened = rest.whiten(&across);
+        Some((log_det, sides.transpose() * over(sides) + whitened.transpose() * whitened * variance))
     }
 }
 
@@ -499,7 +509,7 @@ mod tests {
     use crate::testing::{Coloured, template};
 
     fn seen_of(data: &Data, fitted: &Fitted) -> Seen {
-        Seen::of(data, &Seen { residual: fitted.residual.clone(), jacobian: fitted.jacobian.clone() })
+        Seen::of(data, &Seen::by(fitted, 0..fitted.residual.len()))
     }
 
     #[test]
@@ -507,7 +517,7 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
-        let (linearised, settings) = (Linearised { fitted: &fitted }, Settings::of(&data.drives));
+        let (linearised, settings) = (Linearised::of(&fitted), Settings::of(&data.drives));
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
@@ -533,12 +543,13 @@ mod tests {
         let data = Data::of(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
         assert!(data.noise.momentum.value > 0.0 && data.noise.crates.len() == 1 && !data.noise.slow.is_none());
         let fitted = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
-        let (linearised, seen) = (Linearised { fitted: &fitted }, seen_of(&data, &fitted));
+        let (linearised, seen) = (Linearised::of(&fitted), seen_of(&data, &fitted));
         let whole = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
             let readings = DMatrix::from_fn(data.pools.count, pattern.len(), |_, b| pattern[b]);
             let columns: Vec<DVector<f64>> = indicator.column_iter().map(|c| data.stepping(&readings, &c)).collect();
             let back = DMatrix::from_columns(&columns).transpose();
-            Sums { gram: &back * back.transpose(), cross: &back * &fitted.jacobian, pull: back * &fitted.residual }
+            let own = Seen::by(&fitted, 0..fitted.residual.len());
+            Sums { gram: &back * back.transpose(), cross: &back * own.jacobian, pull: back * own.residual }
         };
         let evidence = |sums: &Sums| linearised.judge(Location::Time, sums, 1).log_bayes;
         let (monitors, mut largest) = (data.active_monitors(), 0.0_f64);

@@ -6,10 +6,10 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 
-use inference::Prior;
 use inference::bounded::Coordinates;
+use inference::{Factor, Prior};
 
 /// Precision given to a var that is held.
 const HELD: f64 = 1e12;
@@ -81,7 +81,7 @@ impl Units {
 /// A Gaussian, and the share of it within the range.
 pub struct Within {
     /// Factor of the precision, the held vars at their bounds.
-    pub free: Cholesky<f64, Dyn>,
+    pub free: Factor,
     /// Slope of the log-density, zero for the held.
     pub slope: DVector<f64>,
     /// `ln` of the determinant of the free unknowns' precision.
@@ -91,36 +91,43 @@ pub struct Within {
 }
 
 impl Within {
-    /// Of a precision and slope at `u`, the first of which are params and have a range; none if the precision is not positive.
-    pub fn of(precision: DMatrix<f64>, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Option<Self> {
+    /// Of the factor of a precision and the slope at `u`, the first of which are params and have a range; none if the precision is not
+    /// positive.
+    pub fn of(precision: &Factor, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Option<Self> {
         let vars = units.len();
         let against = |&i: &usize| {
             let [lower, upper] = units.range[i];
             (u[i] <= lower + AT && slope[i] < 0.0) || (u[i] >= upper - AT && slope[i] > 0.0)
         };
         let held: BTreeMap<usize, f64> = (0..vars).filter(against).map(|i| (i, slope[i].abs())).collect();
-        let mut matrix = precision.clone();
-        for &i in held.keys() {
-            slope[i] = 0.0;
-            matrix.row_mut(i).fill(0.0);
-            matrix.column_mut(i).fill(0.0);
-            matrix[(i, i)] = HELD;
-        }
-        let free = matrix.cholesky()?;
-        let mut log_inside = 0.0;
-        for (&i, &pull) in &held {
-            let coupling =
-                precision.column(i).map_with_location(|row, _, h| if held.contains_key(&row) { 0.0 } else { h });
-            log_inside += log_tail(pull, precision[(i, i)] - coupling.dot(&free.solve(&coupling)));
-        }
-        let covariance = free.inverse();
+        held.keys().for_each(|&i| slope[i] = 0.0);
+        let (free, mut log_inside) =
+            if held.is_empty() { (precision.clone(), 0.0) } else { holding(&precision.matrix(), &held)? };
+        let of_vars = free.whiten(&DMatrix::identity(u.len(), vars));
         for i in (0..vars).filter(|i| !held.contains_key(i)) {
-            let (sigma, [lower, upper]) = (covariance[(i, i)].sqrt(), units.range[i]);
+            let (sigma, [lower, upper]) = (of_vars.column(i).norm(), units.range[i]);
             log_inside += (normal_cdf((upper - u[i]) / sigma) - normal_cdf((lower - u[i]) / sigma)).ln();
         }
-        let log_det = 2.0 * free.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
-        Some(Self { free, slope, log_det: log_det - held.len() as f64 * HELD.ln(), log_inside })
+        let log_det = free.log_determinant() - held.len() as f64 * HELD.ln();
+        Some(Self { free, slope, log_det, log_inside })
     }
+}
+
+/// The factor of a precision with some vars held at a bound, and `ln` of the integrals from their bounds; `held`: the slope of each.
+fn holding(precision: &DMatrix<f64>, held: &BTreeMap<usize, f64>) -> Option<(Factor, f64)> {
+    let mut matrix = precision.clone();
+    for &i in held.keys() {
+        matrix.row_mut(i).fill(0.0);
+        matrix.column_mut(i).fill(0.0);
+        matrix[(i, i)] = HELD;
+    }
+    let free = Factor::of(matrix)?;
+    let of_one = |(&i, &pull): (&usize, &f64)| {
+        let coupling = precision.column(i).map_with_location(|row, _, h| if held.contains_key(&row) { 0.0 } else { h });
+        log_tail(pull, precision[(i, i)] - free.whiten(&coupling).norm_squared())
+    };
+    let log_tails = held.iter().map(of_one).sum();
+    Some((free, log_tails))
 }
 
 /// `ln` of the integral of `exp(-g x - h x^2/2)` over x > 0, over that of a standard normal.

@@ -10,7 +10,7 @@
 
 use core::ops::{Mul, Sub};
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
 
 use super::data::Data;
@@ -18,6 +18,8 @@ use super::error::FitError;
 use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Member, Term, Unknown};
 use super::ordinary::Family;
+use inference::Factor;
+use inference::factor::gram;
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
@@ -40,9 +42,9 @@ pub struct Fitted {
     /// Their derivative, negative, with respect to u.
     pub jacobian: DMatrix<f64>,
     /// Factor of `1 + J^T J`, the inverse of the covariance of u.
-    pub factor: Cholesky<f64, Dyn>,
+    pub factor: Factor,
     /// The same with the vars that are at a bound of their range held there.
-    pub free: Cholesky<f64, Dyn>,
+    pub free: Factor,
     /// `J^T r - u`, zero for the vars that are held.
     pub slope: DVector<f64>,
     /// The data whitened for this hypothesis, where it says that the baselines drift.
@@ -63,13 +65,13 @@ struct Problem<'d> {
     data: &'d Data,
     hypothesis: &'d Hypothesis,
     unknowns: Vec<Unknown>,
+    /// The ordinary imperfections at the start, the last unknowns of the fit.
+    start: DVector<f64>,
     ordinary: Ordinary,
 }
 
-/// The ordinary imperfections, the last unknowns of a fit, to first order about its start.
+/// The ordinary imperfections to first order about a machine.
 struct Ordinary {
-    /// Their values at the start.
-    start: DVector<f64>,
     /// Derivative `Z` of the whitened predictions with respect to each.
     slopes: DMatrix<f64>,
     /// `Z^T Z`.
@@ -145,13 +147,12 @@ impl Fitted {
         Self::at(&problem, here, factor, found.slopes)
     }
 
-    fn at(problem: &Problem, here: Point, factor: Cholesky<f64, Dyn>, slopes: DMatrix<f64>) -> Result<Self, FitError> {
+    fn at(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.data.units.clone());
         let jacobian = problem.ordinary.beside(slopes);
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
-        let lower = factor.l();
-        let within = Within::of(&lower * lower.transpose(), &here.u, slope, &units);
+        let within = Within::of(&factor, &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let of_widths: f64 = problem.hypothesis.ordinary.iter().map(Family::log_prior).sum();
         let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + of_widths;
@@ -339,15 +340,15 @@ impl Fitted {
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
         let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
-        let (lower, identity) = (self.factor.l(), DMatrix::identity(self.u.len(), self.u.len()));
-        let mut matrix = &lower * lower.transpose() - &identity;
+        let identity = DMatrix::identity(self.u.len(), self.u.len());
+        let mut matrix = self.factor.matrix() - &identity;
         let pull = (self.jacobian.tr_mul(&self.residual) + &matrix * &self.u).component_mul(&wider);
         let scaled = |column: &DVector<f64>, w: f64| column.component_mul(&wider) * w;
         for (i, w) in wider.iter().enumerate() {
             let column = scaled(&matrix.column(i).into_owned(), *w);
             matrix.set_column(i, &column);
         }
-        let factor = (matrix + identity).cholesky().ok_or(FitError::Degenerate)?;
+        let factor = Factor::of(matrix + identity).ok_or(FitError::Degenerate)?;
         Ok((self.units.step(&(factor.solve(&pull) - &self.u)), self.units.covariance(&factor.inverse())))
     }
 
@@ -363,28 +364,27 @@ impl<'d> Problem<'d> {
         let unknowns = hypothesis.unknowns(data);
         let others = unknowns.iter().filter(|unknown| !unknown.is_ordinary()).count();
         let first = data.units.len() + others;
-        let start_of_ordinary = start.rows_range(first..).into_owned();
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
-        let ordinary = Ordinary::about(data, &unknowns[others..], machine, start_of_ordinary)?;
-        Ok(Self { data, hypothesis, unknowns, ordinary })
+        let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
+        Ok(Self { data, hypothesis, start: start.rows_range(first..).into_owned(), unknowns, ordinary })
     }
 
     /// Number of unknowns that are no ordinary imperfections, the first.
     fn others(&self) -> usize {
-        self.data.units.len() + self.unknowns.len() - self.ordinary.start.len()
+        self.data.units.len() + self.unknowns.len() - self.start.len()
     }
 
     /// The same point with the ordinary imperfections at their start: the machine about which they are of first order.
     fn held(&self, u: &DVector<f64>) -> DVector<f64> {
         let mut held = u.clone();
-        held.rows_range_mut(self.others()..).copy_from(&self.ordinary.start);
+        held.rows_range_mut(self.others()..).copy_from(&self.start);
         held
     }
 
     /// Whitened residuals.
     fn residual(&self, u: &DVector<f64>) -> Result<DVector<f64>, EffectError> {
         let held = self.held(u);
-        let moved = u.rows_range(self.others()..) - &self.ordinary.start;
+        let moved = u.rows_range(self.others()..) - &self.start;
         let left = self.data.stacked(|campaign, own| {
             let (machine, drives) = machine_at(self.data, self.hypothesis, campaign, &held)?;
             Ok::<_, EffectError>(own.residual(&predicted(&machine, &drives)?))
@@ -420,7 +420,6 @@ impl Ordinary {
         data: &Data,
         unknowns: &[Unknown],
         machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
-        start: DVector<f64>,
     ) -> Result<Self, EffectError> {
         let slopes = data.stacked_columns(unknowns.len(), |campaign, own| {
             let (machine, drives) = machine(campaign)?;
@@ -435,8 +434,8 @@ impl Ordinary {
             };
             own.signatures::<EffectError>(unknowns.len(), unknowns.iter().map(of))
         })?;
-        let gram = slopes.transpose() * &slopes;
-        Ok(Self { start, slopes, gram })
+        let gram = gram(&slopes);
+        Ok(Self { slopes, gram })
     }
 
     /// The derivatives of all unknowns, from those of the others.

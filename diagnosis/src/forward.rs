@@ -104,7 +104,7 @@ impl Standard {
         let machine = machine.on_orbit(&drives.orbit);
         let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
         let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
-        let score = Projection::of(&fitted).score(DMatrix::from_columns(&[column])).scores[0];
+        let score = Projection::of(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];
         Some(score.pull / (1.0 + score.power).sqrt())
     }
 

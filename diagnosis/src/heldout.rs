@@ -18,15 +18,16 @@
 //! Comput. 13 (2001) 1103, eq. 10, what is left out of a Gaussian process.
 
 use estimator::MonitorState;
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use inference::Factor;
+use nalgebra::{DMatrix, DVector};
 
+use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::{Hypothesis, Term};
-use super::scan::{Projection, SignatureScore, signatures};
+use super::hypothesis::Hypothesis;
+use super::scan::SignatureScore;
 use super::settings::Settings;
-use super::triangle::solve_lower;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;
@@ -181,13 +182,13 @@ impl<'d> Precision<'d> {
     }
 
     /// Factor of `K_FF` of some readings, and `(T^T r)_F`.
-    fn of_readings(&self, readings: &[(usize, usize)]) -> Result<(Cholesky<f64, Dyn>, DVector<f64>), FitError> {
+    fn of_readings(&self, readings: &[(usize, usize)]) -> Result<(Factor, DVector<f64>), FitError> {
         let n = readings.len();
         let mut cross = DMatrix::zeros(self.fitted.u.len(), n);
         for (mut column, &(c, row)) in cross.column_iter_mut().zip(readings) {
             column.tr_copy_from(&self.channels[c].cross.row(row));
         }
-        let taken = solve_lower(self.fitted.factor.l_dirty(), cross);
+        let taken = self.fitted.factor.whiten(&cross);
         let mut precision = -(taken.transpose() * taken);
         for (i, &(c, row)) in readings.iter().enumerate() {
             for (j, &(_, other)) in readings.iter().enumerate().filter(|(_, (of, _))| *of == c) {
@@ -195,13 +196,12 @@ impl<'d> Precision<'d> {
             }
         }
         let pull = DVector::from_iterator(n, readings.iter().map(|&(c, row)| self.channels[c].pull[row]));
-        Ok((precision.cholesky().ok_or(FitError::Degenerate)?, pull))
+        Ok((Factor::of(precision).ok_or(FitError::Degenerate)?, pull))
     }
 
-    /// Whitened signatures, one a column, less what the fit absorbs of them, as they stand beside `T^T r`.
-    fn back(&self, signatures: &DMatrix<f64>) -> DMatrix<f64> {
-        let taken = self.fitted.factor.solve(&(self.fitted.jacobian.transpose() * signatures));
-        let mut back = signatures - &self.fitted.jacobian * taken;
+    /// Whitened signatures less what the fit absorbs of them, one a column, as they stand beside `T^T r`.
+    fn back(&self, left: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut back = left.clone();
         for channel in &self.channels {
             let (start, n) = (channel.start, channel.pools.len());
             let part = &channel.back * back.rows(start, n);
@@ -218,8 +218,7 @@ impl<'d> Precision<'d> {
         let rows: Vec<usize> = readings.iter().map(|&(c, row)| self.channels[c].start + row).collect();
         let signatures = back.select_rows(&rows);
         let pulls = signatures.transpose() * factor.solve(&pull);
-        let powers =
-            solve_lower(factor.l_dirty(), signatures).column_iter().map(|one| one.norm_squared()).collect::<Vec<_>>();
+        let powers = factor.whiten(&signatures).column_iter().map(|one| one.norm_squared()).collect::<Vec<_>>();
         Ok(pulls.iter().zip(powers).map(|(&pull, power)| SignatureScore { pull, power }).collect())
     }
 
@@ -238,11 +237,12 @@ impl<'d> Precision<'d> {
         let n = readings.len();
         let (factor, pull) = self.of_readings(&readings)?;
         let innovation = factor.solve(&pull);
-        let pulls = factor.l_dirty().solve_lower_triangular(&pull).ok_or(FitError::Degenerate)?;
+        let pulls = factor.whiten(&pull);
+        let scales: Vec<f64> = factor.diagonal().collect();
         let mixed = self.mixed_log_det(block) / n.max(1) as f64;
         let one = |(i, &(channel, _)): (usize, &(usize, usize))| {
             let sigma = self.channels[channel].sigma;
-            let scale = factor.l_dirty()[(i, i)] / sigma;
+            let scale = scales[i] / sigma;
             let log_density = scale.ln() - 0.5 * (pulls[i].powi(2) + core::f64::consts::TAU.ln() + mixed);
             LeftOut { channel, log_density, innovation: innovation[i] * sigma, pull: pulls[i] }
         };
@@ -256,7 +256,6 @@ const FOLDS: usize = 5;
 /// Gain of held-out log density where not only the amplitude but kind and place too are chosen without the held-out pools: each of five
 /// folds is predicted by all of some terms and by none of them, each with the weight that the other folds give it, to first order about a
 /// fit without any. What was chosen by chance has less than nothing.
-/// `penalty`: of each term the `ln` Bayes factor that pays for the search.
 ///
 /// With the score `B = (d P r)^2/(1 + d P d)/2 - ln(1 + d P d)/2` of a term by all pools and `B_kept` by those outside the fold, the fold's density given
 /// the others is larger by `exp(B - B_kept)` with the term than without; the mixture gains
@@ -265,19 +264,13 @@ const FOLDS: usize = 5;
 ///
 /// # Errors
 /// [`FitError`].
-pub fn gain_of_choice(data: &Data, without: &Fitted, terms: &[Term], penalty: &[f64]) -> Result<f64, FitError> {
-    let columns = signatures(data, without, terms)?;
-    let data = without.data(data);
-    let precision = Precision::of(data, without);
-    let back = precision.back(&columns);
-    let all = Projection::of(without).score(columns).scores;
+pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
+    let (data, all) = (choice.data, &choice.scores);
+    let precision = Precision::of(data, choice.without);
+    let back = precision.back(&choice.left);
     // ln of the weight of any term over that of none
     let odds = |scores: &mut dyn Iterator<Item = SignatureScore>| {
-        let weights = scores
-            .zip(terms)
-            .zip(penalty)
-            .map(|((score, term), penalty)| score.log_bayes(term.kind.is_switch()) - penalty);
-        let weights: Vec<f64> = weights.chain([0.0]).collect();
+        let weights: Vec<f64> = choice.log_weights(scores).chain([0.0]).collect();
         let largest = weights.iter().copied().fold(0.0, f64::max);
         largest + weights.iter().map(|weight| (weight - largest).exp()).sum::<f64>().ln()
     };

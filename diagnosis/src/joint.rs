@@ -231,8 +231,9 @@ mod tests {
         let (fits, both) = (each.each_ref().map(unfitted), unfitted(&joint));
         assert!((both.cost / (fits[0].cost + fits[1].cost) - 1.0).abs() < 1e-12, "rounding");
         let information = |fitted: &Fitted| {
-            let lower = fitted.factor.l();
-            &lower * lower.transpose() - DMatrix::identity(lower.nrows(), lower.nrows())
+            let matrix = fitted.factor.matrix();
+            let unit = DMatrix::identity(matrix.nrows(), matrix.ncols());
+            matrix - unit
         };
         let sum = information(&fits[0]) + information(&fits[1]);
         assert!((information(&both) - &sum).amax() < 1e-9 * sum.amax(), "rounding");

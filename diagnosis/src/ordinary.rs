@@ -13,6 +13,7 @@
 //!
 //! Source: D. J. C. MacKay, Neural Comput. 4 (1992) 415, eq. 4.8; A. Gelman, Bayesian Anal. 1 (2006) 515, half-normal priors of widths.
 
+use inference::Factor;
 use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Measured, Plane, Ring, Site};
 
@@ -181,14 +182,14 @@ impl Projected {
             core::iter::repeat_n((f, scale), family.members(data).len())
         };
         let (family, scale): (Vec<usize>, Vec<f64>) = families.iter().enumerate().flat_map(sized).unzip();
-        let (m, lower) = (family.len(), fitted.factor.l());
+        let m = family.len();
         let k = fitted.u.len() - m;
-        let normal = &lower * lower.transpose();
+        let normal = fitted.factor.matrix();
         let without = fitted.jacobian.columns(k, m) * fitted.u.rows(k, m) + &fitted.residual;
         let mut slope = fitted.jacobian.tr_mul(&without);
         let mut of_others = slope.rows_mut(0, k);
         of_others -= fitted.u.rows(0, k);
-        let factor = normal.view((0, 0), (k, k)).into_owned().cholesky()?;
+        let factor = Factor::of(normal.view((0, 0), (k, k)).into_owned())?;
         let cross = normal.view((0, k), (k, m)).into_owned();
         let taken = factor.solve(&cross);
         let mut gram = normal.view((k, k), (m, m)) - cross.transpose() * &taken;
@@ -208,9 +209,9 @@ impl Projected {
         let mut matrix = self.gram.clone();
         matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
         (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
-        let factor = matrix.cholesky()?;
+        let factor = Factor::of(matrix)?;
         let mean = factor.solve(&self.pull.component_mul(&w));
-        Some((mean, factor.inverse().diagonal()))
+        Some((mean, DVector::from_vec(factor.inverse_diagonal())))
     }
 
     /// The most likely widths of the families that are learnt, from a start, in units of their tolerances.

@@ -80,7 +80,7 @@ impl PlaceScan {
                     own.signatures::<Infallible>(batch.len(), batch.iter().map(of))
                 });
                 let Ok(columns) = columns;
-                projection.score(columns).scores
+                projection.score(&columns).scores
             };
             let scores: Vec<SignatureScore> = segments.chunks(BATCH).flat_map(of_batch).collect();
             let judged = scores.into_iter().map(SignatureScore::of_amplitude);

@@ -38,8 +38,7 @@ pub fn sample(data: &Data, fitted: &Fitted, settings: NutsSettings) -> Result<Nu
 
 /// `1 + J^T J` in coordinates without bounds, with the curvature of the coordinates near a bound.
 fn curvature(fitted: &Fitted) -> DMatrix<f64> {
-    let lower = fitted.factor.l();
-    let mut curvature = &lower * lower.transpose();
+    let mut curvature = fitted.factor.matrix();
     let slope = fitted.jacobian.tr_mul(&fitted.residual) - &fitted.u;
     let free = fitted.units.coordinates.unbounded(&fitted.params);
     for (i, bound) in bounded(fitted, free.as_slice()).enumerate() {

@@ -7,7 +7,8 @@
 //!
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use inference::Factor;
+use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{EffectKind, Signatures, Site};
 
 use super::data::Data;
@@ -32,7 +33,7 @@ pub struct Candidate {
 
 /// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged or reversed
 /// instruments more than a half does.
-const STAYS: f64 = 0.05;
+pub(super) const STAYS: f64 = 0.05;
 
 /// Signatures that are scored together.
 pub const BATCH: usize = 64;
@@ -42,7 +43,7 @@ pub struct Projection {
     residual: DVector<f64>,
     /// `J^T`.
     back: DMatrix<f64>,
-    factor: Cholesky<f64, Dyn>,
+    factor: Factor,
     /// `J^T r - u`, zero at the best point.
     slope: DVector<f64>,
 }
@@ -83,7 +84,7 @@ impl Projection {
         let residual = &fitted.residual + fitted.jacobian.column(unknown) * fitted.u[unknown];
         let back = fitted.jacobian.transpose().remove_row(unknown);
         let normal = &back * back.transpose() + DMatrix::identity(back.nrows(), back.nrows());
-        let factor = normal.cholesky().ok_or(FitError::Degenerate)?;
+        let factor = Factor::of(normal).ok_or(FitError::Degenerate)?;
         let slope = &back * &residual - fitted.u.clone().remove_row(unknown);
         Ok(Self { residual, back, factor, slope })
     }
@@ -93,6 +94,13 @@ impl Projection {
         &self.residual - self.back.tr_mul(&self.factor.solve(&self.slope))
     }
 
+    /// Pull of whitened signatures, one a column, and their whole squares, which bound their power.
+    pub fn bounds(&self, columns: &DMatrix<f64>) -> Vec<SignatureScore> {
+        let pulling = self.pulling();
+        let of = |column: DVectorView<f64>| SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() };
+        columns.column_iter().map(of).collect()
+    }
+
     /// `d_i P d_j` of whitened signatures, one a column.
     pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
@@ -100,8 +108,8 @@ impl Projection {
     }
 
     /// SignatureScore whitened signatures, one a column, in units of their prior standard deviations.
-    pub fn score(&self, columns: DMatrix<f64>) -> Scored {
-        let shared = &self.back * &columns;
+    pub fn score(&self, columns: &DMatrix<f64>) -> Scored {
+        let shared = &self.back * columns;
         let taken = self.factor.solve(&shared);
         let one = |i: usize| {
             let (column, taken) = (columns.column(i), taken.column(i));
@@ -172,17 +180,13 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
     let projection = Projection::of(fitted);
     let columns = signatures(data, fitted, terms)?;
-    let pulling = projection.pulling();
-    let bound = |i: usize| {
-        let column = columns.column(i);
-        SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() }
-    };
+    let bounds = projection.bounds(&columns);
     let is_hopeless = |i: usize| {
-        let SignatureScore { pull, power } = bound(i);
+        let SignatureScore { pull, power } = bounds[i];
         terms[i].kind.is_switch() && pull < 0.5 * STAYS * power
     };
     let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
-    let Scored { scores, taken } = projection.score(columns.select_columns(&scored));
+    let Scored { scores, taken } = projection.score(&columns.select_columns(&scored));
     let mut candidates = vec![None; terms.len()];
     let candidate = |i: usize, score: SignatureScore, adapting: DVector<f64>| {
         let term = terms[i];
@@ -193,7 +197,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
         candidates[i] = candidate(i, score, -taken.column(at));
     }
     for i in hopeless {
-        candidates[i] = candidate(i, bound(i), DVector::zeros(fitted.u.len()));
+        candidates[i] = candidate(i, bounds[i], DVector::zeros(fitted.u.len()));
     }
     Ok(candidates.into_iter().flatten().collect())
 }

@@ -5,6 +5,7 @@ use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
 use super::chance;
+use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
@@ -296,8 +297,8 @@ pub fn tests(
         if without.is_gross() {
             return Ok(Tested { gain, of_choice: None, chance: None });
         }
-        let of_choice = Some(gain_of_choice(data, without, candidates, penalty)?);
-        Ok(Tested { gain, of_choice, chance: Some(chance::of_search(data, without, candidates, penalty)?) })
+        let choice = Choice::of(data, without, candidates, penalty)?;
+        Ok(Tested { gain, of_choice: Some(gain_of_choice(&choice)?), chance: Some(chance::of_search(&choice)?) })
     };
     (0..found.competitions.len()).map(test).collect()
 }

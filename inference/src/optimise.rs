@@ -6,7 +6,9 @@
 //! Source: J. Nocedal and S. Wright, Numerical Optimization (2006), ch. 10.3; projected Gauss-Seidel sweeps, R. Cottle, J.-S. Pang and
 //! R. Stone, The Linear Complementarity Problem (1992), ch. 5.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
+
+use crate::factor::Factor;
 
 /// A cost that is (nearly) a sum of squares.
 pub trait Objective {
@@ -169,8 +171,8 @@ impl Quadratic {
     }
 
     /// Factor of the matrix.
-    pub fn factor(&self) -> Option<Cholesky<f64, Dyn>> {
-        self.matrix.clone().cholesky()
+    pub fn factor(&self) -> Option<Factor> {
+        Factor::of(self.matrix.clone())
     }
 
     /// The best step within the bounds, given that without.

@@ -3,9 +3,10 @@
 //! Readings obey `residual = h step + terms + noise`. Sums over the readings of each monitor are kept apart ([`Common`]); the terms at
 //! their best leave the Schur complement.
 
-use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
+use nalgebra::{DMatrix, DVector, DVectorView};
 
 use super::common::{Common, Eliminated, Weighed};
+use crate::factor::Factor;
 use crate::optimise::Quadratic;
 use crate::prior::Prior;
 
@@ -94,13 +95,13 @@ impl Normal {
         slope: DVectorView<f64>,
         terms: &[f64],
         step: &DVector<f64>,
-        factor: &'n Cholesky<f64, Dyn>,
+        factor: &'n Factor,
     ) -> Option<(f64, f64, impl FnOnce() -> f64 + 'n)> {
         let (solved, along) = self.monitors[b].seen_by(terms)?;
         let best = self.monitors[b].best(step)?;
         let terms = DVector::from_column_slice(terms);
         let (expected, variance, d) = (slope.dot(step) + terms.dot(&best), terms.dot(&solved), slope - along);
-        let of_params = move || factor.l_dirty().solve_lower_triangular(&d).map_or(f64::INFINITY, |z| z.norm_squared());
+        let of_params = move || factor.whiten(&d).norm_squared();
         Some((expected, variance, of_params))
     }
 }

@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use estimator::{Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
 use super::common::Weighed;
@@ -17,6 +17,7 @@ use super::normal::{Normal, Terms};
 use super::rms_by_plane;
 use super::setting::Settings;
 use super::times::Times;
+use crate::factor::Factor;
 use crate::prior::Prior;
 
 /// The monitors, and their readings that count.
@@ -130,7 +131,7 @@ struct Model {
 /// The best params of the normal equations.
 struct Best {
     step: DVector<f64>,
-    factor: Cholesky<f64, Dyn>,
+    factor: Factor,
     /// Rms of the baselines in x and y [m].
     orbit: [f64; 2],
     cost: f64,

@@ -1,0 +1,62 @@
+//! The candidates of a search beside a fit without them, as the tests of a choice need them: how it predicts what it was not chosen by
+//! ([`super::heldout`]), and how often chance chooses as well ([`super::chance`]).
+
+use nalgebra::DMatrix;
+
+use super::data::Data;
+use super::error::FitError;
+use super::fit::Fitted;
+use super::hypothesis::Term;
+use super::scan::{Projection, STAYS, Scored, SignatureScore, signatures};
+
+/// Candidates beside a fit, to first order.
+pub struct Choice<'d> {
+    /// The recording, as the fit whitens it.
+    pub data: &'d Data,
+    /// The fit.
+    pub without: &'d Fitted,
+    terms: Vec<Term>,
+    /// Of each term the `ln` Bayes factor that pays for the search.
+    penalty: Vec<f64>,
+    /// Whitened signatures `d`, and what the fit cannot absorb of them, `P d`: one a column.
+    pub columns: DMatrix<f64>,
+    /// `P d`.
+    pub left: DMatrix<f64>,
+    /// By all readings.
+    pub scores: Vec<SignatureScore>,
+}
+
+/// Power from which on chance cannot choose an effect without an amplitude: that needs a pull of half the power, five standard deviations.
+const BEYOND_CHANCE: f64 = 100.0;
+
+impl<'d> Choice<'d> {
+    /// Of some terms and their penalties. Exchanged and reversed instruments that neither the recording nor chance can choose are left out.
+    ///
+    /// # Errors
+    /// [`FitError`].
+    pub fn of(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
+        let columns = signatures(data, without, terms)?;
+        let projection = Projection::of(without);
+        let bounds = projection.bounds(&columns);
+        let is_open = |&i: &usize| {
+            let SignatureScore { pull, power } = bounds[i];
+            let least = STAYS * power;
+            !terms[i].kind.is_switch() || pull > 0.5 * least || least < BEYOND_CHANCE
+        };
+        let open: Vec<usize> = (0..terms.len()).filter(is_open).collect();
+        let columns = columns.select_columns(&open);
+        let Scored { scores, taken } = projection.score(&columns);
+        let left = &columns - &without.jacobian * taken;
+        let (terms, penalty) = open.iter().map(|&i| (terms[i], penalty[i])).unzip();
+        Ok(Self { data: without.data(data), without, terms, penalty, columns, left, scores })
+    }
+
+    /// `ln` weight of each over that of none, by some scores.
+    pub fn log_weights<'c>(
+        &'c self,
+        scores: impl Iterator<Item = SignatureScore> + 'c,
+    ) -> impl Iterator<Item = f64> + 'c {
+        let all = scores.zip(&self.terms).zip(&self.penalty);
+        all.map(|((score, term), penalty)| score.log_bayes(term.kind.is_switch()) - penalty)
+    }
+}
