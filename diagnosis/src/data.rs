@@ -35,6 +35,7 @@ use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
 use super::settings::Settings;
+use super::tune_shift;
 use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
@@ -90,7 +91,7 @@ pub struct Data {
 #[derive(Debug, Clone)]
 struct Frames {
     drives: Drives,
-    /// As recorded, columns monitors [m] and the two tunes; NaN for what is missing.
+    /// As recorded, columns monitors [m] and the two tunes, these less what the kicks do to them; NaN for what is missing.
     recorded: DMatrix<f64>,
     /// The same at the mean supply currents, at the drives of the pool and without the terms above first order.
     readings: DMatrix<f64>,
@@ -176,8 +177,9 @@ impl Data {
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
         let design = Machine::new(at_supplies, Rf::FixedMomentum, &believed)?;
         let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
+        let shift = tune_shift::by_kicks(&design.without_memory(), &drives)?;
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
-            if of_momentum(i, plane) { campaign.tunes[(i, plane)] } else { f64::NAN }
+            if of_momentum(i, plane) { campaign.tunes[(i, plane)] - shift[(i, plane)] } else { f64::NAN }
         });
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;

@@ -50,6 +50,7 @@ pub mod search;
 pub mod settings;
 pub mod slow;
 pub mod transients;
+mod tune_shift;
 pub mod validation;
 pub mod verdict;
 pub mod wiring;
@@ -202,6 +203,14 @@ impl Diagnosis {
         ordinary::rows(data, best).into_iter().chain(data.noise.rows()).collect()
     }
 
+    /// Least probability that all effects in the fitted model are there: each has its own, given the others, so that all of them hold with
+    /// `1 - sum of (1 - P)` or more (Bonferroni). None where nothing is in it.
+    pub fn joint_probability(&self) -> Option<f64> {
+        let in_model = self.findings.iter().filter(|finding| finding.tested.is_some());
+        let (count, doubt) = in_model.fold((0, 0.0), |(n, sum), finding| (n + 1, sum + 1.0 - finding.probability));
+        (count > 0).then_some((1.0 - doubt).max(0.0))
+    }
+
     /// Gain of held-out log predictive density by all effects, and its standard error.
     pub fn gain(&self) -> (f64, f64) {
         if self.found.competitions.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
@@ -230,6 +239,7 @@ mod tests {
         };
         assert_eq!(of_correctors(&unnamed), of_correctors(&named));
         assert!(named.gain().0 > 10.0);
+        assert_eq!(named.joint_probability(), Some(named.findings[0].probability), "of one effect, its own");
         assert_eq!(unnamed.gain(), named.gain());
     }
 }

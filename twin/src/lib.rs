@@ -16,6 +16,7 @@ mod dispersion;
 mod effects;
 mod lattice;
 mod map;
+mod matrix;
 mod modes;
 mod orbit;
 mod response;

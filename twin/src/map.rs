@@ -82,16 +82,18 @@ impl Element {
 
     /// Linear map about the ray that enters as `z`, which is moved to the exit.
     pub fn linearise(&self, z: &mut Phase<f64>) -> Matrix6<f64> {
-        linearised(z, |z| self.track(z))
+        self.matrix(z, self.length, true).unwrap_or_else(|| derivative(z, |z| self.track(z)))
     }
 
     /// Linear map from the entrance to `depth` [m] inside, about the ray that enters as `z`.
     pub fn linearise_into(&self, z: &Phase<f64>, depth: f64) -> Matrix6<f64> {
-        linearised(&mut z.clone_owned(), |z| self.track_into(z, depth))
+        let exact = || derivative(&mut z.clone_owned(), |z| self.track_into(z, depth));
+        self.matrix(z, depth, false).unwrap_or_else(exact)
     }
 }
 
-fn linearised(z: &mut Phase<f64>, map: impl Fn(&mut Phase<num_dual::DualSVec64<6>>)) -> Matrix6<f64> {
+/// Derivative of a map about the ray that enters as `z`, which is moved to the exit.
+pub(crate) fn derivative(z: &mut Phase<f64>, map: impl Fn(&mut Phase<num_dual::DualSVec64<6>>)) -> Matrix6<f64> {
     let (end, matrix) = jacobian(
         |mut z: Phase<num_dual::DualSVec64<6>>| {
             map(&mut z);
@@ -182,7 +184,7 @@ fn octupole<T: Scalar>(z: &mut Phase<T>, k3l: f64) {
 }
 
 /// Focusing functions `C = cos(sqrt(k) L)` and `S = sin(sqrt(k) L)/sqrt(k)`, hyperbolic for k < 0.
-fn focus<T: Scalar>(k: T, length: f64) -> (T, T) {
+pub(crate) fn focus<T: Scalar>(k: T, length: f64) -> (T, T) {
     let phase = k.re() * length * length;
     if phase.abs() < 1e-10 {
         return (k * (-0.5 * length * length) + 1.0, (k * (-length * length / 6.0) + 1.0) * length);
@@ -310,9 +312,21 @@ impl Bend {
             return;
         }
         // The map follows from the generating function x px + y py - y^2 phi(px, py, delta)/2, so the three partial
-        // derivatives of phi are needed; they are taken with a nested dual number.
+        // derivatives of phi are needed.
+        let (phi, slope) = if self.fringe == 0.0 { hard_edge(z, field) } else { self.soft_edge(z, field) };
+        let y = z[Y] * 2.0 / ((-slope[1] * z[Y] * 2.0 + 1.0).sqrt() + 1.0);
+        let half_square = y * y * 0.5;
+        z[X] += slope[0] * half_square;
+        z[PY] -= phi * y;
+        z[Y] = y;
+        z[PATH] -= slope[2] * half_square;
+    }
+
+    /// `phi` of an edge with its first soft-edge correction, and its derivatives with respect to `px`, `py` and `delta`, by a nested dual
+    /// number.
+    fn soft_edge<T: Scalar>(&self, z: &Phase<T>, field: f64) -> (T, SVector<T, 3>) {
         let at = SVector::<T, 3>::new(z[PX], z[PY], z[DELTA]);
-        let (phi, slope) = num_dual::gradient(
+        num_dual::gradient(
             |p: SVector<num_dual::DualSVec<T, 3>, 3>| {
                 let total = p[2] + 1.0;
                 let pz = (total * total - p[0] * p[0] - p[1] * p[1]).sqrt();
@@ -322,13 +336,7 @@ impl Bend {
                 (bent - soft).tan() * field
             },
             &at,
-        );
-        let y = z[Y] * 2.0 / ((-slope[1] * z[Y] * 2.0 + 1.0).sqrt() + 1.0);
-        let half_square = y * y * 0.5;
-        z[X] += slope[0] * half_square;
-        z[PY] -= phi * y;
-        z[Y] = y;
-        z[PATH] -= slope[2] * half_square;
+        )
     }
 
     /// Ideal wedge of field of opening `angle` [rad].
@@ -353,6 +361,18 @@ impl Bend {
         z[Y] += py * swept / h;
         z[PATH] += p * swept / h;
     }
+}
+
+/// The same of a hard edge: `phi = field px pz/q`, `q = (1 + delta)^2 - px^2`.
+fn hard_edge<T: Scalar>(z: &Phase<T>, field: f64) -> (T, SVector<T, 3>) {
+    let (px, py, p) = (z[PX], z[PY], z[DELTA] + 1.0);
+    let pz = longitudinal(z, px, py);
+    let per_q = (p * p - px * px).recip() * field;
+    let phi = px * pz * per_q;
+    let twice = phi * per_q * (2.0 / field);
+    let by_px = (pz - px * px / pz) * per_q + twice * px;
+    let by_delta = px * p / pz * per_q - twice * p;
+    (phi, SVector::<T, 3>::new(by_px, -px * py / pz * per_q, by_delta))
 }
 
 /// Rotation of the transverse plane about the vertical axis by `angle` [rad], in free space.
@@ -410,14 +430,22 @@ mod tests {
     #[test]
     fn edge_focuses_as_its_tangent() {
         let b = Bend { curvature: 0.1, k1: 0.0, k2: 0.0, e1: 0.2, e2: 0.0, fringe: 0.0 };
-        let m = linearised(&mut Phase::<f64>::zeros(), |z| b.enter(z));
+        let m = derivative(&mut Phase::<f64>::zeros(), |z| b.enter(z));
         let power = 0.1 * 0.2_f64.tan();
         assert!((m[(PX, X)] - power).abs() < 1e-14 && (m[(PY, Y)] + power).abs() < 1e-14);
     }
 
     #[test]
+    fn a_hard_edge_is_a_soft_one_without_extent() {
+        let hard = Bend { curvature: 0.1, k1: 0.0, k2: 0.0, e1: 0.2, e2: 0.0, fringe: 0.0 };
+        let z = Phase::<f64>::new(4e-3, 0.2, -3e-3, 1e-2, 3e-3, 0.0);
+        let ((one, slope), (other, known)) = (hard_edge(&z, 0.1), hard.soft_edge(&z, 0.1));
+        assert!((one - other).abs() < 1e-15 && (slope - known).abs().max() < 1e-15, "{slope} {known}");
+    }
+
+    #[test]
     fn sector_has_the_text_book_matrix() {
-        let m = bend(0.0, 0.0).linearise(&mut Phase::<f64>::zeros());
+        let m = derivative(&mut Phase::<f64>::zeros(), |z| bend(0.0, 0.0).track(z));
         let (s, c) = 0.09_f64.sin_cos();
         let rho = 10.0;
         let known = [
@@ -436,7 +464,7 @@ mod tests {
     #[test]
     fn slices_suffice() {
         for k1 in [0.8, 0.1, 1e-2, 1e-3, 1e-4] {
-            let m = bend(k1, 0.0).linearise(&mut Phase::<f64>::zeros());
+            let m = derivative(&mut Phase::<f64>::zeros(), |z| bend(k1, 0.0).track(z));
             let (x, y) = ((k1 + 0.01).sqrt(), k1.sqrt()); // K1 + h^2
             let known = [
                 ((X, X), (x * 0.9).cos()),

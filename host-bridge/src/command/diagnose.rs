@@ -30,6 +30,9 @@ struct DiagnosisResult {
     verdict: &'static str,
     sentence: String,
     findings: Vec<FindingResult>,
+    /// Least probability that all effects in the model are there.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    joint_probability: Option<f64>,
     monitors: Vec<Monitor>,
     fit: Fits,
     vars_before: Vec<Var>,
@@ -252,6 +255,7 @@ impl DiagnosisResult {
             verdict: diagnosis.verdict.word(),
             sentence: diagnosis.sentence.clone(),
             findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
+            joint_probability: diagnosis.joint_probability(),
             monitors: monitors(ring, &data.health_in_any()),
             fit: Fits {
                 before: fit(&found.null, before)?,
@@ -301,7 +305,11 @@ impl fmt::Display for DiagnosisResult {
                 self.findings.iter().find_map(|finding| finding.fixed.as_ref()).map(|fixed| fixed.kinetic_energy);
             let at =
                 energy.map_or_else(String::new, |energy| format!(" Stray gradients: amplitudes at {energy:.3} GeV."));
-            writeln!(f, "{table}\n{}\n", fill(&format!("{COLUMNS}{at}")))?;
+            let all = match (self.joint_probability, self.findings.len()) {
+                (Some(least), 2..) => format!(" All effects in the model: P at least {least:.3}."),
+                _ => String::new(),
+            };
+            writeln!(f, "{table}\n{}\n", fill(&format!("{COLUMNS}{all}{at}")))?;
         }
         let Fits { before, after, elpd_gain, elpd_gain_se, .. } = &self.fit;
         let summary = format!(

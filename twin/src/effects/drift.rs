@@ -1,7 +1,7 @@
 //! Unrecorded drifts during a campaign.
 //!
-//! Every gradient is `k1 (1 + a t)` in a cycle at time t, from -1 to 1; per frame that is `t a (dR/dln k1) k`, and the derivative is the
-//! same without a. A response, which is the machine in mid-campaign, does not move.
+//! Every gradient is `k1 (1 + a t)` in a cycle at time t, from -1 to 1; per frame that is the parabola in t through the machines at the start, in
+//! the middle and at the end, and its derivative at none is `t (dR/dln k1) k`. A response, which is the machine in mid-campaign, does not move.
 
 use nalgebra::DMatrix;
 
@@ -18,9 +18,6 @@ pub enum DriftEffect {
     /// The gradients of all quadrupoles, from `-a` to `a`.
     Quadrupoles,
 }
-
-/// Relative step of all gradients for the derivative that a drift needs; its truncation is 1e-6 of the derivative.
-const STEP: f64 = 1e-4;
 
 impl Mechanism for DriftEffect {
     fn word(&self) -> &'static str {
@@ -83,21 +80,24 @@ pub(super) fn factor(drift: f64, time: f64) -> f64 {
     1.0 + drift * time
 }
 
-/// Change of the positions by a drift of all quadrupoles, rows frames [m], and of the tunes.
+/// Change of the positions by a drift of all quadrupoles, rows frames [m], from those without, and of the tunes from mid-campaign to its end.
 pub(super) fn of_frames(
     machine: &Machine,
     ring: &Ring,
     drives: &Drives,
     kick: &DMatrix<f64>,
+    without: &[DMatrix<f64>; 2],
 ) -> Result<([DMatrix<f64>; 2], [f64; 2]), OrbitError> {
     let scaled = |factor: f64| machine.seen(&ring.with_strengths(&vec![factor; ring.quadrupoles.len()]));
-    let (up, down) = (scaled(1.0 + STEP)?, scaled(1.0 - STEP)?);
-    let per_step = machine.drift / (2.0 * STEP);
-    let tunes = [up.tunes.x - down.tunes.x, up.tunes.y - down.tunes.y].map(|change| change * per_step);
+    let (end, start) = (scaled(factor(machine.drift, 1.0))?, scaled(factor(machine.drift, -1.0))?);
+    let tunes = [end.tunes.x - start.tunes.x, end.tunes.y - start.tunes.y].map(|change| 0.5 * change);
     let positions = |seen: &Seen| drives.positions(seen, kick);
-    let ([up_x, up_y], [down_x, down_y]) = (positions(&up), positions(&down));
-    let by_time = |change: DMatrix<f64>| in_time(change * per_step, drives);
-    Ok(([by_time(up_x - down_x), by_time(up_y - down_y)], tunes))
+    let (end, start) = (positions(&end), positions(&start));
+    let of_plane = |plane: usize| {
+        let (odd, even) = ((&end[plane] - &start[plane]) * 0.5, (&end[plane] + &start[plane]) * 0.5 - &without[plane]);
+        in_time(odd + in_time(even, drives), drives)
+    };
+    Ok(([of_plane(0), of_plane(1)], tunes))
 }
 
 /// All gradients in proportion to the time.

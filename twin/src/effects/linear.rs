@@ -3,7 +3,7 @@
 //! With `k` the kicks that a frame really had (gains, polarities and even parts applied), `f` its RF offset, `t` its time from
 //! -1 to 1 and `R` the response of the ring with all its effects,
 //!
-//! `position = R k - (D/eta) f + t a (dR/dln k1) k + quadratic terms of sextupole fields`,
+//! `position = R k - (D/eta) f + t a (dR/dln k1) k + t^2 a^2 (d^2R/d(ln k1)^2) k/2 + quadratic terms of sextupole fields`,
 //!
 //! and the monitors' errors (gain, roll, cubic term, exchanged names) are applied last. Everything is the change
 //! against the orbit without kicks, whose own reading is unknown and constant. A sextupole field and a cubic term depend on
@@ -33,7 +33,7 @@ impl Machine {
         let mut positions = drives.positions(&seen, &kick);
         let mut tune_drift = [0.0; 2];
         if self.drift != 0.0 {
-            let (change, of_tunes) = drift::of_frames(self, &ring, drives, &kick)?;
+            let (change, of_tunes) = drift::of_frames(self, &ring, drives, &kick, &positions)?;
             add(&mut positions, change);
             tune_drift = of_tunes;
         }
