@@ -8,9 +8,9 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::Instant;
 
+use super::Plan;
 use super::files::{Files, HistoryError, lock};
 use super::row::{Columns, Row};
-use super::{Plan, Tier};
 use crate::health::{HealthRecord, State};
 use crate::output::{tell, warn};
 use crate::record::EstimateRecord;
@@ -107,8 +107,12 @@ impl Keeper {
     /// [`HistoryError`].
     pub fn start(folder: &Path, plan: &Plan, columns: &Columns, lost: Arc<dyn Lost>) -> Result<Self, HistoryError> {
         let lock = lock(folder)?;
-        let tiers = plan.0.iter().map(|tier| Ok(Thinned::new(tier, Files::open(folder, tier, columns)?)));
-        let tiers: Vec<Thinned> = tiers.collect::<Result<_, _>>()?;
+        let tiers = plan.0.iter().enumerate().map(|(i, tier)| {
+            // of the finest, the loop sends those rows only that are due
+            let every = if i == 0 { Duration::ZERO } else { tier.every };
+            Ok(Thinned::new(every, Files::open(folder, tier, columns)?))
+        });
+        let tiers: Vec<Thinned> = tiers.collect::<Result<_, HistoryError>>()?;
         let (rows, received) = sync_channel(WAITING);
         let writer = Writer { folder: folder.to_owned(), tiers, lost: lost.clone(), failure: None, _lock: lock };
         let thread = thread::Builder::new().name("history".into()).spawn(move || writer.run(&received));
@@ -138,8 +142,8 @@ struct Thinned {
 }
 
 impl Thinned {
-    fn new(tier: &Tier, files: Files) -> Self {
-        Self { every: tier.every, files, last: None, mismatch: false, worst: Vec::new() }
+    fn new(every: Duration, files: Files) -> Self {
+        Self { every, files, last: None, mismatch: false, worst: Vec::new() }
     }
 
     /// Take a row in, if one is due; what is left out counts in the next one.

@@ -49,17 +49,13 @@ pub fn read(folder: &Path, span: &Span) -> Result<History, HistoryError> {
     for tier in TIERS {
         let files = numbered(folder, tier);
         is_there |= !files.is_empty();
-        let mut rows = Vec::new();
-        for (_, path) in files.iter().rev() {
-            let mut of_file = read_file(path, &mut history)?;
-            of_file.retain(|row| (span.since_ms..=until_ms).contains(&row.time_ms));
-            rows.push(of_file);
-        }
-        let rows: Vec<Row> = rows.into_iter().rev().flatten().collect();
+        let of_files = files.iter().rev().map(|(_, path)| read_file(path, &mut history));
+        let of_files: Vec<Vec<Row>> = of_files.collect::<Result<_, _>>()?;
+        let mut rows: Vec<Row> = of_files.into_iter().rev().flatten().collect();
+        let first = rows.iter().map(|row| row.time_ms).min();
+        rows.retain(|row| (span.since_ms..=until_ms).contains(&row.time_ms));
         // coarser rows only before the finer ones
-        if let Some(first) = rows.iter().map(|row| row.time_ms).min() {
-            until_ms = first.saturating_sub(1);
-        }
+        until_ms = first.map_or(until_ms, |first| until_ms.min(first.saturating_sub(1)));
         tiers.push(rows);
     }
     if !is_there {

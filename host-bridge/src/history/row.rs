@@ -13,7 +13,7 @@ const FIRST: [&str; 8] =
 /// Name of the last column.
 const LAST: &str = "crc32";
 /// Most characters of a number, and of the columns before those of the vars and after those of the instruments with their commas.
-const NUMBER: u64 = 15;
+const NUMBER: u64 = 16;
 const REST: u64 = 110;
 
 /// Whose numbers the rows of a file hold.
@@ -133,7 +133,7 @@ impl Row {
     }
 }
 
-/// A number as briefly as reads back to the same `f32`, in 14 characters at most.
+/// A number as briefly as reads back to the same `f32`, in 15 characters at most.
 fn push(line: &mut String, number: f32) {
     let is_plain = number == 0.0 || (1e-4..1e7).contains(&number.abs());
     let _ = if is_plain { write!(line, "{number}") } else { write!(line, "{number:e}") };

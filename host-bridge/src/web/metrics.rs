@@ -189,11 +189,14 @@ mod tests {
             "orbitcal_monitors{state=\"ok\"} 2",
             "orbitcal_monitors{state=\"dead\"} 1",
             "orbitcal_latency_seconds_count 2",
-            "orbitcal_latency_seconds_bucket{le=\"8e-5\"} 1",
             "orbitcal_usable 1",
         ] {
             assert!(text.lines().any(|there| there == line), "{line} in\n{text}");
         }
         assert!(text.contains("orbitcal_estimate_age_seconds "), "{text}");
+        let counts =
+            text.lines().filter_map(|line| line.strip_prefix("orbitcal_latency_seconds_bucket")?.split(' ').nth(1));
+        // 70 us are in the fourth bucket, 2 ms in the ninth
+        assert_eq!(counts.collect::<String>(), "0001111122222222".to_owned() + "2");
     }
 }

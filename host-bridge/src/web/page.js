@@ -72,9 +72,9 @@ function vars(state) {
   const column = wide / columns, left = 9 * Math.max(...names.map((name) => name.length)) + 6, right = 10;
   const at = (c, value) => c * column + left + (column - left - right) * (0.5 + 0.5 * Math.max(-1, Math.min(1, (value - 1) / reach)));
   for (let c = 0; c < columns; c++) {
-    for (const tick of ticks(1 - reach, 1 + reach, 3)) {
+    for (const tick of ticks(1 - reach, 1 + reach, 5)) {
       svg.append(node("line", { class: tick === 1 ? "nominal" : "axis", x1: at(c, tick), x2: at(c, tick), y1: top - 3, y2: top + rows * line }));
-      svg.append(node("text", { class: "pale", x: at(c, tick), y: 11, "text-anchor": "middle" }, tick.toFixed(reach < 0.05 ? 3 : 2)));
+      svg.append(node("text", { class: "pale", x: at(c, tick), y: 11, "text-anchor": "middle" }, String(tick)));
     }
   }
   names.forEach((name, i) => {
@@ -154,7 +154,7 @@ function residuals(state) {
       const look = each.state === "ok" ? "usual" : "faulty";
       group.append(node("rect", { class: each.use === "used" ? look : `${look} hollow`, x: x - 0.3 * step, width: 0.6 * step, y: from, height: Math.max(1, to - from) }));
     }
-    group.append(node("text", { transform: `translate(${x + 4} ${top + high + 6}) rotate(-90)`, "text-anchor": "end", class: each.state === "ok" ? "pale" : "faulty" }, name));
+    group.append(node("text", { transform: `translate(${x + 4} ${top + high + 6}) rotate(-90)`, "text-anchor": "end", class: `${each.state === "ok" ? "pale" : "faulty"}${step < 11 ? " small" : ""}` }, name));
     svg.append(group);
   });
   put("residuals", svg);
@@ -195,7 +195,7 @@ function faults(state) {
 }
 
 async function trail() {
-  const over = $("span").value, wide = width("trail"), left = 50, right = 10, top = 8, high = 180, bottom = 24;
+  const over = $("span").value, wide = width("trail"), left = 50, right = 10, top = 24, high = 180, bottom = 24;
   const reply = await fetch(`/trail.json?span=${over}&var=${encodeURIComponent(chosen)}`);
   const points = (await reply.json()).points.filter(([, mean]) => mean !== null);
   const svg = picture(wide, top + high + bottom, `History of ${chosen}`);
@@ -219,8 +219,8 @@ async function trail() {
     points.filter((point) => point[4]).forEach((point) => svg.append(node("line", { class: "faulty", x1: x(point[0]), x2: x(point[0]), y1: top + high - 6, y2: top + high })));
     const [, mean, sigma] = points[points.length - 1];
     svg.append(node("circle", { class: "weak", cx: x(points[points.length - 1][0]), cy: y(mean), r: 3 }));
-    svg.append(node("text", { x: left + 6, y: top + 12 }, `${chosen}: ${mean.toFixed(4)} ± ${sigma.toFixed(4)}; the band is two error bars`));
-  } else svg.append(node("text", { x: left + 6, y: top + 12, class: "pale" }, "no estimates in this time"));
+    svg.append(node("text", { x: left, y: 12 }, `${chosen}: ${mean.toFixed(4)} ± ${sigma.toFixed(4)}; the band is two error bars`));
+  } else svg.append(node("text", { x: left, y: 12, class: "pale" }, "no estimates in this time"));
   put("trail", svg);
 }
 

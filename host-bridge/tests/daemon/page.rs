@@ -116,7 +116,13 @@ fn a_browser_shows_the_page_at_desk_and_phone_width() {
             let url = format!("http://127.0.0.1:{page}/");
             let run = |what: &str| {
                 let mut command = Command::new(browser);
-                command.args(["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--timeout=4000"]);
+                command.args([
+                    "--headless",
+                    "--no-sandbox",
+                    "--disable-gpu",
+                    "--hide-scrollbars",
+                    "--virtual-time-budget=6000",
+                ]);
                 command.arg(format!("--user-data-dir={}", profile.path().display()));
                 command.arg(format!("--window-size={width},{height}")).args([what, &url]);
                 let output = command.output().unwrap();

@@ -385,7 +385,7 @@ mod tests {
             record.tune_innovation = [None, Some(-1e-3)];
             (record.remarks.baselines_moved, record.remarked.unsolved_frames) = (true, 7);
             let (header, payload) = encoded(&record);
-            assert_eq!(payload.len(), words_of(&stamp().publisher, &record.names));
+            assert_eq!(payload.len(), Text::of(&stamp().publisher, &record.names).words_of(&record.names));
             assert_eq!(decode(&header, &payload, &mut None).unwrap(), (record, stamp()));
         }
     }
