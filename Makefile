@@ -7,7 +7,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -69,6 +69,17 @@ serve-kill: toolchain ## kill -9 of the daemon and of a reader, 100 times at ran
 
 serve-soak: toolchain ## two million frames with 5 % faults of every kind through the daemon, beside a core in process: estimates bit for bit, memory; ten minutes
 	cargo test --locked --release -p host-bridge --test daemon -- --ignored --exact soak::serve_soak --nocapture
+
+clients: .venv-iceoryx target/tools/bin/iox2 ## readers of the shared memory that are not ours, against the daemon: the example in Python and iox2 of iceoryx2; minutes, the first time
+	cargo test --locked -p host-bridge --test daemon -- clients:: --nocapture
+
+.venv-iceoryx:
+	python3 -m venv .venv-iceoryx
+	.venv-iceoryx/bin/pip install --quiet iceoryx2==0.10.0
+
+# the version that the workspace is built with: layouts of 0.x differ
+target/tools/bin/iox2: | toolchain
+	cargo install iceoryx2-cli --version 0.10.0 --locked --root target/tools
 
 train: build ## the surrogate's tables from the twin, and their measured errors
 	$(ORBITCAL) surrogate check
@@ -140,4 +151,4 @@ fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv .venv-peers .venv-export .venv-control
+	rm -rf .venv .venv-peers .venv-export .venv-control .venv-iceoryx

@@ -888,9 +888,18 @@ impl<
         if i < N && j < N { self.posterior.solution.covariance(i, j) as f32 } else { 0.0 }
     }
 
-    /// Covariance of a param `theta = ln var` with each, several times as fast as one by one; zeros if there is no such param.
-    pub fn covariance_row(&self, i: usize) -> [f32; N] {
-        self.posterior.solution.covariance_row(i)
+    /// What the covariance of the params is made of, to be worked out elsewhere, see [`Solution::inverse_factor`].
+    pub fn inverse_factor(&self) -> &[f64] {
+        self.posterior.solution.inverse_factor()
+    }
+
+    /// What the posterior after a frame expects of its reading at a monitor [m], baseline included; before the next
+    /// [`Estimator::prepare`].
+    pub fn fitted(&self, b: usize) -> f32 {
+        let channel = self.predicted.first_channel + b;
+        let Posterior { gaussian, solution, .. } = &self.posterior;
+        let (off_origin, _) = gaussian.expected(channel, self.slope(b), &solution.delta);
+        self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0) + off_origin as f32
     }
 }
 

@@ -49,7 +49,7 @@ pub use state::{Bytes, State, StateError};
 pub use steer::{Feedback, Hold, Response, Steer, Steered};
 pub use stream::{Core, Steering};
 pub use surrogate::{Prediction, Steerable, Surrogate, Tables};
-pub use triangle::Triangle;
+pub use triangle::{Triangle, square};
 pub use wire::packet;
 pub use wire::{
     CurrentCode, Frame, FrameError, IntensityCode, MagnetCurrents, Parcel, ParcelError, PositionCode, RfCode, TuneCode,

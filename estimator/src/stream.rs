@@ -55,7 +55,6 @@ pub trait Core: Sized {
     fn state_layout(&mut self) -> u32;
     fn frames(&self) -> u32;
     fn covariance(&self, i: usize, j: usize) -> f32;
-    fn covariance_row(&self, i: usize) -> impl AsRef<[f32]>;
     /// Number of the frame that an estimate is of.
     fn sequence(estimate: &Self::Estimate) -> u32;
     /// What feedback needs of an estimate.
@@ -169,10 +168,6 @@ impl<
 
     fn covariance(&self, i: usize, j: usize) -> f32 {
         self.covariance(i, j)
-    }
-
-    fn covariance_row(&self, i: usize) -> impl AsRef<[f32]> {
-        self.covariance_row(i)
     }
 
     fn sequence(estimate: &Self::Estimate) -> u32 {

@@ -42,6 +42,11 @@ impl<const N: usize, const T: usize, R: Real> Triangle<N, T, R> {
     }
 
     /// All entries, row by row.
+    pub fn entries(&self) -> &[R] {
+        &self.0
+    }
+
+    /// The same, to be changed.
     pub fn entries_mut(&mut self) -> &mut [R] {
         &mut self.0
     }
@@ -166,16 +171,8 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
     }
 
     /// `L^T L` of a lower triangle, in place: `sum over i >= j of L_ij L_ik` by rows `j`, for which only later rows are needed.
-    #[inline(never)]
     pub fn square(&mut self) {
-        for j in 0..N {
-            let Some((done, below)) = self.0.split_at_mut_checked(start(j + 1)) else { return };
-            let row = done.get_mut(start(j)..).unwrap_or_default();
-            let own = row.last().copied().unwrap_or(0.0);
-            row.iter_mut().for_each(|l| *l *= own);
-            let below = Rows { rest: below, length: j + 2 };
-            combine(row, below.map(|l| (l.get(j).copied().unwrap_or(0.0), l)));
-        }
+        square(&mut self.0);
     }
 
     /// `L x` for a lower triangle, in place.
@@ -212,6 +209,20 @@ impl<const N: usize, const T: usize> Triangle<N, T, f64> {
                 add(open, -*here, left);
             }
         }
+    }
+}
+
+/// [`Triangle::square`] of the entries of a triangle of any size.
+#[inline(never)]
+pub fn square(entries: &mut [f64]) {
+    let mut j = 0;
+    while let Some((done, below)) = entries.split_at_mut_checked(start(j + 1)) {
+        let row = done.get_mut(start(j)..).unwrap_or_default();
+        let own = row.last().copied().unwrap_or(0.0);
+        row.iter_mut().for_each(|l| *l *= own);
+        let below = Rows { rest: below, length: j + 2 };
+        combine(row, below.map(|l| (l.get(j).copied().unwrap_or(0.0), l)));
+        j += 1;
     }
 }
 

@@ -216,6 +216,21 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
+/// A lock beside a checkpoint, held as long as this lives: two daemons do not keep one file.
+fn lock(path: &Path) -> io::Result<File> {
+    let name = beside(path, "lock");
+    let wrong = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", name.display()));
+    let file = File::options().create(true).append(true).open(&name).map_err(wrong)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(fs::TryLockError::WouldBlock) => {
+            let said = format!("{}: another daemon keeps it; give each a checkpoint.file of its own", path.display());
+            Err(io::Error::new(ErrorKind::WouldBlock, said))
+        }
+        Err(fs::TryLockError::Error(error)) => Err(wrong(error)),
+    }
+}
+
 fn remove(path: &Path) -> io::Result<()> {
     fs::remove_file(path).or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
@@ -228,12 +243,12 @@ fn beside(path: &Path, end: &str) -> PathBuf {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     const MODEL: Model = Model { tables: 1, setup: 2, layout: 3 };
 
-    fn checkpoint(sequence: u32) -> Checkpoint {
+    pub(crate) fn checkpoint(sequence: u32) -> Checkpoint {
         let head =
             Head::new(MODEL, [sequence, sequence + 1], Remarked::default(), Faults::default(), Health::new(&[1e-4], 1));
         Checkpoint { head, state: vec![10, 0, 10, 255] }

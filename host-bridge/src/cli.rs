@@ -56,6 +56,8 @@ pub enum Command {
     Serve(Serve),
     /// Ask a running daemon for a snapshot, a reset, or another model
     Request(Request),
+    /// Show what a daemon has estimated over hours and months
+    History(History),
     /// Measure a campaign through the control system, and put the machine back
     Measure(Measure),
     /// Simulate the machine of a plan, one cycle a line, for a soft IOC
@@ -233,6 +235,35 @@ pub enum Ask {
         #[arg(value_name = "FILE")]
         file: PathBuf,
     },
+}
+
+/// `orbitcal history`.
+#[derive(Debug, Args)]
+pub struct History {
+    /// The daemon's configuration, or the folder of its history; the daemon may be running
+    #[arg(value_name = "CONFIG.toml|FOLDER")]
+    pub from: PathBuf,
+    /// Show this var; may be given again
+    #[arg(long = "var", value_name = "NAME")]
+    pub vars: Vec<String>,
+    /// Begin at this time in UTC (2026-11-24, 2026-11-24T18:30), or so long ago (90m, 36h, 7d)
+    #[arg(long, value_name = "WHEN", value_parser = moment)]
+    pub since: Option<u64>,
+    /// End at this time
+    #[arg(long, value_name = "WHEN", value_parser = moment)]
+    pub until: Option<u64>,
+    /// Lines of the table, spread evenly over the time; JSON and CSV have all rows
+    #[arg(long, value_name = "N", default_value_t = 20)]
+    pub rows: usize,
+    /// JSON of all rows, `-` for stdout
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// CSV of all rows, `-` for stdout
+    #[arg(long, value_name = "FILE")]
+    pub csv: Option<PathBuf>,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
 }
 
 /// `orbitcal watch`.
@@ -786,6 +817,19 @@ impl From<Rf> for twin::Rf {
             Rf::FixedFrequency => Self::FixedFrequency,
         }
     }
+}
+
+/// A moment [ms since 1970].
+fn moment(text: &str) -> Result<u64, String> {
+    let wrong = || format!("expected a time in UTC as 2026-11-24T18:30, or so long ago as 36h, found {text:?}");
+    let now = jiff::Timestamp::now().to_zoned_datetime(jiff::tz::TimeZone::UTC);
+    let ago = || now.checked_sub(text.parse::<jiff::Span>().ok()?).ok().map(|zoned| zoned.timestamp());
+    let civil = || {
+        let civil: jiff::civil::DateTime = text.parse().ok()?;
+        civil.to_zoned_datetime(jiff::tz::TimeZone::UTC).ok().map(|zoned| zoned.timestamp())
+    };
+    let moment = text.parse().ok().or_else(civil).or_else(ago).ok_or_else(wrong)?;
+    u64::try_from(moment.as_millisecond()).map_err(|_| wrong())
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {

@@ -3,12 +3,15 @@
 mod keys;
 
 use core::fmt;
+use core::net::SocketAddr;
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use toml::de::DeTable;
 
+use crate::history::Plan;
+use crate::logs::Form;
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
 use crate::source::origin::Origin;
@@ -33,6 +36,15 @@ pub struct Config {
     /// What a restart begins with.
     #[serde(default)]
     pub checkpoint: Checkpoint,
+    /// What is kept of the estimates.
+    #[serde(default)]
+    pub history: History,
+    /// The live page and the metrics.
+    #[serde(default)]
+    pub page: Page,
+    /// What is said on stderr.
+    #[serde(default)]
+    pub logs: Logs,
 }
 
 /// `[machine]`
@@ -212,6 +224,57 @@ impl Default for Checkpoint {
     }
 }
 
+/// `[history]`
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct History {
+    /// Its folder; none, and nothing is kept.
+    pub folder: Option<PathBuf>,
+    /// An estimate is left out if the one before is not as old as this [ms].
+    fine_ms: u64,
+    /// How long these are kept [h].
+    fine_hours: u64,
+    /// How long one a minute is kept [d].
+    minutes_days: u64,
+    /// How long one an hour is kept [d].
+    hours_days: u64,
+}
+
+impl Default for History {
+    fn default() -> Self {
+        Self { folder: None, fine_ms: 100, fine_hours: 1, minutes_days: 31, hours_days: 1826 }
+    }
+}
+
+impl History {
+    /// What is kept of it.
+    pub fn plan(&self) -> Plan {
+        Plan::new(Duration::from_millis(self.fine_ms), self.fine_hours, [self.minutes_days, self.hours_days])
+    }
+}
+
+/// `[page]`
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Page {
+    /// Loopback address on which it is served; none, and there is none.
+    pub address: Option<SocketAddr>,
+}
+
+/// `[logs]`
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Logs {
+    /// Form of a line on stderr.
+    pub form: Form,
+}
+
+impl Default for Logs {
+    fn default() -> Self {
+        Self { form: Form::Plain }
+    }
+}
+
 fn origin<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Origin, D::Error> {
     String::deserialize(value)?.parse().map_err(serde::de::Error::custom)
 }
@@ -256,12 +319,12 @@ impl Config {
         let parsed = std::fs::read_to_string(file).map_err(unread).and_then(|text| Self::parse(&text));
         let mut config = parsed.map_err(|problems| ConfigError { file: file.to_owned(), problems })?;
         let folder = file.parent().unwrap_or(Path::new(""));
-        let Self { machine, source, checkpoint, .. } = &mut config;
+        let Self { machine, source, checkpoint, history, .. } = &mut config;
         let replayed = match &mut source.address {
             Origin::Recording(path) => Some(path),
             Origin::Line(_) | Origin::SharedMemory(_) => None,
         };
-        let optional = [&mut machine.file, &mut machine.model_file, &mut checkpoint.file];
+        let optional = [&mut machine.file, &mut machine.model_file, &mut checkpoint.file, &mut history.folder];
         let paths = optional.into_iter().flatten().chain([&mut machine.recording]).chain(replayed);
         paths.for_each(|path| *path = folder.join(&*path));
         Ok(config)
@@ -320,7 +383,8 @@ mod tests {
     #[test]
     fn every_wrong_value_is_said_at_once_with_key_range_and_line() {
         let text = "[machine]\nfile = 3\n[source]\naddress = \"serial:\"\nrole = \"both\"\ntimeout_ms = 0\n\
-                    buffer_frame = 7\n[walk]\nparams_per_root_second = nan\n[publish]\nservice = \"\"\n[logs]\nlevel = 1\n";
+                    buffer_frame = 7\n[walk]\nparams_per_root_second = nan\n[publish]\nservice = \"\"\n\
+                    [page]\naddress = \"0.0.0.0:80\"\n[graphs]\ncolour = 1\n";
         assert_eq!(
             said(text),
             [
@@ -334,7 +398,8 @@ mod tests {
                 "9: walk.params_per_root_second = nan: expected a number from 0 to 0.1 (1/sqrt(s)); default 1.5e-4",
                 "11: publish.service = \"\": expected 1 to 127 printable ASCII characters, not beginning with iox2://; default \
                  \"orbitcal/estimate\"",
-                "12: logs: no such section",
+                "13: page.address = \"0.0.0.0:80\": expected a loopback address and a port, as 127.0.0.1:9464",
+                "14: graphs: no such section",
             ]
         );
     }
@@ -356,14 +421,16 @@ mod tests {
 
     #[test]
     fn what_is_left_out_has_the_default_that_is_stated() {
-        let written: String = ["machine", "source", "walk", "publish", "requests", "checkpoint"]
-            .iter()
-            .map(|section| {
-                let own = keys::KEYS.iter().filter(|key| key.section == *section);
-                let lines: String = own.filter_map(|key| Some(format!("{} = {}\n", key.name, key.default?))).collect();
-                format!("[{section}]\n{lines}")
-            })
-            .collect();
+        let written: String =
+            ["machine", "source", "walk", "publish", "requests", "checkpoint", "history", "page", "logs"]
+                .iter()
+                .map(|section| {
+                    let own = keys::KEYS.iter().filter(|key| key.section == *section);
+                    let lines: String =
+                        own.filter_map(|key| Some(format!("{} = {}\n", key.name, key.default?))).collect();
+                    format!("[{section}]\n{lines}")
+                })
+                .collect();
         let required = written
             .replace("[machine]\n", "[machine]\nrecording = \"night\"\n")
             .replace("[source]\n", "[source]\naddress = \"tcp://:5000\"\n");

@@ -175,13 +175,25 @@ fn condition<const SAMPLES: u32>(instrument: &Instrument<SAMPLES>) -> Condition 
     Condition { state: instrument.state(), ratios: instrument.ratios() }
 }
 
-/// Currents of the correctors in the bytes of a frame of a ring of these sizes [C] [A].
+/// What health, and who looks at it, needs of a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Measured {
+    /// Currents of the correctors [C] [A].
+    pub currents: Vec<f32>,
+    /// Reading of each monitor that reports [B] [m].
+    pub readings: Vec<Option<f32>>,
+}
+
+/// That of the bytes of a frame of a ring of these sizes.
 ///
 /// # Errors
 /// [`FrameError`].
-pub fn currents(sizes: &Sizes, frame: &[u8]) -> Result<Vec<f32>, FrameError> {
+pub fn measured(sizes: &Sizes, frame: &[u8]) -> Result<Measured, FrameError> {
     let [monitors, correctors] = [sizes.monitors, sizes.correctors].map(|each| each.iter().sum::<u16>());
     let ring = Sizes::new([monitors.into(), 0], [correctors.into(), 0], [0, 0, sizes.supplies.into()]);
     let frame = large::Frame::decode(&Layout { ring, room: large::SIZES }, &mut frame.to_vec())?;
-    Ok(frame.corrector.iter().take(correctors.into()).map(|code| code.value()).collect())
+    let currents = frame.corrector.iter().take(correctors.into()).map(|code| code.value());
+    let readings = frame.reading.iter().take(monitors.into()).enumerate();
+    let readings = readings.map(|(b, code)| frame.valid.has(b).then(|| code.value()));
+    Ok(Measured { currents: currents.collect(), readings: readings.collect() })
 }

@@ -5,11 +5,14 @@ pub mod checkpoint;
 pub mod cli;
 pub mod command;
 pub mod config;
+pub mod daemon;
 pub mod export;
 pub mod fit_page;
 pub mod frames_result;
 pub mod health;
+pub mod history;
 pub mod import_result;
+pub mod logs;
 pub mod matrix_page;
 pub mod matrix_result;
 pub mod model_file;
@@ -21,6 +24,7 @@ pub mod sink;
 pub mod source;
 pub mod stop;
 pub mod watch;
+pub mod web;
 
 /// The worked examples of `docs/extending.md`, compiled and run as a test.
 #[cfg(doctest)]

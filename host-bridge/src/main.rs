@@ -7,12 +7,14 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
-    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, import, measure, replay, request,
-    response, serve, simulate, study, surrogate, validate, watch,
+    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, history, import, measure, replay,
+    request, response, serve, simulate, study, surrogate, validate, watch,
 };
+use host_bridge::logs;
 use host_bridge::output::{self, OutputError};
 
 fn main() -> ExitCode {
+    logs::start();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         // a bare `orbitcal` asks what it can do
@@ -39,6 +41,7 @@ fn main() -> ExitCode {
         Command::Export(options) => export::run(options),
         Command::Validate(options) => validate::run(options),
         Command::Request(options) => request::run(options),
+        Command::History(options) => history::run(options),
         Command::Serve(options) => serve::run(options),
         Command::Measure(options) => measure::run(options),
         Command::Simulate(options) => simulate::run(options),

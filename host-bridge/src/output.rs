@@ -38,9 +38,14 @@ pub fn say(text: impl Display) -> Result<(), OutputError> {
     }
 }
 
-/// A line on stderr, whether or not anybody reads it.
+/// What went wrong: a line on stderr, see [`crate::logs`], whether or not anybody reads it.
 pub fn warn(text: impl Display) {
-    let _ = writeln!(io::stderr(), "orbitcal: {text}");
+    tracing::warn!("{text}");
+}
+
+/// What an operator is told: a line on stderr, too.
+pub fn tell(text: impl Display) {
+    tracing::info!("{text}");
 }
 
 /// A text in lines of 80 columns at most, but for words that are longer.

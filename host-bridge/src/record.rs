@@ -126,19 +126,14 @@ pub struct EstimateRecord {
 }
 
 impl EstimateRecord {
-    /// What a core says after a frame, with the covariance of each `ln var` with those up to itself, or with more, and its mismatch alarm.
-    pub fn of(
-        names: &Arc<Names>,
-        estimate: &Estimate,
-        of_params: impl Fn(usize) -> Vec<f32>,
-        mismatch: Option<bool>,
-    ) -> Self {
+    /// What a core says after a frame, with the covariance of all `ln var`, the lower triangle row by row, or more, and its mismatch alarm.
+    pub fn of(names: &Arc<Names>, estimate: Estimate, of_params: &[f32], mismatch: Option<bool>) -> Self {
         let reading = |(accepted, rejected): (&bool, &bool)| match (accepted, rejected) {
             (true, _) => ReadingUse::Used,
             (false, true) => ReadingUse::Rejected,
             (false, false) => ReadingUse::Absent,
         };
-        let Estimate { mean, health, .. } = estimate;
+        let health = &estimate.health;
         Self {
             names: names.clone(),
             sequence: estimate.sequence,
@@ -153,17 +148,17 @@ impl EstimateRecord {
             nis: estimate.nis,
             tune_innovation: estimate.tune_innovation,
             log_evidence: estimate.log_evidence,
-            mean: mean.clone(),
-            sigma: estimate.sigma.clone(),
-            map_params: estimate.map_params.clone(),
-            centre: estimate.centre.clone(),
-            params_sigma: estimate.params_sigma.clone(),
-            clipped: estimate.clipped.clone(),
-            covariance: of_vars(mean, of_params),
+            covariance: of_vars(&estimate.mean, of_params),
             reading: estimate.accepted.iter().zip(&estimate.rejected).map(reading).collect(),
             monitor_state: health.iter().map(|health| health.state).collect(),
             monitor_sigma: health.iter().map(|health| health.noise).collect(),
             monitor_rejected: health.iter().map(|health| health.rejected).collect(),
+            mean: estimate.mean,
+            sigma: estimate.sigma,
+            map_params: estimate.map_params,
+            centre: estimate.centre,
+            params_sigma: estimate.params_sigma,
+            clipped: estimate.clipped,
         }
     }
 
@@ -222,10 +217,12 @@ impl EstimateRecord {
 }
 
 /// The covariance of vars from that of their logarithms: its lower triangle, row by row.
-fn of_vars(mean: &[f32], of_params: impl Fn(usize) -> Vec<f32>) -> Vec<f32> {
-    let mut entries = Vec::with_capacity(mean.len() * (mean.len() + 1) / 2);
+fn of_vars(mean: &[f32], of_params: &[f32]) -> Vec<f32> {
+    let (mut entries, mut rest) = (Vec::with_capacity(mean.len() * (mean.len() + 1) / 2), of_params);
     for (i, own) in mean.iter().enumerate() {
-        entries.extend(of_params(i).iter().zip(&mean[..=i]).map(|(entry, other)| own * other * entry));
+        let (row, below) = rest.split_at(i + 1);
+        entries.extend(row.iter().zip(mean).map(|(entry, other)| own * other * entry));
+        rest = below;
     }
     entries
 }
@@ -260,9 +257,7 @@ pub(crate) mod tests {
             centre: vec![0.0; vars],
             params_sigma: vec![0.01; vars],
             clipped: vec![false; vars],
-            covariance: of_vars(&vec![1.0; vars], |i| {
-                (0..=i).map(|j| if i == j { 0.01 * 0.01 } else { 0.0 }).collect()
-            }),
+            covariance: (0..vars).flat_map(|i| (0..=i).map(move |j| if i == j { 0.01 * 0.01 } else { 0.0 })).collect(),
             reading: vec![ReadingUse::Used; monitors],
             monitor_state: vec![MonitorState::Ok; monitors],
             monitor_sigma: vec![0.15e-3; monitors],
@@ -301,7 +296,7 @@ pub(crate) mod tests {
         let mut core = inference::stream::estimator(&ring, &recording, Walk::NONE).unwrap();
         let mut wire = inference::stream::wire(&recording, &recording.rows[0]).unwrap();
         let estimate = core.ingest(&mut wire).unwrap();
-        let record = EstimateRecord::of(&Names::of(&ring), &estimate, |i| core.covariance_row(i), None);
+        let record = EstimateRecord::of(&Names::of(&ring), estimate.clone(), &core.spread().covariance(), None);
         assert_eq!(record.mean, estimate.mean);
         assert_eq!((record.sequence, record.frames), (estimate.sequence, 1));
         for (i, j) in [(0, 0), (30, 7), (7, 30), (47, 47)] {

@@ -7,7 +7,6 @@ pub mod feed;
 pub mod link;
 pub mod origin;
 pub mod queue;
-pub mod raw;
 pub mod rehearsal;
 pub mod replay;
 pub mod shared;

@@ -1,5 +1,7 @@
 //! Another process looks on: every estimate counted, shown live, and kept if asked.
 
+mod band;
+mod ill;
 mod screen;
 mod view;
 

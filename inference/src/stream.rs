@@ -3,6 +3,7 @@
 mod estimate;
 mod held;
 mod setup;
+mod spread;
 
 use core::fmt;
 
@@ -21,6 +22,7 @@ pub use estimate::Estimate;
 pub use estimator::Walk;
 use held::{Held, Stream};
 pub use setup::{FOLLOW, Setup, setup, walk_per_cycle};
+pub use spread::Spread;
 
 /// Why a recording cannot be put on the wire.
 #[derive(Debug, thiserror::Error)]
@@ -208,9 +210,14 @@ impl Core {
         self.stream.covariance(i, j)
     }
 
-    /// Covariance of a param `theta = ln var` with each, those that the room has beyond the ring's included.
-    pub fn covariance_row(&self, i: usize) -> Vec<f32> {
-        self.stream.covariance_row(i)
+    /// How far the params are spread now: their covariance, to be worked out elsewhere while this core takes the next frame.
+    pub fn spread(&self) -> Spread {
+        Spread(self.stream.inverse_factor())
+    }
+
+    /// What the posterior expects of the readings of the last frame [B] [m]; before the next [`Core::slice`].
+    pub fn fitted(&self) -> Vec<f32> {
+        self.stream.fitted()
     }
 
     /// Prior of a param.
@@ -361,8 +368,8 @@ mod tests {
                 let (one, two) = (whole.ingest(&mut wire.clone()), core.ingest(&mut wire));
                 assert_eq!(format!("{one:?}"), format!("{two:?}"), "frame {i}");
                 assert_eq!(whole.covariance(30, 7).to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
-                assert_eq!(whole.covariance_row(30)[7].to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
-                assert_eq!(whole.covariance_row(7)[30].to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
+                let triangle = whole.spread().covariance();
+                assert_eq!(triangle[30 * 31 / 2 + 7].to_bits(), core.covariance(30, 7).to_bits(), "frame {i}");
             }
             let quality = [whole.fit_quality(), core.fit_quality()];
             assert_eq!(quality[0], quality[1]);

@@ -184,6 +184,11 @@ impl<const N: usize, const T: usize, const W: usize> Solution<N, T, W> {
         sum.map(|v| v as f32)
     }
 
+    /// What covariances are sums of: the entries of `X` of `P = X^T X`, a lower triangle row by row, which [`crate::square`] makes that of `P`.
+    pub fn inverse_factor(&self) -> &[f64] {
+        self.factor.entries()
+    }
+
     /// Variance of a prediction with derivative `h`: `h^T P h`.
     pub fn variance_of(&self, h: &[f64; N]) -> f64 {
         let image = |row: &[f64]| {

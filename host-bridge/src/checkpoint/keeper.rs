@@ -5,39 +5,43 @@ use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
-use super::write;
-use crate::output::warn;
+use super::{Checkpoint, lock, write};
+use crate::output::{tell, warn};
 use crate::source::queue::Queue;
 
 /// Writes checkpoints, and counts those that it could not write.
 #[derive(Debug)]
 pub struct Keeper {
-    files: Option<SyncSender<Vec<u8>>>,
+    files: Option<SyncSender<Checkpoint>>,
     queue: Queue,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Keeper {
-    /// For a file; failures are counted in the queue.
+    /// For a file that no other daemon keeps; failures are counted in the queue.
     ///
     /// # Errors
-    /// What the system says of a new thread.
+    /// What the system says of a new thread, or that another daemon keeps this file.
     pub fn start(path: &Path, queue: &Queue) -> io::Result<Self> {
+        let lock = lock(path)?;
         let (files, received) = sync_channel(1);
         let (path, counted) = (path.to_owned(), queue.clone());
         let thread = thread::Builder::new().name("checkpoint".into());
-        let thread = thread.spawn(move || keep(&path, &received, &counted))?;
+        let thread = thread.spawn(move || {
+            keep(&path, &received, &counted);
+            drop(lock);
+        })?;
         Ok(Self { files: Some(files), queue: queue.clone(), thread: Some(thread) })
     }
 
     /// Write this one, unless the one before last is still being written: the next one will do.
-    pub fn offer(&self, file: Vec<u8>) {
+    pub fn offer(&self, file: Checkpoint) {
         let taken = self.files.as_ref().is_some_and(|files| files.try_send(file).is_ok());
         self.queue.count(|faults| faults.unsaved += u64::from(!taken));
     }
 
     /// Write this last one, after those that wait.
-    pub fn finish(&mut self, file: Vec<u8>) {
+    pub fn finish(&mut self, file: Checkpoint) {
         let taken = self.files.take().is_some_and(|files| files.send(file).is_ok());
         let ended = self.thread.take().is_some_and(|thread| thread.join().is_ok());
         self.queue.count(|faults| faults.unsaved += u64::from(!(taken && ended)));
@@ -45,12 +49,12 @@ impl Keeper {
 }
 
 /// A failure is said once, and again when it ends.
-fn keep(path: &Path, files: &Receiver<Vec<u8>>, queue: &Queue) {
+fn keep(path: &Path, files: &Receiver<Checkpoint>, queue: &Queue) {
     let mut failed = 0_u64;
     for file in files {
-        match write(path, &file) {
+        match write(path, &file.encode()) {
             Ok(()) if failed > 0 => {
-                warn(format_args!("{}: checkpoints are saved again, {failed} were not", path.display()));
+                tell(format_args!("{}: checkpoints are saved again, {failed} were not", path.display()));
                 failed = 0;
             }
             Ok(()) => {}
@@ -67,6 +71,7 @@ fn keep(path: &Path, files: &Receiver<Vec<u8>>, queue: &Queue) {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::checkpoint;
     use super::*;
     use crate::source::queue::Faults;
 
@@ -76,11 +81,13 @@ mod tests {
         let path = folder.path().join("a");
         let queue = Queue::new(1, Faults::default());
         let mut keeper = Keeper::start(&path, &queue).unwrap();
-        keeper.offer(vec![1]);
-        keeper.finish(vec![2]);
-        assert_eq!((std::fs::read(&path).unwrap(), queue.faults().unsaved), (vec![2], 0));
-        let mut keeper = Keeper::start(&folder.path().join("no/such/folder"), &queue).unwrap();
-        keeper.finish(vec![3]);
+        assert!(Keeper::start(&path, &queue).unwrap_err().to_string().contains("another daemon keeps it"));
+        keeper.offer(checkpoint(1));
+        keeper.finish(checkpoint(2));
+        assert_eq!((std::fs::read(&path).unwrap(), queue.faults().unsaved), (checkpoint(2).encode(), 0));
+        let mut keeper = Keeper::start(&path, &queue).unwrap();
+        drop(folder);
+        keeper.finish(checkpoint(3));
         assert_eq!(queue.faults().unsaved, 1);
     }
 }

@@ -1,6 +1,7 @@
 //! `orbitcal serve CONFIG.toml`: the core in this process beside a machine, for months.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use estimator::wire::packet;
 use inference::stream::{self, Core};
@@ -8,20 +9,22 @@ use training::rooms::large;
 use twin::Ring;
 
 use super::{CommandError, machine, recording, tables};
-use crate::checkpoint::Keeper;
+use crate::checkpoint::{Head, Keeper};
 use crate::cli::CoreModel;
-use crate::config::{Config, ConfigError, Source};
-use crate::output::{self, warn};
-use crate::record::Names;
-use crate::serve::serve;
-use crate::sink::Sinks;
+use crate::config::{self, Config, ConfigError, Publish, Source};
+use crate::daemon::{self, Engine, Outlet};
+use crate::health::{Health, Reporter};
+use crate::history::{self, Columns, Recorder};
+use crate::logs;
+use crate::output::{self, tell};
+use crate::record::{Names, Remarked};
 use crate::sink::shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer};
 use crate::source::desk::Desk;
 use crate::source::origin::Origin;
 use crate::source::queue::{Faults, Queue};
-use crate::source::raw::{self, Raw};
 use crate::source::{feed, rehearsal, shared};
 use crate::stop::Stop;
+use crate::web::{self, Board, Place};
 
 impl From<ConfigError> for CommandError {
     fn from(error: ConfigError) -> Self {
@@ -57,38 +60,73 @@ pub fn check(file: &Path) -> Result<(), CommandError> {
 /// [`CommandError`].
 pub fn run(file: &Path) -> Result<(), CommandError> {
     let config = Config::read(file)?;
+    logs::change(config.logs.form);
     let (ring, mut core) = build(&config)?;
     let stop = Stop::on_signals().map_err(CommandError::other)?;
-    let names = Names::of(&ring);
-    let publisher = Publisher::try_new(&config.publish.service, &config.publish.name, &names);
-    let health = HealthWriter::try_new(&config.publish.service, &config.publish.name, &names, &ring.corrector_names());
-    let health = health.map_err(CommandError::other)?;
-    let frames = config.publish.frames.as_deref().map(|service| FrameWriter::try_new(service, &config.publish.name));
-    let frames = frames.transpose().map_err(CommandError::other)?;
-    let server = RequestServer::try_new(&config.publish.service, &config.publish.name).map_err(CommandError::other)?;
-    let recording = recording(&config.machine.recording, &ring)?;
-    let desk = Desk::new(server, config.requests, recording.powered(&ring).into_owned());
-    let mut sinks = Sinks::default().with(Some(publisher.map_err(CommandError::other)?));
-    let model = raw::model_of(&mut core).map_err(CommandError::other)?;
-    let checkpoint = &config.checkpoint;
-    let resumed = checkpoint.file.as_deref().and_then(|path| raw::resume(&mut core, path, &model));
+    let model = daemon::model_of(&mut core).map_err(CommandError::other)?;
+    let checkpoint = config.checkpoint.file.as_deref();
+    let resumed = checkpoint.and_then(|path| daemon::resume(&mut core, path, &model));
     if let Some(head) = &resumed {
-        warn(format_args!("resumed after frame {}: {} frames, {} s ago", head.sequence, head.frames, head.age()));
+        tell(format_args!("resumed after frame {}: {} frames, {} s ago", head.sequence, head.frames, head.age()));
     }
     let queue = Queue::new(config.source.buffer_frames, resumed.as_ref().map_or(Faults::default(), |head| head.faults));
-    let keeper = checkpoint.file.as_deref().map(|path| Keeper::start(path, &queue));
-    let keeper = keeper.transpose().map_err(CommandError::other)?;
+    let outlet = outlet(&config, &ring, &core, &queue, resumed.as_ref())?;
     start(&config.source, &ring, &queue, &stop)?;
-    warn(format_args!("publishes on {}, takes frames from {}", config.publish.service, config.source.address));
-    let mut source = Raw::new(core, &names, queue, model, resumed.as_ref())
-        .with_health(health)
+    tell(format_args!("publishes on {}, takes frames from {}", config.publish.service, config.source.address));
+    let every = checkpoint.map(|_| config.checkpoint.checkpoint_every_frames);
+    let engine = Engine::new(core, queue, model, resumed.map(|head| head.sequence), every);
+    daemon::run(engine, outlet, &stop).map_err(CommandError::other)
+}
+
+/// Everything that takes estimates.
+fn outlet(
+    config: &Config,
+    ring: &Ring,
+    core: &Core,
+    queue: &Queue,
+    resumed: Option<&Head>,
+) -> Result<Outlet, CommandError> {
+    let (names, correctors) = (Names::of(ring), ring.corrector_names());
+    let Publish { service, name, frames } = &config.publish;
+    // first, as it refuses a second daemon
+    let server = RequestServer::try_new(service, name).map_err(CommandError::other)?;
+    let desk =
+        Desk::new(server, config.requests, recording(&config.machine.recording, ring)?.powered(ring).into_owned());
+    let publisher = Publisher::try_new(service, name, &names).map_err(CommandError::other)?;
+    let health = HealthWriter::try_new(service, name, &names, &correctors).map_err(CommandError::other)?;
+    let frames = frames.as_deref().map(|service| FrameWriter::try_alone(service, name)).transpose();
+    let kept =
+        resumed.map(|head| head.health.clone()).filter(|kept| kept.is_of(names.monitors.len(), correctors.len()));
+    let learnt = kept.unwrap_or_else(|| Health::new(&core.setup.noise, correctors.len()));
+    let reporter = Reporter::new(learnt, core.tables.sizes()).with(health);
+    let board = Board::new(queue.clone(), name, Place::of(ring), Arc::default());
+    let columns =
+        Columns { vars: names.vars.clone(), instruments: names.monitors.iter().chain(&correctors).cloned().collect() };
+    let recorder = recorder(&config.history, &columns, &board)?;
+    if let Some(address) = config.page.address {
+        let address = web::start(address, &board).map_err(CommandError::other)?;
+        tell(format_args!("the page is at http://{address}"));
+    }
+    let keeper = config.checkpoint.file.as_deref().map(|path| Keeper::start(path, queue)).transpose();
+    let remarked = resumed.map_or(Remarked::default(), |head| head.remarked);
+    Ok(Outlet::new(&names, publisher, reporter, remarked, &board)
         .with_requests(desk)
-        .with_frames(frames)
-        .with_checkpoints(keeper, checkpoint.checkpoint_every_frames);
-    let ended = serve(&mut source, &mut sinks, &stop, || {}).map(drop).map_err(CommandError::other);
-    let saved = source.finish().map_err(CommandError::other);
-    let finished = sinks.finish().map_err(CommandError::other);
-    ended.and(saved).and(finished)
+        .with_frames(frames.map_err(CommandError::other)?)
+        .with_checkpoints(keeper.map_err(CommandError::other)?)
+        .with_history(recorder))
+}
+
+/// The history, if one is kept; the page begins with what is there.
+fn recorder(config: &config::History, columns: &Columns, board: &Arc<Board>) -> Result<Option<Recorder>, CommandError> {
+    let Some(folder) = &config.folder else { return Ok(None) };
+    let plan = config.plan();
+    let keeper = history::Keeper::start(folder, &plan, columns, board.metrics.clone()).map_err(CommandError::other)?;
+    if let Ok(there) = history::read(folder, &history::Span::default()) {
+        board.remember(&there);
+    }
+    let megabytes = plan.most_bytes(columns).div_ceil(1_000_000);
+    tell(format_args!("keeps a history in {}, {megabytes} MB at most", folder.display()));
+    Ok(Some(Recorder::new(&plan, columns, keeper)))
 }
 
 /// Begin to put frames into the queue.

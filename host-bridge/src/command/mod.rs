@@ -9,6 +9,7 @@ pub mod diagnose;
 pub mod export;
 pub mod fit;
 pub mod frames;
+pub mod history;
 pub mod import;
 pub mod matrix;
 pub mod measure;
@@ -25,6 +26,7 @@ pub mod watch;
 use core::fmt::Display;
 use std::borrow::Cow;
 use std::path::Path;
+use std::sync::Arc;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use inference::campaign::furthest_stray;
@@ -148,7 +150,7 @@ fn stream_all(
 }
 
 /// The sinks that were asked for. Without shared memory a recording can still be replayed: that it is not published is said.
-fn sinks(publishing: &Publishing, trace: Option<&Path>, names: &Names) -> Result<Sinks, CommandError> {
+fn sinks(publishing: &Publishing, trace: Option<&Path>, names: &Arc<Names>) -> Result<Sinks, CommandError> {
     let trace = trace.map(Trace::create).transpose().map_err(CommandError::other)?;
     let publisher = (!publishing.no_publish).then(|| Publisher::try_new(&publishing.service, &publishing.name, names));
     let publisher = match publisher.transpose() {

@@ -1,5 +1,7 @@
 //! Every key of the configuration with its default, unit and range, and the check of a file against them.
 
+use core::net::SocketAddr;
+
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
@@ -221,6 +223,69 @@ pub const KEYS: &[Key] = &[
         is_required: false,
         kind: Kind::Whole(1, 1_000_000_000),
     },
+    Key {
+        section: "history",
+        name: "folder",
+        doc: "Folder of the history of estimates, made if it is not there; without it, none is kept",
+        range: "a path",
+        default: None,
+        is_required: false,
+        kind: Kind::Text(is_path),
+    },
+    Key {
+        section: "history",
+        name: "fine_ms",
+        doc: "An estimate is left out of the history if the one before in it is not as old as this",
+        range: "a whole number from 1 to 60000 (ms)",
+        default: Some("100"),
+        is_required: false,
+        kind: Kind::Whole(1, 60_000),
+    },
+    Key {
+        section: "history",
+        name: "fine_hours",
+        doc: "How long all others are kept",
+        range: "a whole number from 1 to 744 (h)",
+        default: Some("1"),
+        is_required: false,
+        kind: Kind::Whole(1, 744),
+    },
+    Key {
+        section: "history",
+        name: "minutes_days",
+        doc: "How long one a minute is kept",
+        range: "a whole number from 1 to 3653 (days)",
+        default: Some("31"),
+        is_required: false,
+        kind: Kind::Whole(1, 3653),
+    },
+    Key {
+        section: "history",
+        name: "hours_days",
+        doc: "How long one an hour is kept",
+        range: "a whole number from 1 to 36525 (days)",
+        default: Some("1826"),
+        is_required: false,
+        kind: Kind::Whole(1, 36_525),
+    },
+    Key {
+        section: "page",
+        name: "address",
+        doc: "Where the live page and the metrics are served; without it, they are not",
+        range: "a loopback address and a port, as 127.0.0.1:9464",
+        default: None,
+        is_required: false,
+        kind: Kind::Text(is_loopback),
+    },
+    Key {
+        section: "logs",
+        name: "form",
+        doc: "Form of what is said on stderr",
+        range: "\"plain\" or \"json\"",
+        default: Some("\"plain\""),
+        is_required: false,
+        kind: Kind::Text(|word| ["plain", "json"].contains(&word)),
+    },
 ];
 
 const NAME: &str = "1 to 127 printable ASCII characters, not beginning with iox2://";
@@ -234,6 +299,10 @@ fn is_origin(text: &str) -> bool {
         Ok(Origin::SharedMemory(service)) => is_name(&service),
         origin => origin.is_ok(),
     }
+}
+
+fn is_loopback(text: &str) -> bool {
+    text.parse().is_ok_and(|address: SocketAddr| address.ip().is_loopback())
 }
 
 fn is_name(text: &str) -> bool {

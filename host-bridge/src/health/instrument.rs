@@ -23,9 +23,12 @@ pub enum State {
 }
 
 impl State {
+    /// All of them, in the order of their codes.
+    pub const ALL: [Self; 5] = [Self::Ok, Self::Noisy, Self::Jumps, Self::Dead, Self::Back];
+
     /// The state of a code in shared memory.
     pub fn from_code(code: u32) -> Option<Self> {
-        [Self::Ok, Self::Noisy, Self::Jumps, Self::Dead, Self::Back].get(code as usize).copied()
+        Self::ALL.get(code as usize).copied()
     }
 
     /// In one word.

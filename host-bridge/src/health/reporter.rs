@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use estimator::{FitQuality, Sizes};
 
-use super::{Health, currents};
+use super::{Health, measured};
 use crate::output::warn;
 use crate::record::EstimateRecord;
 use crate::sink::shared_memory::HealthWriter;
@@ -30,12 +30,19 @@ impl Reporter {
         Self { health, sizes, writer: None, last: None, has_news: false }
     }
 
-    /// Learn from a frame and what became of it.
-    pub fn learn(&mut self, record: &EstimateRecord, frame: &[u8]) {
+    /// From now on published.
+    #[must_use]
+    pub fn with(mut self, writer: HealthWriter) -> Self {
+        self.writer = Some(writer);
+        self
+    }
+
+    /// Learn from a frame and what became of it; returns its readings [B] [m].
+    pub fn learn(&mut self, record: &EstimateRecord, frame: &[u8]) -> Option<Vec<Option<f32>>> {
         // the core has taken it: it can be read
-        if let Ok(currents) = currents(&self.sizes, frame) {
-            self.has_news |= self.health.learn(record, &currents);
-        }
+        let measured = measured(&self.sizes, frame).ok()?;
+        self.has_news |= self.health.learn(record, &measured.currents);
+        Some(measured.readings)
     }
 
     /// The core was reset.

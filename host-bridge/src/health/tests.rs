@@ -39,11 +39,11 @@ impl Machine {
             (row.sequence, row.time) = (number, f64::from(number));
             fault(number, &mut row);
             let mut wire = stream::wire(&self.recording, &row).unwrap();
-            let currents = currents(&self.core.tables.sizes(), &wire).unwrap();
+            let currents = measured(&self.core.tables.sizes(), &wire).unwrap().currents;
             assert_eq!(currents.len(), 48);
             let estimate = self.core.ingest(&mut wire).unwrap();
             self.core.prepare();
-            let record = EstimateRecord::of(&names, &estimate, |i| vec![0.0; i + 1], None);
+            let record = EstimateRecord::of(&names, estimate, &self.core.spread().covariance(), None);
             self.health.learn(&record, &currents);
         }
     }

@@ -63,6 +63,12 @@ pub enum PublishError {
         /// Why.
         reason: String,
     },
+    /// Two daemons would publish as one.
+    #[error("service {service}: another daemon publishes there; give each a publish.service of its own")]
+    Taken {
+        /// The service.
+        service: String,
+    },
     /// An estimate was not sent.
     #[error("service {service}: estimate {sequence} was not sent: {reason}")]
     Send {
@@ -98,6 +104,8 @@ pub struct Publisher {
     services: Services,
     name: Arc<str>,
     started_ns: u64,
+    /// The names of the records, as they were last.
+    text: (Arc<Names>, layout::Text),
 }
 
 impl Publisher {
@@ -106,16 +114,18 @@ impl Publisher {
     ///
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
-    pub fn try_new(service: &str, name: &str, names: &Names) -> Result<Self, PublishError> {
+    pub fn try_new(service: &str, name: &str, names: &Arc<Names>) -> Result<Self, PublishError> {
         let is_name = (1..=127).contains(&name.len()) && name.chars().all(|c| (' '..='~').contains(&c));
         if !is_name {
             return Err(PublishError::Name { name: name.to_owned() });
         }
         let services = Services::try_join(service, name)?;
-        let publisher = services.estimates.publisher_builder().initial_max_slice_len(layout::words_of(name, names));
+        let text = layout::Text::of(name, names);
+        let publisher = services.estimates.publisher_builder().initial_max_slice_len(text.words_of(names));
         let publisher = publisher.create().map_err(|e| join(service, "publisher", &e))?;
         let notifier = services.news.notifier_builder().create().map_err(|e| join(service, "notifier", &e))?;
-        let this = Self { notifier, publisher, services, name: name.into(), started_ns: now_ns() };
+        let (text, started_ns) = ((names.clone(), text), now_ns());
+        let this = Self { notifier, publisher, services, name: name.into(), started_ns, text };
         this.announce(); // readers connect now, before the first estimate
         Ok(this)
     }
@@ -125,22 +135,34 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Send`].
     pub fn publish(&mut self, record: &EstimateRecord) -> Result<(), PublishError> {
+        self.send(record)?;
+        self.announce();
+        Ok(())
+    }
+
+    /// Write a record into shared memory and stamp it; [`Publisher::announce`] is to follow, once for several records.
+    ///
+    /// # Errors
+    /// [`PublishError::Send`].
+    pub fn send(&mut self, record: &EstimateRecord) -> Result<(), PublishError> {
         let wrong = |reason: &dyn Display| PublishError::Send {
             service: self.services.name.clone(),
             sequence: record.sequence,
             reason: reason.to_string(),
         };
         let stamp = Stamp { publisher: self.name.clone(), started_ns: self.started_ns, published_ns: now_ns() };
-        let (header, payload) = layout::encode(record, &stamp);
+        if !Arc::ptr_eq(&self.text.0, &record.names) {
+            self.text = (record.names.clone(), layout::Text::of(&self.name, &record.names));
+        }
+        let (header, payload) = layout::encode(record, &stamp, &self.text.1);
         let mut sample = self.publisher.loan_slice_uninit(payload.len()).map_err(|e| wrong(&e))?;
         *sample.user_header_mut() = header;
         sample.write_from_slice(&payload).send().map_err(|e| wrong(&e))?;
-        self.announce();
         Ok(())
     }
 
     /// Wake the readers. One that cannot be woken looks for itself when its wait ends: no error of the writer's.
-    fn announce(&self) {
+    pub fn announce(&self) {
         let _ = self.notifier.notify();
     }
 }

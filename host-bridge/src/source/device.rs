@@ -16,7 +16,9 @@ impl Heard {
     /// What it says to every sink.
     pub fn record(&self, names: &Arc<Names>) -> Box<EstimateRecord> {
         // the alarm is a question of its own, which the line has no time for in every cycle
-        Box::new(EstimateRecord::of(names, &self.estimate, |i| (0..=i).map(|j| self.covariance(i, j)).collect(), None))
+        let vars = 0..self.estimate.mean.len();
+        let covariance: Vec<f32> = vars.flat_map(|i| (0..=i).map(move |j| self.covariance(i, j))).collect();
+        Box::new(EstimateRecord::of(names, self.estimate.clone(), &covariance, None))
     }
 }
 

@@ -16,7 +16,7 @@ use super::address::Address;
 use super::queue::Queue;
 use super::splitter::Splitter;
 use crate::config::{Role, Source, WhenFull};
-use crate::output::warn;
+use crate::output::{tell, warn};
 use crate::stop::Stop;
 
 /// Longest wait in the system before somebody's wish to stop is looked at.
@@ -154,7 +154,7 @@ impl Reader {
         while !self.stop.is_requested() {
             match self.door.next() {
                 Ok(Some(stream)) => {
-                    warn(format_args!("{}: connected", self.source.address));
+                    tell(format_args!("{}: connected", self.source.address));
                     let had_frames = self.read(stream);
                     // somebody who accepts and hangs up is not asked at once again
                     wait = if had_frames { first } else { wait };

@@ -5,6 +5,7 @@ use core::fmt;
 use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
@@ -45,6 +46,15 @@ impl fmt::Display for Faults {
     }
 }
 
+/// A frame as it came.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Arrived {
+    /// On the wire, with the zero byte at its end.
+    pub bytes: Vec<u8>,
+    /// When it was put into the queue.
+    pub at: Instant,
+}
+
 /// Both ends of it.
 #[derive(Debug, Clone)]
 pub struct Queue(Arc<Shared>);
@@ -60,15 +70,18 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct State {
-    frames: VecDeque<Vec<u8>>,
+    frames: VecDeque<Arrived>,
     faults: Faults,
     is_closed: bool,
+    /// The core waits for a frame; whoever brings one waits for room. Nobody else is woken, which is a call of the system.
+    is_awaited: bool,
+    waits_for_room: bool,
 }
 
 impl Queue {
     /// Empty, for so many frames, with these faults so far.
     pub fn new(room: usize, faults: Faults) -> Self {
-        let state = Mutex::new(State { frames: VecDeque::new(), faults, is_closed: false });
+        let state = Mutex::new(State { faults, ..State::default() });
         Self(Arc::new(Shared { state, news: Condvar::new(), space: Condvar::new(), room }))
     }
 
@@ -79,22 +92,28 @@ impl Queue {
             state.frames.pop_front();
             state.faults.dropped += 1;
         }
-        state.frames.push_back(frame);
+        self.put(state, frame);
+    }
+
+    fn put(&self, mut state: MutexGuard<'_, State>, bytes: Vec<u8>) {
+        state.frames.push_back(Arrived { bytes, at: Instant::now() });
+        let is_awaited = state.is_awaited;
         drop(state);
-        self.0.news.notify_one();
+        if is_awaited {
+            self.0.news.notify_one();
+        }
     }
 
     /// Put a frame in as soon as there is room, or somebody asks to stop: then it is left out.
     pub fn push_patiently(&self, frame: Vec<u8>, stop: &Stop) {
         let mut state = self.state();
         while state.frames.len() >= self.0.room && !stop.is_requested() {
+            state.waits_for_room = true;
             state = self.0.space.wait_timeout(state, GLANCE).unwrap_or_else(PoisonError::into_inner).0;
         }
         if !stop.is_requested() {
-            state.frames.push_back(frame);
+            self.put(state, frame);
         }
-        drop(state);
-        self.0.news.notify_one();
     }
 
     /// No more will come.
@@ -110,17 +129,31 @@ impl Queue {
     }
 
     /// Take the oldest frame; none if none comes for so long.
-    pub fn pop(&self, patience: Duration) -> Option<Vec<u8>> {
-        let is_idle = |state: &mut State| state.frames.is_empty() && !state.is_closed;
+    pub fn pop(&self, patience: Duration) -> Option<Arrived> {
+        let is_idle = |state: &mut State| {
+            state.is_awaited = state.frames.is_empty() && !state.is_closed;
+            state.is_awaited
+        };
         let wait = self.0.news.wait_timeout_while(self.state(), patience, is_idle);
-        let frame = wait.unwrap_or_else(PoisonError::into_inner).0.frames.pop_front();
-        self.0.space.notify_one();
+        let mut state = wait.unwrap_or_else(PoisonError::into_inner).0;
+        state.is_awaited = false;
+        let frame = state.frames.pop_front();
+        let waits_for_room = core::mem::take(&mut state.waits_for_room);
+        drop(state);
+        if waits_for_room {
+            self.0.space.notify_one();
+        }
         frame
+    }
+
+    /// Frames that wait.
+    pub fn len(&self) -> usize {
+        self.state().frames.len()
     }
 
     /// True if no frame waits.
     pub fn is_empty(&self) -> bool {
-        self.state().frames.is_empty()
+        self.len() == 0
     }
 
     /// Count what went wrong.
@@ -147,7 +180,7 @@ mod tests {
     fn the_oldest_is_dropped_and_counted() {
         let queue = Queue::new(3, Faults::default());
         (0..5).for_each(|i| queue.push(vec![i]));
-        let taken: Vec<_> = core::iter::from_fn(|| queue.pop(Duration::ZERO)).collect();
+        let taken: Vec<_> = core::iter::from_fn(|| Some(queue.pop(Duration::ZERO)?.bytes)).collect();
         assert_eq!(taken, [[2], [3], [4]]);
         assert_eq!((queue.faults().dropped, queue.is_empty()), (2, true));
     }
@@ -162,7 +195,7 @@ mod tests {
         });
         let mut taken = Vec::new();
         while !queue.is_over() {
-            taken.extend(queue.pop(Duration::from_secs(5)));
+            taken.extend(queue.pop(Duration::from_secs(5)).map(|frame| frame.bytes));
         }
         filler.join().unwrap();
         assert_eq!(taken, (0..100).map(|i| vec![i]).collect::<Vec<_>>());

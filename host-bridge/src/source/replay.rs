@@ -42,7 +42,7 @@ impl Source for Replay<'_> {
         let estimate = self.times.of(|| self.core.ingest(&mut bytes));
         let estimate = estimate.map_err(|error| format!("frame {}: {error}", row.sequence))?;
         let mismatch = self.core.fit_quality().is_mismatch();
-        let covariance = |i| self.core.covariance_row(i);
-        Ok(Next::Estimate(Box::new(EstimateRecord::of(&self.names, &estimate, covariance, Some(mismatch)))))
+        let covariance = self.core.spread().covariance();
+        Ok(Next::Estimate(Box::new(EstimateRecord::of(&self.names, estimate, &covariance, Some(mismatch)))))
     }
 }

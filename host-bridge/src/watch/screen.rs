@@ -2,14 +2,15 @@
 
 use std::collections::VecDeque;
 
-use estimator::MonitorState;
+use estimator::{FitQuality, MonitorState};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
-use super::WatchSummary;
+use super::{WatchSummary, band, ill};
+use crate::health::HealthRecord;
 use crate::output::lines;
 use crate::record::{EstimateRecord, ReadingUse};
 use crate::result::word;
@@ -19,18 +20,20 @@ use crate::sink::shared_memory::Published;
 const HEADER: u16 = 3;
 /// Width of mean, sigma, deviation and a gap.
 const NUMBERS: usize = 19;
-/// Bar and gap on a terminal of 80 columns.
-const BAR: usize = 4;
-/// Widest bar with its gap.
-const WIDEST_BAR: usize = 22;
-/// Deviation that fills half a bar [sigmas].
-const FULL_BAR: f32 = 5.0;
+/// Narrowest band with its gap.
+const BAND: usize = 12;
+/// Widest band with its gap.
+const WIDEST_BAND: usize = 44;
+/// Lines for the instruments that are not ok, where there is room.
+const ILL: usize = 6;
 /// Deviation from which a var stands out [sigmas].
 const NOTABLE: f32 = 2.0;
 /// Weaker than nominal: sky blue; stronger: orange. Told apart with any colour vision, and by the sign as well.
 const WEAKER: Color = Color::Indexed(74);
 /// See [`WEAKER`].
 const STRONGER: Color = Color::Indexed(214);
+/// Points of a trend.
+const TREND: usize = 60;
 /// Estimates over which the rate is taken.
 const RATE_OVER: usize = 64;
 
@@ -40,6 +43,10 @@ pub(super) struct Screen {
     latest: Option<Published>,
     /// Publication times of the last estimates of one publisher [ns].
     stamps: VecDeque<u64>,
+    /// Of its monitors and correctors, and the names of these.
+    health: Option<(HealthRecord, Vec<String>)>,
+    /// Rate, and chi-square per degree of freedom, once a second.
+    trend: VecDeque<[f64; 2]>,
 }
 
 /// How the vars are laid out.
@@ -55,16 +62,22 @@ struct Grid {
 }
 
 impl Grid {
-    /// As many columns as have room for bars; without bars, if that shows all vars; and no more vars than fit.
+    /// As many columns as have room for bands; without bands, if that shows all vars; and no more vars than fit.
     fn of(record: &EstimateRecord, width: usize, height: usize) -> Self {
         let vars = record.mean.len();
         let name = 1 + record.names.vars.iter().map(|name| name.chars().count()).max().unwrap_or(0);
         let cell = name + NUMBERS;
-        let with_bars = (width / (cell + BAR)).max(1);
-        let columns = if vars.div_ceil(with_bars) <= height { with_bars } else { (width / cell).max(1) };
+        let with_bands = (width / (cell + BAND)).max(1);
+        let columns = if vars.div_ceil(with_bands) <= height { with_bands } else { (width / cell).max(1) };
         let is_whole = vars.div_ceil(columns) <= height;
         let rows = if is_whole { vars.div_ceil(columns) } else { height.saturating_sub(1) };
-        Self { columns, rows, width: (width / columns).min(cell + WIDEST_BAR), name, shown: vars.min(rows * columns) }
+        Self { columns, rows, width: (width / columns).min(cell + WIDEST_BAND), name, shown: vars.min(rows * columns) }
+    }
+
+    /// Columns for a band and its gap; none where they are too few.
+    fn room(&self) -> usize {
+        let room = self.width.saturating_sub(self.name + NUMBERS);
+        if room < BAND { 0 } else { room }
     }
 
     /// Lines with the title, and the count of what is left out.
@@ -75,7 +88,24 @@ impl Grid {
 
 impl Screen {
     pub(super) fn new(service: String) -> Self {
-        Self { service, latest: None, stamps: VecDeque::with_capacity(RATE_OVER) }
+        Self { service, latest: None, stamps: VecDeque::new(), health: None, trend: VecDeque::new() }
+    }
+
+    /// Health as it came last.
+    pub(super) fn take_health(&mut self, health: HealthRecord, correctors: Vec<String>) {
+        self.health = Some((health, correctors));
+    }
+
+    /// A second has gone by.
+    pub(super) fn tick(&mut self) {
+        let fit =
+            self.health.as_ref().map(|(health, _)| health.fit.chi_square / health.fit.degrees_of_freedom.max(1.0));
+        if let Some(fit) = fit {
+            if self.trend.len() == TREND {
+                self.trend.pop_front();
+            }
+            self.trend.push_back([self.hertz().unwrap_or(0.0), f64::from(fit)]);
+        }
     }
 
     pub(super) fn take(&mut self, published: &Published) {
@@ -97,15 +127,38 @@ impl Screen {
             return frame.render_widget(Paragraph::new(text), area);
         };
         let record = &published.record;
-        // a title above the vars, a line of monitors below
-        let grid = Grid::of(record, width, height.saturating_sub(usize::from(HEADER) + 2));
+        // a title above the vars, a line of monitors below; more of them where there is room
+        let least = height.saturating_sub(usize::from(HEADER) + 2);
+        let grid = Grid::of(record, width, least.saturating_sub(ILL));
+        let grid = if grid.shown < record.mean.len() { Grid::of(record, width, least) } else { grid };
         let heights =
             [Constraint::Length(HEADER), Constraint::Length(grid.height(record.mean.len())), Constraint::Min(1)];
         let [top, middle, bottom] = Layout::vertical(heights).areas(area);
         frame.render_widget(Paragraph::new(self.header(published, summary, now_ns)), top);
         frame.render_widget(Paragraph::new(vars(record, &grid)), middle);
-        let lines = unwell(record, width, usize::from(bottom.height));
+        let lines = self.below(record, width, usize::from(bottom.height));
         frame.render_widget(Paragraph::new(lines.into_iter().map(Line::from).collect::<Vec<_>>()), bottom);
+    }
+
+    /// Instruments that are not ok, and how rate and fit went where there is room.
+    fn below(&self, record: &EstimateRecord, width: usize, height: usize) -> Vec<String> {
+        let Some((health, correctors)) = &self.health else { return unwell(record, width, height) };
+        let trends = if height >= 4 { self.trends() } else { Vec::new() };
+        let gap = usize::from(height > trends.len() + 2);
+        let mut lines = vec![String::new(); gap];
+        lines.extend(ill::lines(record, health, correctors, height - trends.len() - gap));
+        lines.extend(trends);
+        lines
+    }
+
+    /// The last minute.
+    fn trends(&self) -> Vec<String> {
+        let line = |what: &str, which: usize| {
+            let values: Vec<f64> = self.trend.iter().map(|point| point[which]).collect();
+            let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+            format!("{what:<10} {} {low:.3} to {high:.3}", sparks(&values, low, high))
+        };
+        if self.trend.len() < 2 { Vec::new() } else { vec![line("rate/Hz", 0), line("chi2/dof", 1)] }
     }
 
     fn header(&self, published: &Published, summary: &WatchSummary, now_ns: u64) -> Vec<Line<'static>> {
@@ -119,7 +172,12 @@ impl Screen {
         let second = format!(
             "frames {frames}, {refused} refused, {aside} put aside  seen {seen}  lost {lost}  restarts {restarts}  q quits"
         );
-        let third = format!("from {}: {}", stamp.publisher, record.names.machine);
+        let fit = self.health.as_ref().map_or(String::new(), |(health, _)| {
+            let FitQuality { chi_square, degrees_of_freedom } = health.fit;
+            let (ratio, excess) = (chi_square / degrees_of_freedom.max(1.0), health.fit.excess());
+            format!("  chi2/dof {ratio:.3} ({excess:+.1} sigma)")
+        });
+        let third = format!("from {}: {}{fit}", stamp.publisher, record.names.machine);
         let mismatch = (record.mismatch == Some(true)).then_some("MISMATCH beyond noise");
         let alarm: String = mismatch.into_iter().chain(record.words()).map(|word| format!("{word}  ")).collect();
         let bold = Style::new().add_modifier(Modifier::BOLD);
@@ -132,19 +190,28 @@ impl Screen {
 
     /// Rate of the last estimates, by their publication.
     fn rate(&self) -> String {
+        self.hertz().map_or_else(|| "- Hz".to_owned(), |hertz| format!("{hertz:.1} Hz"))
+    }
+
+    fn hertz(&self) -> Option<f64> {
         let (first, last) = (self.stamps.front().copied().unwrap_or(0), self.stamps.back().copied().unwrap_or(0));
         let seconds = last.saturating_sub(first) as f64 * 1e-9;
         let periods = self.stamps.len().saturating_sub(1) as f64;
-        if seconds > 0.0 { format!("{:.1} Hz", periods / seconds) } else { "- Hz".to_owned() }
+        (seconds > 0.0).then(|| periods / seconds)
     }
 }
 
-/// Vars down the columns, each with mean, sigma, deviation from 1, and a bar of it.
+/// Vars down the columns, each with mean, sigma, deviation from 1, and its band against nominal.
 fn vars(record: &EstimateRecord, grid: &Grid) -> Vec<Line<'static>> {
     let Grid { columns, rows, width, name, shown } = *grid;
-    let title = format!("{:<name$}{:>6}{:>6}{:>6}", "var", "mean", "sd/%", "dev");
+    let reach = band::reach(record);
+    let title = format!("{:<name$}{:>6}{:>6}{:>6} ", "var", "mean", "sd/%", "dev");
+    let title = match grid.room().checked_sub(13) {
+        Some(more) => format!("{title}{:<1$.3}1{2:>1$.3} ", 1.0 - reach, 5 + more / 2, 1.0 + reach),
+        None => title,
+    };
     let title = Span::styled(format!("{title:<width$}").repeat(columns), Style::new().add_modifier(Modifier::DIM));
-    let cells = |row| (row..shown).step_by(rows).flat_map(|i| cell(record, i, grid));
+    let cells = |row| (row..shown).step_by(rows).flat_map(|i| cell(record, i, grid, reach));
     let left_out = record.mean.len() - shown;
     let left_out = (left_out > 0).then(|| {
         let var = if left_out == 1 { "var" } else { "vars" };
@@ -153,15 +220,15 @@ fn vars(record: &EstimateRecord, grid: &Grid) -> Vec<Line<'static>> {
     core::iter::once(Line::from(title)).chain((0..rows).map(|row| cells(row).collect())).chain(left_out).collect()
 }
 
-fn cell(record: &EstimateRecord, i: usize, grid: &Grid) -> [Span<'static>; 2] {
+fn cell(record: &EstimateRecord, i: usize, grid: &Grid, reach: f32) -> [Span<'static>; 2] {
     let deviation = record.deviation(i);
     let style = Style::new().fg(if deviation < 0.0 { WEAKER } else { STRONGER });
     let style = if deviation.abs() < NOTABLE { Style::new() } else { style };
     let (name, mean, percent) = (&record.names.vars[i], record.mean[i], 100.0 * record.sigma[i]);
     let text = format!("{name:<0$}{mean:>6.4}{percent:>6.2}{deviation:>+6.1} ", grid.name);
-    let room = grid.width.saturating_sub(grid.name + NUMBERS);
-    let bar = bar(deviation, room.saturating_sub(1));
-    [Span::styled(text, style), Span::styled(format!("{bar:<room$}"), style)]
+    let room = grid.room();
+    let band = band::band(mean, record.sigma[i], reach, room.saturating_sub(1));
+    [Span::styled(text, style), Span::styled(format!("{band:<room$}"), style)]
 }
 
 /// Monitors that are not ok, with their noise, in this many lines; how many more there are.
@@ -184,15 +251,11 @@ fn unwell(record: &EstimateRecord, width: usize, height: usize) -> Vec<String> {
     (0..=unwell.len()).rev().map(told).find(|lines| lines.len() <= height).unwrap_or_default()
 }
 
-/// A bar from the middle, to the left for a deviation below zero; nothing if there is no room.
-fn bar(deviation: f32, width: usize) -> String {
-    let half = width / 2;
-    if half == 0 {
-        return String::new();
-    }
-    let filled = (deviation.abs() / FULL_BAR * half as f32).round().min(half as f32) as usize;
-    let (blank, full) = (" ".repeat(half - filled), "█".repeat(filled));
-    if deviation < 0.0 { format!("{blank}{full}│") } else { format!("{}│{full}", " ".repeat(half)) }
+/// Values as a line of bars between two ends.
+fn sparks(values: &[f64], low: f64, high: f64) -> String {
+    const BARS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+    let share = |value: &f64| if high > low { (value - low) / (high - low) } else { 0.5 };
+    values.iter().map(|value| BARS[((share(value) * 8.0) as usize).min(7)]).collect()
 }
 
 /// A time span in a unit that suits it.
@@ -209,6 +272,7 @@ mod tests {
     use ratatui::backend::TestBackend;
 
     use super::*;
+    use crate::health::{Condition, State};
     use crate::record::Names;
     use crate::record::tests::record;
     use crate::sink::shared_memory::layout::Stamp;
@@ -291,11 +355,28 @@ mod tests {
     }
 
     #[test]
-    fn bars_grow_from_the_middle() {
-        assert_eq!(bar(0.0, 11), "     │");
-        assert_eq!(bar(2.0, 11), "     │██");
-        assert_eq!(bar(-3.0, 11), "  ███│");
-        assert_eq!(bar(-99.0, 11), "█████│");
-        assert_eq!(bar(1.0, 1), "");
+    fn with_room_there_are_bands_health_and_trends() {
+        let mut screen = filled(&booster());
+        let ok = Condition { state: State::Ok, ratios: [1.0, 0.0, 0.0] };
+        let mut monitors = vec![ok; 33];
+        monitors[4] = Condition { state: State::Dead, ratios: [1.0, 0.0, 1.0] };
+        let fit = FitQuality { chi_square: 990.0, degrees_of_freedom: 1000.0 };
+        let health = HealthRecord { sequence: 345, frames: 346, fit, monitors, correctors: vec![ok; 48] };
+        screen.take_health(health, twin::Ring::booster().corrector_names());
+        (0..70).for_each(|_| screen.tick());
+        let text = drawn(&screen, 120, 40);
+        assert!(text.contains("chi2/dof 0.990 (-0.2 sigma)"), "{text}");
+        assert!(text.contains("dead   missing or without effect in 100 % of its frames"), "{text}");
+        assert!(text.contains("F7 0.9580  0.30 -14.0 ") && text.contains("●"), "{text}");
+        assert!(text.contains("rate/Hz    ▅") && text.contains("10.000 to 10.000"), "{text}");
+        for (width, height) in [(1, 1), (80, 24), (90, 30), (400, 10)] {
+            drawn(&screen, width, height);
+        }
+    }
+
+    #[test]
+    fn a_trend_goes_from_the_lowest_to_the_highest() {
+        assert_eq!(sparks(&[0.0, 1.0, 0.5], 0.0, 1.0), "▁█▅");
+        assert_eq!(sparks(&[2.0], 2.0, 2.0), "▅");
     }
 }

@@ -11,16 +11,22 @@ use super::screen::Screen;
 use super::{WatchOptions, WatchSummary};
 use crate::record::{EstimateRecord, ReadingUse};
 use crate::sink::shared_memory::layout::Stamp;
-use crate::sink::shared_memory::{Published, now_ns};
+use crate::sink::shared_memory::{HealthReader, Published, now_ns};
 
 /// Time between two pictures: what an eye can follow.
 const REDRAW: Duration = Duration::from_millis(100);
+
+/// Time between two points of a trend.
+const TICK: Duration = Duration::from_secs(1);
 
 /// The live table; the terminal is as before once this is gone, after a panic too.
 pub(super) struct Live {
     terminal: DefaultTerminal,
     screen: Screen,
     drawn: Instant,
+    ticked: Instant,
+    /// None where the daemon's health cannot be read: monitors are then shown as the core judges them.
+    health: Option<HealthReader>,
 }
 
 /// Where estimates are shown.
@@ -43,7 +49,8 @@ impl View {
             return Ok(if is_open { Self::Lines { from: None } } else { Self::Silent });
         }
         let screen = Screen::new(options.service.clone());
-        let mut live = Box::new(Live { terminal: ratatui::try_init()?, screen, drawn: Instant::now() });
+        let (health, now) = (HealthReader::try_new(&options.service).ok(), Instant::now());
+        let mut live = Box::new(Live { terminal: ratatui::try_init()?, screen, drawn: now, ticked: now, health });
         live.draw(&WatchSummary::default())?;
         Ok(Self::Live(live))
     }
@@ -64,6 +71,14 @@ impl View {
 impl Live {
     fn show(&mut self, published: &[Published], summary: &WatchSummary) -> io::Result<bool> {
         published.iter().for_each(|one| self.screen.take(one));
+        if let Some((health, names)) = self.health.as_mut().and_then(|reader| reader.newest_with_names().ok().flatten())
+        {
+            self.screen.take_health(health, names);
+        }
+        if self.ticked.elapsed() >= TICK {
+            self.ticked = Instant::now();
+            self.screen.tick();
+        }
         if self.drawn.elapsed() >= REDRAW {
             self.draw(summary)?;
         }

@@ -146,7 +146,8 @@ fn expect_one_core(survivors: &Survivors) {
         (0..record.remarks.slices).for_each(|_| _ = core.slice());
         let estimate = core.ingest(&mut frames.wire(record.sequence)).unwrap();
         let mismatch = core.fit_quality().is_mismatch();
-        let mut expected = EstimateRecord::of(&names, &estimate, |i| core.covariance_row(i), Some(mismatch));
+        let covariance = core.spread().covariance();
+        let mut expected = EstimateRecord::of(&names, estimate, &covariance, Some(mismatch));
         expected.remarked = record.remarked;
         expected.tables = Some(core.tables.digest::<LINE>());
         assert_eq!(numbers(record), numbers(&expected), "frame {}", record.sequence);

@@ -1,7 +1,11 @@
 //! `orbitcal serve CONFIG.toml` as operators run it: a process that is fed, read through shared memory, and killed.
 
+mod clients;
 mod faults;
+mod history;
 mod kills;
+mod operation;
+mod page;
 mod place;
 mod requests;
 mod soak;

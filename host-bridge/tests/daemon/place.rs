@@ -42,9 +42,14 @@ impl Place {
 
     /// Add lines to the section of the source.
     pub fn append_to_source(&self, lines: &str) {
+        self.change("[publish]", &format!("{lines}[publish]"));
+    }
+
+    /// Replace words of the configuration where they first stand.
+    pub fn change(&self, from: &str, to: &str) {
         let config = self.path("config.toml");
         let text = fs::read_to_string(&config).unwrap();
-        fs::write(&config, text.replacen("[publish]", &format!("{lines}[publish]"), 1)).unwrap();
+        fs::write(&config, text.replacen(from, to, 1)).unwrap();
     }
 
     /// A daemon there; what it says is added to the file `said`.

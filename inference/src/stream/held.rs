@@ -15,7 +15,8 @@ pub trait Stream: fmt::Debug + Send + Sync {
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable>;
     fn fit_quality(&mut self) -> FitQuality;
     fn covariance(&self, i: usize, j: usize) -> f32;
-    fn covariance_row(&self, i: usize) -> Vec<f32>;
+    fn inverse_factor(&self) -> Vec<f64>;
+    fn fitted(&self) -> Vec<f32>;
     fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError>;
     fn load(&mut self, from: &[u8]) -> Result<(), StateError>;
     fn state_layout(&mut self) -> u32;
@@ -34,6 +35,10 @@ pub trait Room: Core + Clone + Send + Sync + 'static {
     fn setup(tables: &Self::Tables, setup: &Setup) -> Self::Setup;
     /// Without spare slots.
     fn estimate(tables: &Self::Tables, estimate: &Self::Estimate) -> Estimate;
+    /// What its covariance is made of.
+    fn inverse_factor(&self) -> &[f64];
+    /// What it expects of the readings of the last frame [B] [m].
+    fn fitted(&self, tables: &Self::Tables) -> Vec<f32>;
 }
 
 impl<
@@ -58,6 +63,15 @@ where
 
     fn estimate(tables: &G, estimate: &Self::Estimate) -> Estimate {
         Estimate::of(estimate, &tables.layout())
+    }
+
+    fn inverse_factor(&self) -> &[f64] {
+        self.inverse_factor()
+    }
+
+    fn fitted(&self, tables: &G) -> Vec<f32> {
+        let layout = tables.layout();
+        (0..layout.monitors()).map(|b| self.fitted(layout.monitor(b))).collect()
     }
 }
 
@@ -122,8 +136,12 @@ where
         self.core.covariance(i, j)
     }
 
-    fn covariance_row(&self, i: usize) -> Vec<f32> {
-        self.core.covariance_row(i).as_ref().to_vec()
+    fn inverse_factor(&self) -> Vec<f64> {
+        <E as Room>::inverse_factor(&self.core).to_vec()
+    }
+
+    fn fitted(&self) -> Vec<f32> {
+        <E as Room>::fitted(&self.core, &self.tables)
     }
 
     fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError> {

@@ -38,6 +38,7 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
+    println!("other work: load {}", fs::read_to_string("/proc/loadavg")?.trim());
     println!("{:>6} {:>8} {:>8} {:>8}  latency [us]: median, 99 %, 99.9 %, largest", "Hz", "frames", "lost", "late");
     for (hertz, seconds) in [(10_000, options.seconds), (1_000, 20)] {
         println!("{}", measure(&options, hertz, seconds)?);
@@ -76,7 +77,7 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
     let mut subscriber = Subscriber::try_new(&service)?;
     let said = fs::File::create(folder.path().join("said"))?;
     let mut command = Command::new(&options.program);
-    let _daemon = Daemon(command.arg("serve").arg(&config).stdin(Stdio::null()).stderr(said).spawn()?);
+    let daemon = Daemon(command.arg("serve").arg(&config).stdin(Stdio::null()).stderr(said).spawn()?);
     let line = connect(port)?;
     let sent: Vec<AtomicU64> = frames.iter().map(|_| AtomicU64::new(0)).collect();
     let start = Instant::now();
@@ -93,9 +94,25 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
         latencies.get(index.min(latencies.len().saturating_sub(1))).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
     };
     let quantiles: Vec<String> = [0.5, 0.99, 0.999, 1.0].iter().map(|share| format!("{:.0}", at(*share))).collect();
+    let threads = threads(daemon.0.id(), latencies.len());
     let said = fs::read_to_string(folder.path().join("said"))?;
     let faults: Vec<&str> = said.lines().filter(|line| line.contains("so far")).collect();
-    Ok(format!("{hertz:>6} {:>8} {lost:>8} {late:>8}  {} {}", frames.len(), quantiles.join(", "), faults.join("; ")))
+    let (count, quantiles, faults) = (frames.len(), quantiles.join(", "), faults.join("; "));
+    Ok(format!("{hertz:>6} {count:>8} {lost:>8} {late:>8}  {quantiles} {faults}\n       {threads}"))
+}
+
+/// Time that each thread of the daemon has run for a frame, and waited for a processor [us], by the kernel.
+fn threads(process: u32, frames: usize) -> String {
+    let of = |task: fs::DirEntry| {
+        let read = |name: &str| fs::read_to_string(task.path().join(name)).ok();
+        let (name, times) = (read("comm")?, read("schedstat")?);
+        let us = |ns: &str| ns.parse::<f64>().ok().map(|ns| ns * 1e-3 / frames.max(1) as f64);
+        let mut times = times.split_whitespace();
+        let (ran, waited) = (us(times.next()?)?, us(times.next()?)?);
+        (ran > 0.5).then(|| format!("{} {ran:.0} (waited {waited:.0})", name.trim()))
+    };
+    let tasks = fs::read_dir(format!("/proc/{process}/task")).into_iter().flatten().flatten();
+    format!("us a frame: {}", tasks.filter_map(of).collect::<Vec<_>>().join(", "))
 }
 
 /// Frames of a recording again and again.

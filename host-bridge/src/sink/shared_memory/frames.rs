@@ -7,7 +7,7 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::{publisher, subscriber};
 use iceoryx2::prelude::{AllocationStrategy, ipc};
-use iceoryx2::service::port_factory::{event, publish_subscribe};
+use iceoryx2::service::port_factory::{PortFactory as _, event, publish_subscribe};
 
 use super::services::{join, joined, news};
 use super::{BUFFER, PUBLISHERS, PublishError, SUBSCRIBERS};
@@ -53,6 +53,18 @@ impl FrameWriter {
         let publisher = publisher.initial_max_slice_len(1024).create().map_err(|e| join(name, "publisher", &e))?;
         let notifier = service.news.notifier_builder().create().map_err(|e| join(name, "notifier", &e))?;
         Ok(Self { publisher, notifier, service })
+    }
+
+    /// The same where nobody else may send: frames of two machines would be one stream.
+    ///
+    /// # Errors
+    /// [`PublishError::Name`], [`PublishError::Join`] or [`PublishError::Taken`].
+    pub fn try_alone(name: &str, who: &str) -> Result<Self, PublishError> {
+        let service = Frames::try_join(name, who)?;
+        match service.frames.dynamic_config().number_of_publishers() {
+            0 => Self::try_new(name, who),
+            _ => Err(PublishError::Taken { service: name.to_owned() }),
+        }
     }
 
     /// Send one frame to everybody who reads; waits for nobody.
@@ -124,5 +136,9 @@ mod tests {
         let mut heard = Vec::new();
         reader.wait(Duration::from_secs(5), |frame| heard.push(frame.to_vec())).unwrap();
         assert_eq!(heard, sent);
+        let second = FrameWriter::try_alone(&name, "a daemon").err().unwrap().to_string();
+        assert!(second.contains("another daemon publishes there"), "{second}");
+        drop(writer);
+        FrameWriter::try_alone(&name, "a daemon").unwrap();
     }
 }

@@ -149,9 +149,20 @@ impl HealthReader {
     /// # Errors
     /// [`PublishError::Receive`], also for what is no record.
     pub fn newest(&mut self) -> Result<Option<HealthRecord>, PublishError> {
+        Ok(self.newest_with_names()?.map(|(record, _)| record))
+    }
+
+    /// The same with the names of the correctors.
+    ///
+    /// # Errors
+    /// [`PublishError::Receive`], also for what is no record.
+    pub fn newest_with_names(&mut self) -> Result<Option<(HealthRecord, Vec<String>)>, PublishError> {
         let mut newest = None;
         while let Some(sample) = self.subscriber.receive().map_err(|e| self.wrong(&e))? {
-            newest = Some(decode(sample.user_header(), sample.payload()).ok_or_else(|| self.wrong(&"no record"))?);
+            let (header, payload) = (sample.user_header(), sample.payload());
+            let record = decode(header, payload).ok_or_else(|| self.wrong(&"no record"))?;
+            let names = correctors(header, payload, record.monitors.len() + record.correctors.len());
+            newest = Some((record, names));
         }
         Ok(newest)
     }
@@ -177,6 +188,15 @@ fn decode(header: &HealthHeader, payload: &[u32]) -> Option<HealthRecord> {
     Some(HealthRecord { sequence: header.sequence, frames: header.frames, fit, monitors: all, correctors })
 }
 
+/// Names of the correctors in the text behind the numbers of so many instruments.
+fn correctors(header: &HealthHeader, payload: &[u32], instruments: usize) -> Vec<String> {
+    let words = payload.get(4 * instruments..).unwrap_or_default();
+    let mut text: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    text.truncate(header.text_bytes as usize);
+    let text = String::from_utf8_lossy(&text);
+    text.lines().skip(1 + header.monitors as usize).map(str::to_owned).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -197,7 +217,7 @@ mod tests {
         (1..=3).for_each(|sequence| writer.publish(&record(sequence)).unwrap());
         let mut reader = HealthReader::try_new(&service).unwrap();
         writer.publish(&record(4)).unwrap();
-        assert_eq!(reader.newest().unwrap(), Some(record(4)));
+        assert_eq!(reader.newest_with_names().unwrap(), Some((record(4), vec!["H_A1".to_owned()])));
         assert_eq!(reader.newest().unwrap(), None);
         assert_eq!(core::mem::size_of::<HealthHeader>(), 48);
         let payload = writer.payload(&record(4));

@@ -92,21 +92,31 @@ const fn words(vars: usize, monitors: usize, text_bytes: usize) -> usize {
     6 * vars + vars * (vars + 1) / 2 + 4 * monitors + text_bytes.div_ceil(4)
 }
 
-/// Words of every record with these names.
-pub(super) fn words_of(publisher: &str, names: &Names) -> usize {
-    words(names.vars.len(), names.monitors.len(), text(publisher, names).len())
+/// The names at the end of every record of a publisher and a machine: made once.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Text {
+    words: Vec<u32>,
+    bytes: usize,
 }
 
-fn text(publisher: &str, names: &Names) -> String {
-    let all = [publisher, names.machine.as_str()].into_iter();
-    let all = all.chain(names.vars.iter().chain(&names.monitors).map(String::as_str));
-    // a name with a line feed in it would be two
-    all.map(|name| name.replace('\n', " ") + "\n").collect()
+impl Text {
+    /// Of these names.
+    pub fn of(publisher: &str, names: &Names) -> Self {
+        let all = [publisher, names.machine.as_str()].into_iter();
+        let all = all.chain(names.vars.iter().chain(&names.monitors).map(String::as_str));
+        // a name with a line feed in it would be two
+        let text: String = all.map(|name| name.replace('\n', " ") + "\n").collect();
+        Self { words: text.as_bytes().chunks(4).map(word).collect(), bytes: text.len() }
+    }
+
+    /// Words of every record that ends in it.
+    pub(super) fn words_of(&self, names: &Names) -> usize {
+        words(names.vars.len(), names.monitors.len(), self.bytes)
+    }
 }
 
-/// A record as header and words.
-pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
-    let text = text(&stamp.publisher, &record.names);
+/// A record as header and words, with the text of its names and its publisher.
+pub fn encode(record: &EstimateRecord, stamp: &Stamp, text: &Text) -> (Header, Vec<u32>) {
     let header = Header {
         time_us: record.time_us,
         started_ns: stamp.started_ns,
@@ -121,7 +131,7 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         tune_innovation: record.tune_innovation.map(|tune| tune.unwrap_or(f32::NAN)),
         vars: record.mean.len() as u32,
         monitors: record.reading.len() as u32,
-        text_bytes: text.len() as u32,
+        text_bytes: text.bytes as u32,
         remarks: said(&record.remarks),
         put_aside_frames: record.remarked.put_aside_frames,
         baselines_moved: record.remarked.baselines_moved,
@@ -129,7 +139,7 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
         tables: record.tables.unwrap_or_default(),
         usable: u32::from(record.is_usable()),
     };
-    let mut payload = Vec::with_capacity(words(record.mean.len(), record.reading.len(), text.len()));
+    let mut payload = Vec::with_capacity(text.words_of(&record.names));
     let params = [&record.map_params, &record.centre, &record.params_sigma];
     for values in [&record.mean, &record.sigma].into_iter().chain(params) {
         payload.extend(values.iter().map(|value| value.to_bits()));
@@ -140,7 +150,7 @@ pub fn encode(record: &EstimateRecord, stamp: &Stamp) -> (Header, Vec<u32>) {
     payload.extend(record.monitor_state.iter().map(|state| *state as u32));
     payload.extend(record.monitor_sigma.iter().map(|value| value.to_bits()));
     payload.extend(&record.monitor_rejected);
-    payload.extend(text.as_bytes().chunks(4).map(word));
+    payload.extend(&text.words);
     (header, payload)
 }
 
@@ -162,11 +172,15 @@ pub(super) fn word(bytes: &[u8]) -> u32 {
     u32::from_le_bytes(all)
 }
 
-/// The record of a sample, and who published it.
+/// The record of a sample, and who published it; the names of the one before are `known`, and those of this one are from then on.
 ///
 /// # Errors
 /// [`LayoutError`] if they do not fit each other, which a publisher of this version does not do.
-pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp), LayoutError> {
+pub fn decode(
+    header: &Header,
+    payload: &[u32],
+    known: &mut Option<Known>,
+) -> Result<(EstimateRecord, Stamp), LayoutError> {
     let &Header { vars, monitors, text_bytes, .. } = header;
     let [n, b, bytes] = [vars, monitors, text_bytes].map(|count| count as usize);
     let (expected, found) = (words(n, b, bytes), payload.len());
@@ -181,9 +195,9 @@ pub fn decode(header: &Header, payload: &[u32]) -> Result<(EstimateRecord, Stamp
     let monitor_state = words.take(b).iter().map(|code| state(*code)).collect::<Result<_, _>>()?;
     let monitor_sigma = words.floats(b);
     let monitor_rejected = words.take(b).to_vec();
-    let (publisher, names) = names(words.0, bytes, n, b)?;
+    let (publisher, names) = Known::of(known, words.0, [bytes, n, b])?;
     let record = EstimateRecord {
-        names: Arc::new(names),
+        names,
         sequence: header.sequence,
         time_us: header.time_us,
         frames: header.frames,
@@ -246,6 +260,30 @@ fn state(code: u32) -> Result<MonitorState, LayoutError> {
     known.ok_or(LayoutError::Code { what: "a monitor's state", found: code })
 }
 
+/// Names that were read before: a publisher sends the same ones with every record.
+#[derive(Debug, Clone)]
+pub struct Known {
+    words: Vec<u32>,
+    sizes: [usize; 3],
+    publisher: Arc<str>,
+    names: Arc<Names>,
+}
+
+impl Known {
+    /// The names in these words, which are of so many bytes, of `n` vars and `b` monitors.
+    fn of(known: &mut Option<Self>, words: &[u32], sizes: [usize; 3]) -> Result<(Arc<str>, Arc<Names>), LayoutError> {
+        let is_same = |known: &&mut Self| known.sizes == sizes && known.words == words;
+        if let Some(known) = known.as_mut().filter(is_same) {
+            return Ok((known.publisher.clone(), known.names.clone()));
+        }
+        let [bytes, n, b] = sizes;
+        let (publisher, names) = names(words, bytes, n, b)?;
+        let names = Arc::new(names);
+        *known = Some(Self { words: words.to_vec(), sizes, publisher: publisher.clone(), names: names.clone() });
+        Ok((publisher, names))
+    }
+}
+
 /// The publisher's name, and those of a ring of `n` vars and `b` monitors.
 fn names(words: &[u32], bytes: usize, n: usize, b: usize) -> Result<(Arc<str>, Names), LayoutError> {
     let mut text: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
@@ -274,6 +312,22 @@ mod tests {
         Stamp { publisher: "control room".into(), started_ns: 7, published_ns: 9 }
     }
 
+    fn encoded(record: &EstimateRecord) -> (Header, Vec<u32>) {
+        encode(record, &stamp(), &Text::of("control room", &record.names))
+    }
+
+    #[test]
+    fn names_that_are_known_are_the_same_and_others_are_read() {
+        let mut known = None;
+        let mut read = |record: &EstimateRecord| {
+            let (header, payload) = encoded(record);
+            decode(&header, &payload, &mut known).unwrap().0
+        };
+        let (one, same, other) = (read(&record(3, 2)), read(&record(3, 2)), read(&record(2, 3)));
+        assert!(Arc::ptr_eq(&one.names, &same.names));
+        assert_eq!(other.names, record(2, 3).names);
+    }
+
     #[test]
     fn the_header_is_the_documented_one() {
         assert_eq!((size_of::<Header>(), align_of::<Header>()), (96, 8));
@@ -296,7 +350,7 @@ mod tests {
         (record.clipped[2], record.monitor_rejected[1]) = (true, 41);
         (record.remarks.put_aside, record.remarks.unsolved, record.remarked.put_aside_frames) = (true, true, 12);
         (record.reading[0], record.monitor_state[1]) = (ReadingUse::Rejected, MonitorState::Jumps);
-        let (header, payload) = encode(&record, &stamp());
+        let (header, payload) = encoded(&record);
         let at = |field: &str| match field {
             "mean" => 0,
             "clipped" => 5 * 3,
@@ -330,16 +384,16 @@ mod tests {
             record.tables = Some(0xfeed);
             record.tune_innovation = [None, Some(-1e-3)];
             (record.remarks.baselines_moved, record.remarked.unsolved_frames) = (true, 7);
-            let (header, payload) = encode(&record, &stamp());
-            assert_eq!(payload.len(), words_of(&stamp().publisher, &record.names));
-            assert_eq!(decode(&header, &payload).unwrap(), (record, stamp()));
+            let (header, payload) = encoded(&record);
+            assert_eq!(payload.len(), Text::of(&stamp().publisher, &record.names).words_of(&record.names));
+            assert_eq!(decode(&header, &payload, &mut None).unwrap(), (record, stamp()));
         }
     }
 
     #[test]
     fn what_is_no_record_is_refused_with_its_numbers() {
-        let (header, payload) = encode(&record(2, 1), &stamp());
-        let refused = |header: &Header, payload: &[u32]| decode(header, payload).unwrap_err().to_string();
+        let (header, payload) = encoded(&record(2, 1));
+        let refused = |header: &Header, payload: &[u32]| decode(header, payload, &mut None).unwrap_err().to_string();
         let expected = "2 vars, 1 monitors and 32 bytes of names take 27 words, found 26";
         assert_eq!(refused(&header, &payload[1..]), expected);
         let mut other = payload.clone();

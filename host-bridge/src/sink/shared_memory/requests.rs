@@ -8,7 +8,7 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::client::Client;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
-use iceoryx2::service::port_factory::request_response;
+use iceoryx2::service::port_factory::{PortFactory as _, request_response};
 
 use super::services::{NODES, join, joined};
 use super::{PUBLISHERS, PublishError, SUBSCRIBERS};
@@ -124,12 +124,15 @@ pub struct RequestServer {
 }
 
 impl RequestServer {
-    /// Join the service beside that of the estimates, or create it.
+    /// Join the service beside that of the estimates, or create it; a process that was killed has left it.
     ///
     /// # Errors
-    /// [`PublishError::Name`] or [`PublishError::Join`].
+    /// [`PublishError::Name`] or [`PublishError::Join`]; [`PublishError::Taken`] where another daemon has it.
     pub fn try_new(estimates: &str, who: &str) -> Result<Self, PublishError> {
         let service = Service::try_join(estimates, who)?;
+        if service.requests.dynamic_config().number_of_servers() > 0 {
+            return Err(PublishError::Taken { service: estimates.to_owned() });
+        }
         let server = service.requests.server_builder().allocation_strategy(AllocationStrategy::PowerOfTwo);
         // a client that takes no replies is not waited for
         let server = server.initial_max_slice_len(1024).backpressure_strategy(BackpressureStrategy::DiscardData);
@@ -208,6 +211,8 @@ mod tests {
         let error = client.ask(&Request::Reset, Duration::from_millis(20)).unwrap_err();
         assert!(error.to_string().contains("is the daemon running?"), "{error}");
         let mut server = RequestServer::try_new(&name, "a test").unwrap();
+        let second = RequestServer::try_new(&name, "another").err().unwrap().to_string();
+        assert!(second.contains("another daemon publishes there"), "{second}");
         let large: Vec<u8> = (0..200_000_u32).map(|i| i as u8).collect();
         drop(client);
         std::thread::scope(|scope| {

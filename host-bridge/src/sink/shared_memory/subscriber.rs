@@ -9,7 +9,7 @@ use iceoryx2::port::subscriber;
 use iceoryx2::prelude::ipc;
 use iceoryx2::sample::Sample;
 
-use super::layout::{Header, Stamp, decode};
+use super::layout::{Header, Known, Stamp, decode};
 use super::services::{Services, join};
 use super::{BUFFER, PublishError};
 use crate::record::EstimateRecord;
@@ -31,6 +31,8 @@ pub struct Subscriber {
     listener: Listener<ipc::Service>,
     subscriber: subscriber::Subscriber<ipc::Service, [u32], Header>,
     services: Services,
+    /// Names of the last record.
+    known: Option<Known>,
 }
 
 impl Subscriber {
@@ -43,7 +45,7 @@ impl Subscriber {
         let listener = services.news.listener_builder().create().map_err(|e| join(service, "listener", &e))?;
         let subscriber =
             services.estimates.subscriber_builder().create().map_err(|e| join(service, "subscriber", &e))?;
-        Ok(Self { listener, subscriber, services })
+        Ok(Self { listener, subscriber, services, known: None })
     }
 
     /// Everything that has arrived, in order; waits for something until the time is over or a signal comes.
@@ -63,13 +65,17 @@ impl Subscriber {
 
     /// The estimates at hand: wake-ups coalesce, so one may stand for many. No more than a full buffer, or a fast writer
     /// would keep its reader here.
-    fn drain(&self) -> Result<Vec<Published>, PublishError> {
+    fn drain(&mut self) -> Result<Vec<Published>, PublishError> {
+        let mut known = self.known.take();
         let next = || self.subscriber.receive().map_err(|e| self.wrong(&e)).transpose();
-        let published = |sample: Sample<ipc::Service, [u32], Header>| {
-            let (record, stamp) = decode(sample.user_header(), sample.payload()).map_err(|e| self.wrong(&e))?;
+        let mut published = |sample: Sample<ipc::Service, [u32], Header>| {
+            let decoded = decode(sample.user_header(), sample.payload(), &mut known);
+            let (record, stamp) = decoded.map_err(|e| self.wrong(&e))?;
             Ok(Published { record, stamp })
         };
-        core::iter::from_fn(next).take(BUFFER).map(|sample| published(sample?)).collect()
+        let records = core::iter::from_fn(next).take(BUFFER).map(|sample| published(sample?)).collect();
+        self.known = known;
+        records
     }
 
     /// Sleep until there is news; true if a signal came instead.

@@ -1,8 +1,10 @@
-"""Read published estimates from shared memory (PyPI: iceoryx2==0.10.0, the version that orbitcal is built with).
+"""Read a daemon's estimates and its health from shared memory: an example to build on, in one file.
 
-Usage: iceoryx_reader.py [SERVICE [COUNT [SECONDS]]]; the defaults are orbitcal/estimate, no end, and 20 s without news.
-Prints the publisher, the sequence number and the strength factor (var) farthest from 1 of every estimate, then how many
-came and how many are missing between them. Exit status 0 if COUNT came and none is missing.
+It needs nothing but the package iceoryx2==0.10.0 from PyPI, the version that orbitcal is built with, and the daemon's user.
+
+Usage: orbitcal_reader.py [SERVICE [COUNT [SECONDS]]]; the defaults are orbitcal/estimate, no end, and 20 s without news.
+Prints the publisher, each estimate's sequence number and the strength factor (var) farthest from 1, monitors and correctors
+that are not ok, then how many estimates came and how many are missing between them. Exit status 0 if COUNT came and none is missing.
 """
 
 import ctypes
@@ -75,6 +77,75 @@ class Estimate:
         return f"{self.vars[i]} {self.mean[i]:.4f} ± {self.sigma[i]:.4f}"
 
 
+class HealthHeader(ctypes.Structure):
+    """The header of the health in docs/daemon.md, which says what each field means."""
+
+    _fields_ = [
+        ("published_ns", ctypes.c_uint64),
+        ("sequence", ctypes.c_uint32),
+        ("frames", ctypes.c_uint32),
+        ("mismatch", ctypes.c_uint32),
+        ("chi_square", ctypes.c_float),
+        ("degrees_of_freedom", ctypes.c_float),
+        ("excess", ctypes.c_float),
+        ("monitors", ctypes.c_uint32),
+        ("correctors", ctypes.c_uint32),
+        ("text_bytes", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name():
+        return "orbitcal.Health.v1"
+
+
+assert ctypes.sizeof(HealthHeader) == 48
+STATES = ["ok", "noisy", "jumps", "dead", "back"]
+
+
+class Health:
+    """State and filtered ratios of every monitor, then of every corrector."""
+
+    def __init__(self, header, payload):
+        count = header.monitors + header.correctors
+        codes = struct.unpack(f"<{count}I", payload[: 4 * count])
+        ratios = struct.unpack(f"<{3 * count}f", payload[4 * count : 16 * count])
+        names = payload[16 * count :][: header.text_bytes].decode().splitlines()
+        self.header, self.machine = header, names[0]
+        self.state = dict(zip(names[1:], (STATES[code] for code in codes)))
+        self.scatter, self.jumps, self.missing = (ratios[i * count : (i + 1) * count] for i in range(3))
+        assert len(self.state) == count, f"{len(self.state)} names of {count} instruments"
+
+    def unwell(self):
+        """Those that are not ok, with their states."""
+        return [f"{name} {state}" for name, state in self.state.items() if state != "ok"]
+
+
+def bytes_of(sample):
+    """The payload of a sample, copied: the sample goes back to its writer."""
+    payload = sample.payload()
+    return ctypes.string_at(payload.as_ptr(), 4 * payload.len())
+
+
+class HealthReader:
+    """The last health of a daemon: it is there for whoever joins, and comes anew every second."""
+
+    def __init__(self, node, name):
+        service = node.service_builder(iox2.ServiceName.new(name + "/health"))
+        service = service.publish_subscribe(iox2.Slice[ctypes.c_uint32]).user_header(HealthHeader)
+        service = service.history_size(1).subscriber_max_buffer_size(16).enable_safe_overflow(True)
+        service = service.max_subscribers(16).max_publishers(4).max_nodes(24).open_or_create()
+        self._subscriber = service.subscriber_builder().create()
+
+    def newest(self):
+        """What has come since the last call; None if nothing has."""
+        newest = None
+        while (sample := self._subscriber.receive()) is not None:
+            newest = Health(HealthHeader.from_buffer_copy(sample.user_header().contents), bytes_of(sample))
+            sample.delete()
+        return newest
+
+
 def join(name):
     """Both ends of the service; with the publisher's settings, so that either side may start first."""
     iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
@@ -96,9 +167,10 @@ def join(name):
     return node, news.listener_builder().create(), estimates.subscriber_builder().create()
 
 
-def estimates(name, seconds):
-    """Every estimate as it comes, until there is none for some seconds."""
+def news(name, seconds):
+    """Every estimate, and health, as they come, until there is no estimate for some seconds."""
     node, listener, subscriber = join(name)
+    health = HealthReader(node, name)
     print(f"listening on {name}", flush=True)
     heard = time.monotonic()
     while time.monotonic() - heard < seconds:
@@ -108,18 +180,23 @@ def estimates(name, seconds):
         except (iox2.NodeWaitFailure, iox2.ListenerWaitError):  # SIGINT or SIGTERM
             return
         while (sample := subscriber.receive()) is not None:  # one wake-up may stand for many
-            header = Header.from_buffer_copy(sample.user_header().contents)
-            payload = sample.payload()
-            estimate = Estimate(header, ctypes.string_at(payload.as_ptr(), 4 * payload.len()))
+            estimate = Estimate(Header.from_buffer_copy(sample.user_header().contents), bytes_of(sample))
             sample.delete()
             heard = time.monotonic()
             yield estimate
+        if (newest := health.newest()) is not None:
+            yield newest
 
 
 def main(name="orbitcal/estimate", count="0", seconds="20"):
     seen, lost, last = 0, 0, {}  # last frame count of each publisher, by its start
-    for estimate in estimates(name, float(seconds)):
+    for estimate in news(name, float(seconds)):
         header = estimate.header
+        if isinstance(estimate, Health):
+            fit = header.chi_square / header.degrees_of_freedom if header.degrees_of_freedom > 0 else 0
+            unwell = ", ".join(estimate.unwell()) or "all ok"
+            print(f"health after {header.frames} frames: chi2/dof {fit:.3f}, {len(estimate.state)} instruments, {unwell}", flush=True)
+            continue
         seen += 1
         lost += header.frames - last.get(header.started_ns, header.frames - 1) - 1
         if header.started_ns not in last:
