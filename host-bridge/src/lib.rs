@@ -13,6 +13,7 @@ pub mod import_result;
 pub mod matrix_page;
 pub mod matrix_result;
 pub mod model_file;
+pub mod next_plan;
 pub mod output;
 pub mod record;
 pub mod result;

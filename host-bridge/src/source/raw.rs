@@ -8,7 +8,7 @@ use std::time::Instant;
 use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::surrogate::Unstable;
 use estimator::{IngestError, Prepared, StateError, Tables as _};
-use inference::stream::Core;
+use inference::stream::{Core, Feedback};
 use training::{LINE, Tables};
 
 use super::desk::{Desk, Wish, reply};
@@ -18,7 +18,7 @@ use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Keeper, Model};
 use crate::health::{Health, Reporter};
 use crate::output::warn;
 use crate::record::{EstimateRecord, Names, Remarked};
-use crate::sink::shared_memory::{FrameWriter, HealthWriter, Reply};
+use crate::sink::shared_memory::{FrameWriter, HealthWriter, Reply, SetpointWriter};
 
 /// Longest wait for a frame before somebody's wish to stop is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
@@ -53,6 +53,16 @@ pub fn resume(core: &mut Core, path: &Path, model: &Model) -> Option<Head> {
     })
 }
 
+/// The orbit feedback of a running core.
+pub struct Steering {
+    /// What is wanted.
+    pub wanted: Feedback,
+    /// Its set points are computed and published.
+    pub is_on: bool,
+    /// Where they go; none once that has failed.
+    pub writer: Option<SetpointWriter>,
+}
+
 /// Checkpoints of a running core.
 struct Checkpoints {
     keeper: Keeper,
@@ -71,6 +81,7 @@ pub struct Raw {
     reporter: Reporter,
     desk: Option<Desk>,
     frames: Option<FrameWriter>,
+    steering: Option<Steering>,
     /// Taken, and not published yet.
     taken: Option<Vec<u8>>,
     /// Last frame of the checkpoint, until the first frame says what was lost.
@@ -100,6 +111,7 @@ impl Raw {
             reporter: Reporter::new(health, sizes),
             desk: None,
             frames: None,
+            steering: None,
             taken: None,
             resumed: resumed.map(|head| head.sequence),
             is_prepared: false,
@@ -134,6 +146,14 @@ impl Raw {
     #[must_use]
     pub fn with_frames(mut self, writer: Option<FrameWriter>) -> Self {
         self.frames = writer;
+        self
+    }
+
+    /// From now on with an orbit feedback, whose set points are published.
+    #[must_use]
+    pub fn with_feedback(mut self, steering: Option<Steering>) -> Self {
+        self.steering = steering;
+        self.steer();
         self
     }
 
@@ -184,6 +204,31 @@ impl Raw {
         }
     }
 
+    /// Publish what the feedback made of a frame; a failure is said, and ends that.
+    fn publish_setpoints(&mut self, of: [u32; 2]) {
+        let Some((steering, correction)) = self.steering.as_mut().zip(self.core.correction()) else { return };
+        if let Some(Err(error)) = steering.writer.as_mut().map(|writer| writer.publish(of, &correction)) {
+            warn(format_args!("{error}; there is no feedback any more"));
+            (steering.is_on, steering.writer) = (false, None);
+            self.steer();
+        }
+    }
+
+    /// The feedback as it is switched: from the next frame on, as if that were the first.
+    fn steer(&mut self) {
+        let steering = self.steering.as_ref().filter(|steering| steering.is_on);
+        self.core.steer(steering.map(|steering| &steering.wanted));
+    }
+
+    fn switch(&mut self, on: bool) -> Result<Vec<u8>, String> {
+        let steering = self.steering.as_mut().filter(|steering| steering.writer.is_some());
+        steering.ok_or("its set points cannot be published")?.is_on = on;
+        self.steer();
+        let said = format!("the orbit feedback is {}", if on { "on" } else { "off" });
+        warn(format_args!("asked for: {said}"));
+        Ok(said.into_bytes())
+    }
+
     /// Do what operators ask for, one request at a time.
     fn obey(&mut self) {
         let Some((wish, asked)) = self.desk.as_mut().and_then(Desk::receive) else { return };
@@ -191,6 +236,7 @@ impl Raw {
             Wish::Snapshot => self.snapshot(),
             Wish::Reset => self.reset(),
             Wish::Model(tables) => self.adopt(*tables),
+            Wish::Feedback(on) => self.switch(on),
         };
         reply(asked, &done.map_or_else(Reply::Refused, Reply::Done));
     }
@@ -203,6 +249,7 @@ impl Raw {
     fn reset(&mut self) -> Result<Vec<u8>, String> {
         let (tables, setup) = (self.core.tables.clone(), self.core.setup.clone());
         self.core = Core::with_tables(tables, setup).map_err(|error| error.to_string())?;
+        self.steer();
         self.begin_anew("the core is at its prior");
         self.last = None;
         Ok(b"the core is at its prior".to_vec())
@@ -258,6 +305,7 @@ impl Raw {
         self.taken = self.frames.is_some().then_some(frame);
         self.is_prepared = false;
         self.last = Some([record.sequence, record.frames]);
+        self.publish_setpoints([record.sequence, record.frames]);
         self.remarked.add(&record.remarks);
         self.checkpoints.iter_mut().for_each(|checkpoints| checkpoints.since += 1);
         if let Some(before) = self.resumed.take() {

@@ -6,3 +6,4 @@ mod place;
 mod requests;
 mod soak;
 mod sources;
+mod steering;
