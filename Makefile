@@ -3,7 +3,7 @@
 
 TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
-SEED ?= 1
+SEED ?= 3
 ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
