@@ -3,11 +3,12 @@
 
 TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
+SEED ?= 3
 ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -118,15 +119,20 @@ exports: build .venv-export ## exports opened in MAD-X, pyAT, Xsuite and the sch
 
 .venv-control: control/epics/pyproject.toml control/gateway/pyproject.toml
 	python3 -m venv .venv-control
-	.venv-control/bin/pip install --quiet -e control/epics -e 'control/gateway[test]'
+	.venv-control/bin/pip install --quiet -e 'control/epics[test]' -e 'control/gateway[test]'
 	touch .venv-control
 
-control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the gateway seen by three EPICS clients; three minutes
+control: build .venv-control ## orbitcal measure against the simulated Booster behind a soft IOC, killed 20 times; the daemon on its channels; the gateway seen by three EPICS clients
+	.venv-control/bin/python -m unittest discover -s control/epics/tests
 	.venv-control/bin/python control/epics/tests/measure.py $(ORBITCAL)
+	.venv-control/bin/python control/epics/tests/live.py $(ORBITCAL)
 	.venv-control/bin/python control/gateway/tests/clients.py $(ORBITCAL)
 
-booster: build .venv-control ## the simulated Booster with a concealed effect, measured through EPICS, diagnosed, judged on one more measurement: target/booster.json; two minutes
-	.venv-control/bin/python control/epics/tests/booster.py $(ORBITCAL)
+gateway-kill: build .venv-control ## kill -9 of the gateway, 100 times at random moments, beside another subscriber: restarts, leaks; six minutes
+	.venv-control/bin/python control/gateway/tests/kills.py $(ORBITCAL) 84
+
+booster: build .venv-control ## the whole story: the simulated Booster with a concealed effect, followed live, measured, diagnosed, steered with what was found: target/booster.html, SEED=N another one; three minutes
+	.venv-control/bin/python control/epics/tests/booster.py $(ORBITCAL) $(SEED)
 
 control-env: .venv-control ## what speaks EPICS: orbitcal-epics, orbitcal-soft-ioc and orbitcal-gateway, in .venv-control
 

@@ -37,6 +37,8 @@ pub struct Plan {
     pub rf_tolerance: f64,
     /// Smallest and largest RF frequency that is written [Hz].
     pub rf_limits: [f64; 2],
+    /// RF frequency whose offset is 0 in a live frame [Hz]; without one it always is.
+    pub rf_nominal: Option<f64>,
     /// How long a read-back stays at its set point before frames are taken [s].
     pub settle: f64,
     /// How long is waited for anything [s].
@@ -159,6 +161,8 @@ struct RfFile {
     limits: [f64; 2],
     #[serde(rename = "tolerance_Hz")]
     tolerance: f64,
+    #[serde(rename = "nominal_Hz")]
+    nominal: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -253,6 +257,7 @@ impl Check<'_> {
             corrector_limits: file.correctors.limits,
             rf_tolerance: rf.map_or(0.0, |rf| rf.tolerance),
             rf_limits: rf.map_or([0.0; 2], |rf| rf.limits),
+            rf_nominal: rf.and_then(|rf| rf.nominal),
             settle: timing.settle_s,
             timeout: timing.timeout_s,
             match_window: timing.match_window_s,
@@ -300,6 +305,7 @@ impl Check<'_> {
         self.expect(0.0 < low && low < high, || {
             format!("rf.limits_Hz: expected two rising numbers, found {low}, {high}")
         });
+        file.nominal.iter().for_each(|nominal| self.positive("rf.nominal_Hz", *nominal));
         for step in &file.steps_relative {
             self.expect(*step != 0.0 && step.abs() <= 0.01, || {
                 format!("rf.steps_relative: expected numbers from -0.01 to 0.01 without 0, found {step}")

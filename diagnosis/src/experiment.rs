@@ -12,9 +12,24 @@ use super::fit::Fitted;
 use super::hypothesis::Term;
 use super::scan::Rivals;
 
+/// What a possible measurement changes of the present one.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Change {
+    /// Nothing.
+    Same,
+    /// All corrector settings by a factor.
+    Settings(f64),
+    /// Only these correctors are used, by their index.
+    Correctors(Vec<usize>),
+    /// Another machine or another time in the cycle, or the RF frequency in frames of the correctors: more than settings one after the other.
+    Machine,
+}
+
 /// One possible measurement.
 #[derive(Debug, Clone)]
 pub struct Proposal {
+    /// What it changes.
+    pub change: Change,
     /// Its description, to follow "A second campaign".
     pub what: String,
     /// Expected `ln` Bayes factor between the two causes, present and new campaign together.
@@ -60,11 +75,11 @@ impl Menu {
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
-        for (what, machine, drives, weight) in scenarios(data, &machine, &drives, one.0) {
+        for Scenario { what, change, machine, drives, weight } in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is not proposed
             let Ok(new) = Derivatives::of(data, &machine, &drives, one.0, other, weight) else { continue };
             let both: Vec<&Derivatives> = present.iter().chain([&new]).collect();
-            proposals.push(Proposal { what, separation: separation(&both, amplitude, free) });
+            proposals.push(Proposal { what, change, separation: separation(&both, amplitude, free) });
         }
         proposals.sort_by(|a, b| b.separation.total_cmp(&a.separation));
         Ok(Self { present: separation(&present.iter().collect::<Vec<_>>(), amplitude, free), proposals })
@@ -96,43 +111,56 @@ impl Derivatives {
     }
 }
 
-/// Possible measurements: description, machine, drives, and the weight of stray fields.
-fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<(String, Machine, Drives, f64)> {
+/// A possible measurement.
+struct Scenario {
+    what: String,
+    change: Change,
+    machine: Machine,
+    drives: Drives,
+    /// Of stray fields.
+    weight: f64,
+}
+
+impl Scenario {
+    fn new(what: impl Into<String>, change: Change, machine: &Machine, drives: Drives) -> Self {
+        Self { what: what.into(), change, machine: machine.clone(), drives, weight: 1.0 }
+    }
+}
+
+fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<Scenario> {
     let ring = machine.ring();
     let retuned = |supply: usize, factor: f64| {
         let of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
         machine.with_strengths(&ring.quadrupoles.iter().map(of).collect::<Vec<_>>())
     };
-    let mut all = vec![("with the same settings".to_owned(), machine.clone(), drives.clone(), 1.0)];
+    let mut all = vec![Scenario::new("with the same settings", Change::Same, machine, drives.clone())];
     let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };
-    all.push(("with twice the corrector settings".into(), machine.clone(), doubled, 1.0));
+    all.push(Scenario::new("with twice the corrector settings", Change::Settings(2.0), machine, doubled));
     for (supply, family) in ring.supplies.iter().enumerate() {
         for (word, factor) in [("raised", 1.0 + RETUNE), ("lowered", 1.0 - RETUNE)] {
             let what = format!("with {} {word} by {:.0} %", family.name, RETUNE * 100.0);
-            all.push((what, retuned(supply, factor), drives.clone(), 1.0));
+            all.push(Scenario::new(what, Change::Machine, &retuned(supply, factor), drives.clone()));
         }
     }
     let alternating = DVector::from_fn(drives.rf_offset.len(), |i, _| if i % 2 == 0 { RF_STEP } else { -RF_STEP });
     let stepped = Drives { rf_offset: alternating, ..drives.clone() };
-    all.push((
-        format!("with the RF frequency stepped by ±{RF_STEP:.0e} in every frame"),
-        machine.clone(),
-        stepped,
-        1.0,
-    ));
-    if let Some(others) = other_correctors(data, drives) {
-        all.push(("with the correctors that were not used".into(), machine.clone(), others, 1.0));
+    let what = format!("with the RF frequency stepped by ±{RF_STEP:.0e} in every frame");
+    all.push(Scenario::new(what, Change::Machine, machine, stepped));
+    if let Some((idle, others)) = other_correctors(data, drives) {
+        let change = Change::Correctors(idle);
+        all.push(Scenario::new("with the correctors that were not used", change, machine, others));
     }
     if one.kind.is_stray() {
         let stronger = Drives { kick: &drives.kick / EARLIER, ..drives.clone() };
         let what = "earlier in the cycle, at half the momentum, where a stray field has twice the effect".to_owned();
-        all.push((what, machine.clone(), stronger, 1.0 / EARLIER));
+        let weight = 1.0 / EARLIER;
+        all.push(Scenario { weight, ..Scenario::new(what, Change::Machine, machine, stronger) });
     }
     all
 }
 
 /// The same frames with the correctors that were never powered, in turn.
-fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
+fn other_correctors(data: &Data, drives: &Drives) -> Option<(Vec<usize>, Drives)> {
     let driven = data.driven_correctors();
     let idle: Vec<usize> = (0..drives.kick.ncols()).filter(|c| !driven.contains(c)).collect();
     if idle.is_empty() {
@@ -143,7 +171,7 @@ fn other_correctors(data: &Data, drives: &Drives) -> Option<Drives> {
         let mut column = kick.column_mut(idle[i % idle.len()]);
         column += drives.kick.column(c);
     }
-    Some(Drives { kick, ..drives.clone() })
+    Some((idle, Drives { kick, ..drives.clone() }))
 }
 
 /// Expected `ln` Bayes factor of the first cause over the other.

@@ -197,6 +197,15 @@ impl Diagnosis {
         passing.chain(best.hypothesis.terms.iter().enumerate().map(of)).collect()
     }
 
+    /// The possible measurements for an ambiguous verdict, best first; none for another.
+    ///
+    /// # Errors
+    /// [`error::FitError`].
+    pub fn proposals(&self) -> Result<Vec<experiment::Proposal>, error::FitError> {
+        let menu = verdict::menu(&self.found.data, &self.found, self.verdict)?;
+        Ok(menu.map_or_else(Vec::new, |(menu, _)| menu.proposals))
+    }
+
     /// What was learnt of the machine besides.
     pub fn imperfections(&self) -> Vec<Imperfection> {
         let Found { data, best, .. } = &self.found;

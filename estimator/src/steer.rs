@@ -57,7 +57,7 @@ pub struct Feedback<const B: usize, const C: usize> {
     pub step_kick: f32,
     /// The same of its whole kick: what no monitor sees decays, and correctors stay near 0 [rad].
     pub total_kick: f32,
-    /// Largest current of each corrector [A].
+    /// Largest current of each corrector [A]; one with 0 is moved by others, and not by the feedback.
     pub limit: Each<C>,
     /// Largest change of a setpoint in one frame [A].
     pub rate: f32,
@@ -78,7 +78,14 @@ impl<const B: usize, const C: usize> Feedback<B, C> {
             && sizes.iter().all(|v| v.is_finite() && *v > 0.0)
             && self.probe.is_finite()
             && self.probe >= 0.0
-            && self.limit.is_positive()
+            && self.limit.is_finite()
+            && (0..C).all(|c| self.limit.of(c) >= 0.0)
+            && (0..C).any(|c| self.uses(c))
+    }
+
+    /// True for a corrector that the feedback moves.
+    pub fn uses(&self, corrector: usize) -> bool {
+        self.limit.of(corrector) > 0.0
     }
 
     /// Largest current that a correction asks of a corrector: a probe has room beyond it [A].
@@ -274,11 +281,16 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         self.weigh_momentum(&response.dispersion());
         let diagonal = 1.0 / (feedback.step_kick * feedback.step_kick) + stiffness(feedback);
         match turn {
-            0 => self.x.invert(self.matrix(response, 0, diagonal, covariance)),
-            1 => self.y.invert(self.matrix(response, CX, diagonal, covariance)),
+            0 => self.x.invert(self.matrix(response, 0, diagonal, covariance, |c| self.counts(feedback, c))),
+            1 => self.y.invert(self.matrix(response, CX, diagonal, covariance, |c| self.counts(feedback, c))),
             _ => return false,
         }
         true
+    }
+
+    /// True for a corrector that the feedback moves, and that follows.
+    fn counts(&self, feedback: &Feedback<B, C>, corrector: usize) -> bool {
+        feedback.uses(corrector) && self.supplies.follows(corrector)
     }
 
     /// Time since the last frame [s]; none if there was none that belongs to this one: too early, or of another time in the cycle.
@@ -322,7 +334,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         seconds: f32,
     ) {
         let frame = &judged.frame;
-        let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close);
+        let (done, changed) = self.supplies.hear(&frame.corrector, feedback.close, |c| feedback.uses(c));
         if changed {
             self.forget_gains();
         } else if judged.linearised && self.turn > 1 {
@@ -390,7 +402,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         weighted
     }
 
-    /// `A` of the plane whose correctors begin at `first`; those that are left out have a diagonal only.
+    /// `A` of the plane whose correctors begin at `first`; those that do not count have a diagonal only.
     #[inline(never)]
     fn matrix<G: Steerable<B, C, F, N>, const F: usize, const N: usize, const CP: usize, const TP: usize>(
         &self,
@@ -398,6 +410,7 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         first: usize,
         diagonal: f32,
         covariance: impl Fn(usize) -> [f32; N],
+        counts: impl Fn(usize) -> bool,
     ) -> Triangle<CP, TP, f64> {
         let mut matrix = Triangle::ZERO;
         matrix.fill_diagonal(f64::from(diagonal));
@@ -411,9 +424,8 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         response.surrogate.response_covariance(response.at, plane, &self.weight, covariance, |here, there| {
             matrix.rows_mut().zip(here).for_each(|(row, h)| add_single(row, *h, there));
         });
-        let follows = |i: usize| self.supplies.follows(first + i);
         for (i, row) in matrix.rows_mut().enumerate() {
-            for (j, to) in row.iter_mut().enumerate().filter(|(j, _)| !(follows(i) && follows(*j))) {
+            for (j, to) in row.iter_mut().enumerate().filter(|(j, _)| !(counts(first + i) && counts(first + *j))) {
                 *to = if i == j { f64::from(diagonal) } else { 0.0 };
             }
         }
@@ -434,12 +446,15 @@ impl<const B: usize, const C: usize, const CX: usize, const CY: usize, const TX:
         let (stiffness, total) =
             (stiffness(feedback), response.kicks(self.supplies.setpoints().map(CurrentCode::value)));
         for (c, (pull, total)) in pull.iter_mut().zip(total).enumerate() {
-            *pull = if self.supplies.follows(c) { *pull + stiffness * total } else { 0.0 };
+            *pull = if self.counts(feedback, c) { *pull + stiffness * total } else { 0.0 };
         }
         let setpoints = self.supplies.setpoints();
         let room = |c: usize| {
             let (limit, rate, kick) = (feedback.edge(c), feedback.rate, response.kick(c));
             let current = setpoints.get(c).copied().unwrap_or_default().value();
+            if !feedback.uses(c) {
+                return [0.0; 2];
+            }
             // one that is beyond its limit comes back at its rate
             [-limit - current, limit - current].map(|to| to.min(rate).max(-rate) * kick)
         };

@@ -235,6 +235,20 @@ pub enum Ask {
         #[arg(value_name = "FILE")]
         file: PathBuf,
     },
+    /// The orbit feedback on, from where the correctors are, or off
+    Feedback {
+        /// Which
+        #[arg(value_enum)]
+        state: Switch,
+    },
+}
+
+/// On or off.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[allow(missing_docs)] // their names
+pub enum Switch {
+    On,
+    Off,
 }
 
 /// `orbitcal history`.
@@ -350,6 +364,9 @@ pub struct Simulate {
     /// Time constant of the correctors' supplies [s]
     #[arg(long, value_name = "S", default_value_t = 0.3)]
     pub settling_s: f64,
+    /// What is true, for whoever judges: one CSV row a cycle, each monitor's reading [mm] without noise, jumps and faults
+    #[arg(long, value_name = "FILE.csv")]
+    pub exact: Option<PathBuf>,
 }
 
 /// `orbitcal fit`.
@@ -429,6 +446,12 @@ pub struct Diagnose {
     /// The model with what was identified, for `orbitcal replay --model-file` and for a device
     #[arg(long, value_name = "FILE")]
     pub model_out: Option<PathBuf>,
+    /// The plan by which the recordings were measured, for --plan-out
+    #[arg(long, value_name = "PLAN.toml")]
+    pub plan: Option<PathBuf>,
+    /// Where the data cannot decide: the measurement that would, for `orbitcal measure`, within the channels and limits of --plan
+    #[arg(long, value_name = "NEXT.toml", requires = "plan")]
+    pub plan_out: Option<PathBuf>,
 }
 
 /// `orbitcal export`.

@@ -1,5 +1,6 @@
 //! What an operator may change of the daemon: one TOML file. `config/booster.toml` shows every key; `config/keys.rs` their ranges.
 
+mod feedback;
 mod keys;
 
 use core::fmt;
@@ -9,6 +10,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use toml::de::DeTable;
+
+pub use feedback::Feedback;
 
 use crate::history::Plan;
 use crate::logs::Form;
@@ -30,6 +33,9 @@ pub struct Config {
     /// Where estimates go.
     #[serde(default)]
     pub publish: Publish,
+    /// What is wanted of the orbit.
+    #[serde(default)]
+    pub feedback: Feedback,
     /// What may be asked of the running daemon.
     #[serde(default)]
     pub requests: Requests,
@@ -107,6 +113,20 @@ pub struct Source {
     /// What is done with one for which there is no room.
     #[serde(default = "default_when_full")]
     pub when_full: WhenFull,
+    /// Program that speaks EPICS.
+    #[serde(default = "default_program")]
+    pub program: PathBuf,
+    /// How long a cycle waits for values that are missing [ms].
+    #[serde(default = "default_late_ms")]
+    late_ms: u64,
+}
+
+fn default_program() -> PathBuf {
+    "orbitcal-epics-source".into()
+}
+
+fn default_late_ms() -> u64 {
+    200
 }
 
 fn default_role() -> Role {
@@ -137,6 +157,11 @@ impl Source {
     /// Silence after which a connection is given up.
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
+    }
+
+    /// How long a cycle of a control system waits for values that are missing [s].
+    pub fn late(&self) -> f64 {
+        Duration::from_millis(self.late_ms).as_secs_f64()
     }
 
     /// How fast a recording is replayed.
@@ -200,11 +225,13 @@ pub struct Requests {
     pub reset: bool,
     /// The tables may be changed.
     pub model: bool,
+    /// The orbit feedback may be switched on and off.
+    pub feedback: bool,
 }
 
 impl Default for Requests {
     fn default() -> Self {
-        Self { snapshot: true, reset: false, model: false }
+        Self { snapshot: true, reset: false, model: false, feedback: false }
     }
 }
 
@@ -319,12 +346,21 @@ impl Config {
         let parsed = std::fs::read_to_string(file).map_err(unread).and_then(|text| Self::parse(&text));
         let mut config = parsed.map_err(|problems| ConfigError { file: file.to_owned(), problems })?;
         let folder = file.parent().unwrap_or(Path::new(""));
-        let Self { machine, source, checkpoint, history, .. } = &mut config;
+        let Self { machine, source, checkpoint, feedback, history, .. } = &mut config;
         let replayed = match &mut source.address {
-            Origin::Recording(path) => Some(path),
+            Origin::Recording(path) | Origin::Epics(path) => Some(path),
             Origin::Line(_) | Origin::SharedMemory(_) => None,
         };
-        let optional = [&mut machine.file, &mut machine.model_file, &mut checkpoint.file, &mut history.folder];
+        if source.program.components().count() > 1 {
+            source.program = folder.join(&source.program);
+        }
+        let optional = [
+            &mut machine.file,
+            &mut machine.model_file,
+            &mut checkpoint.file,
+            &mut feedback.orbit_file,
+            &mut history.folder,
+        ];
         let paths = optional.into_iter().flatten().chain([&mut machine.recording]).chain(replayed);
         paths.for_each(|path| *path = folder.join(&*path));
         Ok(config)
@@ -388,10 +424,10 @@ mod tests {
         assert_eq!(
             said(text),
             [
-                "0: machine.recording is missing: Recording whose header states calibration, noise and ramp, a path",
+                "0: machine.recording is missing: Recording whose header states calibration, noise and ramp, or that header alone, a path",
                 "2: machine.file = 3: expected a path",
-                "4: source.address = \"serial:\": expected tcp://HOST:PORT, unix:PATH, serial:PATH[@BAUD], replay:RECORDING or \
-                 iceoryx2:SERVICE",
+                "4: source.address = \"serial:\": expected tcp://HOST:PORT, unix:PATH, serial:PATH[@BAUD], replay:RECORDING, \
+                 iceoryx2:SERVICE or epics:PLAN.toml",
                 "5: source.role = \"both\": expected \"connect\" or \"listen\"; default \"connect\"",
                 "6: source.timeout_ms = 0: expected a whole number from 100 to 600000 (ms); default 5000",
                 "7: source.buffer_frame: no such key",
@@ -422,7 +458,7 @@ mod tests {
     #[test]
     fn what_is_left_out_has_the_default_that_is_stated() {
         let written: String =
-            ["machine", "source", "walk", "publish", "requests", "checkpoint", "history", "page", "logs"]
+            ["machine", "source", "walk", "publish", "feedback", "requests", "checkpoint", "history", "page", "logs"]
                 .iter()
                 .map(|section| {
                     let own = keys::KEYS.iter().filter(|key| key.section == *section);

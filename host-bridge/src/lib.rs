@@ -16,6 +16,7 @@ pub mod logs;
 pub mod matrix_page;
 pub mod matrix_result;
 pub mod model_file;
+pub mod next_plan;
 pub mod output;
 pub mod record;
 pub mod result;

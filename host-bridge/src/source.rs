@@ -6,6 +6,7 @@ pub mod device;
 pub mod feed;
 pub mod link;
 pub mod origin;
+pub mod program;
 pub mod queue;
 pub mod rehearsal;
 pub mod replay;

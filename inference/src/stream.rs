@@ -3,6 +3,7 @@
 mod estimate;
 mod held;
 mod setup;
+mod steering;
 mod spread;
 
 use core::fmt;
@@ -22,6 +23,7 @@ pub use estimate::Estimate;
 pub use estimator::Walk;
 use held::{Held, Stream};
 pub use setup::{FOLLOW, Setup, setup, walk_per_cycle};
+pub use steering::{Correction, Feedback, Role};
 pub use spread::Spread;
 
 /// Why a recording cannot be put on the wire.
@@ -103,9 +105,9 @@ impl Core {
     /// [`StreamError::Unstable`].
     pub fn with_tables(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
         let stream = if setup.ramp.is_empty() || !ramped::SIZES.hold(&tables.sizes()) {
-            in_room!(tables.sizes(), |room| Held::<room::Estimator>::boxed(&tables, &setup))
+            in_room!(tables.sizes(), |room| Held::<room::Estimator, room::Steer>::boxed(&tables, &setup))
         } else {
-            Some(Held::<ramped::Estimator>::boxed(&tables, &setup))
+            Some(Held::<ramped::Estimator, ramped::Steer>::boxed(&tables, &setup))
         };
         Self::holding(tables, setup, stream)
     }
@@ -115,7 +117,8 @@ impl Core {
     /// # Errors
     /// [`StreamError::Unstable`].
     pub fn with_spare_room(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
-        let stream = in_spare_room!(tables.sizes(), |room| Held::<room::Estimator>::boxed(&tables, &setup));
+        let stream =
+            in_spare_room!(tables.sizes(), |room| Held::<room::Estimator, room::Steer>::boxed(&tables, &setup));
         Self::holding(tables, setup, stream)
     }
 
@@ -124,7 +127,7 @@ impl Core {
     /// # Errors
     /// [`StreamError::Unstable`].
     pub fn in_largest_room(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
-        let stream = Held::<large::Estimator>::boxed(&tables, &setup);
+        let stream = Held::<large::Estimator, large::Steer>::boxed(&tables, &setup);
         Self::holding(tables, setup, Some(stream))
     }
 
@@ -177,6 +180,24 @@ impl Core {
             Err(Unstable) => self.stream.adopt(&self.tables).unwrap_or_default(),
         }
         adopted
+    }
+
+    /// Steer from the next frame on, as if it were the first, or no more. Set points are not saved: a core that is loaded begins anew.
+    ///
+    /// # Panics
+    /// If there is not one number for each monitor and corrector.
+    pub fn steer(&mut self, feedback: Option<&Feedback>) {
+        let (sizes, total) = (self.tables.sizes(), |[x, y]: [u16; 2]| usize::from(x) + usize::from(y));
+        if let Some(feedback) = feedback {
+            assert_eq!(feedback.orbit.len(), total(sizes.monitors), "a wanted reading for each monitor");
+            assert_eq!(feedback.limit.len(), total(sizes.correctors), "a limit for each corrector");
+        }
+        self.stream.steer(feedback);
+    }
+
+    /// What the feedback made of the last frame that was taken; nothing without a feedback.
+    pub fn correction(&self) -> Option<Correction> {
+        self.stream.correction()
     }
 
     /// How well the model describes the frames so far. See [`estimator::Estimator::fit_quality`].
@@ -373,6 +394,51 @@ mod tests {
             }
             let quality = [whole.fit_quality(), core.fit_quality()];
             assert_eq!(quality[0], quality[1]);
+        }
+    }
+
+    /// The frames of a campaign, whose correctors others move: what is learnt is the same, and set points of correctors that are not
+    /// used are their read-backs. In a core with spare room, too.
+    #[test]
+    fn a_feedback_changes_no_estimate() {
+        let ring = Ring::booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let recording = Recording::read(&folder, &ring).unwrap();
+        let (powered, mut limit) = (recording.powered(&ring), vec![20.0; 48]);
+        limit[5] = 0.0;
+        let wanted = Feedback {
+            orbit: vec![0.0; 33],
+            limit,
+            walk: 5e-6,
+            step_kick: 2e-5,
+            total_kick: 1e-3,
+            rate: 2.0,
+            probe: 1.0,
+            close: 0.3,
+            patience_us: 60_000_000,
+        };
+        let setup = setup(&powered, &recording, FOLLOW).unwrap();
+        let tables = training::green::tables(&powered).unwrap();
+        for mut steering in
+            [Core::with_tables, Core::with_spare_room].map(|of| of(tables.clone(), setup.clone()).unwrap())
+        {
+            let mut plain = steering.clone();
+            steering.steer(Some(&wanted));
+            for row in &recording.rows[..60] {
+                let [one, two] = [&mut plain, &mut steering].map(|core| {
+                    core.prepare();
+                    core.ingest(&mut wire(&recording, row).unwrap()).unwrap()
+                });
+                assert_eq!(format!("{one:?}"), format!("{two:?}"), "frame {}", row.sequence);
+                let correction = steering.correction().unwrap();
+                assert_eq!((correction.setpoint.len(), correction.role[5]), (48, Role::Unused));
+                let read_back = CurrentCode::nearest(row.corrector_current[5]).unwrap().value();
+                assert_eq!(correction.setpoint[5], read_back);
+            }
+            let correction = steering.correction().unwrap();
+            assert!(correction.role.iter().enumerate().all(|(c, role)| (c == 5) == (*role == Role::Unused)));
+            assert!(correction.setpoint.iter().any(|current| current.abs() > 1.0), "{correction:?}");
+            assert_eq!(plain.correction(), None);
         }
     }
 

@@ -18,6 +18,9 @@ from softioc import builder, softioc
 from softioc.asyncio_dispatcher import AsyncioDispatcher
 
 
+STAMPED = -2  # the record keeps the time stamp that it is given
+
+
 class Machine:
     """The simulation, one cycle a line."""
 
@@ -40,11 +43,11 @@ def record(described):
     """The EPICS record of a channel."""
     name, kind, unit = described["name"], described["kind"], described["unit"]
     if kind == "waveform":
-        return builder.WaveformIn(name, length=described["length"], datatype=float, EGU=unit)
+        return builder.WaveformIn(name, length=described["length"], datatype=float, EGU=unit, TSE=STAMPED)
     if kind == "counter":
-        return builder.longIn(name)
+        return builder.longIn(name, TSE=STAMPED)
     if kind == "value":
-        return builder.aIn(name, EGU=unit, PREC=6)
+        return builder.aIn(name, EGU=unit, PREC=6, TSE=STAMPED)
     low, high = described["limits"]
     limits = {"DRVL": low, "DRVH": high, "LOPR": low, "HOPR": high}
     return builder.aOut(name, initial_value=described["value"], always_update=True, EGU=unit, PREC=6, **limits)

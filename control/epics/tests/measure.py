@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LOOPBACK = {
-    "EPICS_CA_ADDR_LIST": "127.0.0.1",
+    "EPICS_CA_ADDR_LIST": "127.0.0.1:35164 127.0.0.1:35264",  # the machine's IOC, and a gateway
     "EPICS_CA_AUTO_ADDR_LIST": "NO",
     "EPICS_CAS_INTF_ADDR_LIST": "127.0.0.1",
     "EPICS_CA_SERVER_PORT": "35164",
@@ -57,7 +57,7 @@ class Story:
         for old, new in FAST.items():
             assert old in text, old
             text = text.replace(old, new)
-        self.plan = folder / "plan.toml"
+        self.plan, self.period = folder / "plan.toml", PERIOD_S
         self.plan.write_text(text)
         self.truth = json.loads(Path("recordings/random-vars/truth.json").read_text())["vars"]
         (folder / "vars.json").write_text(json.dumps(self.truth))
@@ -66,7 +66,7 @@ class Story:
     def booster(self, *more):
         """The simulated Booster behind its IOC, steered."""
         command = [self.orbitcal, "simulate", self.plan, "--vars", self.folder / "vars.json", "--settling-s", "0.02", "--seed", "5", *more]
-        ioc = [BIN / "orbitcal-soft-ioc", "--period-s", str(PERIOD_S), *command]
+        ioc = [BIN / "orbitcal-soft-ioc", "--period-s", str(self.period), *command]
         process = subprocess.Popen(ioc, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             LOOP.run_until_complete(steer())

@@ -16,7 +16,7 @@ class Config:
     sigma_minor: float = 0.01
     sigma_major: float = 0.03
     stale_s: float = 20.0
-    setpoints: list = field(default_factory=list)  # correctors with a feedback set point
+    setpoints: list = field(default_factory=list)  # correctors with a set point; none: those of the daemon's feedback
     setpoint_limits_A: list = field(default_factory=lambda: [-25.0, 25.0])
     writable: bool = False
 

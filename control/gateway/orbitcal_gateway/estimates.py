@@ -53,8 +53,9 @@ class Estimate:
             raise ValueError(f"a record of {words} words, {need} are needed for {n} vars and {b} monitors")
         numbers = struct.unpack_from(f"<{2 * n}f", payload)
         self.mean, self.sigma = numbers[:n], numbers[n:]
-        state = 4 * (6 * n + n * (n + 1) // 2 + b)
-        self.monitor_state = struct.unpack_from(f"<{b}I", payload, state)
+        readings = 4 * (6 * n + n * (n + 1) // 2)
+        self.reading = struct.unpack_from(f"<{b}I", payload, readings)
+        self.monitor_state = struct.unpack_from(f"<{b}I", payload, readings + 4 * b)
         text = payload[4 * need : 4 * need + header.text_bytes].decode()
         names = text.splitlines()
         self.publisher, self.machine = names[:2]
@@ -96,15 +97,23 @@ class Subscriber:
 
     def newest(self, seconds):
         """The newest estimate that comes within some seconds; None without one. Those before it are passed over."""
+        come = self._wait(seconds, lambda records: records[-1:])
+        return come[0] if come else None
+
+    def all(self, seconds):
+        """All estimates that have come, once there is one; none if none comes within some seconds."""
+        return self._wait(seconds, lambda records: records)
+
+    def _wait(self, seconds, wanted):
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             self.listener.timed_wait(iox2.Duration.from_millis(max(1, min(100, int(1000 * left)))))
-            newest = None
+            records = []
             while (sample := self.subscriber.receive()) is not None:  # one wake-up may stand for many
                 payload = sample.payload()
                 header = Header.from_buffer_copy(sample.user_header().contents)
-                newest = Estimate(header, ctypes.string_at(payload.as_ptr(), 4 * payload.len()))
+                records.append((header, ctypes.string_at(payload.as_ptr(), 4 * payload.len())))
                 sample.delete()
-            if newest is not None:
-                return newest
-        return None
+            if records:
+                return [Estimate(*record) for record in wanted(records)]
+        return []

@@ -10,6 +10,7 @@ import iceoryx2 as iox2
 from softioc import builder, imports, softioc
 from softioc.asyncio_dispatcher import AsyncioDispatcher
 
+from .beside import Health, Reader, Setpoints
 from .config import Config, read
 from .estimates import Subscriber
 from .records import Records
@@ -17,6 +18,7 @@ from .table import Table
 
 BEAT_S = 1.0
 GLANCE_S = 0.2  # between two looks at whether to stop
+BESIDE_S = 1.5  # for health, which a daemon publishes every second
 ACCESS = Path(__file__).with_name("access.acf")
 
 
@@ -25,10 +27,14 @@ class Gateway:
 
     def __init__(self, config):
         self.config, self.subscriber = config, Subscriber(config.service)
+        node = self.subscriber.node
+        self.health, self.setpoints = Reader(node, config.service, Health), Reader(node, config.service, Setpoints)
         self.records = self.table = None
+        self.steered = None  # when set points came last
 
     def begin(self, estimate):
-        self.records = Records(self.config, estimate)
+        health = self.health.within(BESIDE_S)
+        self.records = Records(self.config, estimate, health)
         builder.LoadDatabase()
         imports.dbCore.asSetFilename(str(ACCESS).encode())
         softioc.iocInit(AsyncioDispatcher())
@@ -43,6 +49,8 @@ class Gateway:
             now = time.monotonic()
             if estimate is not None and self.records is None:
                 self.begin(estimate)
+            if self.records is not None:
+                self.show_beside(now)
             if estimate is not None and self.fits(estimate):
                 heard, stale = now, False
                 self.records.show(estimate)
@@ -54,6 +62,17 @@ class Gateway:
                 due = now + BEAT_S
                 if self.records is not None:
                     self.records.beat()
+
+    def show_beside(self, now):
+        """Set points and health, as they come; set points first, somebody waits for them. A feedback that is off publishes none."""
+        if (setpoints := self.setpoints.newest()) is not None:
+            self.steered = now
+            self.records.show_setpoints(setpoints)
+        elif self.steered is not None and now - self.steered > self.config.stale_s:
+            self.steered = None
+            self.records.setpoints_stale()
+        if (health := self.health.newest()) is not None:
+            self.records.show_health(health)
 
     def fits(self, estimate):
         """Records are those of one machine."""

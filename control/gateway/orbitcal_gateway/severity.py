@@ -4,6 +4,21 @@ NO_ALARM, MINOR, MAJOR, INVALID = range(4)
 # alarm status of EPICS
 NONE, HIHI, HIGH, SOFT, UDF = 0, 3, 4, 15, 17
 
+# states of an instrument: docs/daemon.md
+STATES = [("ok", NO_ALARM), ("noisy", MINOR), ("jumps", MINOR), ("dead", MAJOR), ("back", MINOR)]
+FAULTY = (1, 2, 3)
+# why the feedback holds: docs/feedback.md
+HOLDS = [
+    ("follows", NO_ALARM),
+    ("first after a silence", MINOR),
+    ("no beam it knows", MINOR),
+    ("estimate failed", MAJOR),
+    ("surprising frame", MINOR),
+    ("model disagrees", MAJOR),
+    ("too few monitors", MAJOR),
+    ("gains not made yet", MINOR),
+]
+
 MISMATCH = ["fits", "does not fit", "not checked"]
 
 
@@ -28,6 +43,17 @@ def of_row(config, estimate, i):
     low, high = config.mean_alarm
     beyond = estimate.mean[i] <= low or estimate.mean[i] >= high
     return MAJOR if beyond else of_mean(config, estimate, i)[0]
+
+
+def of_count(faulty):
+    """Some instruments are not as they should be."""
+    return (MINOR, SOFT) if faulty else (NO_ALARM, NONE)
+
+
+def of_code(words, code):
+    """A state, or a reason to hold; a word that this gateway does not know is INVALID."""
+    worst = words[code][1] if code < len(words) else INVALID
+    return worst, SOFT if worst else NONE
 
 
 def of_mismatch(estimate):

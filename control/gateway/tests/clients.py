@@ -14,6 +14,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+from orbitcal_gateway import severity
+
 BASE = 20000 + 8 * (os.getpid() % 4000)
 # the processes of one test share them
 os.environ.update({} if "ORBITCAL_GATEWAY_TEST" in os.environ else
@@ -33,6 +35,9 @@ os.environ.update({} if "ORBITCAL_GATEWAY_TEST" in os.environ else
 )
 BIN = Path(sys.executable).parent
 SERVICE = f"orbitcal.GatewayTest.{os.getpid()}"
+CORRECTORS = [f"{plane}_{cell}{n}" for plane, n0 in (("H", 2), ("V", 1)) for cell in "ABCDEF" for n in range(n0, 9, 2)]
+SCREEN = Path(__file__).parents[1] / "vars.bob"
+HOLDS, STATES = [[word for word, _ in words] for words in (severity.HOLDS, severity.STATES)]
 VARS = [f"{cell}{n}" for n0 in (2, 1) for cell in "ABCDEF" for n in range(n0, 9, 2)]
 NO_ALARM, MINOR, MAJOR, INVALID = range(4)
 CONFIG = f'service = "{SERVICE}"\nsetpoints = ["H_A4"]\nstale_s = 3.0\nsigma_minor = 0.004\n'
@@ -53,6 +58,20 @@ def gateway(folder, config):
         except subprocess.TimeoutExpired:
             process.kill()
             raise
+
+
+@contextmanager
+def daemon(orbitcal, folder, feedback):
+    """The daemon on a recording as if it were live."""
+    recording = Path("recordings/paper-vars").resolve()
+    text = f'[machine]\nrecording = "{recording}"\n[source]\naddress = "replay:{recording}"\nrate_hz = 12\n'
+    (folder / "daemon.toml").write_text(f'{text}[publish]\nservice = "{SERVICE}"\n[feedback]\n{feedback}\npatience_ms = 60000\n')
+    process = subprocess.Popen([orbitcal, "serve", folder / "daemon.toml"], stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
 
 
 @contextmanager
@@ -141,6 +160,68 @@ def by_p4p():
     print(f"p4p: 48 records, the table with {len(updates)} updates in 3 s")
 
 
+def screen():
+    """Every channel that the operators' screen shows is there."""
+    import xml.etree.ElementTree as xml
+
+    import epics
+
+    shown = [node.text.replace("$(P)", "ORBITCAL") for node in xml.parse(SCREEN).iter("pv_name")]
+    pvs = [epics.PV(name) for name in shown]
+    missing = [pv.pvname for pv in pvs if not pv.wait_for_connection(10)]
+    assert len(shown) > 100 and not missing, missing
+    print(f"screen: all {len(shown)} channels of {SCREEN.name} are there")
+
+
+def steered():
+    """Set points and health of a daemon, by all three clients: values, limits, units, alarms, and what may be written."""
+    import epics
+    from caproto import ChannelType
+    from caproto.threading.client import Context as Caproto
+    from p4p.client.thread import Context as P4p
+
+    names = [f"ORBITCAL:{corrector}:SETPOINT" for corrector in CORRECTORS]
+    pvs = [epics.PV(name, form="ctrl") for name in names]
+    hold = epics.PV("ORBITCAL:FEEDBACK:HOLD")
+    assert hold.wait_for_connection(10)
+    for pv in pvs:
+        assert pv.wait_for_connection(10) and pv.units == "A" and not pv.write_access, pv.pvname
+        assert (pv.lower_disp_limit, pv.upper_disp_limit) == (-25.0, 25.0)
+        assert abs(pv.get()) <= 25.0 and pv.severity in (NO_ALARM, MINOR), (pv.pvname, pv.get(), pv.severity)
+    # of a campaign, whose correctors others move: those of the feedback do not follow, and are said
+    assert hold.get(as_string=True) in HOLDS and hold.severity in (NO_ALARM, MINOR, MAJOR)
+    left_out = epics.PV("ORBITCAL:FEEDBACK:LEFT_OUT")
+    assert left_out.wait_for_connection(10)
+    assert left_out.get() == 0 or left_out.severity == MINOR
+    values = {name: pv.get() for name, pv in zip(names, pvs)}
+    context = Caproto()
+    for pv in context.get_pvs(*names, timeout=10):
+        pv.wait_for_connection(timeout=10)
+        reply = pv.read(data_type=ChannelType.CTRL_DOUBLE, timeout=10)
+        assert reply.metadata.units == b"A" and abs(reply.data[0]) <= 25.0, pv.name
+    pva = P4p("pva", nt=False)
+    for name in names:
+        value = pva.get(name, timeout=10)
+        assert abs(value.value) <= 25.0 and value.display.units == "A" and value.alarm.severity < INVALID, name
+    states = [epics.PV(f"ORBITCAL:{name}:STATE") for name in ("x_C6", "y_B5", "H_A4", "V_F7")]
+    for pv in states:
+        assert pv.wait_for_connection(10) and pv.get(as_string=True) in STATES, pv.pvname
+    chi2 = epics.PV("ORBITCAL:CHI2_PER_DOF")
+    assert chi2.wait_for_connection(10) and 0.5 < chi2.get() < 2.0, chi2.get()
+    moved = sum(abs(value) > 0.05 for value in values.values())
+    print(f"set points: {len(names)} by pyepics, caproto and p4p, {moved} of them moved; health of instruments; chi2/dof {chi2.get():.2f}")
+
+
+def not_steered():
+    """Without a feedback a set point is there, and INVALID: nobody is to write it."""
+    import epics
+
+    for record in ("H_A4:SETPOINT", "V_F7:SETPOINT", "FEEDBACK:HOLD"):
+        pv = epics.PV(f"ORBITCAL:{record}")
+        assert pv.wait_for_connection(10) and pv.get_timevars()["severity"] == INVALID, record
+    print("without a feedback: set points are INVALID")
+
+
 def gone_stale():
     """What was published stays to be read, and is invalid."""
     import epics
@@ -172,7 +253,7 @@ def alive():
     assert pv.wait_for_connection(15) and 0.9 < pv.get() < 1.1
 
 
-CLIENTS = {one.__name__: one for one in (by_pyepics, by_caproto, by_p4p, gone_stale, written, alive)}
+CLIENTS = {one.__name__: one for one in (by_pyepics, by_caproto, by_p4p, screen, steered, not_steered, gone_stale, written, alive)}
 
 
 def see(*clients):
@@ -206,6 +287,10 @@ def main(orbitcal):
                 see(by_pyepics, by_caproto, by_p4p)
             time.sleep(5.0)
             see(gone_stale)
+        with daemon(orbitcal, Path(folder), "on = true"), gateway(folder, CONFIG.replace('setpoints = ["H_A4"]\n', "")):
+            see(screen, steered)
+        with daemon(orbitcal, Path(folder), ""), gateway(folder, CONFIG.replace('setpoints = ["H_A4"]\n', "")):
+            see(alive, not_steered)
         with gateway(folder, CONFIG + "writable = true\n"), replay(orbitcal, "--rate", "15"):
             see(written)
         pick = random.Random(3)

@@ -161,6 +161,16 @@ impl SimulatedMachine {
         values
     }
 
+    /// Number of the last cycle.
+    pub fn cycles(&self) -> u32 {
+        self.cycle
+    }
+
+    /// What the monitors would have read in the last cycle without noise, jumps and faults [mm].
+    pub fn exact_mm(&self) -> Vec<f64> {
+        self.live.exact().iter().map(|metres| metres * 1e3).collect()
+    }
+
     /// Correctors move towards their set points, but for those that stick.
     fn follow(&mut self, set: &BTreeMap<String, f64>, seconds: f64) {
         let share = 1.0 - (-seconds / self.settling).exp();

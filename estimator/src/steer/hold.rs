@@ -30,6 +30,11 @@ pub enum Hold {
 }
 
 impl Hold {
+    /// As a number, from 1 on.
+    pub fn code(self) -> u8 {
+        self as u8
+    }
+
     /// True where the readings contradict the model: without kicks nothing would tell which of them is wrong.
     pub fn is_doubt(self) -> bool {
         matches!(self, Self::PutAside | Self::Surprising | Self::Mismatch)

@@ -43,11 +43,15 @@ impl<const C: usize> Supplies<C> {
 
     /// Take new read-backs; returns how far each has moved [A], and whether one is left out or counts again since.
     ///
-    /// A supply is missed in a frame that finds it further than `close` from its setpoint, and less than half of the way nearer.
-    pub fn hear(&mut self, read_back: &[CurrentCode; C], close: f32) -> ([f32; C], bool) {
+    /// A supply is missed in a frame that finds it further than `close` from its setpoint, and less than half of the way nearer. One that
+    /// is not used is moved by others: its setpoint is where it is.
+    pub fn hear(&mut self, read_back: &[CurrentCode; C], close: f32, uses: impl Fn(usize) -> bool) -> ([f32; C], bool) {
         let (mut done, left_out) = ([0.0; C], self.left_out());
-        let each = self.setpoint.iter().zip(&mut self.read_back).zip(&mut self.missed);
-        for (((setpoint, before), missed), (now, done)) in each.zip(read_back.iter().zip(&mut done)) {
+        let each = self.setpoint.iter_mut().zip(&mut self.read_back).zip(&mut self.missed).enumerate();
+        for ((c, ((setpoint, before), missed)), (now, done)) in each.zip(read_back.iter().zip(&mut done)) {
+            if !uses(c) {
+                *setpoint = *now;
+            }
             let [gap_before, gap] = [*before, *now].map(|at| (setpoint.value() - at.value()).abs());
             *missed = match gap > close {
                 true if 2.0 * gap > gap_before => missed_once_more(*missed),
@@ -76,6 +80,9 @@ impl<const C: usize> Supplies<C> {
     #[inline(never)]
     pub fn probe(&mut self, size: f32, n: u32, limit: &Each<C>) {
         for (c, setpoint) in self.setpoint.iter_mut().enumerate().filter(|_| n != 0) {
+            if limit.of(c) <= 0.0 {
+                continue; // it is not used
+            }
             let room = (limit.of(c) - setpoint.value().abs()).max(0.0);
             let by = size * sign(n, c as u32);
             let outward = by * setpoint.value() > 0.0;
@@ -90,7 +97,7 @@ impl<const C: usize> Supplies<C> {
             let (limit, at) = (limit(c), setpoint.value());
             let edge = limit.max(at.abs());
             *setpoint = moved(*setpoint, by.min(edge - at).max(-edge - at));
-            limited += u16::from(setpoint.steps().abs() >= moved(ZERO, limit).steps());
+            limited += u16::from(limit > 0.0 && setpoint.steps().abs() >= moved(ZERO, limit).steps());
         }
         limited
     }

@@ -243,6 +243,27 @@ fn a_known_response_removes_the_orbit_in_one_step() {
     assert!(machine.orbit().iter().all(|x| (x - 1e-3).abs() < 2.0 * ROUNDING), "{:?}", machine.orbit());
 }
 
+/// The second corrector is another's, who sets it: the orbit that it makes is removed by the others as far as they can, and it stays.
+#[test]
+fn a_corrector_that_is_not_used_is_left_to_others() {
+    let mut table = diagonal();
+    table.at[0][1] = 10.0; // the first monitor sees it, too
+    let limit = Each { all: 1e3, own: heapless::Vec::from_slice(&[1e3, 0.0, 1e3, 1e3]).unwrap() };
+    let mut machine = Machine::new(table, Feedback { limit, probe: 1.0, step_kick: STEP, ..free() }, 0.0);
+    machine.cycles(3);
+    machine.current[1] = CurrentCode::nearest(7.0).unwrap();
+    machine.cycles(1);
+    assert_eq!(machine.state.steered(), Steered { hold: None, left_out: 0, limited: 0 });
+    assert_eq!(machine.amperes()[1], 7.0);
+    // 1 % of what an orbit costs, see STEP
+    assert!(machine.orbit()[0].abs() < 0.02 * 7e-4, "{:?}", machine.orbit());
+    assert!((machine.orbit()[1] - 7e-4).abs() < 2.0 * ROUNDING, "{:?}", machine.orbit());
+    machine.judged.remarks.put_aside = true;
+    machine.cycles(4); // the model is in doubt: the others are probed
+    assert_eq!(machine.amperes()[1], 7.0);
+    assert!(machine.amperes()[2].abs() > 0.5);
+}
+
 #[test]
 fn at_half_the_momentum_half_the_current_removes_the_orbit() {
     let amperes = |momentum: f32| {

@@ -3,8 +3,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use control::{Gathering, Plan};
 use estimator::wire::packet;
-use inference::stream::{self, Core};
+use inference::Recording;
+use inference::recording::Header;
+use inference::stream::{self, Core, Feedback};
 use training::rooms::large;
 use twin::Ring;
 
@@ -18,9 +21,11 @@ use crate::history::{self, Columns, Recorder};
 use crate::logs;
 use crate::output::{self, tell};
 use crate::record::{Names, Remarked};
-use crate::sink::shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer};
+use crate::sink::shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer, SetpointWriter};
+use crate::source::desk::Allowed;
 use crate::source::desk::Desk;
 use crate::source::origin::Origin;
+use crate::source::program::Program;
 use crate::source::queue::{Faults, Queue};
 use crate::source::{feed, rehearsal, shared};
 use crate::stop::Stop;
@@ -39,9 +44,12 @@ impl From<ConfigError> for CommandError {
 pub fn check(file: &Path) -> Result<(), CommandError> {
     let config = Config::read(file)?;
     let (ring, core) = build(&config)?;
-    if let Origin::Recording(path) = &config.source.address {
-        recording(path, &ring)?;
+    match &config.source.address {
+        Origin::Recording(path) => _ = recording(path, &ring)?,
+        Origin::Epics(path) => _ = plan(path, &ring)?,
+        Origin::Line(_) | Origin::SharedMemory(_) => {}
     }
+    feedback_wanted(&config, &ring)?;
     let sizes = core.tables.sizes();
     output::say(format_args!(
         "{}: good; {}, {} monitors, {} vars, frames from {}",
@@ -74,7 +82,8 @@ pub fn run(file: &Path) -> Result<(), CommandError> {
     start(&config.source, &ring, &queue, &stop)?;
     tell(format_args!("publishes on {}, takes frames from {}", config.publish.service, config.source.address));
     let every = checkpoint.map(|_| config.checkpoint.checkpoint_every_frames);
-    let engine = Engine::new(core, queue, model, resumed.map(|head| head.sequence), every);
+    let engine = Engine::new(core, queue, model, resumed.map(|head| head.sequence), every)
+        .with_feedback(feedback_wanted(&config, &ring)?, config.feedback.on);
     daemon::run(engine, outlet, &stop).map_err(CommandError::other)
 }
 
@@ -90,8 +99,9 @@ fn outlet(
     let Publish { service, name, frames } = &config.publish;
     // first, as it refuses a second daemon
     let server = RequestServer::try_new(service, name).map_err(CommandError::other)?;
-    let desk =
-        Desk::new(server, config.requests, recording(&config.machine.recording, ring)?.powered(ring).into_owned());
+    let calibrated = calibration(&config.machine.recording, ring)?;
+    let desk = Desk::new(server, Allowed { requests: config.requests, ring: calibrated.powered(ring).into_owned() });
+    let setpoints = setpoints(config, ring)?;
     let publisher = Publisher::try_new(service, name, &names).map_err(CommandError::other)?;
     let health = HealthWriter::try_new(service, name, &names, &correctors).map_err(CommandError::other)?;
     let frames = frames.as_deref().map(|service| FrameWriter::try_alone(service, name)).transpose();
@@ -113,7 +123,8 @@ fn outlet(
         .with_requests(desk)
         .with_frames(frames.map_err(CommandError::other)?)
         .with_checkpoints(keeper.map_err(CommandError::other)?)
-        .with_history(recorder))
+        .with_history(recorder)
+        .with_feedback(setpoints))
 }
 
 /// The history, if one is kept; the page begins with what is there.
@@ -129,6 +140,21 @@ fn recorder(config: &config::History, columns: &Columns, board: &Arc<Board>) -> 
     Ok(Some(Recorder::new(&plan, columns, keeper)))
 }
 
+/// What is wanted of the orbit, if the feedback is on or can be switched on.
+fn feedback_wanted(config: &Config, ring: &Ring) -> Result<Option<Feedback>, CommandError> {
+    let is_possible = config.feedback.on || config.requests.feedback;
+    is_possible.then(|| config.feedback.of(ring).map_err(CommandError::Input)).transpose()
+}
+
+/// Where set points go, if there can be a feedback.
+fn setpoints(config: &Config, ring: &Ring) -> Result<Option<SetpointWriter>, CommandError> {
+    if feedback_wanted(config, ring)?.is_none() {
+        return Ok(None);
+    }
+    let Publish { service, name, .. } = &config.publish;
+    SetpointWriter::try_new(service, name, &ring.name, &ring.corrector_names()).map(Some).map_err(CommandError::other)
+}
+
 /// Begin to put frames into the queue.
 fn start(source: &Source, ring: &Ring, queue: &Queue, stop: &Stop) -> Result<(), CommandError> {
     let most = packet::wire_bytes(large::Frame::MAX_BYTES);
@@ -136,15 +162,34 @@ fn start(source: &Source, ring: &Ring, queue: &Queue, stop: &Stop) -> Result<(),
         Origin::Line(address) => feed::start(source, address, most, queue, stop),
         Origin::Recording(path) => rehearsal::start(recording(path, ring)?, source.rate(), queue, stop),
         Origin::SharedMemory(service) => shared::start(service, most, queue, stop),
+        Origin::Epics(path) => {
+            let request = Gathering::of(&plan(path, ring)?, source.late()).line();
+            let program = Program { path: source.program.clone(), request };
+            feed::start_program(program, source, most, queue, stop)
+        }
     }
     .map_err(|error| CommandError::Other(format!("{}: {error}", source.address)))
+}
+
+/// A recording whose header has calibration, noise and ramp; of a header alone, one without frames.
+fn calibration(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {
+    if !path.is_file() {
+        return recording(path, ring);
+    }
+    let header = Header::read(path, ring)?;
+    Ok(Recording { name: path.display().to_string(), header, other: Vec::new(), rows: Vec::new() })
+}
+
+/// A measurement plan, whose channels are gathered.
+fn plan(path: &Path, ring: &Ring) -> Result<Plan, CommandError> {
+    Plan::read(path, ring).map_err(|error| CommandError::Input(error.to_string()))
 }
 
 /// The ring, and a core for it at its prior.
 fn build(config: &Config) -> Result<(Ring, Core), CommandError> {
     let machine_file = &config.machine;
     let ring = machine(machine_file.file.as_deref())?;
-    let recording = recording(&machine_file.recording, &ring)?;
+    let recording = calibration(&machine_file.recording, &ring)?;
     let powered = recording.powered(&ring);
     let tables = tables(CoreModel::Green, &powered, machine_file.model_file.as_deref())?;
     let setup = stream::setup(&powered, &recording, config.walk.into())?;

@@ -17,6 +17,7 @@ use twin::{Measured, Ring};
 use super::{CommandError, check_outputs, deliver, machine_with, matrix, progress, recording};
 use crate::cli::Diagnose;
 use crate::model_file;
+use crate::next_plan::{self, NextPlanError};
 use crate::output::{self, fill, table};
 use crate::result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 
@@ -172,7 +173,7 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
             "--model-file is for a measured matrix; the model of a recording is its machine file".into(),
         ));
     }
-    let outputs = [&options.common.json, &options.report, &options.model_out];
+    let outputs = [&options.common.json, &options.report, &options.model_out, &options.plan_out];
     check_outputs(outputs.map(Option::as_deref))?;
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recordings = recordings(&options.recordings, &ring)?;
@@ -194,6 +195,9 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     if let Some(path) = options.report.as_ref().filter(|_| options.common.speaks()) {
         output::say(format_args!("\n{}", path.display()))?;
     }
+    if let (Some(plan), Some(out)) = (&options.plan, &options.plan_out) {
+        write_plan(options, &ring, &diagnosis, [plan, out])?;
+    }
     options.model_out.as_deref().map_or(Ok(()), |path| write_model(&diagnosis, path))
 }
 
@@ -209,6 +213,29 @@ fn recordings(folders: &[PathBuf], ring: &Ring) -> Result<Vec<Recording>, Comman
         }
     }
     Ok(folders.iter().map(|folder| Recording::read_at_its_energy(folder, ring)).collect::<Result<_, _>>()?)
+}
+
+/// Write the measurement that would decide; without anything to decide that is said.
+fn write_plan(
+    options: &Diagnose,
+    ring: &Ring,
+    diagnosis: &Diagnosis,
+    [plan, out]: [&Path; 2],
+) -> Result<(), CommandError> {
+    let proposals = diagnosis.proposals().map_err(CommandError::other)?;
+    if proposals.is_empty() {
+        output::warn(format_args!("{}: not written: no two causes are left to tell apart", out.display()));
+        return Ok(());
+    }
+    let what = next_plan::write(plan, out, ring, &proposals).map_err(|error| match error {
+        NextPlanError::Plan(..) => CommandError::Input(error.to_string()),
+        error => CommandError::other(error),
+    })?;
+    if options.common.speaks() {
+        Ok(output::say(format_args!("\n{}: a campaign {what}", out.display()))?)
+    } else {
+        Ok(())
+    }
 }
 
 /// Write the core's tables of the machine that was found, if they can hold all of it.

@@ -4,7 +4,7 @@ use core::time::Duration;
 use std::path::{Path, PathBuf};
 
 use super::{CommandError, check_outputs};
-use crate::cli::{Ask, Request};
+use crate::cli::{Ask, Request, Switch};
 use crate::output;
 use crate::sink::shared_memory::{self, Reply, RequestClient};
 
@@ -22,6 +22,7 @@ pub fn run(options: &Request) -> Result<(), CommandError> {
             (shared_memory::Request::Snapshot, Some(out))
         }
         Ask::Reset => (shared_memory::Request::Reset, None),
+        Ask::Feedback { state } => (shared_memory::Request::Feedback(*state == Switch::On), None),
         Ask::Model { file } => (shared_memory::Request::Model(whole(file)?), None),
     };
     let mut client = RequestClient::try_new(&options.service).map_err(CommandError::other)?;

@@ -4,13 +4,16 @@
 //! cycle comes out as `{"values": {CHANNEL: [NUMBER or null]}}`. The end of the input is the end.
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead};
+use std::fs::File;
+use std::io::{self, BufRead, Write};
+use std::path::Path;
 
 use control::Plan;
 use control::simulated::{Fault, Settings, SimulatedMachine};
 use inference::simulate;
 use serde::Deserialize;
 use serde_json::json;
+use twin::Ring;
 
 use super::response::vars;
 use super::{CommandError, machine};
@@ -46,11 +49,26 @@ pub fn run(options: &Simulate) -> Result<(), CommandError> {
         seed: options.seed,
     };
     let mut machine = SimulatedMachine::try_new(&plan, &ring, settings).map_err(|error| input(&error))?;
+    let mut exact = options.exact.as_deref().map(|path| exact(path, &ring)).transpose()?;
     output::say(json!({"records": machine.records()}))?;
     for line in io::stdin().lock().lines() {
         let line = line.map_err(CommandError::other)?;
         let Cycle { set, seconds } = serde_json::from_str(&line).map_err(|error| input(&format!("stdin: {error}")))?;
-        output::say(json!({"values": machine.cycle(&set, seconds)}))?;
+        let values = machine.cycle(&set, seconds);
+        if let Some(file) = &mut exact {
+            let readings: Vec<String> = machine.exact_mm().iter().map(|mm| format!("{mm:.6}")).collect();
+            writeln!(file, "{},{}", machine.cycles(), readings.join(",")).map_err(CommandError::other)?;
+        }
+        output::say(json!({"values": values}))?;
     }
     Ok(())
+}
+
+/// The file of what is true, with its head.
+fn exact(path: &Path, ring: &Ring) -> Result<File, CommandError> {
+    let file = File::create(path).and_then(|mut file| {
+        writeln!(file, "cycle,{}", ring.monitor_names().join(","))?;
+        Ok(file)
+    });
+    file.map_err(|error| CommandError::Other(format!("{}: {error}", path.display())))
 }

@@ -7,7 +7,7 @@ use std::time::Instant;
 use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::surrogate::Unstable;
 use estimator::{IngestError, Prepared, StateError, Tables as _};
-use inference::stream::Core;
+use inference::stream::{Core, Feedback};
 use training::{LINE, Tables};
 
 use super::work::{Done, Saved, Taken};
@@ -55,12 +55,21 @@ struct Saving {
     since: u32,
 }
 
+/// The orbit feedback.
+struct Steering {
+    /// What is wanted.
+    wanted: Feedback,
+    /// Set points are computed.
+    is_on: bool,
+}
+
 /// The core, and the frames that wait for it.
 pub struct Engine {
     core: Core,
     pub(super) queue: Queue,
     model: Model,
     saving: Option<Saving>,
+    steering: Option<Steering>,
     /// Last frame of the checkpoint, until the first frame says what was lost.
     resumed: Option<u32>,
     /// Nothing is left to do before the next frame.
@@ -74,7 +83,21 @@ impl Engine {
     /// Frames of a queue through a core, of this model, which is at its prior or was resumed after a frame; with a checkpoint every so many frames.
     pub fn new(core: Core, queue: Queue, model: Model, resumed: Option<u32>, every: Option<u32>) -> Self {
         let saving = every.map(|every| Saving { every, since: 0 });
-        Self { core, queue, model, saving, resumed, is_prepared: false, last: None, fitted: None }
+        Self { core, queue, model, saving, steering: None, resumed, is_prepared: false, last: None, fitted: None }
+    }
+
+    /// From now on with an orbit feedback, if one is wanted, on or to be switched on.
+    #[must_use]
+    pub fn with_feedback(mut self, wanted: Option<Feedback>, is_on: bool) -> Self {
+        self.steering = wanted.map(|wanted| Steering { wanted, is_on });
+        self.steer();
+        self
+    }
+
+    /// The feedback as it is switched: from the next frame on, as if that were the first.
+    fn steer(&mut self) {
+        let steering = self.steering.as_ref().filter(|steering| steering.is_on);
+        self.core.steer(steering.map(|steering| &steering.wanted));
     }
 
     /// Take a frame; one that the core refuses is counted.
@@ -97,7 +120,8 @@ impl Engine {
         }
         let fitted = self.fitted_if_due();
         let (spread, fit) = (self.core.spread(), self.core.fit_quality());
-        Some(Taken { frame, estimate, spread, fit, tables: self.model.tables, fitted })
+        let correction = self.core.correction();
+        Some(Taken { frame, estimate, correction, spread, fit, tables: self.model.tables, fitted })
     }
 
     fn fitted_if_due(&mut self) -> Option<Vec<f32>> {
@@ -147,6 +171,7 @@ impl Engine {
             Wish::Snapshot => self.snapshot(),
             Wish::Reset => self.reset(),
             Wish::Model(tables) => self.adopt(*tables),
+            Wish::Feedback(on) => self.switch(on),
         }
     }
 
@@ -158,8 +183,15 @@ impl Engine {
     fn reset(&mut self) -> Result<Done, String> {
         let (tables, setup) = (self.core.tables.clone(), self.core.setup.clone());
         self.core = Core::with_tables(tables, setup).map_err(|error| error.to_string())?;
+        self.steer();
         (self.last, self.is_prepared) = (None, false);
         Ok(Done::Anew("the core is at its prior".into()))
+    }
+
+    fn switch(&mut self, on: bool) -> Result<Done, String> {
+        self.steering.as_mut().ok_or("no orbit feedback is configured")?.is_on = on;
+        self.steer();
+        Ok(Done::Switched(format!("the orbit feedback is {}", if on { "on" } else { "off" })))
     }
 
     fn adopt(&mut self, tables: Tables) -> Result<Done, String> {

@@ -6,6 +6,7 @@ use std::sync::mpsc::Sender;
 use std::time::Instant;
 
 use estimator::FitQuality;
+use inference::stream::Correction;
 
 use super::work::{Done, Saved, Taken};
 use crate::checkpoint::{self, Checkpoint, Head};
@@ -13,7 +14,7 @@ use crate::health::{HealthRecord, Reporter};
 use crate::history::Recorder;
 use crate::output::{tell, warn};
 use crate::record::{EstimateRecord, Names, Remarked};
-use crate::sink::shared_memory::{Asked, FrameWriter, PublishError, Publisher, Reply};
+use crate::sink::shared_memory::{Asked, FrameWriter, PublishError, Publisher, Reply, SetpointWriter};
 use crate::source::desk::{Desk, Wish, reply};
 use crate::source::queue::{Arrived, Faults, Queue};
 use crate::web::Board;
@@ -45,6 +46,7 @@ pub struct Outlet {
     asked: Option<Asked>,
     checkpoints: Option<checkpoint::Keeper>,
     history: Option<Recorder>,
+    setpoints: Option<SetpointWriter>,
     /// Number of the last frame, and of all frames; how well the model describes them.
     last: Option<([u32; 2], FitQuality)>,
     listened: Instant,
@@ -74,6 +76,7 @@ impl Outlet {
             asked: None,
             checkpoints: None,
             history: None,
+            setpoints: None,
             last: None,
             listened: now,
             said,
@@ -108,9 +111,17 @@ impl Outlet {
         self
     }
 
+    /// From now on with the set points of an orbit feedback.
+    #[must_use]
+    pub fn with_feedback(mut self, writer: Option<SetpointWriter>) -> Self {
+        self.setpoints = writer;
+        self
+    }
+
     /// The estimate of a frame to shared memory; [`Outlet::announce`] and [`Outlet::note`] follow.
     pub(super) fn publish(&mut self, taken: Taken) -> Result<Published, PublishError> {
-        let Taken { frame, estimate, spread, fit, tables, fitted } = taken;
+        let Taken { frame, estimate, correction, spread, fit, tables, fitted } = taken;
+        self.publish_setpoints([estimate.sequence, estimate.frames], correction);
         let mismatch = Some(fit.is_mismatch());
         let mut record = EstimateRecord::of(&self.names, estimate, &spread.covariance(), mismatch);
         self.remarked.add(&record.remarks);
@@ -143,6 +154,15 @@ impl Outlet {
 
     fn health(&self, record: &EstimateRecord, fit: FitQuality) -> HealthRecord {
         self.reporter.health.record([record.sequence, record.frames], fit)
+    }
+
+    /// Publish what the feedback made of a frame; a failure is said, and ends that.
+    fn publish_setpoints(&mut self, of: [u32; 2], correction: Option<Correction>) {
+        let Some((writer, correction)) = self.setpoints.as_mut().zip(correction) else { return };
+        if let Err(error) = writer.publish(of, &correction) {
+            warn(format_args!("{error}; there is no feedback any more"));
+            self.setpoints = None;
+        }
     }
 
     /// Publish a frame; a failure is said, and ends that.
@@ -183,8 +203,13 @@ impl Outlet {
         if self.asked.is_none()
             && let Some((wish, asked)) = self.desk.as_mut().and_then(Desk::receive)
         {
-            // a core that has ended takes no wish; whoever asked hears nothing
-            self.asked = wishes.send(wish).is_ok().then_some(asked);
+            match wish {
+                Wish::Feedback(true) if self.setpoints.is_none() => {
+                    reply(asked, &Reply::Refused("its set points cannot be published".into()));
+                }
+                // a core that has ended takes no wish; whoever asked hears nothing
+                wish => self.asked = wishes.send(wish).is_ok().then_some(asked),
+            }
         }
         self.say_faults(PAUSE);
     }
@@ -197,6 +222,10 @@ impl Outlet {
                 tell(format_args!("asked for: {words}"));
                 self.reporter.restart();
                 self.last = None;
+                Reply::Done(words.into_bytes())
+            }
+            Ok(Done::Switched(words)) => {
+                tell(format_args!("asked for: {words}"));
                 Reply::Done(words.into_bytes())
             }
             Err(why) => Reply::Refused(why),

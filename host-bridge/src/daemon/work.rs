@@ -1,7 +1,7 @@
 //! What the core's thread hands to the one that publishes.
 
 use estimator::FitQuality;
-use inference::stream::{Estimate, Spread};
+use inference::stream::{Correction, Estimate, Spread};
 
 use crate::checkpoint::Model;
 use crate::source::queue::Arrived;
@@ -24,6 +24,8 @@ pub struct Taken {
     pub frame: Arrived,
     /// Vars and monitors after it.
     pub estimate: Estimate,
+    /// What the orbit feedback makes of it; none without one.
+    pub correction: Option<Correction>,
     /// Of which the covariance is made.
     pub spread: Spread,
     /// Readings against the model, all frames so far.
@@ -50,4 +52,6 @@ pub enum Done {
     Snapshot(Saved),
     /// The core is at its prior, or has other tables: health is learnt anew. In words.
     Anew(String),
+    /// The feedback is on or off. In words.
+    Switched(String),
 }

@@ -8,6 +8,7 @@ mod health;
 pub mod layout;
 mod requests;
 mod services;
+mod setpoints;
 mod subscriber;
 
 use core::fmt::Display;
@@ -25,6 +26,7 @@ pub use health::{HealthReader, HealthWriter};
 use layout::{Header, Stamp};
 pub use requests::{Asked, Reply, Request, RequestClient, RequestServer};
 use services::{Services, join};
+pub use setpoints::{SetpointHeader, SetpointReader, SetpointWriter, Setpoints};
 pub use subscriber::{Published, Subscriber};
 
 /// Name of the service of estimates, and of the event that announces each of them.

@@ -18,20 +18,28 @@ pub enum Wish {
     Reset,
     /// These tables.
     Model(Box<Tables>),
+    /// The orbit feedback on or off.
+    Feedback(bool),
+}
+
+/// What may be asked, of which machine.
+pub struct Allowed {
+    /// By the configuration.
+    pub requests: Requests,
+    /// As its supplies are recorded.
+    pub ring: Ring,
 }
 
 /// Takes requests.
 pub struct Desk {
     server: RequestServer,
-    allowed: Requests,
-    /// As its supplies are recorded.
-    ring: Ring,
+    allowed: Allowed,
 }
 
 impl Desk {
-    /// For the daemon of a ring.
-    pub fn new(server: RequestServer, allowed: Requests, ring: Ring) -> Self {
-        Self { server, allowed, ring }
+    /// For a daemon.
+    pub fn new(server: RequestServer, allowed: Allowed) -> Self {
+        Self { server, allowed }
     }
 
     /// The next wish that is allowed, and who has it; others are refused here.
@@ -51,7 +59,7 @@ impl Desk {
     }
 
     fn judge(&self, request: Option<&Request>) -> Result<Wish, String> {
-        let Requests { snapshot, reset, model } = self.allowed;
+        let Requests { snapshot, reset, model, feedback } = self.allowed.requests;
         let not_allowed = |key: &str| Err(format!("requests.{key} is false in the configuration"));
         match request {
             Some(Request::Snapshot) if snapshot => Ok(Wish::Snapshot),
@@ -59,10 +67,12 @@ impl Desk {
             Some(Request::Reset) if reset => Ok(Wish::Reset),
             Some(Request::Reset) => not_allowed("reset"),
             Some(Request::Model(path)) if model => {
-                let tables = model_file::read(Path::new(path), &self.ring);
+                let tables = model_file::read(Path::new(path), &self.allowed.ring);
                 Ok(Wish::Model(Box::new(tables.map_err(|error| error.to_string())?)))
             }
             Some(Request::Model(_)) => not_allowed("model"),
+            Some(Request::Feedback(on)) if feedback => Ok(Wish::Feedback(*on)),
+            Some(Request::Feedback(_)) => not_allowed("feedback"),
             None => Err("the bytes are no request".to_owned()),
         }
     }

@@ -1,4 +1,4 @@
-//! Raw frames from a TCP or unix socket or a serial line, on a thread of its own: it connects or listens, again and again, and reads into a [`Queue`].
+//! Raw frames from a TCP or unix socket, a serial line or a process, on a thread of its own: it connects, listens or starts, again and again, and reads into a [`Queue`].
 
 use core::time::Duration;
 use std::fs;
@@ -13,6 +13,7 @@ use std::time::Instant;
 use serialport::SerialPort;
 
 use super::address::Address;
+use super::program::{Program, Running};
 use super::queue::Queue;
 use super::splitter::Splitter;
 use crate::config::{Role, Source, WhenFull};
@@ -46,6 +47,12 @@ impl Stream for UnixStream {
     }
 }
 
+impl Stream for Running {
+    fn glance(&self) -> io::Result<()> {
+        self.line.glance()
+    }
+}
+
 impl Stream for Box<dyn SerialPort> {
     fn glance(&self) -> io::Result<()> {
         // it was opened with this time
@@ -56,6 +63,7 @@ impl Stream for Box<dyn SerialPort> {
 /// Where connections come from.
 enum Door {
     Connect(Address),
+    Program(Program),
     Tcp(TcpListener),
     Unix(UnixListener),
 }
@@ -86,6 +94,7 @@ impl Door {
             Self::Connect(Address::Tcp(address)) => connect(address).map(|stream| Box::new(stream) as _),
             Self::Connect(Address::Unix(path)) => UnixStream::connect(path).map(|stream| Box::new(stream) as _),
             Self::Connect(Address::Serial(path, baud)) => serial(path, *baud).map(|line| Box::new(line) as _),
+            Self::Program(program) => program.start().map(|running| Box::new(running) as _),
             Self::Tcp(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
             Self::Unix(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
         };
@@ -127,8 +136,20 @@ fn connect(address: &str) -> io::Result<TcpStream> {
 /// # Errors
 /// What the system says of a socket on which the daemon is to listen.
 pub fn start(source: &Source, address: &Address, most: usize, queue: &Queue, stop: &Stop) -> io::Result<()> {
+    start_at(Door::open(source.role, address)?, source, most, queue, stop)
+}
+
+/// Read the frames of a process, which is started again whenever it ends.
+///
+/// # Errors
+/// What the system says of a new thread.
+pub fn start_program(program: Program, source: &Source, most: usize, queue: &Queue, stop: &Stop) -> io::Result<()> {
+    start_at(Door::Program(program), source, most, queue, stop)
+}
+
+fn start_at(door: Door, source: &Source, most: usize, queue: &Queue, stop: &Stop) -> io::Result<()> {
     let reader = Reader {
-        door: Door::open(source.role, address)?,
+        door,
         source: source.clone(),
         splitter: Splitter::new(most),
         queue: queue.clone(),
@@ -171,7 +192,7 @@ impl Reader {
                 }
                 Err(_) => {}
             }
-            if matches!(self.door, Door::Connect(_)) {
+            if matches!(self.door, Door::Connect(_) | Door::Program(_)) {
                 self.stop.sleep_until(Instant::now() + wait);
                 wait = (2 * wait).min(most.max(first));
             }

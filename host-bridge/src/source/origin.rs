@@ -15,6 +15,8 @@ pub enum Origin {
     Recording(PathBuf),
     /// `iceoryx2:SERVICE`
     SharedMemory(String),
+    /// `epics:PLAN.toml`
+    Epics(PathBuf),
 }
 
 impl FromStr for Origin {
@@ -23,6 +25,7 @@ impl FromStr for Origin {
     fn from_str(text: &str) -> Result<Self, String> {
         match text.split_once(':').filter(|(_, rest)| !rest.is_empty()) {
             Some(("replay", path)) => Ok(Self::Recording(path.into())),
+            Some(("epics", plan)) => Ok(Self::Epics(plan.into())),
             Some(("iceoryx2", service)) => Ok(Self::SharedMemory(service.to_owned())),
             _ => text.parse().map(Self::Line),
         }
@@ -35,6 +38,7 @@ impl fmt::Display for Origin {
             Self::Line(address) => address.fmt(f),
             Self::Recording(path) => write!(f, "replay:{}", path.display()),
             Self::SharedMemory(service) => write!(f, "iceoryx2:{service}"),
+            Self::Epics(plan) => write!(f, "epics:{}", plan.display()),
         }
     }
 }
@@ -45,12 +49,18 @@ mod tests {
 
     #[test]
     fn frames_come_from_lines_recordings_or_shared_memory() {
-        for text in ["tcp://localhost:5000", "unix:/run/a", "serial:/dev/ttyS1@115200", "replay:night", "iceoryx2:a/b"]
-        {
+        for text in [
+            "tcp://localhost:5000",
+            "unix:/run/a",
+            "serial:/dev/ttyS1@115200",
+            "replay:night",
+            "iceoryx2:a/b",
+            "epics:p.toml",
+        ] {
             assert_eq!(text.parse::<Origin>().unwrap().to_string(), text);
         }
         assert_eq!("replay:night".parse(), Ok(Origin::Recording("night".into())));
-        for wrong in ["replay:", "iceoryx2:", "night", "serial:"] {
+        for wrong in ["replay:", "iceoryx2:", "epics:", "night", "serial:"] {
             assert!(wrong.parse::<Origin>().is_err(), "{wrong}");
         }
     }

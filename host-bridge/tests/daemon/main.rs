@@ -10,3 +10,4 @@ mod place;
 mod requests;
 mod soak;
 mod sources;
+mod steering;

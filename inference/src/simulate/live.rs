@@ -21,6 +21,7 @@ pub struct Live {
     jumps: StdRng,
     meter: StdRng,
     before: Option<Cycle>,
+    exact: Vec<f64>,
 }
 
 impl Live {
@@ -46,7 +47,12 @@ impl Live {
         let mut offset = DMatrix::zeros(1, hardware.noise.len());
         hardware.offset(&mut offset, &mut stream());
         let (noise, jumps, meter) = (stream(), stream(), stream());
-        Ok(Self { template, ring, tracked, hardware, offset, noise, jumps, meter, before: None })
+        Ok(Self { template, ring, tracked, hardware, offset, noise, jumps, meter, before: None, exact: Vec::new() })
+    }
+
+    /// What the monitors would have read in the last cycle without noise and jumps [m].
+    pub fn exact(&self) -> &[f64] {
+        &self.exact
     }
 
     /// The row with what monitors and tune meter read; an effect that remembers does so for one cycle.
@@ -60,6 +66,7 @@ impl Live {
         let (orbits, tunes) = self.tracked.cycles(&cycles)?;
         let last = cycles.len() - 1;
         let mut reading = orbits.rows(last, 1) + &self.offset;
+        self.exact = reading.iter().copied().collect();
         self.hardware.add_noise(&mut reading, &mut self.noise);
         self.hardware.jump(&mut reading, &mut self.jumps);
         let tune = self.hardware.meter(&tunes[last..], &mut self.meter)[0];

@@ -6,6 +6,7 @@ use estimator::surrogate::{Surrogate, Unstable};
 use estimator::{Core, Estimator, FitQuality, IngestError, Prepared, StateError};
 use training::{Tables, with_stack};
 
+use super::steering::{Correction, Feedback, Loop, Steers};
 use super::{Estimate, Setup};
 
 /// What [`super::Core`] needs of a core.
@@ -14,6 +15,8 @@ pub trait Stream: fmt::Debug + Send + Sync {
     fn prepare(&mut self) -> Prepared;
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable>;
     fn fit_quality(&mut self) -> FitQuality;
+    fn steer(&mut self, feedback: Option<&Feedback>);
+    fn correction(&self) -> Option<Correction>;
     fn covariance(&self, i: usize, j: usize) -> f32;
     fn inverse_factor(&self) -> Vec<f64>;
     fn fitted(&self) -> Vec<f32>;
@@ -76,10 +79,11 @@ where
 }
 
 /// A core, its tables and its setup. Boxed: the Booster's state is some 150 kB, the largest some 6 MB.
-pub struct Held<E: Core> {
+pub struct Held<E: Core, S: Steers<E>> {
     tables: Box<E::Tables>,
     setup: E::Setup,
     core: Box<E>,
+    steering: Option<Box<Loop<E, S>>>,
 }
 
 /// Size of a core from which on its work, and putting it together, may exceed the stack of a thread [B].
@@ -90,40 +94,73 @@ fn on_its_stack<E, R: Send>(work: impl FnOnce() -> R + Send) -> R {
     if size_of::<E>() < LARGE { work() } else { with_stack(work) }
 }
 
-impl<E: Room> Held<E>
+impl<E: Room, S: Steers<E>> Held<E, S>
 where
     E::Tables: Clone + Send + Sync + 'static,
     E::Setup: Send + Sync + 'static,
+    S::Feedback: Send + Sync + 'static,
 {
     /// The core at its prior.
     pub fn boxed(tables: &Tables, setup: &Setup) -> Result<Box<dyn Stream>, Unstable> {
         on_its_stack::<E, _>(|| {
             let mut own = Box::new(<E::Tables as estimator::Tables>::BLANK);
             tables.fill(&mut *own).expect("the room was chosen for them");
-            let mut held = Self { setup: E::setup(&own, setup), tables: own, core: Box::new(E::BLANK) };
+            let mut held = Self { setup: E::setup(&own, setup), tables: own, core: Box::new(E::BLANK), steering: None };
             held.core.restart(&held.tables, &held.setup)?;
             Ok(Box::new(held) as Box<dyn Stream>)
         })
     }
 }
 
-impl<E: Room> Stream for Held<E>
+impl<E: Room, S: Steers<E>> Stream for Held<E, S>
 where
     E::Tables: Clone + Send + Sync + 'static,
     E::Setup: Send + Sync + 'static,
+    S::Feedback: Send + Sync + 'static,
 {
     fn ingest(&mut self, bytes: &mut [u8]) -> Result<Estimate, IngestError> {
-        let estimate = self.core.ingest(&self.tables, &self.setup, bytes)?;
-        Ok(<E as Room>::estimate(&self.tables, &estimate))
+        let Self { tables, setup, core, steering } = self;
+        let estimate = match steering {
+            None => core.ingest(tables, setup, bytes)?,
+            Some(steering) => {
+                let mut judged = steering.state.judge(core, (tables, setup), &steering.feedback, bytes)?;
+                core.learn(tables, setup, &mut judged);
+                steering.is_due = true;
+                core.estimate(tables, setup, &judged)
+            }
+        };
+        Ok(<E as Room>::estimate(tables, &estimate))
     }
 
     fn prepare(&mut self) -> Prepared {
-        on_its_stack::<E, _>(|| self.core.prepare(&self.tables, &self.setup))
+        on_its_stack::<E, _>(|| {
+            let prepared = self.core.prepare(&self.tables, &self.setup);
+            // the feedback's share comes last, once a frame
+            if let (Prepared::Nothing, Some(steering)) = (&prepared, &mut self.steering)
+                && core::mem::replace(&mut steering.is_due, false)
+            {
+                let model = (&*self.tables, &self.setup);
+                let _ = steering.state.prepare(&self.core, model, &steering.feedback);
+            }
+            prepared
+        })
+    }
+
+    fn steer(&mut self, feedback: Option<&Feedback>) {
+        let tables: &E::Tables = &self.tables;
+        self.steering = on_its_stack::<E, _>(|| feedback.map(|wanted| Box::new(Loop::new(tables, wanted))));
+    }
+
+    fn correction(&self) -> Option<Correction> {
+        let steering = self.steering.as_ref()?;
+        Some(steering.state.correction(&self.tables, &steering.feedback))
     }
 
     fn adopt(&mut self, tables: &Tables) -> Result<(), Unstable> {
         on_its_stack::<E, _>(|| {
             tables.fill(&mut *self.tables).expect("they are of this machine");
+            // its gains are those of the former tables
+            self.steering.iter_mut().for_each(|steering| steering.restart());
             self.core.adopt(&self.tables, &self.setup)
         })
     }
@@ -166,13 +203,14 @@ where
 
     fn boxed_clone(&self) -> Box<dyn Stream> {
         on_its_stack::<E, _>(|| {
-            Box::new(Self { tables: self.tables.clone(), setup: self.setup.clone(), core: self.core.clone() })
-                as Box<dyn Stream>
+            let Self { tables, setup, core, steering } = self;
+            let (tables, setup, core) = (tables.clone(), setup.clone(), core.clone());
+            Box::new(Self { tables, setup, core, steering: steering.clone() }) as Box<dyn Stream>
         })
     }
 }
 
-impl<E: Core> fmt::Debug for Held<E> {
+impl<E: Core, S: Steers<E>> fmt::Debug for Held<E, S> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "core of {} bytes after {} frames", size_of::<E>(), self.core.frames())
     }

@@ -27,6 +27,8 @@ pub enum Request {
     Reset,
     /// Other tables, from this file.
     Model(String),
+    /// The orbit feedback on or off.
+    Feedback(bool),
 }
 
 /// What became of it.
@@ -44,6 +46,7 @@ impl Request {
             Self::Snapshot => vec![1],
             Self::Reset => vec![2],
             Self::Model(path) => [&[3], path.as_bytes()].concat(),
+            Self::Feedback(on) => vec![4, u8::from(*on)],
         }
     }
 
@@ -51,6 +54,7 @@ impl Request {
         match bytes {
             [1] => Some(Self::Snapshot),
             [2] => Some(Self::Reset),
+            [4, on @ (0 | 1)] => Some(Self::Feedback(*on == 1)),
             [3, path @ ..] => Some(Self::Model(String::from_utf8(path.to_vec()).ok()?)),
             _ => None,
         }
@@ -193,13 +197,13 @@ mod tests {
 
     #[test]
     fn requests_and_replies_survive_shared_memory() {
-        for request in [Request::Snapshot, Request::Reset, Request::Model("a/b ü".into())] {
+        for request in [Request::Snapshot, Request::Reset, Request::Model("a/b ü".into()), Request::Feedback(true)] {
             assert_eq!(Request::decode(&request.encode()), Some(request));
         }
         for reply in [Reply::Done(vec![0, 255]), Reply::Done(vec![]), Reply::Refused("no".into())] {
             assert_eq!(Reply::decode(&reply.encode()), Some(reply));
         }
-        for wrong in [&[][..], &[1, 0], &[9], &[3, 0xff]] {
+        for wrong in [&[][..], &[1, 0], &[9], &[3, 0xff], &[4, 2]] {
             assert_eq!(Request::decode(wrong), None, "{wrong:?}");
         }
     }
