@@ -3,8 +3,8 @@
 mod estimate;
 mod held;
 mod setup;
-mod steering;
 mod spread;
+mod steering;
 
 use core::fmt;
 
@@ -23,8 +23,8 @@ pub use estimate::Estimate;
 pub use estimator::Walk;
 use held::{Held, Stream};
 pub use setup::{FOLLOW, Setup, setup, walk_per_cycle};
-pub use steering::{Correction, Feedback, Role};
 pub use spread::Spread;
+pub use steering::{Correction, Feedback, Role};
 
 /// Why a recording cannot be put on the wire.
 #[derive(Debug, thiserror::Error)]
