@@ -55,9 +55,9 @@ fn the_example_in_python_reads_estimates_and_health() {
             command.arg(root("contrib/orbitcal_reader.py")).args([&place.service, "300", "20"]).output().unwrap();
         let said = String::from_utf8(output.stdout).unwrap();
         assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
-        assert!(said.contains("from orbitcal: AGS Booster, 48 vars, 33 monitors"), "{said}");
+        assert!(said.contains("from orbitcal: AGS Booster") && said.contains(", 48 vars, 33 monitors"), "{said}");
         assert!(said.contains("300 estimates seen, 0 lost"), "{said}");
-        assert!(said.contains("81 instruments, x_D8 dead"), "{said}");
+        assert!(said.contains("81 instruments") && said.contains("x_D8 dead"), "{said}");
     });
 }
 
