@@ -1,12 +1,12 @@
 //! Readers that are not ours: the example in Python, and the command line of iceoryx2. `make clients` installs both and runs this.
 
+use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use std::io::Write;
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
 use crate::place::{Frames, Place, connected, port};

@@ -13,6 +13,9 @@ use serde_json::Value;
 
 use crate::place::{Frames, Place, connected, listening, port};
 
+/// A change of a configuration's text.
+type Edit<'e> = &'e dyn Fn(String) -> String;
+
 /// A daemon that listens, with more in its configuration.
 fn place(test: &str, more: &str) -> (Place, u16) {
     let port = port();
@@ -42,7 +45,7 @@ fn two_daemons_run_side_by_side_and_what_collides_is_refused() {
     let mut daemon = first.start();
     first.hear("takes frames from");
     let shared = |name: &str| first.path(name).display().to_string();
-    let cases: [(&str, &dyn Fn(String) -> String, &str); 5] = [
+    let cases: [(&str, Edit, &str); 5] = [
         (
             "same-service",
             &|text| {
