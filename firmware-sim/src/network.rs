@@ -63,7 +63,7 @@ mod chip {
                 weights = in(reg) weights,
                 even = in(reg) even,
                 odd = in(reg) odd,
-                sum = inlateout(reg) sum => result,
+                sum = inout(reg) sum => result,
                 options(pure, nomem, nostack)
             );
         }
@@ -74,7 +74,8 @@ mod chip {
     fn main() -> ! {
         let pass = PASS.take();
         let digests = [PLANES[0].digest::<Dual>(pass), PLANES[1].digest::<Dual>(pass)];
-        defmt::info!("outputs and Jacobians {=[u32]:08x}, on the host {=[u32]:08x}", digests, DIGESTS);
+        let ([x, y], [host_x, host_y]) = (digests, DIGESTS);
+        defmt::info!("x {=u32:08x}, host {=u32:08x}; y {=u32:08x}, host {=u32:08x}", x, host_x, y, host_y);
         debug::exit(if digests == DIGESTS { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
         panic!("the emulator goes on")
     }

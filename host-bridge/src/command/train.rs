@@ -70,7 +70,7 @@ pub fn run(options: &Train) -> Result<(), CommandError> {
         return Err(CommandError::Other(format!("stopped after {done} of {all}; the same command goes on from there")));
     }
     fs::create_dir_all(&options.out).map_err(CommandError::other)?;
-    let each = [0, 1].map(|plane| {
+    let [x, y] = [0, 1].map(|plane: usize| -> Result<Plane, CommandError> {
         let trainee = &planes[plane];
         let bytes = tables::bytes(&source, plane, &fit::rounded(&trainee.network), &validation[plane]);
         let errors = tables::errors(&source, plane, &bytes, &validation[plane]);
@@ -79,7 +79,6 @@ pub fn run(options: &Train) -> Result<(), CommandError> {
         output::bytes(&path, &bytes)?;
         Ok(Plane { free: fit::validate(&trainee.free, &validation[plane]), core, bytes: bytes.len() })
     });
-    let [x, y]: [Result<Plane, CommandError>; 2] = each;
     if let Some(path) = &options.curves {
         output::bytes(path, curves(&planes).svg.as_bytes())?;
     }
