@@ -272,7 +272,9 @@ impl fmt::Display for FitResult {
         self.remarked.map_or(Ok(()), |remarked| write!(f, "{remarked}"))?;
         if let Some(share) = self.extrapolated.filter(|share| *share > 0.0) {
             let percent = 100.0 * share;
-            let said = format!("{percent:.0} % of the predictions lie outside the vars and tunes that the network was trained on");
+            let said = format!(
+                "{percent:.0} % of the predictions lie outside the vars and tunes that the network was trained on"
+            );
             write!(f, "\n{}", fill(&said))?;
         }
         self.timing.map_or(Ok(()), |timing| write!(f, "\n{timing}"))?;

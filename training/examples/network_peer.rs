@@ -46,7 +46,10 @@ fn main() -> std::io::Result<()> {
     let start = Instant::now();
     (0..TIMED).for_each(|_| fit::learn(&source, &plan, &mut planes, &validation));
     let samples = (2 * 24 * TIMED * plan.machines) as f64;
-    println!("{:.0} samples a second, both planes together, drawing them included", samples / start.elapsed().as_secs_f64());
+    println!(
+        "{:.0} samples a second, both planes together, drawing them included",
+        samples / start.elapsed().as_secs_f64()
+    );
     Ok(())
 }
 

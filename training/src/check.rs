@@ -6,8 +6,8 @@ use nalgebra::DMatrix;
 use twin::{Hold, Optics, Parameter, ParameterPrior, Ring};
 
 use crate::instruments::Instruments;
-use crate::network::{OtherRing, PLANES};
 use crate::network::layers::Network;
+use crate::network::{OtherRing, PLANES};
 use crate::response::{CoreResponse, network_responses, network_responses_f32, responses};
 use crate::tables::{LINE, Tables};
 

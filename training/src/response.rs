@@ -82,13 +82,12 @@ fn network_response(
     let correctors = planes[0].shape().0 - CURRENTS - vars.len();
     let monitors = planes.each_ref().map(|plane| plane.shape().1);
     let mut response = DMatrix::zeros(monitors[0] + monitors[1], 2 * correctors);
-    let inputs = DMatrix::from_fn(planes[0].shape().0, correctors, |row, column| {
-        match row.checked_sub(correctors + CURRENTS) {
+    let inputs =
+        DMatrix::from_fn(planes[0].shape().0, correctors, |row, column| match row.checked_sub(correctors + CURRENTS) {
             Some(var) => (vars[var] - 1.0) as f32 * (LAST_VAR / SPAN),
             None if row == column => CORRECTOR,
             None => 0.0,
-        }
-    });
+        });
     for (plane, network) in planes.iter().enumerate() {
         let outputs = outputs(plane, &inputs);
         for c in 0..correctors {

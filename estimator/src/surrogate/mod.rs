@@ -13,7 +13,8 @@ pub use network::{HIDDEN, LAYERS, Network, Pass, Plain, Products};
 pub use parcels::{List, RING, Table, VERSION, shape};
 pub use quantised::{Block, SymmetricBlock, code, step};
 pub use resnet::{
-    CORRECTOR, CURRENTS, LAST_VAR, ORBIT, ResNet, ResNetLinearised, ResNetProgress, SETTING_KICK, SPAN, TUNE_SPAN, Trained,
+    CORRECTOR, CURRENTS, LAST_VAR, ORBIT, ResNet, ResNetLinearised, ResNetProgress, SETTING_KICK, SPAN, TUNE_SPAN,
+    Trained,
 };
 
 use nalgebra::SMatrix;

@@ -61,34 +61,6 @@ pub struct Network<'t> {
     layers: [Layer<'t>; LAYERS],
     /// Step of the codes that a layer is given.
     steps: [f32; LAYERS],
-    /// CRC-32 (ISO-HDLC) of outputs and Jacobians at [`SAMPLES`] fixed inputs, in f32, little endian: what every target arrives at.
-    pub fn digest<P: Products>(&self, pass: &mut Pass) -> u32 {
-        let mut digest = CRC.digest();
-        let (mut inputs, mut outputs) = ([0.0; HIDDEN], [0.0; HIDDEN]);
-        for sample in 0..SAMPLES {
-            // spread over -1.73 to 1.73 in no order
-            let spread = |i: usize| 1.73 * (((37 * (i + 101 * sample)) % 103) as f32 / 51.0 - 1.0);
-            inputs.iter_mut().enumerate().for_each(|(i, input)| *input = spread(i));
-            self.forward::<P>(&inputs, pass, &mut outputs);
-            outputs.iter().take(self.outputs).for_each(|output| digest.update(&output.to_le_bytes()));
-            for output in 0..self.outputs {
-                self.back(output, pass, &mut inputs);
-                inputs.iter().take(self.inputs).for_each(|slope| digest.update(&slope.to_le_bytes()));
-            }
-        }
-        digest.finalize()
-    }
-
-    /// Codes of the weights, step and bias of each output of a layer.
-    pub fn rows(&self, layer: usize) -> impl Iterator<Item = (&'t [u8], f32, f32)> {
-        self.layers.get(layer).into_iter().flat_map(Layer::rows)
-    }
-
-    /// Inputs and outputs.
-    pub const fn shape(&self) -> (usize, usize) {
-        (self.inputs, self.outputs)
-    }
-
     /// Orbit of the design for the setting of each corrector [m], f32, corrector by corrector.
     design: &'t [u8],
     /// Stated rms error of the orbit of one setting [m].
@@ -152,6 +124,34 @@ impl<'t> Network<'t> {
         HIDDEN * (self.inputs + 2 * HIDDEN + self.outputs) + 3 * HIDDEN + self.outputs
     }
 
+    /// CRC-32 (ISO-HDLC) of outputs and Jacobians at [`SAMPLES`] fixed inputs, in f32, little endian: what every target arrives at.
+    pub fn digest<P: Products>(&self, pass: &mut Pass) -> u32 {
+        let mut digest = CRC.digest();
+        let (mut inputs, mut outputs) = ([0.0; HIDDEN], [0.0; HIDDEN]);
+        for sample in 0..SAMPLES {
+            // spread over -1.73 to 1.73 in no order
+            let spread = |i: usize| 1.73 * (((37 * (i + 101 * sample)) % 103) as f32 / 51.0 - 1.0);
+            inputs.iter_mut().enumerate().for_each(|(i, input)| *input = spread(i));
+            self.forward::<P>(&inputs, pass, &mut outputs);
+            outputs.iter().take(self.outputs).for_each(|output| digest.update(&output.to_le_bytes()));
+            for output in 0..self.outputs {
+                self.back(output, pass, &mut inputs);
+                inputs.iter().take(self.inputs).for_each(|slope| digest.update(&slope.to_le_bytes()));
+            }
+        }
+        digest.finalize()
+    }
+
+    /// Codes of the weights, step and bias of each output of a layer.
+    pub fn rows(&self, layer: usize) -> impl Iterator<Item = (&'t [u8], f32, f32)> {
+        self.layers.get(layer).into_iter().flat_map(Layer::rows)
+    }
+
+    /// Inputs and outputs.
+    pub const fn shape(&self) -> (usize, usize) {
+        (self.inputs, self.outputs)
+    }
+
     /// Orbit of the design for the setting of a corrector at a monitor [m].
     pub fn design(&self, corrector: usize, monitor: usize) -> f32 {
         number(self.design, corrector * self.outputs + monitor)
@@ -198,12 +198,8 @@ impl<'t> Network<'t> {
 
 impl Pass {
     /// Work space, all zero.
-    pub const BLANK: Self = Self {
-        values: [0.0; HIDDEN],
-        codes: [0; HIDDEN],
-        slopes: [[0.0; HIDDEN]; LAYERS - 1],
-        sums: [0; HIDDEN],
-    };
+    pub const BLANK: Self =
+        Self { values: [0.0; HIDDEN], codes: [0; HIDDEN], slopes: [[0.0; HIDDEN]; LAYERS - 1], sums: [0; HIDDEN] };
 }
 
 impl<'t> Layer<'t> {

@@ -115,7 +115,10 @@ impl fmt::Display for Trained {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (name, plane) in ['x', 'y'].iter().zip(&self.planes) {
             let (free, core, bytes) = (1e3 * plane.free, 1e3 * plane.core, plane.bytes);
-            writeln!(f, "{name}: rms error {free:.4} mm in f32, {core:.4} mm with 8-bit weights in the core, {bytes} bytes")?;
+            writeln!(
+                f,
+                "{name}: rms error {free:.4} mm in f32, {core:.4} mm with 8-bit weights in the core, {bytes} bytes"
+            )?;
         }
         write!(f, "{:.0} samples of each plane a second", self.rate)
     }

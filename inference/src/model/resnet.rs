@@ -108,7 +108,8 @@ impl ResnetOptics<'_> {
                 let mut unit = DMatrix::zeros(monitors, CORRECTORS);
                 unit.row_mut(b).fill(1.0);
                 let mut row = DMatrix::zeros(2 * CORRECTORS + 1, self.vars.len());
-                row.view_mut((across, 0), (CORRECTORS, self.vars.len())).copy_from(&self.slopes(plane, &unit).transpose());
+                row.view_mut((across, 0), (CORRECTORS, self.vars.len()))
+                    .copy_from(&self.slopes(plane, &unit).transpose());
                 let mut rf = DMatrix::zeros(PLANES[0].shape().1 + PLANES[1].shape().1, 2 * CORRECTORS + 1);
                 rf[(rows.len(), 2 * CORRECTORS)] = 1.0;
                 row.row_mut(2 * CORRECTORS).copy_from_slice(&self.green.pull_back(&rf));

@@ -8,7 +8,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Parser;
-use estimator::surrogate::{CORRECTOR, CURRENTS, LAST_VAR, Network as Core, ORBIT, Pass as CorePass, Plain, SETTING_KICK, SPAN};
+use estimator::surrogate::{
+    CORRECTOR, CURRENTS, LAST_VAR, Network as Core, ORBIT, Pass as CorePass, Plain, SETTING_KICK, SPAN,
+};
 use inference::ResponseModel;
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -64,11 +66,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut random = StdRng::seed_from_u64(18);
     let even = machines(&ring, options.samples, || 1.0 + f64::from(SPAN) * random.random_range(-1.0..1.0));
     let mut random = StdRng::seed_from_u64(19);
-    let prior = machines(&ring, options.samples, || loop {
-        let normal: f64 = StandardNormal.sample(&mut random);
-        let var = (0.03 * normal - 0.5 * 0.03_f64.powi(2)).exp();
-        if (var - 1.0).abs() <= f64::from(SPAN) {
-            return var;
+    let prior = machines(&ring, options.samples, || {
+        loop {
+            let normal: f64 = StandardNormal.sample(&mut random);
+            let var = (0.03 * normal - 0.5 * 0.03_f64.powi(2)).exp();
+            if (var - 1.0).abs() <= f64::from(SPAN) {
+                return var;
+            }
         }
     });
     println!("error of the difference of the orbits at -22 A and 22 A [mm]; {} machines a set", options.samples);

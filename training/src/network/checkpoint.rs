@@ -38,7 +38,8 @@ pub fn load(path: &Path, planes: &mut [Trainee; 2]) -> io::Result<bool> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
         bytes => bytes?,
     };
-    let other = || io::Error::new(io::ErrorKind::InvalidData, format!("{}: no checkpoint of this training", path.display()));
+    let other =
+        || io::Error::new(io::ErrorKind::InvalidData, format!("{}: no checkpoint of this training", path.display()));
     let mut numbers = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
     if numbers.next() != Some(MAGIC) {
         return Err(other());

@@ -246,4 +246,3 @@ pub fn rounded(network: &Network) -> Network {
     }
     rounded
 }
-

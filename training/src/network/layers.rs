@@ -122,7 +122,12 @@ impl Pass {
     pub fn new(network: &Network, batch: usize) -> Self {
         let matrix = |layer: &Layer| DMatrix::zeros(layer.weight.nrows(), batch);
         let hidden = || DMatrix::zeros(HIDDEN, batch);
-        Self { sums: network.layers.each_ref().map(matrix), hidden: [hidden(), hidden(), hidden()], back: hidden(), slope: hidden() }
+        Self {
+            sums: network.layers.each_ref().map(matrix),
+            hidden: [hidden(), hidden(), hidden()],
+            back: hidden(),
+            slope: hidden(),
+        }
     }
 
     /// The outputs of [`Pass::forward`].
@@ -157,7 +162,13 @@ impl Pass {
 
     /// The derivative with respect to every number of the network, after [`Pass::forward`] of the same inputs, from that with
     /// respect to the outputs.
-    pub fn backward(&mut self, network: &Network, inputs: &DMatrixView<f32>, by_output: &DMatrix<f32>, into: &mut Network) {
+    pub fn backward(
+        &mut self,
+        network: &Network,
+        inputs: &DMatrixView<f32>,
+        by_output: &DMatrix<f32>,
+        into: &mut Network,
+    ) {
         for l in (0..LAYERS).rev() {
             let layer = &network.layers[l];
             let is_last = l == LAYERS - 1;

@@ -107,7 +107,8 @@ impl Source {
         let transfer = |r: f64| TRANSFER.iter().rev().fold(0.0, |sum, c| sum * r + c);
         let factor = |supply: usize| transfer(1.0 + currents[supply]) / transfer(1.0) / momentum;
         let each = self.ring.quadrupoles.iter().zip(&self.currents);
-        let factors: Vec<f64> = each.map(|(q, supply)| q.parameter.map_or(1.0, |p| vars[p]) * factor(*supply)).collect();
+        let factors: Vec<f64> =
+            each.map(|(q, supply)| q.parameter.map_or(1.0, |p| vars[p]) * factor(*supply)).collect();
         let optics = self.varied.at(&factors).ok()?;
         let is_near = |(tune, design): (f64, &f64)| (tune - design).abs() <= TUNE_CUT;
         if !optics.tunes().into_iter().zip(&self.tunes).all(is_near) {
@@ -140,7 +141,8 @@ impl Source {
             let response = machine.response.view((monitors.start, correctors.start), (b, c)) - &design;
             let orbit = response * &currents / f64::from(ORBIT);
             samples.targets.column_mut(at).iter_mut().zip(&orbit).for_each(|(to, orbit)| *to = *orbit as f32);
-            let inputs = currents.iter().map(|i| (i / SETTING) as f32 * CORRECTOR).chain(machine.inputs.iter().copied());
+            let inputs =
+                currents.iter().map(|i| (i / SETTING) as f32 * CORRECTOR).chain(machine.inputs.iter().copied());
             samples.inputs.column_mut(at).iter_mut().zip(inputs).for_each(|(to, input)| *to = input);
         }
         samples

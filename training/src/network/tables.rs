@@ -88,4 +88,3 @@ fn input_steps(network: &Network, samples: &Samples) -> [f32; LAYERS] {
     }
     largest.map(|largest| largest / LARGEST)
 }
-
