@@ -754,10 +754,10 @@ pub struct Train {
     #[arg(long, value_name = "FILE.svg")]
     pub curves: Option<PathBuf>,
     /// Machines of the training set, in thousands; each is seen once, with all 48 correctors
-    #[arg(long, default_value_t = 450, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 520, value_parser = clap::value_parser!(u32).range(1..))]
     pub machines: u32,
     /// Machines that are learnt with rounded weights after that, in thousands
-    #[arg(long, default_value_t = 80, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..))]
     pub rounded: u32,
     /// Seed of everything random
     #[arg(long, default_value_t = 18)]

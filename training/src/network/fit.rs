@@ -34,7 +34,7 @@ pub struct Plan {
 
 impl Plan {
     /// That of the committed tables.
-    pub const FULL: Self = Self { machines: 1024, batch: 2048, free: 450, rounded: 80, peak: [1.0, 0.2], seed: 18 };
+    pub const FULL: Self = Self { machines: 1024, batch: 2048, free: 520, rounded: 90, peak: [1.0, 0.2], seed: 18 };
 
     /// All chunks.
     pub fn chunks(&self) -> usize {
