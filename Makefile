@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -36,7 +36,7 @@ test: setup ## format, lint, tests in debug and release, docs, and the core for 
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
 	cargo build --locked --release -p estimator --target $(TARGET)
 	cargo build --locked --release -p firmware-sim --lib --target $(TARGET) # the core with its log lines, and the loop
-	cargo clippy --locked --profile firmware -p firmware-sim --bin firmware --target $(TARGET) -- -D warnings
+	cargo clippy --locked --profile firmware -p firmware-sim --bins --target $(TARGET) -- -D warnings
 	$(MAKE) board
 
 firmware: toolchain ## the image for the emulated chip; MACHINE=FILE makes it for another machine
@@ -82,8 +82,14 @@ clients: .venv-iceoryx target/tools/bin/iox2 ## readers of the shared memory tha
 target/tools/bin/iox2: | toolchain
 	cargo install iceoryx2-cli --version 0.10.0 --locked --root target/tools
 
-train: build ## the surrogate's tables from the twin, and their measured errors
-	$(ORBITCAL) surrogate check
+train: build ## the network trained on the twin, its tables and curves; then the errors of all surrogates; an hour or two
+	$(ORBITCAL) train --out training/tables --checkpoint target/train.checkpoint --curves docs/figures/training.svg
+	$(MAKE) build
+	$(ORBITCAL) surrogate check --checkpoint target/train.checkpoint
+	cargo run --locked --release -p system-tests --bin surrogates -- --checkpoint target/train.checkpoint --figures docs/figures
+
+network: setup ## the network on the emulated chip beside the host, bit for bit, with instructions
+	cargo test --locked --release -p system-tests --test network -- --nocapture
 
 measured: toolchain ## four measured rings beside LOCO's fits of them: the numbers of docs/real-rings.md; three minutes
 	cargo test --locked --release -p system-tests --test measured -- --include-ignored --nocapture --test-threads 2

@@ -8,7 +8,9 @@ use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use estimator::surrogate::{Pass, Plain};
 use training::Tables;
+use training::network::PLANES;
 use twin::Ring;
 
 fn main() {
@@ -18,11 +20,21 @@ fn main() {
         Ok((ring, tables)) => write(&ring, &tables),
         Err(error) => println!("cargo::error={error}"),
     }
+    digests();
     if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os == "none") {
         link("-Tlink.x"); // cortex-m-rt: vector table and sections
         link("-Tdefmt.x"); // defmt: the texts of log lines stay in the ELF file and take no flash
         link("--nmagic"); // sections are not aligned to pages, which a chip does not have
     }
+}
+
+/// What the networks of the Booster arrive at on the host.
+fn digests() {
+    let mut pass = Pass::BLANK;
+    let digests = PLANES.map(|network| network.digest::<Plain>(&mut pass));
+    let source = format!("/// Digests of the networks in x and y.\npub const DIGESTS: [u32; 2] = {digests:?};\n");
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
+    fs::write(out.join("network.rs"), source).expect("the build folder can be written");
 }
 
 fn link(argument: &str) {

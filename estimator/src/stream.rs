@@ -64,6 +64,8 @@ pub trait Core: Sized {
     /// Number of the frame that was judged.
     fn number(judged: &Self::Judged) -> u32;
     fn needs_attention(&self) -> bool;
+    /// See [`Estimator::is_within`].
+    fn is_within(&self, tables: &Self::Tables) -> bool;
 }
 
 /// A feedback on a core; see [`Steer`] for what each method does.
@@ -190,6 +192,10 @@ impl<
 
     fn needs_attention(&self) -> bool {
         self.needs_attention()
+    }
+
+    fn is_within(&self, surrogate: &G) -> bool {
+        self.is_within(surrogate)
     }
 }
 

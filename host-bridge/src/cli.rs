@@ -64,6 +64,8 @@ pub enum Command {
     Simulate(Simulate),
     /// Surrogates and their measured errors
     Surrogate(Surrogate),
+    /// Train the network of the built-in Booster on the twin, and write its tables
+    Train(Train),
 }
 
 /// Options that every command has.
@@ -787,7 +789,36 @@ pub enum SurrogateAction {
         /// Seed of the scrambled sequence
         #[arg(long, default_value_t = 1)]
         seed: u32,
+        /// A checkpoint of `orbitcal train`: its network in f32 is measured as well
+        #[arg(long, value_name = "FILE")]
+        checkpoint: Option<PathBuf>,
     },
+}
+
+/// `orbitcal train`.
+#[derive(Debug, Args)]
+pub struct Train {
+    /// Folder of the tables, `resnet-x.bin` and `resnet-y.bin`
+    #[arg(long, value_name = "DIR", default_value = "training/tables")]
+    pub out: PathBuf,
+    /// Where training goes on after it was stopped
+    #[arg(long, value_name = "FILE", default_value = "target/train.checkpoint")]
+    pub checkpoint: PathBuf,
+    /// Curves of the errors as a figure
+    #[arg(long, value_name = "FILE.svg")]
+    pub curves: Option<PathBuf>,
+    /// Machines of the training set, in thousands; each is seen once, with all 48 correctors
+    #[arg(long, default_value_t = 520, value_parser = clap::value_parser!(u32).range(1..))]
+    pub machines: u32,
+    /// Machines that are learnt with rounded weights after that, in thousands
+    #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..))]
+    pub rounded: u32,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 18)]
+    pub seed: u32,
+    /// Print nothing but errors
+    #[arg(long)]
+    pub quiet: bool,
 }
 
 /// Predictions that the core can make.
@@ -795,6 +826,8 @@ pub enum SurrogateAction {
 pub enum CoreModel {
     /// Quantised Green's function
     Green,
+    /// The published network with 8-bit weights; built-in Booster only
+    Resnet,
 }
 
 impl CoreModel {
@@ -802,6 +835,7 @@ impl CoreModel {
     pub fn word(self) -> &'static str {
         match self {
             Self::Green => "green",
+            Self::Resnet => "resnet",
         }
     }
 }
@@ -813,6 +847,8 @@ pub enum FitModel {
     Twin,
     /// The Green's function with the core's tables, in f64
     Green,
+    /// The network with the core's weights, in f32; built-in Booster only
+    Resnet,
 }
 
 /// Ways to fit.

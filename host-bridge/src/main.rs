@@ -8,7 +8,7 @@ use clap::error::ErrorKind;
 use host_bridge::cli::{Cli, Command};
 use host_bridge::command::{
     CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, history, import, measure, replay,
-    request, response, serve, simulate, study, surrogate, validate, watch,
+    request, response, serve, simulate, study, surrogate, train, validate, watch,
 };
 use host_bridge::logs;
 use host_bridge::output::{self, OutputError};
@@ -46,6 +46,7 @@ fn main() -> ExitCode {
         Command::Measure(options) => measure::run(options),
         Command::Simulate(options) => simulate::run(options),
         Command::Surrogate(options) => surrogate::run(options),
+        Command::Train(options) => train::run(options),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -56,6 +56,9 @@ pub struct FitResult {
     pub timing: Option<Timing>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub nuts: Option<Sampling>,
+    /// Share of the frames that were predicted outside the range that the model was made for; only of a model that has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub extrapolated: Option<f64>,
     /// How it was found, for a person.
     #[serde(skip)]
     pub notes: Vec<String>,
@@ -154,6 +157,7 @@ impl FitResult {
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
             nuts: None,
+            extrapolated: None,
             notes: Vec::new(),
         }
     }
@@ -209,6 +213,7 @@ impl FitResult {
             log_evidence: None,
             timing: None,
             nuts: None,
+            extrapolated: None,
             notes: Vec::new(),
         }
     }
@@ -265,6 +270,13 @@ impl fmt::Display for FitResult {
             write!(f, ", {} frames refused", self.rejected_frames)?;
         }
         self.remarked.map_or(Ok(()), |remarked| write!(f, "{remarked}"))?;
+        if let Some(share) = self.extrapolated.filter(|share| *share > 0.0) {
+            let percent = 100.0 * share;
+            let said = format!(
+                "{percent:.0} % of the predictions lie outside the vars and tunes that the network was trained on"
+            );
+            write!(f, "\n{}", fill(&said))?;
+        }
         self.timing.map_or(Ok(()), |timing| write!(f, "\n{timing}"))?;
         self.notes.iter().try_for_each(|note| write!(f, "\n{}", fill(note)))
     }

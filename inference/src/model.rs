@@ -1,15 +1,19 @@
-//! What predicts the readings: the exact twin, or the surrogate's Green's function in f64.
+//! What predicts the readings: the exact twin, the surrogate's Green's function in f64, or the network.
 //!
 //! Both give the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
 //! frequency: `-D/eta`, the orbit of a unit of relative offset [m]; and with the tunes. And both give the gradient of any function of
 //! these.
 
 mod green;
+mod resnet;
 
 use nalgebra::DMatrix;
 use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 
+use crate::stream::StreamError;
+
 pub use green::GreenModel;
+pub use resnet::ResnetModel;
 
 /// A model of the ring in its vars.
 #[derive(Debug, Clone)]
@@ -18,6 +22,8 @@ pub enum ResponseModel {
     Twin(Box<VariedRing>),
     /// The Green's function with the tables of the core, in f64.
     Green(Box<GreenModel>),
+    /// The network with the weights of the core, in f32.
+    Resnet(Box<ResnetModel>),
 }
 
 impl ResponseModel {
@@ -37,11 +43,33 @@ impl ResponseModel {
         Ok(Self::Green(Box::new(GreenModel::of(&training::green::tables(ring)?))))
     }
 
+    /// The network, of the ring that it was trained on.
+    ///
+    /// # Errors
+    /// [`StreamError`] for another ring.
+    pub fn resnet(ring: &Ring) -> Result<Self, StreamError> {
+        training::network::expect_known(ring)?;
+        let green = GreenModel::of(&training::green::tables(ring)?);
+        Ok(Self::Resnet(Box::new(ResnetModel::of(green))))
+    }
+
+    /// False if a prediction at `ln` of the factor on each quadrupole's gradient [M] is beyond the range that the model was made for.
+    ///
+    /// # Errors
+    /// [`OrbitError`] where there is no stable ring.
+    pub fn is_within(&self, strength: &[f64]) -> Result<bool, OrbitError> {
+        match self {
+            Self::Twin(_) | Self::Green(_) => Ok(true),
+            Self::Resnet(resnet) => resnet.is_within(&exponential(strength)),
+        }
+    }
+
     /// The word for it.
     pub fn word(&self) -> &'static str {
         match self {
             Self::Twin(_) => "twin",
             Self::Green(_) => "green",
+            Self::Resnet(_) => "resnet",
         }
     }
 
@@ -50,6 +78,7 @@ impl ResponseModel {
         match self {
             Self::Twin(_) => 0.0,
             Self::Green(green) => green.stated_error(b),
+            Self::Resnet(resnet) => resnet.stated_error(b),
         }
     }
 
@@ -62,6 +91,7 @@ impl ResponseModel {
         match self {
             Self::Twin(ring) => Ok(ring.at(&factors)?.prediction()),
             Self::Green(green) => Ok(green.at(&factors)?.prediction()),
+            Self::Resnet(resnet) => Ok(resnet.at(&factors)?.prediction()),
         }
     }
 
@@ -79,6 +109,7 @@ impl ResponseModel {
         match self {
             Self::Twin(ring) => Ok(pull_back(&ring.at(&factors)?, function)),
             Self::Green(green) => Ok(pull_back(&green.at(&factors)?, function)),
+            Self::Resnet(resnet) => Ok(pull_back(&resnet.at(&factors)?, function)),
         }
     }
 
@@ -91,6 +122,10 @@ impl ResponseModel {
         match self {
             Self::Twin(ring) => Ok(slopes(&ring.at(&factors)?, strength.len())),
             Self::Green(green) => Ok(slopes(&green.at(&factors)?, strength.len())),
+            Self::Resnet(resnet) => {
+                let optics = resnet.at(&factors)?;
+                Ok((optics.rows(), tune_rows(&optics, strength.len())))
+            }
         }
     }
 }
@@ -153,9 +188,14 @@ fn pull_back<V>(optics: &impl Optics, function: impl FnOnce(&Prediction) -> (V, 
 }
 
 fn slopes(optics: &impl Optics, quadrupoles: usize) -> (Vec<DMatrix<f64>>, DMatrix<f64>) {
-    let tunes = optics.tune_slopes();
     let rows = rows_of(&optics.response(), quadrupoles, |weights| optics.pull_back(weights));
-    (rows, DMatrix::from_fn(2, quadrupoles, |plane, m| tunes[m][plane]))
+    (rows, tune_rows(optics, quadrupoles))
+}
+
+/// Derivatives of both tunes.
+fn tune_rows(optics: &impl Optics, quadrupoles: usize) -> DMatrix<f64> {
+    let tunes = optics.tune_slopes();
+    DMatrix::from_fn(2, quadrupoles, |plane, m| tunes[m][plane])
 }
 
 fn exponential(params: &[f64]) -> Vec<f64> {

@@ -70,6 +70,9 @@ pub enum StreamError {
         /// Why.
         source: IngestError,
     },
+    /// The network is that of another ring.
+    #[error(transparent)]
+    Network(#[from] training::network::OtherRing),
     /// No tables for this ring.
     #[error(transparent)]
     Training(#[from] training::TrainingError),
@@ -110,6 +113,21 @@ impl Core {
             Some(Held::<ramped::Estimator, ramped::Steer>::boxed(&tables, &setup))
         };
         Self::holding(tables, setup, stream)
+    }
+
+    /// The core at its prior, whose orbits of kicks and their derivatives are those of the trained network; the rest is the tables'.
+    ///
+    /// # Errors
+    /// [`StreamError::Network`] for a ring that it was not trained on, [`StreamError::Unstable`].
+    pub fn with_network(ring: &Ring, tables: Tables, setup: Setup) -> Result<Self, StreamError> {
+        training::network::expect_known(ring)?;
+        let stream = Held::<training::network::Estimator, training::network::Steer>::boxed(&tables, &setup);
+        Self::holding(tables, setup, Some(stream))
+    }
+
+    /// False if the model was linearised outside the range that it was made for. See [`estimator::Estimator::is_within`].
+    pub fn is_within(&self) -> bool {
+        self.stream.is_within()
     }
 
     /// The same in a core that is larger than the ring: its result differs by rounding.

@@ -1,11 +1,14 @@
 //! Measured error of a surrogate against the exact twin; the tables state it.
 
 use estimator::Tables as _;
+use estimator::surrogate::Network as Core;
 use nalgebra::DMatrix;
 use twin::{Hold, Optics, Parameter, ParameterPrior, Ring};
 
 use crate::instruments::Instruments;
-use crate::response::responses;
+use crate::network::layers::Network;
+use crate::network::{OtherRing, PLANES};
+use crate::response::{CoreResponse, network_responses, network_responses_f32, responses};
 use crate::tables::{LINE, Tables};
 
 /// Error of one surrogate in one plane, of the orbit of a kick of 0.4 mrad, over many vars.
@@ -74,6 +77,33 @@ pub(crate) fn check_with(
     seed: u32,
     mut progress: impl FnMut(),
 ) -> [SurrogateError; 2] {
+    let (vars, rings) = sample(ring, instruments, samples, seed, &mut progress);
+    let predicted = responses(tables, &vars);
+    let about = |plane: usize| About {
+        name: "green",
+        parameters: parameters(tables),
+        bytes: bytes(tables),
+        stated_rms: f64::from(tables.stated_error()[plane]),
+    };
+    compare(ring, &rings, &predicted, about)
+}
+
+/// What is known of a surrogate.
+struct About {
+    name: &'static str,
+    parameters: usize,
+    bytes: usize,
+    stated_rms: f64,
+}
+
+/// Vars within the tune cut, the design first, and what the twin makes of them.
+fn sample(
+    ring: &Ring,
+    instruments: &Instruments,
+    samples: usize,
+    seed: u32,
+    progress: &mut impl FnMut(),
+) -> (Vec<Vec<f64>>, Vec<Exact>) {
     let ones = vec![1.0; ring.parameters.len()];
     let exact = |vars: &[f64]| exact(ring, instruments, vars);
     let design = exact(&ones).expect("the surrogate has a stable design").tunes;
@@ -81,9 +111,18 @@ pub(crate) fn check_with(
     let tried = (0..).map(|i| sobol_vars(i, ring, seed)).take(TRIES * samples);
     let within =
         core::iter::once(ones).chain(tried).filter_map(|vars| exact(&vars).filter(near).map(|exact| (vars, exact)));
-    let (vars, rings): (Vec<_>, Vec<_>) = within.inspect(|_| progress()).take(samples).unzip();
+    within.inspect(|_| progress()).take(samples).unzip()
+}
+
+/// The errors of predictions of these rings.
+fn compare(
+    ring: &Ring,
+    rings: &[Exact],
+    predicted: &[Option<CoreResponse>],
+    about: impl Fn(usize) -> About,
+) -> [SurrogateError; 2] {
     let (mut errors, mut each) = ([Errors::default(); 2], [Vec::new(), Vec::new()]);
-    for (exact, core) in rings.iter().zip(responses(tables, &vars)) {
+    for (exact, core) in rings.iter().zip(predicted) {
         // a core refuses a ring beyond a resonance
         let Some(core) = core else { continue };
         let (monitors, correctors) = (ring.horizontal_monitors(), ring.horizontal_correctors());
@@ -104,17 +143,45 @@ pub(crate) fn check_with(
         }
     }
     [0, 1].map(|plane| SurrogateError {
-        name: "green",
+        name: about(plane).name,
         plane: ['x', 'y'][plane],
-        parameters: parameters(tables),
-        bytes: bytes(tables),
+        parameters: about(plane).parameters,
+        bytes: about(plane).bytes,
         samples: each[plane].len(),
         rms: errors[plane].rms(),
         median: median(&mut each[plane]),
         max: errors[plane].largest,
-        stated_rms: f64::from(tables.stated_error()[plane]),
+        stated_rms: about(plane).stated_rms,
         tune_max: errors[plane].tune,
     })
+}
+
+/// The same of the trained network; `free` is the network in f32 before its weights were rounded, if there is one at hand.
+///
+/// # Errors
+/// [`OtherRing`] for a ring that it was not trained on.
+pub fn check_networks(
+    ring: &Ring,
+    free: Option<&[Network; 2]>,
+    samples: usize,
+    seed: u32,
+    mut progress: impl FnMut(),
+) -> Result<Vec<SurrogateError>, OtherRing> {
+    crate::network::expect_known(ring)?;
+    let (vars, rings) = sample(ring, &Instruments::sound(ring), samples, seed, &mut progress);
+    let parameters = |plane: usize| PLANES[plane].parameters();
+    let own = |plane: usize| About {
+        name: "resnet",
+        parameters: parameters(plane),
+        bytes: Core::bytes(PLANES[plane].shape().0, PLANES[plane].shape().1, ring.horizontal_correctors()),
+        stated_rms: 2.0 * f64::from(PLANES[plane].stated_error()),
+    };
+    let mut errors = compare(ring, &rings, &network_responses(&PLANES, &vars), own).to_vec();
+    if let Some(free) = free {
+        let of_free = |plane: usize| About { name: "resnet f32", bytes: 4 * parameters(plane), ..own(plane) };
+        errors.extend(compare(ring, &rings, &network_responses_f32(free, &vars), of_free));
+    }
+    Ok(errors)
 }
 
 /// Points that are tried for each that is wanted: a ring next to a resonance loses most of them.

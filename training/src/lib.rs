@@ -4,6 +4,7 @@ pub mod check;
 pub mod extended;
 pub mod green;
 mod instruments;
+pub mod network;
 mod response;
 pub mod rooms;
 mod source;
@@ -11,7 +12,7 @@ mod tables;
 #[cfg(test)]
 mod testing;
 
-pub use check::{SurrogateError, check};
+pub use check::{SurrogateError, check, check_networks};
 pub use extended::Extended;
 pub use green::TrainingError;
 pub use rooms::with_stack;

@@ -48,6 +48,11 @@ impl<
         Remarks { unsolved, let_loose: self.posterior.let_loose.take(), ..judged.remarks }
     }
 
+    /// True if the surrogate was linearised within the range that it was made for; outside it extrapolates.
+    pub fn is_within(&self, surrogate: &G) -> bool {
+        surrogate.is_within(&self.tangent.linearised)
+    }
+
     /// True if an operator should look: a monitor is not ok, or a var is clipped.
     pub fn needs_attention(&self) -> bool {
         self.monitors.iter().any(|m| m.state() != MonitorState::Ok) || !self.posterior.solution.clipped.is_empty()

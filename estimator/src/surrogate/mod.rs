@@ -2,13 +2,20 @@
 
 mod green;
 mod low_rank;
+mod network;
 mod parcels;
 mod quantised;
+mod resnet;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, GreenProgress, NONE};
 pub use low_rank::{LowRank, TERMS};
+pub use network::{HIDDEN, LAYERS, Network, Pass, Plain, Products};
 pub use parcels::{List, RING, Table, VERSION, shape};
 pub use quantised::{Block, SymmetricBlock, code, step};
+pub use resnet::{
+    CORRECTOR, CURRENTS, LAST_VAR, ORBIT, ResNet, ResNetLinearised, ResNetProgress, SETTING_KICK, SPAN, TUNE_SPAN,
+    Trained,
+};
 
 use nalgebra::SMatrix;
 
@@ -108,6 +115,11 @@ pub trait Surrogate<const B: usize, const C: usize, const F: usize, const N: usi
         let mut progress = Self::BEGIN;
         while !self.advance(params, supplies, &mut progress, into)? {}
         Ok(())
+    }
+
+    /// True if what was linearised is within the range that the surrogate was made for; outside it extrapolates.
+    fn is_within(&self, _at: &Self::Linearised) -> bool {
+        true
     }
 
     /// The orbit that a drive makes [m].

@@ -41,8 +41,9 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
 
 /// See that the options go together and the outputs can be written.
 fn check(options: &Fit) -> Result<(), CommandError> {
-    if options.method == Method::Map && options.model == FitModel::Green {
-        return Err(CommandError::Input("--model green needs --method nuts; Gauss-Newton runs on the twin".into()));
+    if options.method == Method::Map && options.model != FitModel::Twin {
+        let refused = "--model green and resnet need --method nuts; Gauss-Newton runs on the twin";
+        return Err(CommandError::Input(refused.into()));
     }
     if options.method == Method::Map && options.save_draws.is_some() {
         return Err(CommandError::Input("--save-draws needs --method nuts".into()));
@@ -84,6 +85,7 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
     let model = match options.model {
         FitModel::Twin => ResponseModel::twin(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Green => ResponseModel::green(ring).map_err(|e| failed(e.to_string()))?,
+        FitModel::Resnet => ResponseModel::resnet(ring)?,
     };
     let word = model.word();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
@@ -93,14 +95,25 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
     let nuts::NutsSettings { chains, warm_up, draws, .. } = settings;
     let bar = progress(chains * (warm_up + draws), "draws", options.common.quiet);
     let names = ring.var_names();
+    let posterior = Arc::new(posterior);
     let run =
-        nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |done| bar.set_position(done as u64));
+        nuts::sample(posterior.clone(), Arc::new(laplace), &names, settings, |done| bar.set_position(done as u64));
     bar.finish_and_clear();
     let run = run.map_err(|e| failed(e.to_string()))?;
     if let Some(folder) = &options.save_draws {
         run.draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
     }
-    Ok(FitResult { notes: notes(&run), ..FitResult::of_draws(&reduced, word, &run) })
+    let result = FitResult::of_draws(&reduced, word, &run);
+    let extrapolated = (options.model == FitModel::Resnet).then(|| outside(&posterior, &reduced, &result));
+    Ok(FitResult { notes: notes(&run), extrapolated, ..result })
+}
+
+/// 1 if the mean of the vars lies outside the range that the model was made for, else 0.
+fn outside(posterior: &Posterior, reduced: &Reduced, result: &FitResult) -> f64 {
+    let params: Vec<f64> = result.vars.iter().map(|var| var.mean.ln()).collect();
+    let factors = reduced.campaign.ring.strengths(&params, &reduced.campaign.supplies);
+    let strength: Vec<f64> = factors.iter().map(|factor| factor.ln()).collect();
+    f64::from(u8::from(!posterior.model.is_within(&strength).unwrap_or(false)))
 }
 
 /// How well the posterior was sampled.

@@ -20,6 +20,7 @@ pub mod serve;
 pub mod simulate;
 pub mod study;
 pub mod surrogate;
+pub mod train;
 pub mod validate;
 pub mod watch;
 
@@ -124,7 +125,11 @@ fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeErr
 fn tables(model: CoreModel, ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
     match (model, file) {
         (CoreModel::Green, Some(path)) => Ok(model_file::read(path, ring)?),
-        (CoreModel::Green, None) => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
+        (CoreModel::Resnet, Some(path)) => Err(CommandError::Input(format!(
+            "{}: the network has no terms of a model file; leave out --model resnet",
+            path.display()
+        ))),
+        (_, None) => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
     }
 }
 

@@ -6,7 +6,7 @@ use super::{
     CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables,
     warn_if_not_modelled,
 };
-use crate::cli::Replay;
+use crate::cli::{CoreModel, Replay};
 use crate::record::Names;
 use crate::result::FitResult;
 use crate::source::{self, Clock};
@@ -31,7 +31,11 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     } else {
         stream::walk_per_cycle(&recording, options.process_noise, options.baseline_walk * MICRO)
     };
-    let core = Core::with_tables(tables, stream::setup(&powered, &recording, walk)?)?;
+    let setup = stream::setup(&powered, &recording, walk)?;
+    let core = match options.model {
+        CoreModel::Green => Core::with_tables(tables, setup)?,
+        CoreModel::Resnet => Core::with_network(&powered, tables, setup)?,
+    };
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let names = Names::of(&ring);
     let sinks = sinks(&options.publishing, options.trace.as_deref(), &names)?;
@@ -39,8 +43,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    deliver(
-        &options.common,
-        &FitResult::of_core(options.model.word(), &ring, (&recording, walk), &last, quality, timing),
-    )
+    let result = FitResult::of_core(options.model.word(), &ring, (&recording, walk), &last, quality, timing);
+    let extrapolated = (options.model == CoreModel::Resnet).then(|| source.extrapolated());
+    deliver(&options.common, &FitResult { extrapolated, ..result })
 }

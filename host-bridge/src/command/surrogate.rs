@@ -2,8 +2,14 @@
 
 use core::fmt;
 
+use std::path::Path;
+
 use serde::Serialize;
 use training::SurrogateError;
+use training::network::checkpoint;
+use training::network::fit::{Plan, Trainee};
+use training::network::layers::Network;
+use training::network::samples::Source;
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress};
@@ -32,7 +38,7 @@ struct Entry {
 /// # Errors
 /// [`CommandError`].
 pub fn run(options: &Surrogate) -> Result<(), CommandError> {
-    let SurrogateAction::Check { common, samples, seed } = &options.action;
+    let SurrogateAction::Check { common, samples, seed, checkpoint } = &options.action;
     check_outputs([common.json.as_deref()])?;
     let ring = machine(common.machine.as_deref())?;
     check_ring(&ring)?;
@@ -40,7 +46,34 @@ pub fn run(options: &Surrogate) -> Result<(), CommandError> {
     let bar = progress(*samples, "vars", common.quiet);
     let planes = training::check(&ring, &green, *samples, *seed, || bar.inc(1));
     bar.finish_and_clear();
-    deliver(common, &Check { surrogates: planes.iter().map(Entry::of).collect() })
+    let networks = networks(&ring, checkpoint.as_deref(), (*samples, *seed), common.quiet)?;
+    deliver(common, &Check { surrogates: planes.iter().chain(&networks).map(Entry::of).collect() })
+}
+
+/// Errors of the trained network, if it is of this ring.
+fn networks(
+    ring: &Ring,
+    file: Option<&Path>,
+    (samples, seed): (usize, u32),
+    quiet: bool,
+) -> Result<Vec<SurrogateError>, CommandError> {
+    let free = file.map(free).transpose()?;
+    if file.is_none() && training::network::expect_known(ring).is_err() {
+        return Ok(Vec::new());
+    }
+    let bar = progress(samples, "vars", quiet);
+    let errors = training::check_networks(ring, free.as_ref(), samples, seed, || bar.inc(1));
+    bar.finish_and_clear();
+    errors.map_err(|error| CommandError::Input(error.to_string()))
+}
+
+/// The networks in f32 of a checkpoint.
+fn free(path: &Path) -> Result<[Network; 2], CommandError> {
+    let source = Source::of(&Ring::booster());
+    let mut planes = [0, 1].map(|plane| Trainee::new(&source, plane, &Plan::FULL));
+    let is_there = checkpoint::load(path, &mut planes).map_err(|error| CommandError::Input(error.to_string()))?;
+    let missing = || CommandError::Input(format!("{}: file not found", path.display()));
+    is_there.then(|| planes.map(|plane| plane.free)).ok_or_else(missing)
 }
 
 /// A core predicts what monitors read, given vars.

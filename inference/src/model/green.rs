@@ -92,6 +92,11 @@ impl GreenModel {
         self.stated_error[usize::from(b >= self.planes[0].direct.nrows())]
     }
 
+    /// Tunes of the design.
+    pub fn tunes(&self) -> [f64; 2] {
+        self.planes.each_ref().map(|plane| plane.tune)
+    }
+
     /// The ring at given vars.
     ///
     /// # Errors

@@ -23,6 +23,7 @@ pub trait Stream: fmt::Debug + Send + Sync {
     fn save(&mut self, to: &mut Vec<u8>) -> Result<(), StateError>;
     fn load(&mut self, from: &[u8]) -> Result<(), StateError>;
     fn state_layout(&mut self) -> u32;
+    fn is_within(&self) -> bool;
     fn boxed_clone(&self) -> Box<dyn Stream>;
 }
 
@@ -199,6 +200,10 @@ where
 
     fn state_layout(&mut self) -> u32 {
         on_its_stack::<E, _>(|| self.core.state_layout())
+    }
+
+    fn is_within(&self) -> bool {
+        self.core.is_within(&self.tables)
     }
 
     fn boxed_clone(&self) -> Box<dyn Stream> {

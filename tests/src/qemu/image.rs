@@ -42,14 +42,22 @@ pub struct Sizes {
 }
 
 impl Image {
-    /// Build the image by cargo, in the profile `firmware`.
+    /// Build the image of a device by cargo, in the profile `firmware`.
     ///
     /// # Errors
     /// If cargo fails, for instance since the Cortex-M target is not installed.
     pub fn build() -> Result<Self, Error> {
+        Self::build_of("firmware")
+    }
+
+    /// The same of any program of `firmware-sim`.
+    ///
+    /// # Errors
+    /// If cargo fails.
+    pub fn build_of(program: &str) -> Result<Self, Error> {
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| OsString::from("cargo"));
         let build = ["build", "--locked", "--profile", "firmware", "--message-format", "json-render-diagnostics"];
-        let what = ["--package", "firmware-sim", "--bin", "firmware", "--target", "thumbv7em-none-eabihf"];
+        let what = ["--package", "firmware-sim", "--bin", program, "--target", "thumbv7em-none-eabihf"];
         let mut command = Command::new(cargo);
         command.args(build).args(what).current_dir(repository("."));
         let output = command.output().map_err(Error::starting("cargo"))?;
