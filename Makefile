@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -150,6 +150,10 @@ gateway: .venv-control ## published estimates as EPICS records and an NTTable, a
 
 validate: build ## how often the diagnosis is right: 690 blind campaigns, 20 minutes on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
 	$(ORBITCAL) validate recordings/paper-vars --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
+
+adversary: build .venv ## 220 blind campaigns by pyAT of machines with ordinary imperfections, simulated by a program written without sight of the diagnosis, and their scores; an hour
+	.venv/bin/python tests/peers/adversary.py --machine machines/booster.json --out target/adversary
+	$(ORBITCAL) challenge target/adversary --json target/adversary.json
 
 validate-short: build ## the same with 80 campaigns, four minutes, and an error at a false identification (unmodelled physics apart)
 	rm -f target/validate-short.jsonl
