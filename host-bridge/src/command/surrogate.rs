@@ -57,7 +57,7 @@ fn networks(
     (samples, seed): (usize, u32),
     quiet: bool,
 ) -> Result<Vec<SurrogateError>, CommandError> {
-    let free = file.map(|path| free(path)).transpose()?;
+    let free = file.map(free).transpose()?;
     if file.is_none() && training::network::expect_known(ring).is_err() {
         return Ok(Vec::new());
     }

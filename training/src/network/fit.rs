@@ -117,7 +117,7 @@ impl Trainee {
             self.free = self.network.clone();
         }
         let training = 2.0 * ORBIT * squares.sqrt();
-        let is_due = done % EVERY == 0 || done + 1 == plan.free || done + 1 == plan.chunks();
+        let is_due = done.is_multiple_of(EVERY) || done + 1 == plan.free || done + 1 == plan.chunks();
         let validation = is_due.then(|| {
             let network = if is_rounded { rounded(&self.network) } else { self.network.clone() };
             validate(&network, validation)
