@@ -86,7 +86,7 @@ train: build ## the network trained on the twin, its tables and curves; then the
 	$(ORBITCAL) train --out training/tables --checkpoint target/train.checkpoint --curves docs/figures/training.svg
 	$(MAKE) build
 	$(ORBITCAL) surrogate check --checkpoint target/train.checkpoint
-	cargo run --locked --release -p system-tests --bin surrogates -- --checkpoint target/train.checkpoint --figures docs/figures
+	cargo run --locked --release -p system-tests --bin surrogates -- --checkpoint target/train.checkpoint
 
 network: setup ## the network on the emulated chip beside the host, bit for bit, with instructions
 	cargo test --locked --release -p system-tests --test network -- --nocapture

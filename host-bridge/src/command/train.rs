@@ -2,11 +2,13 @@
 
 use core::fmt;
 use std::fs;
+use std::path::Path;
 use std::time::Instant;
 
+use estimator::surrogate::ORBIT;
 use report::{Axes, Figure, Series};
 use training::network::fit::{self, Plan, Progress, Trainee};
-use training::network::samples::Source;
+use training::network::samples::{Samples, Source};
 use training::network::{checkpoint, tables};
 use twin::Ring;
 
@@ -46,48 +48,67 @@ pub fn run(options: &Train) -> Result<(), CommandError> {
         ..Plan::FULL
     };
     let source = Source::of(&Ring::booster());
+    let validation = fit::validation(&source);
     let mut planes = [0, 1].map(|plane| Trainee::new(&source, plane, &plan));
     checkpoint::load(&options.checkpoint, &mut planes).map_err(CommandError::other)?;
-    let validation = fit::validation(&source);
+    let rate = learn(options, &plan, &source, &mut planes, &validation)?;
+    fs::create_dir_all(&options.out).map_err(CommandError::other)?;
+    let write = |plane: usize| write(&options.out, &source, plane, &planes[plane], &validation[plane]);
+    let trained = Trained { planes: [write(0)?, write(1)?], rate };
+    if let Some(path) = &options.curves {
+        output::bytes(path, curves(&planes).svg.as_bytes())?;
+    }
+    if !options.quiet {
+        output::say(trained)?;
+    }
+    Ok(())
+}
+
+/// Learn all that is left, with a checkpoint now and then; returns the samples of each plane in a second.
+fn learn(
+    options: &Train,
+    plan: &Plan,
+    source: &Source,
+    planes: &mut [Trainee; 2],
+    validation: &[Samples; 2],
+) -> Result<f64, CommandError> {
+    let save = |planes: &[Trainee; 2]| checkpoint::save(&options.checkpoint, planes).map_err(CommandError::other);
     let stop = Stop::on_signals().map_err(CommandError::other)?;
     let bar = progress(plan.chunks(), "thousand machines", options.quiet);
     let (start, first, mut saved) = (Instant::now(), planes[0].progress.len(), Instant::now());
     while planes[0].progress.len() < plan.chunks() && !stop.is_requested() {
-        fit::learn(&source, &plan, &mut planes, &validation);
+        fit::learn(source, plan, planes, validation);
         bar.set_position(planes[0].progress.len() as u64);
         if saved.elapsed().as_secs() >= SAVED_EVERY {
-            checkpoint::save(&options.checkpoint, &planes).map_err(CommandError::other)?;
+            save(planes)?;
             saved = Instant::now();
         }
     }
     bar.finish_and_clear();
-    let learnt = planes[0].progress.len() - first;
-    if learnt > 0 {
-        checkpoint::save(&options.checkpoint, &planes).map_err(CommandError::other)?;
+    let (done, all) = (planes[0].progress.len(), plan.chunks());
+    if done > first {
+        save(planes)?;
     }
-    if planes[0].progress.len() < plan.chunks() {
-        let (done, all) = (planes[0].progress.len(), plan.chunks());
+    if done < all {
         return Err(CommandError::Other(format!("stopped after {done} of {all}; the same command goes on from there")));
     }
-    fs::create_dir_all(&options.out).map_err(CommandError::other)?;
-    let [x, y] = [0, 1].map(|plane: usize| -> Result<Plane, CommandError> {
-        let trainee = &planes[plane];
-        let bytes = tables::bytes(&source, plane, &fit::rounded(&trainee.network), &validation[plane]);
-        let errors = tables::errors(&source, plane, &bytes, &validation[plane]);
-        let core = 2e-3 * tables::rms(&errors);
-        let path = options.out.join(["resnet-x.bin", "resnet-y.bin"][plane]);
-        output::bytes(&path, &bytes)?;
-        Ok(Plane { free: fit::validate(&trainee.free, &validation[plane]), core, bytes: bytes.len() })
-    });
-    if let Some(path) = &options.curves {
-        output::bytes(path, curves(&planes).svg.as_bytes())?;
-    }
-    let samples = (learnt * plan.machines * source.correctors(0).len()) as f64;
-    let trained = Trained { planes: [x?, y?], rate: samples / start.elapsed().as_secs_f64() };
-    if !options.quiet {
-        output::say(trained.to_string())?;
-    }
-    Ok(())
+    let samples = ((done - first) * plan.machines * source.correctors(0).len()) as f64;
+    Ok(samples / start.elapsed().as_secs_f64())
+}
+
+/// Write the tables of a plane, and measure them.
+fn write(
+    folder: &Path,
+    source: &Source,
+    plane: usize,
+    trainee: &Trainee,
+    validation: &Samples,
+) -> Result<Plane, CommandError> {
+    let bytes = tables::bytes(source, plane, &fit::rounded(&trainee.network), validation);
+    let errors = tables::errors(source, plane, &bytes, validation);
+    output::bytes(&folder.join(["resnet-x.bin", "resnet-y.bin"][plane]), &bytes)?;
+    let core = 2.0 * ORBIT * tables::rms(&errors);
+    Ok(Plane { free: fit::validate(&trainee.free, validation), core, bytes: bytes.len() })
 }
 
 /// Errors while training, of the difference of the orbits at 22 A and at -22 A.
