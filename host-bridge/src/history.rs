@@ -1,8 +1,8 @@
 //! What became of the estimates over hours and months, in files that survive restarts: every estimate of the last hour, one a minute of
 //! the last month, one an hour of the last years.
 //!
-//! Each of these is a [`Tier`]: a few CSV files, [`files`], of which the oldest is removed when another one begins, so that the disk it
-//! takes is bounded. A thread of its own writes them, [`keeper`]; [`reading`] reads them, also while that goes on.
+//! Each of these is a [`Tier`]: a few CSV files, `files.rs`, of which the oldest is removed when another one begins, so that the disk it
+//! takes is bounded. A thread of its own writes them, `keeper.rs`; `reading.rs` reads them, also while that goes on.
 
 mod files;
 mod keeper;
