@@ -26,7 +26,7 @@ pub struct Plan {
     pub free: usize,
     /// Chunks of machines with rounded weights, after that.
     pub rounded: usize,
-    /// Largest step of both parts, over [`STEP`] and [`TURN`].
+    /// Largest step of both parts, over `STEP` and `TURN`.
     pub peak: [f64; 2],
     /// Everything random.
     pub seed: u64,
