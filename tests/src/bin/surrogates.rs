@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p system-tests --bin surrogates -- [--samples N] [--checkpoint FILE]`
 
-use std::error::Error;
+use core::error::Error;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -48,10 +48,13 @@ struct Exact {
     tunes: [f64; 2],
 }
 
-/// A prediction of all responses at given vars.
+/// All responses at given vars.
+type Predict = dyn Fn(&[f64]) -> DMatrix<f64>;
+
+/// What predicts them.
 struct Model {
     name: &'static str,
-    value: Box<dyn Fn(&[f64]) -> DMatrix<f64>>,
+    value: Box<Predict>,
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
