@@ -119,7 +119,13 @@ pub struct Pass {
 
 impl Pass {
     /// Room for a batch.
+    ///
+    /// # Panics
+    /// For fewer than six samples, inputs or outputs: nalgebra then multiplies by a loop of its own, which takes no transposed views.
     pub fn new(network: &Network, batch: usize) -> Self {
+        let [first, .., last] = &network.layers;
+        let sizes = [batch, first.weight.ncols(), last.weight.nrows()];
+        assert!(sizes.iter().all(|size| *size > 5), "samples, inputs and outputs {sizes:?}: fewer than six");
         let matrix = |layer: &Layer| DMatrix::zeros(layer.weight.nrows(), batch);
         let hidden = || DMatrix::zeros(HIDDEN, batch);
         Self {
@@ -219,17 +225,17 @@ mod tests {
     use super::super::fit::columns;
     use super::*;
 
-    /// Five samples of seven inputs and three outputs.
+    /// Eight samples of seven inputs and six outputs.
     fn example() -> (Network, DMatrix<f32>, DMatrix<f32>) {
-        let network = Network::random(7, 3, &mut StdRng::seed_from_u64(3));
-        let inputs = DMatrix::from_fn(7, 5, |i, j| (2.3 * i as f32 + 1.1 * j as f32).sin());
-        let weights = DMatrix::from_fn(3, 5, |i, j| (1.7 * i as f32 + 0.9 * j as f32).cos());
+        let network = Network::random(7, 6, &mut StdRng::seed_from_u64(3));
+        let inputs = DMatrix::from_fn(7, 8, |i, j| (2.3 * i as f32 + 1.1 * j as f32).sin());
+        let weights = DMatrix::from_fn(6, 8, |i, j| (1.7 * i as f32 + 0.9 * j as f32).cos());
         (network, inputs, weights)
     }
 
     /// A function of the outputs.
     fn value(network: &Network, inputs: &DMatrix<f32>, weights: &DMatrix<f32>) -> f64 {
-        let outputs = Pass::new(network, 5).forward(network, &columns(inputs, 0, 5)).clone();
+        let outputs = Pass::new(network, 8).forward(network, &columns(inputs, 0, 8)).clone();
         outputs.iter().zip(weights).map(|(output, weight)| f64::from(output * weight)).sum()
     }
 
@@ -237,10 +243,10 @@ mod tests {
     #[test]
     fn derivatives_are_those_of_the_outputs() {
         let (network, inputs, weights) = example();
-        let mut pass = Pass::new(&network, 5);
-        pass.forward(&network, &columns(&inputs, 0, 5));
+        let mut pass = Pass::new(&network, 8);
+        pass.forward(&network, &columns(&inputs, 0, 8));
         let mut slopes = network.clone();
-        pass.backward(&network, &columns(&inputs, 0, 5), &weights, &mut slopes);
+        pass.backward(&network, &columns(&inputs, 0, 8), &weights, &mut slopes);
         let step = 0.01;
         for l in 0..LAYERS {
             let largest = slopes.layers[l].weight.amax();
