@@ -83,3 +83,30 @@ fn is_design(ring: &Ring) -> bool {
     let largest = of_plane(0).chain(of_plane(1)).fold(0.0, f64::max);
     largest <= ALIKE * response.amax()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::fit::validation;
+    use super::super::samples::Source;
+    use super::super::tables::{self, network, rms};
+    use super::*;
+
+    /// On the published kind of validation set [mm]: the published errors of the emulator, and what the tables state.
+    #[test]
+    fn the_tables_are_as_good_as_the_published_network_and_as_they_state() {
+        let source = Source::of(&Ring::booster());
+        let files: [&[u8]; 2] =
+            [include_bytes!("../../tables/resnet-x.bin"), include_bytes!("../../tables/resnet-y.bin")];
+        for (plane, published) in [0.057, 0.017].into_iter().enumerate() {
+            let samples = &validation(&source)[plane];
+            let error = 2.0 * rms(&tables::errors(&source, plane, files[plane], samples));
+            assert!(error < published, "{error} mm");
+            let stated = 2e3 * PLANES[plane].stated_error();
+            assert!((error / stated - 1.0).abs() < 1e-3, "{error} mm, stated {stated} mm");
+            // the codes of 16 bits that weights multiply cost next to nothing
+            let in_f32 = 1e3 * super::super::fit::validate(&network(&PLANES[plane]), samples);
+            assert!((in_f32 / error - 1.0).abs() < 0.02, "{in_f32} mm, in integers {error} mm");
+        }
+        assert!(files[0].len() + files[1].len() <= 760_000);
+    }
+}

@@ -59,3 +59,43 @@ pub fn load(path: &Path, planes: &mut [Trainee; 2]) -> io::Result<bool> {
     }
     Ok(true)
 }
+
+#[cfg(test)]
+mod tests {
+    use twin::Ring;
+
+    use super::super::fit::{Plan, learn, validate, validation};
+    use super::super::samples::Source;
+    use super::*;
+
+    /// Two chunks with free weights, one with rounded ones.
+    const PLAN: Plan = Plan { machines: 64, batch: 256, free: 2, rounded: 1, ..Plan::FULL };
+
+    #[test]
+    fn training_that_was_stopped_goes_on_to_the_bit() {
+        let source = Source::of(&Ring::booster());
+        let validation = validation(&source);
+        let fresh = || [0, 1].map(|plane| Trainee::new(&source, plane, &PLAN));
+        let path = std::env::temp_dir().join(format!("orbitcal-checkpoint-{}", std::process::id()));
+        let (mut whole, mut resumed) = (fresh(), fresh());
+        let before = validate(&whole[0].network, &validation[0]);
+        for chunk in 0..PLAN.chunks() {
+            learn(&source, &PLAN, &mut whole, &validation);
+            learn(&source, &PLAN, &mut resumed, &validation);
+            save(&path, &resumed).unwrap();
+            resumed = fresh();
+            assert!(load(&path, &mut resumed).unwrap());
+            for (one, other) in whole.iter().zip(&resumed) {
+                assert!(
+                    (&one.network, &one.free, &one.moments) == (&other.network, &other.free, &other.moments),
+                    "{chunk}"
+                );
+            }
+        }
+        assert!(validate(&whole[0].network, &validation[0]) < 0.95 * before, "it learns");
+        fs::write(&path, [0; 40]).unwrap();
+        assert!(load(&path, &mut resumed).is_err(), "no checkpoint");
+        fs::remove_file(&path).unwrap();
+        assert!(!load(&path, &mut resumed).unwrap());
+    }
+}

@@ -119,7 +119,13 @@ pub struct Pass {
 
 impl Pass {
     /// Room for a batch.
+    ///
+    /// # Panics
+    /// For fewer than six samples, inputs or outputs: nalgebra then multiplies by a loop of its own, which takes no transposed views.
     pub fn new(network: &Network, batch: usize) -> Self {
+        let [first, .., last] = &network.layers;
+        let sizes = [batch, first.weight.ncols(), last.weight.nrows()];
+        assert!(sizes.iter().all(|size| *size > 5), "samples, inputs and outputs {sizes:?}: fewer than six");
         let matrix = |layer: &Layer| DMatrix::zeros(layer.weight.nrows(), batch);
         let hidden = || DMatrix::zeros(HIDDEN, batch);
         Self {
@@ -210,4 +216,69 @@ pub(super) fn transposed(matrix: &DMatrix<f32>) -> Transposed<'_> {
     let (rows, columns) = matrix.shape();
     let (shape, strides) = ((Dyn(columns), Dyn(rows)), (Dyn(rows), Dyn(1)));
     Transposed::from_slice_with_strides_generic(matrix.as_slice(), shape.0, shape.1, strides.0, strides.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::super::fit::columns;
+    use super::*;
+
+    /// Eight samples of seven inputs and six outputs.
+    fn example() -> (Network, DMatrix<f32>, DMatrix<f32>) {
+        let network = Network::random(7, 6, &mut StdRng::seed_from_u64(3));
+        let inputs = DMatrix::from_fn(7, 8, |i, j| (2.3 * i as f32 + 1.1 * j as f32).sin());
+        let weights = DMatrix::from_fn(6, 8, |i, j| (1.7 * i as f32 + 0.9 * j as f32).cos());
+        (network, inputs, weights)
+    }
+
+    /// A function of the outputs.
+    fn value(network: &Network, inputs: &DMatrix<f32>, weights: &DMatrix<f32>) -> f64 {
+        let outputs = Pass::new(network, 8).forward(network, &columns(inputs, 0, 8)).clone();
+        outputs.iter().zip(weights).map(|(output, weight)| f64::from(output * weight)).sum()
+    }
+
+    /// Central differences in a step of 0.01: rounding of f32 over it, and the second order of `s`.
+    #[test]
+    fn derivatives_are_those_of_the_outputs() {
+        let (network, inputs, weights) = example();
+        let mut pass = Pass::new(&network, 8);
+        pass.forward(&network, &columns(&inputs, 0, 8));
+        let mut slopes = network.clone();
+        pass.backward(&network, &columns(&inputs, 0, 8), &weights, &mut slopes);
+        let step = 0.01;
+        for l in 0..LAYERS {
+            let largest = slopes.layers[l].weight.amax();
+            for at in (0..network.layers[l].weight.len()).step_by(977).chain([0]) {
+                let moved = |by: f32| {
+                    let mut network = network.clone();
+                    network.layers[l].weight.as_mut_slice()[at] += by;
+                    value(&network, &inputs, &weights)
+                };
+                let difference = (moved(step) - moved(-step)) / f64::from(2.0 * step);
+                let slope = slopes.layers[l].weight.as_slice()[at];
+                assert!(
+                    (f64::from(slope) - difference).abs() < 2e-3 * f64::from(largest),
+                    "{l} {at}: {slope} {difference}"
+                );
+            }
+        }
+        let by_input = pass.input_slopes(&network, &weights);
+        for at in 0..inputs.len() {
+            let moved = |by: f32| {
+                let mut inputs = inputs.clone();
+                inputs[at] += by;
+                value(&network, &inputs, &weights)
+            };
+            let difference = (moved(step) - moved(-step)) / f64::from(2.0 * step);
+            let miss = (f64::from(by_input[at]) - difference).abs();
+            assert!(miss < 5e-3 * f64::from(by_input.amax()), "{at}: {} {difference}", by_input[at]);
+        }
+    }
+
+    #[test]
+    fn the_numbers_are_those_of_the_published_network() {
+        assert_eq!([Network::zeros(77, 15).len(), Network::zeros(77, 18).len()], [358_015, 359_218]);
+    }
 }
