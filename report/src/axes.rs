@@ -21,6 +21,8 @@ pub struct Axes {
     pub strip: Option<Strip>,
     /// What happens where on the horizontal axis: a line from bottom to top, and a word beside it, above the data.
     pub events: Vec<(f64, String)>,
+    /// The vertical axis of lines and points is logarithmic; values that are not above 0 leave a gap.
+    pub is_logarithmic: bool,
 }
 
 /// A line to compare the data with, dashed in grey.
@@ -50,6 +52,12 @@ impl Axes {
         Axes { reference: Some(reference), ..self }
     }
 
+    /// The same with a logarithmic vertical axis.
+    #[must_use]
+    pub fn logarithmic(self) -> Axes {
+        Axes { is_logarithmic: true, ..self }
+    }
+
     /// The same along the beam.
     #[must_use]
     pub fn along(self, strip: Strip) -> Axes {
@@ -60,6 +68,15 @@ impl Axes {
     #[must_use]
     pub fn marked(self, events: Vec<(f64, String)>) -> Axes {
         Axes { events, ..self }
+    }
+
+    /// As they are drawn: a level by its logarithm, where the axis is one of logarithms.
+    pub(super) fn drawn(&self) -> Axes {
+        let reference = self.reference.map(|reference| match reference {
+            Reference::Level(level) if self.is_logarithmic => Reference::Level(level.log10()),
+            reference => reference,
+        });
+        Axes { reference, ..self.clone() }
     }
 
     /// The level to keep in sight, if there is one.

@@ -16,9 +16,12 @@ const HEIGHT: f64 = 320.0;
 impl Figure {
     /// Lines and points on common axes, each as its [`Series`] says.
     pub fn lines(axes: &Axes, series: &[Series]) -> Figure {
-        let [x, y] = spans(series.iter(), axes).map(aired);
+        let drawn: Vec<Series> = series.iter().map(|one| one.on(axes)).collect();
+        let numbers = numbers::of_series(axes, series);
+        let axes = &axes.drawn();
+        let [x, y] = spans(drawn.iter(), axes).map(aired);
         let y = below_words(axes, y);
-        Figure::drawn(numbers::of_series(axes, series), |width| chart(axes, series, [&x, &y], width))
+        Figure::drawn(numbers, |width| chart(axes, &drawn, [&x, &y], width))
     }
 
     /// Probability densities: curves on a common ground at zero, with a pale area below each.
@@ -74,6 +77,18 @@ mod tests {
         let figure = Figure::lines(&Axes::new("t", "x", "y"), &series());
         assert_eq!(figure.csv.lines().count(), 1 + 2 * 30);
         assert!(figure.csv.contains("line,3.0,6.0,5.0,7.0"), "{}", figure.csv);
+    }
+
+    #[test]
+    fn a_logarithmic_axis_has_the_numbers_themselves() {
+        let decay = Series::line("decay", vec![0.0, 1.0, 2.0, 3.0], vec![2.0, 0.2, 0.02, 0.0]);
+        let axes = Axes::new("t", "x", "error [mm]").logarithmic().compared(Reference::Level(0.05));
+        let figure = Figure::lines(&axes, &[decay.within(vec![(1.0, 3.0), (0.1, 0.3), (0.0, 0.03), (0.0, 0.0)])]);
+        assert!(figure.csv.contains("decay,1.0,0.2,0.1,0.3"), "{}", figure.csv);
+        for number in ["0.02", "0.1", "2"] {
+            assert!(figure.svg.contains(&format!(">\n{number}\n</text>")), "{number}");
+        }
+        assert!(!figure.svg.contains("NaN"));
     }
 
     #[test]

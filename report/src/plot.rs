@@ -75,10 +75,15 @@ impl<'s, 'a> Plot<'s, 'a> {
         self.sheet.draw(&PathElement::new(path, FRAME.stroke_width(px(1.0) as u32)))
     }
 
+    /// So many ticks on the vertical axis at most.
+    pub fn y_ticks(&self, count: usize) -> Ticks {
+        Ticks::new(&self.y, count)
+    }
+
     /// Pale lines at the ticks of the vertical axis.
-    pub fn grid(&self, ticks: usize) -> Drawn {
+    pub fn grid(&self, ticks: &Ticks) -> Drawn {
         let style = GRID.stroke_width(px(0.8) as u32);
-        Ticks::new(&self.y, ticks).values.iter().try_for_each(|&y| {
+        ticks.values.iter().try_for_each(|&y| {
             self.sheet.draw(&PathElement::new([self.spot(self.x.start, y), self.spot(self.x.end, y)], style))
         })
     }
@@ -92,8 +97,7 @@ impl<'s, 'a> Plot<'s, 'a> {
     }
 
     /// Numbers on the vertical axis, in text of a size [px].
-    pub fn y_numbers(&self, ticks: usize, size: f64) -> Drawn {
-        let ticks = Ticks::new(&self.y, ticks);
+    pub fn y_numbers(&self, ticks: &Ticks, size: f64) -> Drawn {
         ticks.values.iter().try_for_each(|&y| {
             let (left, height) = self.spot(self.x.start, y);
             self.tick((left, height), (-TICK_LENGTH, 0.0))?;
@@ -156,9 +160,10 @@ impl<'s, 'a> Plot<'s, 'a> {
     /// All that surrounds the data of a figure with one plot; the data is drawn on top.
     pub fn surround(&self, axes: &Axes) -> Drawn {
         self.stripes(axes.x_names.len())?;
-        self.grid(7)?;
+        let ticks = if axes.is_logarithmic { Ticks::decades(&self.y, 9) } else { self.y_ticks(7) };
+        self.grid(&ticks)?;
         self.frame()?;
-        self.y_numbers(7, TICK)?;
+        self.y_numbers(&ticks, TICK)?;
         self.y_label(&axes.y_label)?;
         if axes.x_names.is_empty() {
             self.x_numbers(((self.place.right - self.place.left) / NUMBER) as usize, TICK)?;

@@ -60,6 +60,16 @@ impl Series {
         Series { band: Some(band), ..self }
     }
 
+    /// As it is drawn on axes: by its logarithms, where the vertical axis is one of logarithms.
+    pub(super) fn on(&self, axes: &Axes) -> Series {
+        if !axes.is_logarithmic {
+            return self.clone();
+        }
+        let log = |value: &f64| if *value > 0.0 { value.log10() } else { f64::NAN };
+        let band = self.band.as_ref().map(|band| band.iter().map(|(low, high)| (log(low), log(high))).collect());
+        Series { y: self.y.iter().map(log).collect(), band, ..self.clone() }
+    }
+
     /// Draws what lies behind the data: the area of a line. It is drawn for all series before any data, to hide none.
     fn draw_ground(&self, plot: &Plot, pen: Pen) -> Drawn {
         match self.mark {

@@ -69,10 +69,10 @@ fn place(index: usize, first: f64) -> Place {
 
 /// Numbers stand where there is no panel to the left, or none below.
 fn surround(plot: &Plot, axes: &Axes, index: usize, count: usize) -> Drawn {
-    plot.grid(TICKS)?;
+    plot.grid(&plot.y_ticks(TICKS))?;
     plot.frame()?;
     if index.is_multiple_of(COLUMNS) {
-        plot.y_numbers(TICKS, SMALL)?;
+        plot.y_numbers(&plot.y_ticks(TICKS), SMALL)?;
     }
     if index + COLUMNS >= count {
         plot.x_numbers(TICKS, SMALL)?;

@@ -42,15 +42,11 @@ pub fn section(data: &Data, residuals: &[Residuals]) -> Section {
     let figure = |title: &str, label: &str, of: &[usize], names: &[String], series: Vec<Series>| {
         let names: Vec<String> = of.iter().map(|&i| names[i].clone()).collect();
         let largest = series.iter().flat_map(|one| &one.y).copied().fold(0.0, f64::max);
-        let (scale, one, series) = match largest > LOGARITHMIC {
-            true => ("log10 of chi-square", 0.0, series.into_iter().map(log).collect()),
-            false => ("chi-square", 1.0, series),
-        };
         let last = &series[series.len() - 1];
         let worst = (0..names.len()).filter(|&i| !last.y[i].is_nan()).max_by(|&i, &j| last.y[i].total_cmp(&last.y[j]));
         let title = worst.map_or(title.to_owned(), |i| format!("{title}: largest at {}", names[i]));
-        let axes = Axes::new(&title, label, &format!("{scale} per reading [1]"));
-        Figure::lines(&axes.named(&names).compared(Reference::Level(one)), &series)
+        let axes = Axes::new(&title, label, "chi-square per reading [1]").named(&names).compared(Reference::Level(1.0));
+        Figure::lines(&if largest > LOGARITHMIC { axes.logarithmic() } else { axes }, &series)
     };
     let kicked = residuals[0].all.iter().filter(|one| one.kick.is_some()).count() as f64;
     let scatter = |members: usize| (2.0 * members as f64 / kicked.max(1.0)).sqrt();
@@ -89,11 +85,6 @@ fn by(residuals: &[Residuals], members: &[usize], of: impl Fn(&Residual) -> Opti
         Series::points(one.name, x, members.iter().map(value).collect())
     };
     residuals.iter().enumerate().map(series).collect()
-}
-
-/// On a logarithmic axis.
-fn log(series: Series) -> Series {
-    Series { y: series.y.iter().map(|y| y.log10()).collect(), ..series }
 }
 
 /// By sign of the kick and by stretch of time.

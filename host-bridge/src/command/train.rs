@@ -113,11 +113,11 @@ fn write(
 
 /// Errors while training, of the difference of the orbits at 22 A and at -22 A.
 fn curves(planes: &[Trainee; 2]) -> Figure {
-    let axes = Axes::new("Error while training", "samples of each plane [million]", "log10 of the rms error over 1 mm");
+    let axes = Axes::new("Error while training", "samples of each plane [million]", "rms error [mm]").logarithmic();
     let of = |label: &str, plane: &Trainee, error: fn(&Progress) -> f32| {
         let seen = plane.progress.iter().enumerate().filter(|(_, progress)| !error(progress).is_nan());
         let million = |chunk: usize| (chunk + 1) as f64 * (Plan::FULL.machines * 24) as f64 * 1e-6;
-        let (x, y) = seen.map(|(i, p)| (million(i), f64::from(1e3 * error(p)).log10())).unzip();
+        let (x, y) = seen.map(|(i, p)| (million(i), f64::from(1e3 * error(p)))).unzip();
         Series::line(label, x, y)
     };
     let [x, y] = planes;

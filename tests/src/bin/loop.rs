@@ -141,12 +141,13 @@ fn figure(scenario: &Scenario, all: [&[Sample]; 3]) -> Figure {
     let from = scenario.campaign as usize;
     let on = (f64::from(scenario.campaign), "feedback".to_owned());
     let events = scenario.events.iter().map(|(at, event)| (f64::from(*at), event.word().to_owned()));
-    let axes = Axes::new("Orbit with and without feedback", "frame", "log10(rms orbit/mm)")
+    let axes = Axes::new("Orbit with and without feedback", "frame", "rms orbit [mm]")
+        .logarithmic()
         .marked([on].into_iter().chain(events).collect());
     let names = ["without correction", "response of the design", "response at the estimated vars"];
     let series = names.into_iter().zip(all).map(|(name, samples)| {
         let frames = (from..samples.len()).map(|frame| frame as f64).collect();
-        Series::line(name, frames, samples[from..].iter().map(|sample| (1e3 * sample.rms).log10()).collect())
+        Series::line(name, frames, samples[from..].iter().map(|sample| 1e3 * sample.rms).collect())
     });
     Figure::lines(&axes, &series.collect::<Vec<_>>())
 }
