@@ -9,7 +9,7 @@ mod resnet;
 
 pub use green::{Dispersion, Green, GreenLinearised, GreenPlane, GreenProgress, NONE};
 pub use low_rank::{LowRank, TERMS};
-pub use network::{HIDDEN, LAYERS, Network, Pass, Plain, Products, SAMPLES};
+pub use network::{HIDDEN, LARGEST, LAYERS, Network, Pass, Plain, Products, SAMPLES, smooth, smooth_slope};
 pub use parcels::{List, RING, Table, VERSION, shape};
 pub use quantised::{Block, SymmetricBlock, code, step};
 pub use resnet::{

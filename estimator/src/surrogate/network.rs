@@ -22,8 +22,8 @@ pub const LAYERS: usize = 4;
 /// Inputs at which targets are compared.
 pub const SAMPLES: usize = 2;
 static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
-/// Largest code of 16 bits.
-const LARGEST: f32 = 32_767.0;
+/// Largest code of what weights multiply: 16 bits.
+pub const LARGEST: f32 = 32_767.0;
 
 /// Sum of products of codes: the one inner loop of the network. A chip may have an instruction for two products at once; the sum
 /// is an integer, and the same however it is made.
@@ -257,14 +257,14 @@ fn nearest(value: f32) -> i16 {
     (value + if value < 0.0 { -0.5 } else { 0.5 }) as i16
 }
 
-/// `s(z)`.
-fn smooth(z: f32) -> f32 {
+/// `s(z)`, of the network's units.
+pub fn smooth(z: f32) -> f32 {
     let t = z.clamp(-1.0, 1.0) + 1.0;
     0.25 * t * t + (z - 1.0).max(0.0)
 }
 
 /// Its derivative.
-fn smooth_slope(z: f32) -> f32 {
+pub fn smooth_slope(z: f32) -> f32 {
     0.5 * (z.clamp(-1.0, 1.0) + 1.0)
 }
 

@@ -1,10 +1,11 @@
-//! Training: Adam on the mean square error, batches of machines that no batch had before, then the same with rounded weights.
+//! Training on the mean square error, batches of machines that no batch had before, then the same with rounded weights: Adam for the first and
+//! the last layer and all biases, steps of the two hidden matrices with all singular values alike.
 //!
 //! The two planes are two networks, trained beside each other, one a core. A step is one batch; the step size rises over the first
 //! 200, then falls as a cosine to zero. From [`Plan::rounded`] on the sums are those of weights rounded to 8 bits, and their
 //! derivatives are taken for those of the weights themselves, with a cosine of their own.
 //!
-//! Source: D. Kingma and J. Ba, Adam (2015); I. Loshchilov and F. Hutter, SGDR (2017), for the cosine; B. Jacob et al., Quantization and
+//! Source: D. Kingma and J. Ba, Adam (2015); K. Jordan et al., Muon: An optimizer for hidden layers in neural networks (2024); I. Loshchilov and F. Hutter, SGDR (2017), for the cosine; B. Jacob et al., Quantization and
 //! Training of Neural Networks (2018), for rounding on the way forward.
 
 use estimator::surrogate::ORBIT;

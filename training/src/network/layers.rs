@@ -9,15 +9,11 @@
 //!
 //! Many samples at once, a column each. Source: K. He et al., Deep Residual Learning (2016); D. Rumelhart et al., Nature 323 (1986) 533.
 
+use estimator::surrogate::{HIDDEN, LAYERS, smooth, smooth_slope};
 use nalgebra::{DMatrix, DMatrixView, DVector, Dyn, Matrix, ViewStorage};
 use rand::RngExt;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
-
-/// Units of a hidden layer.
-pub const HIDDEN: usize = 400;
-/// Layers.
-pub const LAYERS: usize = 4;
 
 /// One layer.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,17 +89,6 @@ impl Network {
     pub fn slices_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
         self.layers.iter_mut().flat_map(|layer| [layer.weight.as_mut_slice(), layer.bias.as_mut_slice()])
     }
-}
-
-/// `s(z)`.
-pub fn smooth(z: f32) -> f32 {
-    let t = z.clamp(-1.0, 1.0) + 1.0;
-    0.25 * t * t + (z - 1.0).max(0.0)
-}
-
-/// Its derivative.
-pub fn smooth_slope(z: f32) -> f32 {
-    0.5 * (z.clamp(-1.0, 1.0) + 1.0)
 }
 
 /// What a batch leaves in the layers on its way forward, and its derivatives on the way back.

@@ -1,17 +1,15 @@
 //! The network in 8-bit codes: the bytes that a core reads, see [`estimator::surrogate::Network::new`].
 
-use estimator::surrogate::{Network as Core, ORBIT, Pass as CorePass, Plain};
+use estimator::surrogate::{HIDDEN, LARGEST, LAYERS, Network as Core, ORBIT, Pass as CorePass, Plain, smooth};
 
 use super::fit::{columns, steps};
-use super::layers::{HIDDEN, LAYERS, Network, Pass, smooth};
+use super::layers::{Network, Pass};
 use super::samples::{Samples, Source};
 
 /// Largest input that has a code: vars reach 1.73 within the range of the training, the corrector that is set 5.
 const INPUT: f32 = 8.0;
 /// Room above the largest value of a layer among the samples.
 const HEADROOM: f32 = 1.5;
-/// Largest code of what weights multiply.
-const LARGEST: f32 = 32_767.0;
 
 /// Tables of a plane, whose weights are multiples of their steps; what hidden layers reach, and the error that is stated, are those
 /// of some samples.
