@@ -7,7 +7,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Term;
-use super::scan::{Projection, STAYS, Scored, SignatureScore, signatures};
+use super::scan::{Projection, Scored, SignatureScore, signatures};
 
 /// Candidates beside a fit, to first order.
 pub struct Choice<'d> {
@@ -18,9 +18,9 @@ pub struct Choice<'d> {
     terms: Vec<Term>,
     /// Of each term the `ln` Bayes factor that pays for the search.
     penalty: Vec<f64>,
-    /// Whitened signatures `d`, and what the fit cannot absorb of them, `P d`: one a column.
+    /// Whitened signatures `d`, one a column.
     pub columns: DMatrix<f64>,
-    /// `P d`.
+    /// What the fit cannot absorb of them, `P d`.
     pub left: DMatrix<f64>,
     /// By all readings.
     pub scores: Vec<SignatureScore>,
@@ -39,9 +39,8 @@ impl<'d> Choice<'d> {
         let projection = Projection::of(without);
         let bounds = projection.bounds(&columns);
         let is_open = |&i: &usize| {
-            let SignatureScore { pull, power } = bounds[i];
-            let least = STAYS * power;
-            !terms[i].kind.is_switch() || pull > 0.5 * least || least < BEYOND_CHANCE
+            let bound = bounds[i];
+            !terms[i].kind.is_switch() || !bound.is_below_half_of_least() || bound.least() < BEYOND_CHANCE
         };
         let open: Vec<usize> = (0..terms.len()).filter(is_open).collect();
         let columns = columns.select_columns(&open);

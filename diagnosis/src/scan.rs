@@ -33,7 +33,7 @@ pub struct Candidate {
 
 /// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged or reversed
 /// instruments more than a half does.
-pub(super) const STAYS: f64 = 0.05;
+const STAYS: f64 = 0.05;
 
 /// Signatures that are scored together.
 pub const BATCH: usize = 64;
@@ -121,6 +121,16 @@ impl Projection {
 }
 
 impl SignatureScore {
+    /// Of a bound: the power that stays at least.
+    pub fn least(self) -> f64 {
+        STAYS * self.power
+    }
+
+    /// Of a bound: an effect without an amplitude is less likely than nothing.
+    pub fn is_below_half_of_least(self) -> bool {
+        self.pull < 0.5 * self.least()
+    }
+
     /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
     pub fn of_amplitude(self) -> (f64, f64) {
         let Self { pull, power } = self;
@@ -181,10 +191,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     let projection = Projection::of(fitted);
     let columns = signatures(data, fitted, terms)?;
     let bounds = projection.bounds(&columns);
-    let is_hopeless = |i: usize| {
-        let SignatureScore { pull, power } = bounds[i];
-        terms[i].kind.is_switch() && pull < 0.5 * STAYS * power
-    };
+    let is_hopeless = |i: usize| terms[i].kind.is_switch() && bounds[i].is_below_half_of_least();
     let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
     let Scored { scores, taken } = projection.score(&columns.select_columns(&scored));
     let mut candidates = vec![None; terms.len()];
