@@ -16,6 +16,8 @@ pub use keeper::{Keeper, Lost, Recorder};
 pub use reading::{History, Span, read};
 pub use row::{Columns, Row};
 
+/// Names of the tiers, the finest first.
+const TIERS: [&str; 3] = ["fine", "minutes", "hours"];
 /// Files of a tier that are kept beside the one that is being written.
 const FILES: u64 = 8;
 
@@ -45,10 +47,11 @@ impl Plan {
     /// A row every `fine` for so many hours, one a minute and one an hour for so many days.
     pub fn new(fine: Duration, fine_hours: u64, [minute_days, hour_days]: [u64; 2]) -> Self {
         let fine_rows = (3600.0 * fine_hours as f64 / fine.as_secs_f64()).ceil() as u64;
+        let [of_fine, of_minutes, of_hours] = TIERS;
         Self([
-            Tier { name: "fine", every: fine, rows: fine_rows },
-            Tier { name: "minutes", every: Duration::from_secs(60), rows: minute_days * 24 * 60 },
-            Tier { name: "hours", every: Duration::from_secs(3600), rows: hour_days * 24 },
+            Tier { name: of_fine, every: fine, rows: fine_rows },
+            Tier { name: of_minutes, every: Duration::from_secs(60), rows: minute_days * 24 * 60 },
+            Tier { name: of_hours, every: Duration::from_secs(3600), rows: hour_days * 24 },
         ])
     }
 

@@ -4,12 +4,10 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use super::TIERS;
 use super::files::{HistoryError, numbered};
 use super::row::{Columns, Row};
 use crate::health::State;
-
-/// Names of the tiers, the finest first.
-const TIERS: [&str; 3] = ["fine", "minutes", "hours"];
 
 /// From when until when [ms since 1970], both included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

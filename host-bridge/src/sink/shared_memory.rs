@@ -5,6 +5,7 @@
 
 mod frames;
 mod health;
+mod latest;
 pub mod layout;
 mod requests;
 mod services;

@@ -1,22 +1,17 @@
 //! Health in shared memory: the last one is there for whoever joins, a new one comes when a state changes, and every second.
 
-use core::fmt::Display;
 use std::sync::Arc;
 
 use estimator::FitQuality;
-use iceoryx2::port::{publisher, subscriber};
-use iceoryx2::prelude::{Node, ZeroCopySend, ipc};
-use iceoryx2::service::port_factory::publish_subscribe;
+use iceoryx2::prelude::ZeroCopySend;
 
-use super::services::{NODES, join, joined};
-use super::{PUBLISHERS, PublishError, SUBSCRIBERS, now_ns};
+use super::latest::{Reader, Writer};
+use super::{PublishError, now_ns};
 use crate::health::{Condition, HealthRecord, State};
 use crate::record::Names;
 
 /// What the health of a service of estimates is called: its name, and this.
 const SUFFIX: &str = "/health";
-/// Records that wait for a slow reader.
-const BUFFER: usize = 16;
 
 /// What holds for a whole record; see the table in `docs/daemon.md`.
 #[repr(C)]
@@ -37,32 +32,8 @@ pub struct HealthHeader {
     pub reserved: u32,
 }
 
-/// Service of the health, and the process that has joined it.
-struct Service {
-    name: String,
-    health: publish_subscribe::PortFactory<ipc::Service, [u32], HealthHeader>,
-    /// Belongs to it: it ends with it.
-    _node: Node<ipc::Service>,
-}
-
-impl Service {
-    fn try_join(estimates: &str, who: &str) -> Result<Self, PublishError> {
-        let name = format!("{estimates}{SUFFIX}");
-        let (node, service) = joined(&name, who)?;
-        let health = node.service_builder(&service).publish_subscribe::<[u32]>().user_header::<HealthHeader>();
-        let health = health.history_size(1).subscriber_max_buffer_size(BUFFER).enable_safe_overflow(true);
-        let health = health.max_subscribers(SUBSCRIBERS).max_publishers(PUBLISHERS).max_nodes(NODES);
-        let health = health.open_or_create().map_err(|e| join(&name, "health", &e))?;
-        Ok(Self { name, health, _node: node })
-    }
-}
-
 /// The daemon's end.
-pub struct HealthWriter {
-    publisher: publisher::Publisher<ipc::Service, [u32], HealthHeader>,
-    service: Service,
-    text: String,
-}
+pub struct HealthWriter(Writer<HealthHeader>);
 
 impl HealthWriter {
     /// Join the service beside that of the estimates, or create it, for a machine with these monitors and correctors.
@@ -75,14 +46,9 @@ impl HealthWriter {
         names: &Arc<Names>,
         correctors: &[String],
     ) -> Result<Self, PublishError> {
-        let service = Service::try_join(estimates, who)?;
-        let all = [&names.machine].into_iter().chain(&names.monitors).chain(correctors);
-        // a name with a line feed in it would be two
-        let text: String = all.map(|name| name.replace('\n', " ") + "\n").collect();
-        let words = 4 * (names.monitors.len() + correctors.len()) + text.len().div_ceil(4);
-        let publisher = service.health.publisher_builder().initial_max_slice_len(words).create();
-        let publisher = publisher.map_err(|e| join(&service.name, "publisher", &e))?;
-        Ok(Self { publisher, service, text })
+        let all = [&names.machine].into_iter().chain(&names.monitors).chain(correctors).map(String::as_str);
+        let numbers = 4 * (names.monitors.len() + correctors.len());
+        Writer::try_new(format!("{estimates}{SUFFIX}"), who, numbers, all).map(Self)
     }
 
     /// Publish; waits for nobody.
@@ -90,16 +56,8 @@ impl HealthWriter {
     /// # Errors
     /// [`PublishError::Send`].
     pub fn publish(&mut self, record: &HealthRecord) -> Result<(), PublishError> {
-        let wrong = |reason: &dyn Display| PublishError::Send {
-            service: self.service.name.clone(),
-            sequence: record.sequence,
-            reason: reason.to_string(),
-        };
-        let payload = self.payload(record);
-        let mut sample = self.publisher.loan_slice_uninit(payload.len()).map_err(|e| wrong(&e))?;
-        *sample.user_header_mut() = self.header(record);
-        sample.write_from_slice(&payload).send().map_err(|e| wrong(&e))?;
-        Ok(())
+        let (header, payload) = (self.header(record), self.payload(record));
+        self.0.send(record.sequence, header, &payload)
     }
 
     fn header(&self, record: &HealthRecord) -> HealthHeader {
@@ -113,7 +71,7 @@ impl HealthWriter {
             excess: record.fit.excess(),
             monitors: record.monitors.len() as u32,
             correctors: record.correctors.len() as u32,
-            text_bytes: self.text.len() as u32,
+            text_bytes: self.0.text_bytes(),
             reserved: 0,
         }
     }
@@ -121,16 +79,12 @@ impl HealthWriter {
     fn payload(&self, record: &HealthRecord) -> Vec<u32> {
         let all = || record.monitors.iter().chain(&record.correctors);
         let ratio = |which: usize| all().map(move |each| each.ratios[which].to_bits());
-        let text = self.text.as_bytes().chunks(4).map(super::layout::word);
-        all().map(|each| each.state as u32).chain((0..3).flat_map(ratio)).chain(text).collect()
+        self.0.payload(all().map(|each| each.state as u32).chain((0..3).flat_map(ratio)))
     }
 }
 
 /// A reader's end.
-pub struct HealthReader {
-    subscriber: subscriber::Subscriber<ipc::Service, [u32], HealthHeader>,
-    service: Service,
-}
+pub struct HealthReader(Reader<HealthHeader>);
 
 impl HealthReader {
     /// Join the service beside that of the estimates, or create it.
@@ -138,10 +92,7 @@ impl HealthReader {
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
     pub fn try_new(estimates: &str) -> Result<Self, PublishError> {
-        let service = Service::try_join(estimates, "orbitcal-health")?;
-        let subscriber = service.health.subscriber_builder().create();
-        let subscriber = subscriber.map_err(|e| join(&service.name, "subscriber", &e))?;
-        Ok(Self { subscriber, service })
+        Reader::try_new(format!("{estimates}{SUFFIX}"), "orbitcal-health").map(Self)
     }
 
     /// The newest record that has come since the last call.
@@ -149,7 +100,7 @@ impl HealthReader {
     /// # Errors
     /// [`PublishError::Receive`], also for what is no record.
     pub fn newest(&mut self) -> Result<Option<HealthRecord>, PublishError> {
-        Ok(self.newest_with_names()?.map(|(record, _)| record))
+        self.0.newest(decode)
     }
 
     /// The same with the names of the correctors.
@@ -157,18 +108,11 @@ impl HealthReader {
     /// # Errors
     /// [`PublishError::Receive`], also for what is no record.
     pub fn newest_with_names(&mut self) -> Result<Option<(HealthRecord, Vec<String>)>, PublishError> {
-        let mut newest = None;
-        while let Some(sample) = self.subscriber.receive().map_err(|e| self.wrong(&e))? {
-            let (header, payload) = (sample.user_header(), sample.payload());
-            let record = decode(header, payload).ok_or_else(|| self.wrong(&"no record"))?;
+        self.0.newest(|header, payload| {
+            let record = decode(header, payload)?;
             let names = correctors(header, payload, record.monitors.len() + record.correctors.len());
-            newest = Some((record, names));
-        }
-        Ok(newest)
-    }
-
-    fn wrong(&self, reason: &dyn Display) -> PublishError {
-        PublishError::Receive { service: self.service.name.clone(), reason: reason.to_string() }
+            Some((record, names))
+        })
     }
 }
 

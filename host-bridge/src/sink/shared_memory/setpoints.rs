@@ -1,19 +1,13 @@
 //! Set points of the orbit feedback in shared memory: one record a frame; the last one is there for whoever joins.
 
-use core::fmt::Display;
-
-use iceoryx2::port::{publisher, subscriber};
-use iceoryx2::prelude::{Node, ZeroCopySend, ipc};
-use iceoryx2::service::port_factory::publish_subscribe;
+use iceoryx2::prelude::ZeroCopySend;
 use inference::stream::Correction;
 
-use super::services::{NODES, join, joined};
-use super::{PUBLISHERS, PublishError, SUBSCRIBERS, now_ns};
+use super::latest::{Reader, Writer};
+use super::{PublishError, now_ns};
 
 /// What the set points of a service of estimates are called: its name, and this.
 const SUFFIX: &str = "/setpoints";
-/// Records that wait for a slow reader.
-const BUFFER: usize = 16;
 
 /// What holds for a whole record; see the table in `docs/daemon.md`.
 #[repr(C)]
@@ -43,33 +37,8 @@ pub struct Setpoints {
     pub role: Vec<u32>,
 }
 
-/// Service of the set points, and the process that has joined it.
-struct Service {
-    name: String,
-    setpoints: publish_subscribe::PortFactory<ipc::Service, [u32], SetpointHeader>,
-    /// Belongs to it: it ends with it.
-    _node: Node<ipc::Service>,
-}
-
-impl Service {
-    fn try_join(estimates: &str, who: &str) -> Result<Self, PublishError> {
-        let name = format!("{estimates}{SUFFIX}");
-        let (node, service) = joined(&name, who)?;
-        let setpoints = node.service_builder(&service).publish_subscribe::<[u32]>().user_header::<SetpointHeader>();
-        let setpoints = setpoints.history_size(1).subscriber_max_buffer_size(BUFFER).enable_safe_overflow(true);
-        let setpoints = setpoints.max_subscribers(SUBSCRIBERS).max_publishers(PUBLISHERS).max_nodes(NODES);
-        let setpoints = setpoints.open_or_create().map_err(|e| join(&name, "set points", &e))?;
-        Ok(Self { name, setpoints, _node: node })
-    }
-}
-
 /// The daemon's end.
-pub struct SetpointWriter {
-    publisher: publisher::Publisher<ipc::Service, [u32], SetpointHeader>,
-    service: Service,
-    text: String,
-    correctors: usize,
-}
+pub struct SetpointWriter(Writer<SetpointHeader>);
 
 impl SetpointWriter {
     /// Join the service beside that of the estimates, or create it, for these correctors of a machine.
@@ -77,14 +46,8 @@ impl SetpointWriter {
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
     pub fn try_new(estimates: &str, who: &str, machine: &str, correctors: &[String]) -> Result<Self, PublishError> {
-        let service = Service::try_join(estimates, who)?;
-        // a name with a line feed in it would be two
-        let all = [machine].into_iter().chain(correctors.iter().map(String::as_str));
-        let text: String = all.map(|name| name.replace('\n', " ") + "\n").collect();
-        let words = 2 * correctors.len() + text.len().div_ceil(4);
-        let publisher = service.setpoints.publisher_builder().initial_max_slice_len(words).create();
-        let publisher = publisher.map_err(|e| join(&service.name, "publisher", &e))?;
-        Ok(Self { publisher, service, text, correctors: correctors.len() })
+        let names = [machine].into_iter().chain(correctors.iter().map(String::as_str));
+        Writer::try_new(format!("{estimates}{SUFFIX}"), who, 2 * correctors.len(), names).map(Self)
     }
 
     /// Publish what a feedback made of a frame: its number, and that of all frames; waits for nobody.
@@ -92,12 +55,6 @@ impl SetpointWriter {
     /// # Errors
     /// [`PublishError::Send`].
     pub fn publish(&mut self, [sequence, frames]: [u32; 2], correction: &Correction) -> Result<(), PublishError> {
-        let service = self.service.name.clone();
-        let wrong = |reason: &dyn Display| PublishError::Send { service, sequence, reason: reason.to_string() };
-        let text = self.text.as_bytes().chunks(4).map(super::layout::word);
-        let current = correction.setpoint.iter().map(|current| current.to_bits());
-        let role = correction.role.iter().map(|role| *role as u32);
-        let payload: Vec<u32> = current.chain(role).chain(text).collect();
         let header = SetpointHeader {
             published_ns: now_ns(),
             sequence,
@@ -105,25 +62,18 @@ impl SetpointWriter {
             hold: correction.steered.hold.map_or(0, |hold| hold.code().into()),
             left_out: correction.steered.left_out.into(),
             limited: correction.steered.limited.into(),
-            correctors: self.correctors as u32,
-            text_bytes: self.text.len() as u32,
+            correctors: correction.setpoint.len() as u32,
+            text_bytes: self.0.text_bytes(),
             reserved: 0,
         };
-        let mut sample = match self.publisher.loan_slice_uninit(payload.len()) {
-            Ok(sample) => sample,
-            Err(error) => return Err(wrong(&error)),
-        };
-        *sample.user_header_mut() = header;
-        sample.write_from_slice(&payload).send().map_err(|e| wrong(&e))?;
-        Ok(())
+        let current = correction.setpoint.iter().map(|current| current.to_bits());
+        let payload = self.0.payload(current.chain(correction.role.iter().map(|role| *role as u32)));
+        self.0.send(sequence, header, &payload)
     }
 }
 
 /// A reader's end.
-pub struct SetpointReader {
-    subscriber: subscriber::Subscriber<ipc::Service, [u32], SetpointHeader>,
-    service: Service,
-}
+pub struct SetpointReader(Reader<SetpointHeader>);
 
 impl SetpointReader {
     /// Join the service beside that of the estimates, or create it.
@@ -131,10 +81,7 @@ impl SetpointReader {
     /// # Errors
     /// [`PublishError::Name`] or [`PublishError::Join`].
     pub fn try_new(estimates: &str) -> Result<Self, PublishError> {
-        let service = Service::try_join(estimates, "orbitcal-setpoints")?;
-        let subscriber = service.setpoints.subscriber_builder().create();
-        let subscriber = subscriber.map_err(|e| join(&service.name, "subscriber", &e))?;
-        Ok(Self { subscriber, service })
+        Reader::try_new(format!("{estimates}{SUFFIX}"), "orbitcal-setpoints").map(Self)
     }
 
     /// The newest record that has come since the last call.
@@ -142,24 +89,16 @@ impl SetpointReader {
     /// # Errors
     /// [`PublishError::Receive`], also for what is no record.
     pub fn newest(&mut self) -> Result<Option<Setpoints>, PublishError> {
-        let wrong = |reason: &dyn Display| PublishError::Receive {
-            service: self.service.name.clone(),
-            reason: reason.to_string(),
-        };
-        let mut newest = None;
-        while let Some(sample) = self.subscriber.receive().map_err(|e| wrong(&e))? {
-            newest = Some(decode(*sample.user_header(), sample.payload()).ok_or_else(|| wrong(&"no record"))?);
-        }
-        Ok(newest)
+        self.0.newest(decode)
     }
 }
 
 /// The record of a sample; none if it is too short.
-fn decode(header: SetpointHeader, payload: &[u32]) -> Option<Setpoints> {
+fn decode(header: &SetpointHeader, payload: &[u32]) -> Option<Setpoints> {
     let count = header.correctors as usize;
     let (current, role) = (payload.get(..count)?, payload.get(count..count.checked_mul(2)?)?);
     let current = current.iter().map(|word| f32::from_bits(*word)).collect();
-    Some(Setpoints { header, current, role: role.to_vec() })
+    Some(Setpoints { header: *header, current, role: role.to_vec() })
 }
 
 #[cfg(test)]
