@@ -8,6 +8,7 @@ import matplotlib
 matplotlib.use("svg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+from matplotlib.ticker import LogLocator  # noqa: E402
 
 USED = 1  # of a reading
 MEAN = 20  # frames
@@ -26,6 +27,18 @@ def svg(figure):
     return out.getvalue()[out.getvalue().index("<svg") :]
 
 
+def decades(axis):
+    """A logarithmic axis with plain numbers."""
+    for each in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+        each(lambda number, _: f"{number:g}")
+    axis.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+
+
+def legend(axis):
+    """Above the axes, where it hides nothing."""
+    axis.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2)
+
+
 def live(show, recorder):
     """Innovations of the stream against time, with what was done."""
     start = show.marks[0][0]
@@ -34,10 +47,14 @@ def live(show, recorder):
     times, each = np.array(used).T
     axis.semilogy(times[MEAN - 1 :], np.convolve(each, np.full(MEAN, 1 / MEAN), "valid"), color=TRUE, lw=1.0)
     axis.axhline(1.0, color="#999999", lw=0.8, ls=":")
+    # marks that follow each other within a few seconds have one number below the other
+    row, near = 0, 0.02 * (show.marks[-1][0] - start)
     for number, (when, _) in enumerate(show.marks, 1):
+        row = row + 1 if number > 1 and when - show.marks[number - 2][0] < near else 0
         axis.axvline(when - start, color="#cccccc", lw=0.8, zorder=0)
-        axis.annotate(str(number), (when - start, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", color="#555555")
+        axis.annotate(str(number), (when - start, 1.0 + 0.07 * row), xycoords=("data", "axes fraction"), ha="center", va="bottom", color="#555555")
     axis.set(xlabel="time [s]", ylabel="NIS per reading")
+    decades(axis)
     return svg(figure)
 
 
@@ -51,7 +68,8 @@ def orbit(runs, orbits):
     for move in runs[0]["moves"]:
         axis.axvline(move - runs[0]["first"], color="#dddddd", lw=0.8, zorder=0)
     axis.set(xlabel="cycle since the feedback was switched on", ylabel="orbit, rms over monitors [mm]")
-    axis.legend(frameon=False, loc="upper right")
+    decades(axis)
+    legend(axis)
     return svg(figure)
 
 
@@ -64,7 +82,7 @@ def monitors(names, runs, orbits):
         axis.bar(at + offset, np.sqrt(np.mean(each**2, axis=0)), 0.38, color=colour, label=run["name"])
     axis.set(ylabel="orbit, rms over cycles [mm]", xlim=(-0.8, len(names) - 0.2))
     axis.set_xticks(at, names, rotation=90)
-    axis.legend(frameon=False)
+    legend(axis)
     return svg(figure)
 
 
@@ -81,7 +99,7 @@ def factors(show, recorder, runs):
     axis.axhline(0.0, color="#999999", lw=0.8)
     axis.set(ylabel="strength factor, estimate − truth [%]", xlim=(-0.8, len(at) - 0.2))
     axis.set_xticks(at, before.vars, rotation=90)
-    axis.legend(frameon=False)
+    legend(axis)
     return svg(figure)
 
 
@@ -117,7 +135,7 @@ def page(path, show, recorder, runs, exact, result):
     text = f"""<!doctype html><html lang=en><meta charset=utf-8><title>The Booster, a concealed effect, and the feedback</title><style>{STYLE}</style>
 <h1>A concealed effect found, and what that is worth to the orbit feedback</h1>
 {table([("concealed", shown(show.truth)), ("found", shown(found[0]) if found else "nothing")])}
-<p>{html.escape(result["verdict"])} after {result["campaigns"]} measured campaign(s), {result["seconds"]:.0f} s in all. The machine is simulated by exact closed orbits behind an
+<p>{html.escape(result["verdict"])} after {result["campaigns"]} measured {"campaign" if result["campaigns"] == 1 else "campaigns"}, {result["seconds"]:.0f} s in all. The machine is simulated by exact closed orbits behind an
 EPICS IOC; the daemon, the measurement and the feedback see its channels and nothing else.</p>
 {numbers}
 <h2>The live stream</h2>
