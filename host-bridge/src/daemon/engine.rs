@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::surrogate::Unstable;
-use estimator::{IngestError, Prepared, StateError, Tables as _};
+use estimator::{Hold, IngestError, Prepared, StateError, Tables as _};
 use inference::stream::{Core, Feedback};
 use training::{LINE, Tables};
 
@@ -74,6 +74,8 @@ pub struct Engine {
     resumed: Option<u32>,
     /// Nothing is left to do before the next frame.
     is_prepared: bool,
+    /// The feedback waits for its gains, which are made last of what is done between frames.
+    owes_gains: bool,
     /// Number of the last frame, and of all frames.
     last: Option<[u32; 2]>,
     fitted: Option<Instant>,
@@ -83,7 +85,18 @@ impl Engine {
     /// Frames of a queue through a core, of this model, which is at its prior or was resumed after a frame; with a checkpoint every so many frames.
     pub fn new(core: Core, queue: Queue, model: Model, resumed: Option<u32>, every: Option<u32>) -> Self {
         let saving = every.map(|every| Saving { every, since: 0 });
-        Self { core, queue, model, saving, steering: None, resumed, is_prepared: false, last: None, fitted: None }
+        Self {
+            core,
+            queue,
+            model,
+            saving,
+            steering: None,
+            resumed,
+            is_prepared: false,
+            owes_gains: false,
+            last: None,
+            fitted: None,
+        }
     }
 
     /// From now on with an orbit feedback, if one is wanted, on or to be switched on.
@@ -121,6 +134,7 @@ impl Engine {
         let fitted = self.fitted_if_due();
         let (spread, fit) = (self.core.spread(), self.core.fit_quality());
         let correction = self.core.correction();
+        self.owes_gains = correction.as_ref().is_some_and(|made| made.steered.hold == Some(Hold::Unprepared));
         Some(Taken { frame, estimate, correction, spread, fit, tables: self.model.tables, fitted })
     }
 
@@ -132,11 +146,12 @@ impl Engine {
         })
     }
 
-    /// Slices of what prepares for the next frame: one at least, and more until that frame waits.
+    /// Slices of what prepares for the next frame: one at least, and more until that frame waits. A feedback without gains comes
+    /// before it: where frames come as fast as they are taken, it would never have them.
     pub(super) fn prepare(&mut self) {
         while !self.is_prepared {
             self.is_prepared = self.core.slice() == Prepared::Nothing;
-            if !self.queue.is_empty() {
+            if !self.queue.is_empty() && !self.owes_gains {
                 break;
             }
         }
