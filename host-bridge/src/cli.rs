@@ -849,6 +849,8 @@ pub enum FitModel {
     Green,
     /// The network with the core's weights, in f32; built-in Booster only
     Resnet,
+    /// The first order about the design, as one step of LOCO takes it
+    Linear,
 }
 
 /// Ways to fit.

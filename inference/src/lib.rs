@@ -22,7 +22,7 @@ pub use campaign::{Campaign, Drive, Meter, Screened};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use factor::Factor;
 pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, TuneUse};
-pub use model::ResponseModel;
+pub use model::{GreenModel, ResnetModel, ResponseModel};
 pub use posterior::{Laplace, LaplaceError, Posterior};
 pub use prior::{Prior, Width, with_priors};
 pub use readings::{Pair, Readings, Reduced};

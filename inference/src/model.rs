@@ -1,10 +1,11 @@
-//! What predicts the readings: the exact twin, the surrogate's Green's function in f64, or the network.
+//! What predicts the readings: the exact twin, the surrogate's Green's function in f64, the network, or the first order about the design.
 //!
-//! Both give the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
-//! frequency: `-D/eta`, the orbit of a unit of relative offset [m]; and with the tunes. And both give the gradient of any function of
+//! Each gives the orbit response [m/rad] of the read monitors to the correctors and, as one more column, to the RF
+//! frequency: `-D/eta`, the orbit of a unit of relative offset [m]; and with the tunes. And each gives the gradient of any function of
 //! these.
 
 mod green;
+mod linear;
 mod resnet;
 
 use nalgebra::DMatrix;
@@ -13,6 +14,7 @@ use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 use crate::stream::StreamError;
 
 pub use green::GreenModel;
+pub use linear::LinearModel;
 pub use resnet::ResnetModel;
 
 /// A model of the ring in its vars.
@@ -24,6 +26,8 @@ pub enum ResponseModel {
     Green(Box<GreenModel>),
     /// The network with the weights of the core, in f32.
     Resnet(Box<ResnetModel>),
+    /// The first order about the design.
+    Linear(Box<LinearModel>),
 }
 
 impl ResponseModel {
@@ -53,13 +57,21 @@ impl ResponseModel {
         Ok(Self::Resnet(Box::new(ResnetModel::of(green))))
     }
 
+    /// The first order about a ring's design.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the ring has no closed orbit.
+    pub fn linear(ring: &Ring) -> Result<Self, OrbitError> {
+        Ok(Self::Linear(Box::new(LinearModel::of(ring)?)))
+    }
+
     /// False if a prediction at `ln` of the factor on each quadrupole's gradient [M] is beyond the range that the model was made for.
     ///
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn is_within(&self, strength: &[f64]) -> Result<bool, OrbitError> {
         match self {
-            Self::Twin(_) | Self::Green(_) => Ok(true),
+            Self::Twin(_) | Self::Green(_) | Self::Linear(_) => Ok(true),
             Self::Resnet(resnet) => resnet.is_within(&exponential(strength)),
         }
     }
@@ -70,6 +82,7 @@ impl ResponseModel {
             Self::Twin(_) => "twin",
             Self::Green(_) => "green",
             Self::Resnet(_) => "resnet",
+            Self::Linear(_) => "linear",
         }
     }
 
@@ -79,6 +92,7 @@ impl ResponseModel {
             Self::Twin(_) => 0.0,
             Self::Green(green) => green.stated_error(b),
             Self::Resnet(resnet) => resnet.stated_error(b),
+            Self::Linear(linear) => linear.stated_error(b),
         }
     }
 
@@ -92,6 +106,7 @@ impl ResponseModel {
             Self::Twin(ring) => Ok(ring.at(&factors)?.prediction()),
             Self::Green(green) => Ok(green.at(&factors)?.prediction()),
             Self::Resnet(resnet) => Ok(resnet.at(&factors)?.prediction()),
+            Self::Linear(linear) => Ok(linear.at(&factors).prediction()),
         }
     }
 
@@ -110,6 +125,7 @@ impl ResponseModel {
             Self::Twin(ring) => Ok(pull_back(&ring.at(&factors)?, function)),
             Self::Green(green) => Ok(pull_back(&green.at(&factors)?, function)),
             Self::Resnet(resnet) => Ok(pull_back(&resnet.at(&factors)?, function)),
+            Self::Linear(linear) => Ok(pull_back(&linear.at(&factors), function)),
         }
     }
 
@@ -126,6 +142,7 @@ impl ResponseModel {
                 let optics = resnet.at(&factors)?;
                 Ok((optics.rows(), tune_rows(&optics, strength.len())))
             }
+            Self::Linear(linear) => Ok(slopes(&linear.at(&factors), strength.len())),
         }
     }
 }

@@ -8,6 +8,7 @@ pub mod machine;
 pub mod qemu;
 pub mod sil;
 pub mod soak;
+pub mod surrogates;
 
 use std::path::{Path, PathBuf};
 

@@ -176,7 +176,7 @@ pub fn check_networks(
         bytes: Core::bytes(PLANES[plane].shape().0, PLANES[plane].shape().1, ring.horizontal_correctors()),
         stated_rms: 2.0 * f64::from(PLANES[plane].stated_error()),
     };
-    let mut errors = compare(ring, &rings, &network_responses(&PLANES, &vars), own).to_vec();
+    let mut errors = compare(ring, &rings, &network_responses(&vars), own).to_vec();
     if let Some(free) = free {
         let of_free = |plane: usize| About { name: "resnet f32", bytes: 4 * parameters(plane), ..own(plane) };
         errors.extend(compare(ring, &rings, &network_responses_f32(free, &vars), of_free));

@@ -2,6 +2,7 @@
 
 use estimator::surrogate::{List, NONE, Table};
 use estimator::{GROUPS, ParcelError, Sizes};
+use nalgebra::DMatrix;
 use twin::{
     ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source,
     spurious_dispersion,
@@ -130,13 +131,17 @@ pub(crate) fn tables_with(ring: &Ring, instruments: &Instruments) -> Result<Tabl
     let optics = Optics::of(ring, Hold::Momentum { delta: instruments.delta })?;
     let mut tables = Tables::zeros(sizes(ring)?);
     let (monitors, correctors) = (instruments.monitors(&optics), instruments.correctors(&optics));
-    let (monitors_x, monitors_y) = monitors.split_at(ring.horizontal_monitors());
-    let (correctors_x, correctors_y) = correctors.split_at(ring.horizontal_correctors());
-    let of_x = [Table::DirectX, Table::SeenX, Table::DrivenX, Table::MutualX];
-    let of_y = [Table::DirectY, Table::SeenY, Table::DrivenY, Table::MutualY];
-    plane(ring, &optics, Plane::X, (monitors_x, correctors_x), &mut tables, of_x);
-    plane(ring, &optics, Plane::Y, (monitors_y, correctors_y), &mut tables, of_y);
-    dispersion(ring, &optics, instruments, monitors_x, &mut tables)?;
+    let of_planes = [
+        [Table::DirectX, Table::SeenX, Table::DrivenX, Table::MutualX],
+        [Table::DirectY, Table::SeenY, Table::DrivenY, Table::MutualY],
+    ];
+    for (of, responses) in of_planes.into_iter().zip(planes_of(ring, &optics, &monitors, &correctors)) {
+        let PlaneResponses { direct, seen, driven, mutual } = responses;
+        for (table, response) in of.into_iter().zip([direct, seen, driven, mutual]) {
+            tables.quantise(table, |entry, line| response[(entry, line)]);
+        }
+    }
+    dispersion(ring, &optics, instruments, &monitors[..ring.horizontal_monitors()], &mut tables)?;
     wiring(ring, &mut tables)?;
     let stated = stated_error(ring, instruments, &tables);
     tables.state_error(stated);
@@ -199,28 +204,57 @@ fn nodes(ring: &Ring) -> Vec<Place> {
     ring.quadrupoles.iter().flat_map(|q| at(q.element)).collect()
 }
 
+/// The responses of a plane that its tables hold [m/rad].
+#[derive(Debug, Clone)]
+pub struct PlaneResponses {
+    /// Rows monitors, columns correctors.
+    pub direct: DMatrix<f64>,
+    /// Rows nodes, columns monitors.
+    pub seen: DMatrix<f64>,
+    /// Rows nodes, columns correctors.
+    pub driven: DMatrix<f64>,
+    /// Rows and columns nodes.
+    pub mutual: DMatrix<f64>,
+}
+
+/// The responses of the design ring in x and y, as the twin has them.
+///
+/// # Errors
+/// [`OrbitError`] if it has no closed orbit.
+pub fn planes(ring: &Ring) -> Result<[PlaneResponses; 2], OrbitError> {
+    let instruments = Instruments::sound(ring);
+    let optics = Optics::of(ring, Hold::Momentum { delta: instruments.delta })?;
+    Ok(planes_of(ring, &optics, &instruments.monitors(&optics), &instruments.correctors(&optics)))
+}
+
+fn planes_of(ring: &Ring, optics: &Optics, monitors: &[Observer], correctors: &[Source]) -> [PlaneResponses; 2] {
+    let (monitors_x, monitors_y) = monitors.split_at(ring.horizontal_monitors());
+    let (correctors_x, correctors_y) = correctors.split_at(ring.horizontal_correctors());
+    [
+        plane(ring, optics, (Plane::X, [1.0, 0.0]), monitors_x, correctors_x),
+        plane(ring, optics, (Plane::Y, [0.0, 1.0]), monitors_y, correctors_y),
+    ]
+}
+
 fn plane(
     ring: &Ring,
     optics: &Optics,
-    plane: Plane,
-    (monitors, correctors): (&[Observer], &[Source]),
-    tables: &mut Tables,
-    [direct, seen, driven, mutual]: [Table; 4],
-) {
-    let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
+    (plane, direction): (Plane, [f64; 2]),
+    monitors: &[Observer],
+    correctors: &[Source],
+) -> PlaneResponses {
     let nodes = nodes(ring);
     let observers: Vec<Observer> = nodes.iter().map(|&n| optics.observe(n, plane)).collect();
     let kicks: Vec<Source> = nodes.iter().map(|&n| optics.kick(n, direction)).collect();
-    let response = optics.response(monitors, correctors);
-    tables.quantise(direct, |b, c| response[(b, c)]);
-    // seen from the monitors: G is symmetric, so a kick at a node stands for a kick at a monitor
-    let response = optics.response(monitors, &kicks);
-    tables.quantise(seen, |q, b| response[(b, q)]);
-    let response = optics.response(&observers, correctors);
-    tables.quantise(driven, |q, c| response[(q, c)]);
-    let response = optics.response(&observers, &kicks);
-    // the average of both orders removes what rounding of the transfer maps leaves of an asymmetry
-    tables.quantise(mutual, |i, j| 0.5 * (response[(i, j)] + response[(j, i)]));
+    let mutual = optics.response(&observers, &kicks);
+    PlaneResponses {
+        direct: optics.response(monitors, correctors),
+        // seen from the monitors: G is symmetric, so a kick at a node stands for a kick at a monitor
+        seen: optics.response(monitors, &kicks).transpose(),
+        driven: optics.response(&observers, correctors),
+        // the average of both orders removes what rounding of the transfer maps leaves of an asymmetry
+        mutual: 0.5 * (&mutual + mutual.transpose()),
+    }
 }
 
 fn dispersion(

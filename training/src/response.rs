@@ -1,12 +1,11 @@
 //! Orbit response and tunes of a core with given tables, at given vars.
 
-use estimator::surrogate::{CORRECTOR, CURRENTS, LAST_VAR, Network as Core, ORBIT, Pass, Plain, SETTING_KICK, SPAN};
 use estimator::{Drive, Surrogate};
 use nalgebra::DMatrix;
 
 use crate::network::fit::columns;
 use crate::network::layers::{self, Network};
-
+use crate::network::settings::{self, response_of_core};
 use crate::tables::Tables;
 use crate::{in_room, with_stack};
 
@@ -51,52 +50,21 @@ fn responses_of<G: Surrogate<B, C, F, N>, const B: usize, const C: usize, const 
     vars.iter().map(&mut each).collect()
 }
 
-/// Predictions of the networks of a core at each of many vars `[N]`, without tunes.
-pub(crate) fn network_responses(planes: &[Core<'_>; 2], vars: &[Vec<f64>]) -> Vec<Option<CoreResponse>> {
-    let mut pass = Box::new(Pass::BLANK);
-    let mut outputs = |plane: usize, inputs: &DMatrix<f32>| {
-        let mut outputs = DMatrix::zeros(planes[plane].shape().1, inputs.ncols());
-        for (inputs, mut outputs) in inputs.column_iter().zip(outputs.column_iter_mut()) {
-            planes[plane].forward::<Plain>(inputs.as_slice(), &mut pass, outputs.as_mut_slice());
-        }
-        outputs
-    };
-    vars.iter().map(|vars| Some(network_response(planes, vars, &mut outputs))).collect()
+/// Predictions of the networks of the core at each of many vars `[N]`, without tunes.
+pub(crate) fn network_responses(vars: &[Vec<f64>]) -> Vec<Option<CoreResponse>> {
+    vars.iter().map(|vars| Some(without_tunes(response_of_core(vars)))).collect()
 }
 
 /// Predictions of networks in f32, beyond the design of those of the core.
 pub(crate) fn network_responses_f32(free: &[Network; 2], vars: &[Vec<f64>]) -> Vec<Option<CoreResponse>> {
-    let mut outputs = |plane: usize, inputs: &DMatrix<f32>| {
+    let outputs = |plane: usize, inputs: &DMatrix<f32>| {
         let mut pass = layers::Pass::new(&free[plane], inputs.ncols());
         pass.forward(&free[plane], &columns(inputs, 0, inputs.ncols())).clone()
     };
-    vars.iter().map(|vars| Some(network_response(&crate::network::PLANES, vars, &mut outputs))).collect()
+    vars.iter().map(|vars| Some(without_tunes(settings::response(vars, outputs)))).collect()
 }
 
-/// The responses to all correctors, one at a time.
-fn network_response(
-    planes: &[Core<'_>; 2],
-    vars: &[f64],
-    outputs: &mut impl FnMut(usize, &DMatrix<f32>) -> DMatrix<f32>,
-) -> CoreResponse {
-    let correctors = planes[0].shape().0 - CURRENTS - vars.len();
-    let monitors = planes.each_ref().map(|plane| plane.shape().1);
-    let mut response = DMatrix::zeros(monitors[0] + monitors[1], 2 * correctors);
-    let inputs =
-        DMatrix::from_fn(planes[0].shape().0, correctors, |row, column| match row.checked_sub(correctors + CURRENTS) {
-            Some(var) => (vars[var] - 1.0) as f32 * (LAST_VAR / SPAN),
-            None if row == column => CORRECTOR,
-            None => 0.0,
-        });
-    for (plane, network) in planes.iter().enumerate() {
-        let outputs = outputs(plane, &inputs);
-        for c in 0..correctors {
-            for b in 0..monitors[plane] {
-                let orbit = network.design(c, b) + ORBIT * outputs[(b, c)];
-                response[(plane * monitors[0] + b, plane * correctors + c)] = f64::from(orbit / SETTING_KICK);
-            }
-        }
-    }
+fn without_tunes(response: DMatrix<f64>) -> CoreResponse {
     CoreResponse { response, tunes: [f64::NAN; 2] }
 }
 

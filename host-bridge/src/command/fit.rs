@@ -42,7 +42,7 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
 /// See that the options go together and the outputs can be written.
 fn check(options: &Fit) -> Result<(), CommandError> {
     if options.method == Method::Map && options.model != FitModel::Twin {
-        let refused = "--model green and resnet need --method nuts; Gauss-Newton runs on the twin";
+        let refused = "--model green, resnet and linear need --method nuts; Gauss-Newton runs on the twin";
         return Err(CommandError::Input(refused.into()));
     }
     if options.method == Method::Map && options.save_draws.is_some() {
@@ -86,6 +86,7 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
         FitModel::Twin => ResponseModel::twin(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Green => ResponseModel::green(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Resnet => ResponseModel::resnet(ring)?,
+        FitModel::Linear => ResponseModel::linear(ring).map_err(|e| failed(e.to_string()))?,
     };
     let word = model.word();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
@@ -104,16 +105,18 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
         run.draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
     }
     let result = FitResult::of_draws(&reduced, word, &run);
-    let extrapolated = (options.model == FitModel::Resnet).then(|| outside(&posterior, &reduced, &result));
+    let extrapolated = (options.model == FitModel::Resnet).then(|| outside(&posterior, &run));
     Ok(FitResult { notes: notes(&run), extrapolated, ..result })
 }
 
-/// 1 if the mean of the vars lies outside the range that the model was made for, else 0.
-fn outside(posterior: &Posterior, reduced: &Reduced, result: &FitResult) -> f64 {
-    let params: Vec<f64> = result.vars.iter().map(|var| var.mean.ln()).collect();
-    let factors = reduced.campaign.ring.strengths(&params, &reduced.campaign.supplies);
-    let strength: Vec<f64> = factors.iter().map(|factor| factor.ln()).collect();
-    f64::from(u8::from(!posterior.model.is_within(&strength).unwrap_or(false)))
+/// Share of the draws outside the range that the model was made for.
+fn outside(posterior: &Posterior, run: &NutsRun) -> f64 {
+    let is_outside = |draw: &&Vec<f64>| {
+        let params: Vec<f64> = draw.iter().map(|var| var.ln()).collect();
+        !posterior.model.is_within(&posterior.readings.strength(&params)).unwrap_or(false)
+    };
+    let draws = || run.draws.chains.iter().flat_map(|chain| &chain.draws);
+    draws().filter(is_outside).count() as f64 / draws().count().max(1) as f64
 }
 
 /// How well the posterior was sampled.

@@ -3,9 +3,11 @@
 //! Responses to correctors are the network's, all 24 of a plane evaluated at once; tunes and dispersion, which it does not know, are
 //! those of the Green's function. A function of the response is differentiated backwards through both.
 
-use estimator::surrogate::{CORRECTOR, CURRENTS, LAST_VAR, ORBIT, SETTING_KICK, SPAN, TUNE_SPAN};
+use estimator::surrogate::{CURRENTS, LAST_VAR, ORBIT, SETTING_KICK, SPAN, TUNE_SPAN};
 use nalgebra::DMatrix;
+use training::network::fit::columns;
 use training::network::layers::{Network, Pass};
+use training::network::settings::{self, settings};
 use training::network::{PLANES, tables};
 use twin::OrbitError;
 
@@ -38,8 +40,13 @@ const SCALE: f32 = ORBIT / SETTING_KICK;
 impl ResnetModel {
     /// With the Green's function of the same ring.
     pub fn of(green: GreenModel) -> Self {
+        Self::with_networks(green, PLANES.map(|core| tables::network(&core)))
+    }
+
+    /// The same with other weights: those that were not rounded.
+    pub fn with_networks(green: GreenModel, planes: [Network; 2]) -> Self {
         let tunes = green.tunes().map(|tune| tune.rem_euclid(1.0));
-        Self { green, planes: PLANES.map(|core| tables::network(&core)), tunes }
+        Self { green, planes, tunes }
     }
 
     /// Stated rms error at monitor `b` [m].
@@ -65,22 +72,11 @@ impl ResnetModel {
     pub fn at(&self, vars: &[f64]) -> Result<ResnetOptics<'_>, OrbitError> {
         let pass = |plane: usize| {
             let mut pass = Pass::new(&self.planes[plane], CORRECTORS);
-            let inputs = inputs(vars);
-            pass.forward(&self.planes[plane], &training::network::fit::columns(&inputs, 0, CORRECTORS));
+            pass.forward(&self.planes[plane], &columns(&settings(vars), 0, CORRECTORS));
             pass
         };
         Ok(ResnetOptics { model: self, green: self.green.at(vars)?, passes: [pass(0), pass(1)], vars: vars.to_vec() })
     }
-}
-
-/// Inputs of all correctors, a column each.
-fn inputs(vars: &[f64]) -> DMatrix<f32> {
-    let first = CORRECTORS + CURRENTS;
-    DMatrix::from_fn(first + vars.len(), CORRECTORS, |row, column| match row.checked_sub(first) {
-        Some(var) => (vars[var] - 1.0) as f32 * (LAST_VAR / SPAN),
-        None if row == column => CORRECTOR,
-        None => 0.0,
-    })
 }
 
 impl ResnetOptics<'_> {
@@ -123,15 +119,11 @@ impl ResnetOptics<'_> {
 impl Optics for ResnetOptics<'_> {
     fn response(&self) -> DMatrix<f64> {
         let mut response = self.green.response();
+        let own = settings::response(&self.vars, |plane, _| self.passes[plane].outputs().clone());
         for plane in [0, 1] {
             let (first, across, monitors) = Self::place(plane);
-            let outputs = self.passes[plane].outputs();
-            for c in 0..CORRECTORS {
-                for b in 0..monitors {
-                    let orbit = PLANES[plane].design(c, b) + ORBIT * outputs[(b, c)];
-                    response[(first + b, across + c)] = f64::from(orbit / SETTING_KICK);
-                }
-            }
+            let block = ((first, across), (monitors, CORRECTORS));
+            response.view_mut(block.0, block.1).copy_from(&own.view(block.0, block.1));
         }
         response
     }

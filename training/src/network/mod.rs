@@ -5,6 +5,7 @@ pub mod checkpoint;
 pub mod fit;
 pub mod layers;
 pub mod samples;
+pub mod settings;
 pub mod tables;
 
 pub use booster::{Booster, Estimator, OtherRing, PLANES, ResNet, Steer, expect_known};

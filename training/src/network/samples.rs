@@ -7,6 +7,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use twin::{Hold, Optics, Ring, VariedRing};
 
+use super::settings::of_var;
 use crate::check::TUNE_CUT;
 
 /// Setting of a corrector [A].
@@ -115,7 +116,7 @@ impl Source {
             return None;
         }
         let inputs = currents.iter().zip(WIDTHS).map(|(c, width)| (c / width) as f32 / LAST_VAR);
-        let inputs = inputs.chain(vars.iter().map(|v| (v - 1.0) as f32 * (LAST_VAR / SPAN))).collect();
+        let inputs = inputs.chain(vars.iter().map(|var| of_var(*var))).collect();
         let response = optics.response().columns(0, self.design.ncols()) * (KICK / momentum);
         Some(Drawn { inputs, response })
     }

@@ -1,0 +1,49 @@
+//! What the network is asked, each corrector of a plane at 22 A, and the response in its answers.
+
+use estimator::surrogate::{CORRECTOR, CURRENTS, LAST_VAR, ORBIT, Pass, Plain, SETTING_KICK, SPAN};
+use nalgebra::DMatrix;
+
+use super::PLANES;
+
+/// The input of a var.
+pub fn of_var(var: f64) -> f32 {
+    (var - 1.0) as f32 * (LAST_VAR / SPAN)
+}
+
+/// Inputs at vars `[N]`, a column for each corrector of a plane, with the magnets' currents at nominal.
+pub fn settings(vars: &[f64]) -> DMatrix<f32> {
+    let inputs = PLANES[0].shape().0;
+    let correctors = inputs - CURRENTS - vars.len();
+    DMatrix::from_fn(inputs, correctors, |row, column| match row.checked_sub(correctors + CURRENTS) {
+        Some(var) => of_var(vars[var]),
+        None if row == column => CORRECTOR,
+        None => 0.0,
+    })
+}
+
+/// Response of all monitors to all correctors at vars `[N]` [m/rad], by what a plane's network gives for a column of inputs each; zero across the planes.
+pub fn response(vars: &[f64], mut outputs: impl FnMut(usize, &DMatrix<f32>) -> DMatrix<f32>) -> DMatrix<f64> {
+    let inputs = settings(vars);
+    let (correctors, monitors) = (inputs.ncols(), PLANES.each_ref().map(|plane| plane.shape().1));
+    let mut response = DMatrix::zeros(monitors[0] + monitors[1], 2 * correctors);
+    for (plane, network) in PLANES.iter().enumerate() {
+        let outputs = outputs(plane, &inputs);
+        let own = DMatrix::from_fn(monitors[plane], correctors, |b, c| {
+            f64::from((network.design(c, b) + ORBIT * outputs[(b, c)]) / SETTING_KICK)
+        });
+        response.view_mut((plane * monitors[0], plane * correctors), own.shape()).copy_from(&own);
+    }
+    response
+}
+
+/// The same by the networks of the core, in integers.
+pub fn response_of_core(vars: &[f64]) -> DMatrix<f64> {
+    let mut pass = Pass::BLANK;
+    response(vars, |plane, inputs| {
+        let mut outputs = DMatrix::zeros(PLANES[plane].shape().1, inputs.ncols());
+        for (inputs, mut outputs) in inputs.column_iter().zip(outputs.column_iter_mut()) {
+            PLANES[plane].forward::<Plain>(inputs.as_slice(), &mut pass, outputs.as_mut_slice());
+        }
+        outputs
+    })
+}
