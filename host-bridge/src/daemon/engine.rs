@@ -19,6 +19,10 @@ use crate::source::queue::{Arrived, Queue};
 /// What the posterior expects of readings is worked out as often as this.
 const FITTED: Duration = Duration::from_millis(200);
 
+/// While as many frames wait, only one in so many is followed by a slice of preparation: the orbit is known at 10 kHz, and the core is
+/// linearised anew within a tenth of a second.
+const BEHIND: u32 = 16;
+
 /// Of what a core's state is.
 ///
 /// # Errors
@@ -146,15 +150,23 @@ impl Engine {
         })
     }
 
-    /// Slices of what prepares for the next frame: one at least, and more until that frame waits. A feedback without gains comes
+    /// Slices of what prepares for the next frame: one at least, and more until that frame waits; fewer when many do. A feedback without gains comes
     /// before it: where frames come as fast as they are taken, it would never have them.
     pub(super) fn prepare(&mut self) {
+        if !self.owes_gains && self.queue.len() >= BEHIND as usize && self.frames() % BEHIND != 0 {
+            return;
+        }
         while !self.is_prepared {
             self.is_prepared = self.core.slice() == Prepared::Nothing;
             if !self.queue.is_empty() && !self.owes_gains {
                 break;
             }
         }
+    }
+
+    /// Frames taken so far.
+    fn frames(&self) -> u32 {
+        self.last.map_or(0, |[_, frames]| frames)
     }
 
     /// The core's part of a checkpoint, if one is due.
