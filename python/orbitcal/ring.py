@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping
+from itertools import count
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 
 from . import _orbitcal, codes
+from .labels import Labels
 
 if TYPE_CHECKING:
     import at
@@ -45,7 +46,7 @@ class Ring:
 
     def _take(self, ring: _orbitcal.Ring) -> None:
         self._ring = ring
-        self._response: xr.DataArray | None = None
+        self._labels: Labels | None = None
 
     @classmethod
     def _of(cls, ring: _orbitcal.Ring) -> Ring:
@@ -163,14 +164,9 @@ class Ring:
             coords = {"plane": ["x", "y"], "monitor": self._ring.places, "corrector": self.correctors}
             return xr.DataArray(values, coords, ("plane", "monitor", "corrector"), "response", _of_response("m/rad"))
         values = self._ring.response(_words(effects), rf)
-        if self._response is None:
-            self._response = self._labelled(values)
-            return self._response.copy(deep=False, data=values)
-        return self._response.copy(deep=False, data=values)
-
-    def _labelled(self, values: np.ndarray) -> xr.DataArray:
-        coords = self._coords()
-        return xr.DataArray(values, coords, ("monitor", "corrector"), "response", _of_response("m/rad"))
+        if self._labels is None:
+            self._labels = Labels(xr.DataArray(values, self._coords(), ("monitor", "corrector")))
+        return self._labels.on(values, "response", _of_response("m/rad"))
 
     def _coords(self) -> dict[str, Any]:
         of_monitors, of_correctors = self._ring.positions
@@ -222,7 +218,7 @@ class Ring:
             },
             coords={
                 "plane": ["x", "y"],
-                "element": [*names, "end"],
+                "element": [*_named(names), "end"],
                 "s": ("element", [*starts, self.circumference], {"units": "m"}),
             },
             attrs={
@@ -264,6 +260,12 @@ class Ring:
 
 def _again(state: Any) -> Ring:
     return Ring._of(_orbitcal.Ring.again(state))
+
+
+def _named(elements: Iterable[str]) -> list[str]:
+    """Names of elements; drifts are counted, as in exported lattices."""
+    drifts = count(1)
+    return [name or f"drift_{next(drifts)}" for name in elements]
 
 
 def _words(effects: Iterable[Effect]) -> list[str]:

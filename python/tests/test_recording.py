@@ -57,7 +57,7 @@ def test_a_check_says_what_can_be_done(paper_vars):
 def matrix(twelve_cells):
     """docs/your-own-ring.md, whose numbers these are."""
     table = pd.read_csv(IMPORTS / "response.csv", index_col=0)
-    dispersion = pd.read_csv(IMPORTS / "dispersion.csv", index_col=0).iloc[:, 0]
+    dispersion = pd.read_csv(IMPORTS / "dispersion.csv", index_col=0, header=None)[1]
     ring = orbitcal.Ring.from_pyat(twelve_cells)
     return orbitcal.Recording.from_response(
         table, ring, orbit_unit="mm", kick=(0.2, 0.15), kick_is="full", kick_sign="x+y+", noise=0.002,

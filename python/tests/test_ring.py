@@ -110,7 +110,9 @@ def test_a_pyat_lattice_comes_in_and_goes_out(twelve_cells):
     assert (len(ring.monitors), len(ring.correctors), len(ring.quadrupoles)) == (24, 24, 24)
     assert abs(both_planes(ring) - response_of_pyat(twelve_cells)).max() < RESPONSE
     back = ring.to_pyat()
-    assert abs(at.get_tune(back)[:2] - at.get_tune(twelve_cells)[:2]).max() < TUNE
+    flat = twelve_cells.deepcopy()
+    flat.disable_6d()  # its cavity moves the orbit
+    assert abs(at.get_tune(back)[:2] - at.get_tune(flat)[:2]).max() < TUNE
     assert abs(response_of_pyat(back) - response_of_pyat(twelve_cells)).max() < RESPONSE
     again = orbitcal.Ring.from_pyat(back)
     assert abs(again.response().values - ring.response().values).max() < 1e-9  # decimals of the file
@@ -161,7 +163,7 @@ def test_errors_are_those_of_the_program(booster, tmp_path):
     assert said(lambda: booster.with_vars({"Z9": 1.0})) == f'expected a quadrupole of {booster.name}, found "Z9"'
     assert said(lambda: booster.with_vars({"D8": 9.0})) == "var D8: expected 0.5 to 1.5, found 9"
     assert "bpm_gane" in said(lambda: booster.response(effects=["bpm_gane@x_E4"]))
-    assert said(lambda: booster.with_vars({name: 1.45 for name in booster.vars.index}).response()).startswith(f"{booster.name}: ")
+    assert said(booster.with_vars({name: 0.5 for name in booster.vars.index[:24]}).response).startswith(f"{booster.name}: unstable motion: half trace")
     assert isinstance(orbitcal.InputError(), ValueError)
     with pytest.raises(orbitcal.InputError, match="no monitors by the types of the elements"):
         orbitcal.Ring.from_lattice(IMPORTS / "twelve-cells.xsuite.json")
