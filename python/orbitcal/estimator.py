@@ -23,11 +23,18 @@ Frame = bytes | Mapping[str, Any] | pd.Series
 
 @dataclass(frozen=True)
 class Correction:
-    """What the feedback made of a frame: set points [A] by name of the corrector, and why they stayed, if they did."""
+    """What the feedback made of a frame, by name of the corrector (docs/feedback.md)."""
 
     setpoint: pd.Series
-    held: str
+    """Set points [A]."""
+    hold: str | None
+    """Why they stay as they were; none where they follow."""
     role: pd.Series
+    """`used`, `unused` (others move it) or `left out` (it does not follow)."""
+    left_out: int
+    """How many are left out."""
+    limited: int
+    """How many are at their limit."""
 
 
 class Estimator:
@@ -120,7 +127,8 @@ class Estimator:
             return None
         index = pd.Index(self.ring.correctors, name="corrector")
         role = pd.Series([ROLES[code] for code in made["role"]], index, name="role")
-        return Correction(pd.Series(made["setpoint"], index, name="setpoint_A"), made["held"], role)
+        setpoint = pd.Series(made["setpoint"], index, name="setpoint_A", dtype=float)
+        return Correction(setpoint, made["hold"], role, made["left_out"], made["limited"])
 
     @property
     def fitted(self) -> pd.Series:

@@ -8,42 +8,51 @@ import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from .results import Change, Comparison, DiagnosisResult, Var
 
 COLOURS = ("#9aa5b1", "#1f5fa8")
+VARS = 3.2  # inches, height of a figure of vars
+MOST = 8  # causes that are shown
+
+
+class Drawn(Figure):
+    """A figure that a notebook shows, apart from pyplot, which would show it twice."""
+
+    def _repr_png_(self) -> bytes:
+        drawn = io.BytesIO()
+        self.savefig(drawn, format="png", dpi=90)
+        return drawn.getvalue()
 
 
 def html(result: Any) -> str:
     """The text that the program prints, and the main figure."""
-    figure = result.figure()
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=110, bbox_inches="tight")
-    data = base64.b64encode(drawn.getvalue()).decode()
+    data = base64.b64encode(result.figure()._repr_png_()).decode()
     text = escaping.escape(str(result))
     return f'<pre style="line-height: 1.2">{text}</pre><img alt="" src="data:image/png;base64,{data}"/>'
 
 
-def of_vars(fits: dict[str, list[Var]], title: str) -> Figure:
+def of_vars(fits: dict[str, list[Var]], title: str) -> Drawn:
     """Vars with their 68 % (thick) and 95 % intervals, one colour a fit."""
-    figure, (axes,) = _axes(1, len(next(iter(fits.values()))))
+    figure, (axes,) = _axes([VARS], len(next(iter(fits.values()))))
     _vars(axes, fits)
     axes.set_title(title)
     return figure
 
 
-def of_diagnosis(result: DiagnosisResult) -> Figure:
+def of_diagnosis(result: DiagnosisResult) -> Drawn:
     """Probabilities of the causes above, vars without and with them below."""
     fits = {"without": result.vars_before, "with what was found": result.vars_after}
     fits = {name: vars for name, vars in fits.items() if vars}
     causes = [(one, other) for one in result.findings for other in (one, *one.alternatives)]
     has_causes = any(cause.probability is not None for _, cause in causes)
     count = max((len(vars) for vars in fits.values()), default=12)
-    figure, axes = _axes(1 + has_causes, count)
+    heights = [0.7 + 0.3 * min(MOST, len(causes))] if has_causes else []
+    figure, axes = _axes([*heights, VARS], count)
     if has_causes:
         _causes(axes[0], causes)
     _vars(axes[-1], fits)
@@ -51,9 +60,9 @@ def of_diagnosis(result: DiagnosisResult) -> Figure:
     return figure
 
 
-def of_changes(result: Comparison) -> Figure:
+def of_changes(result: Comparison) -> Drawn:
     """Changes of the vars with their 68 % error bars; those too large for chance in colour."""
-    figure, (axes,) = _axes(1, len(result.changes))
+    figure, (axes,) = _axes([VARS], len(result.changes))
     at = np.arange(len(result.changes))
     for is_changed, colour, word in [(False, COLOURS[0], "within chance"), (True, COLOURS[1], "changed")]:
         own = [(i, one) for i, one in zip(at, result.changes) if one.changed == is_changed]
@@ -90,7 +99,7 @@ def _vars(axes: Axes, fits: dict[str, list[Var]]) -> None:
 
 
 def _causes(axes: Axes, causes: list[Any]) -> None:
-    shown = [(one, cause) for one, cause in causes if (cause.probability or 0) > 1e-3][:8]
+    shown = [(one, cause) for one, cause in causes if (cause.probability or 0) > 1e-3][:MOST]
     words = [f"{cause.kind} {cause.at or ''}" for _, cause in shown]
     values = [cause.probability for _, cause in shown]
     colours = [COLOURS[1] if one is cause else COLOURS[0] for one, cause in shown]
@@ -101,14 +110,9 @@ def _causes(axes: Axes, causes: list[Any]) -> None:
     axes.set_xlabel("probability")
 
 
-def _axes(rows: int, names: int) -> tuple[Figure, list[Axes]]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # apart from pyplot, which would show it a second time in a notebook
-    figure = Figure(figsize=(min(14, max(6, 0.2 * names)), 3.2 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, list(np.atleast_1d(figure.subplots(rows, 1)))
+def _axes(heights: list[float], names: int) -> tuple[Drawn, list[Axes]]:
+    figure = Drawn(figsize=(min(14, max(6, 0.2 * names)), sum(heights)), layout="constrained")
+    return figure, list(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
 
 
 def _names(axes: Axes, names: list[str]) -> None:

@@ -18,7 +18,7 @@ import pandas as pd
 from . import _orbitcal, figures
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from .figures import Drawn
 
 
 def _known(kind: type, values: dict[str, Any]) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class _Result:
     def _repr_html_(self) -> str:
         return figures.html(self)
 
-    def figure(self) -> Figure:
+    def figure(self) -> Drawn:
         """The main figure, by matplotlib."""
         raise NotImplementedError
 
@@ -177,7 +177,7 @@ class FitResult(_Result):
         """Covariance of the vars [N][N] [1]."""
         return np.array(self.json["covariance"])
 
-    def figure(self) -> Figure:
+    def figure(self) -> Drawn:
         """The vars with their 68 % and 95 % intervals."""
         return figures.of_vars({"fit": self.vars}, self.recording)
 
@@ -229,7 +229,7 @@ class DiagnosisResult(_Result):
         columns = ["kind", "at", "s_m", "amplitude", "sigma", "unit", "log_evidence_gain", "probability"]
         return pd.DataFrame([["" if word == "" else word, *(getattr(one, c) for c in columns)] for one, word in rows], columns=["", *columns])
 
-    def figure(self) -> Figure:
+    def figure(self) -> Drawn:
         """Probabilities of what was found and of its alternatives, and the vars without and with it."""
         return figures.of_diagnosis(self)
 
@@ -253,7 +253,7 @@ class Comparison(_Result):
         """The changes as a table [1]."""
         return _table(self.changes)
 
-    def figure(self) -> Figure:
+    def figure(self) -> Drawn:
         """The changes with their 68 % error bars."""
         return figures.of_changes(self)
 

@@ -132,7 +132,10 @@ impl Core {
         let Some(correction) = self.core.correction() else { return Ok(None) };
         let result = PyDict::new(py);
         result.set_item("setpoint", PyArray1::from_vec(py, correction.setpoint))?;
-        result.set_item("held", format!("{:?}", correction.steered))?;
+        let estimator::Steered { hold, left_out, limited } = correction.steered;
+        result.set_item("hold", hold.map(|why| why.to_string()))?;
+        result.set_item("left_out", left_out)?;
+        result.set_item("limited", limited)?;
         result.set_item("role", correction.role.iter().map(|role| *role as u32).collect::<Vec<_>>())?;
         Ok(Some(result))
     }
