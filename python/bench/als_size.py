@@ -48,7 +48,15 @@ def ring():
     elements = []
     for _ in range(CELLS):
         behind = [*station(), drift(0.62), quadrupole("QFA"), drift(0.763), *station(), drift(0.05), bend()]
-        behind += [drift(0.219), quadrupole("QD"), drift(0.2155), quadrupole("QF"), drift(0.296), *station(), drift(3.683185)]
+        behind += [
+            drift(0.219),
+            quadrupole("QD"),
+            drift(0.2155),
+            quadrupole("QF"),
+            drift(0.296),
+            *station(),
+            drift(3.683185),
+        ]
         elements += [*half_cell(), bend(), *behind]
     lattice = at.Lattice(elements, name="als-size", energy=1.9e9, periodicity=1)
     lattice.disable_6d()

@@ -99,7 +99,9 @@ def als():
     reference = Tracked(finer(lattice))
     tunes = at.get_tune(lattice, get_integer=True)[:2]
     size = f"{lattice.circumference:.1f} m, {len(tracked.quadrupoles)} quadrupoles"
-    print(f"pyAT {at.__version__}, orbitcal {orbitcal.__version__}: {size}, response {len(ring.monitors)} x {len(ring.correctors)}, tunes {tunes[0]:.4f} {tunes[1]:.4f}")
+    print(
+        f"pyAT {at.__version__}, orbitcal {orbitcal.__version__}: {size}, response {len(ring.monitors)} x {len(ring.correctors)}, tunes {tunes[0]:.4f} {tunes[1]:.4f}"
+    )
     exact = reference.response(convergence=1e-12, max_iterations=50)
     half = len(exact) // 2
     blocks = lambda matrix: (matrix[:half, :half], matrix[half:, half:])
@@ -107,7 +109,11 @@ def als():
     by_orbits, orbits_s = timed(tracked.response, 3)
     by_optics, optics_s = timed(tracked.analytical, 5)
     line("response, pyAT's orbits of ±2 urad", orbits_s, abs(by_orbits - exact).max())
-    line("response, pyAT's linear optics (x-x, y-y)", optics_s, max(abs(a - b).max() for a, b in zip(by_optics, blocks(exact))))
+    line(
+        "response, pyAT's linear optics (x-x, y-y)",
+        optics_s,
+        max(abs(a - b).max() for a, b in zip(by_optics, blocks(exact))),
+    )
     line("response, orbitcal", seconds, abs(own.values - exact).max(), min(orbits_s, optics_s))
     jacobian(tracked, reference, ring, [orbits_s, optics_s], blocks)
 
@@ -115,21 +121,28 @@ def als():
 def jacobian(tracked, reference, ring, seconds_of_pyat, blocks):
     quadrupoles = tracked.quadrupoles
     own, seconds = timed(lambda: ring.jacobian(by="quadrupole"), 7)
-    by_optics, optics_s = timed(lambda: [tracked.slope(q, tracked.analytical) for q in quadrupoles[:: len(quadrupoles) // SAMPLE]], 1)
+    by_optics, optics_s = timed(
+        lambda: [tracked.slope(q, tracked.analytical) for q in quadrupoles[:: len(quadrupoles) // SAMPLE]], 1
+    )
     # each of the gradients takes as long
     optics_s *= len(quadrupoles) / len(by_optics)
     precise = lambda: reference.response(convergence=1e-13, max_iterations=50)
     sample = quadrupoles[:: len(quadrupoles) // SAMPLE]
     exact = [reference.slope(q, precise) for q in sample]
     # orbitcal has focusing quadrupoles first, each named by its row of the lattice
-    rows = [next(i for i, name in enumerate(own.quadrupole.values) if name == f"{tracked.lattice[q].FamName}.{q}") for q in sample]
+    rows = [
+        next(i for i, name in enumerate(own.quadrupole.values) if name == f"{tracked.lattice[q].FamName}.{q}")
+        for q in sample
+    ]
     error = max(abs(own.values[row] - slope).max() for row, slope in zip(rows, exact))
     off = max(abs(a - b).max() for one, slope in zip(by_optics, exact) for a, b in zip(one, blocks(slope)))
     largest = max(abs(slope).max() for slope in exact)
     line(f"Jacobian by {len(quadrupoles)} gradients, pyAT's orbits", 2 * len(quadrupoles) * seconds_of_pyat[0])
     line("Jacobian, pyAT's linear optics (x-x, y-y)", optics_s, off)
     line("Jacobian, orbitcal", seconds, error, optics_s)
-    print(f"  errors of the Jacobian in m/rad per 1/m^2, of {len(sample)} gradients; its largest element is {largest:.0f}")
+    print(
+        f"  errors of the Jacobian in m/rad per 1/m^2, of {len(sample)} gradients; its largest element is {largest:.0f}"
+    )
 
 
 def booster(rust_us):

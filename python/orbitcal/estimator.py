@@ -66,7 +66,7 @@ class Estimator:
     def update(self, frame: Frame) -> Estimate:
         """The estimate after one more frame: wire bytes (docs/frame.md), or the columns of a row of `frames.csv` by name."""
         if isinstance(frame, (bytes, bytearray)):
-            return self._ready(None).bytes(bytes(frame))
+            return self._ready(None).of_bytes(bytes(frame))
         text = _text_of_frame(frame)
         return self._ready(text).of_text(text)
 

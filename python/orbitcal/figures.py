@@ -63,9 +63,8 @@ def of_diagnosis(result: DiagnosisResult) -> Drawn:
 def of_changes(result: Comparison) -> Drawn:
     """Changes of the vars with their 68 % error bars; those too large for chance in colour."""
     figure, (axes,) = _axes([VARS], len(result.changes))
-    at = np.arange(len(result.changes))
     for is_changed, colour, word in [(False, COLOURS[0], "within chance"), (True, COLOURS[1], "changed")]:
-        own = [(i, one) for i, one in zip(at, result.changes) if one.changed == is_changed]
+        own = [(i, one) for i, one in enumerate(result.changes) if one.changed == is_changed]
         if own:
             _bars(axes, own, colour, word)
     axes.axhline(0, color="black", linewidth=0.6)

@@ -38,9 +38,7 @@ class Recording:
         return _again, (self.name, self.ring, *self._recording.texts(self.ring._ring))
 
     @classmethod
-    def read(
-        cls, folder: str | PathLike[str], ring: Ring | None = None, *, any_energy: bool = False
-    ) -> Recording:
+    def read(cls, folder: str | PathLike[str], ring: Ring | None = None, *, any_energy: bool = False) -> Recording:
         """Read a folder with `header.toml` and `frames.csv`, or with a measured response matrix.
 
         Without a ring the frames are those of the built-in Booster; a matrix brings its own lattice. Frames that were taken at another energy than

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from . import _orbitcal, figures
+from . import figures
 
 if TYPE_CHECKING:
     from .figures import Drawn
@@ -227,7 +227,10 @@ class DiagnosisResult(_Result):
         rows = [(one, "") for one in self.findings]
         rows = [row for one, word in rows for row in [(one, word), *((other, "or") for other in one.alternatives)]]
         columns = ["kind", "at", "s_m", "amplitude", "sigma", "unit", "log_evidence_gain", "probability"]
-        return pd.DataFrame([["" if word == "" else word, *(getattr(one, c) for c in columns)] for one, word in rows], columns=["", *columns])
+        return pd.DataFrame(
+            [["" if word == "" else word, *(getattr(one, c) for c in columns)] for one, word in rows],
+            columns=["", *columns],
+        )
 
     def figure(self) -> Drawn:
         """Probabilities of what was found and of its alternatives, and the vars without and with it."""

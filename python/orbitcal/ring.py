@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from itertools import count
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import pandas as pd
 import xarray as xr
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from .results import DiagnosisResult, Finding, FitResult
 
-Effect = "str | Finding | Mapping[str, Any]"
+Effect: TypeAlias = "str | Finding | Mapping[str, Any]"
 Rf = Literal["fixed-momentum", "fixed-frequency"]
 Format = Literal["madx", "bmad", "at", "xsuite", "pals"]
 
@@ -91,8 +91,8 @@ class Ring:
     @classmethod
     def _of_lattice(cls, text: str, name: str, monitors: Iterable[str], correctors: Iterable[str]) -> Ring:
         ring = cls._of(_orbitcal.Ring.lattice(text, name, list(monitors), list(correctors)))
-        for what, count in ring._ring.left_out:
-            warnings.warn(f"{name}: left out of {count} elements: {what}", stacklevel=3)
+        for what, elements in ring._ring.left_out:
+            warnings.warn(f"{name}: left out of {elements} elements: {what}", stacklevel=3)
         return ring
 
     @property
@@ -276,7 +276,7 @@ def _words(effects: Iterable[Effect]) -> list[str]:
 def _word(effect: Finding | Mapping[str, Any]) -> str:
     of = effect.get if isinstance(effect, Mapping) else lambda name: getattr(effect, name)
     at, amplitude = of("at"), of("amplitude")
-    return of("kind") + (f"@{at}" if at else "") + ("" if amplitude is None else f"={amplitude!r}")
+    return f"{of('kind')}{f'@{at}' if at else ''}{'' if amplitude is None else f'={float(amplitude)!r}'}"
 
 
 def _of_response(unit: str) -> dict[str, str]:

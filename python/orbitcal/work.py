@@ -14,9 +14,7 @@ if TYPE_CHECKING:
     import arviz
 
 
-def fit(
-    recording: Recording, ring: Ring | None = None, *, rf: Rf | None = None, progress: bool = False
-) -> FitResult:
+def fit(recording: Recording, ring: Ring | None = None, *, rf: Rf | None = None, progress: bool = False) -> FitResult:
     """The batch fit: damped Gauss-Newton on the exact twin to the maximum a posteriori, with its covariance.
 
     `ring` is the recording's unless another is given (other priors, for instance). Of a measured matrix `rf` says what the machine held
@@ -47,9 +45,7 @@ def sample(
 
     ring = recording.ring if ring is None else ring
     with bar("sample", chains * (warm_up + draws), is_shown=progress) as hear:
-        outcome, drawn = _orbitcal.sample(
-            ring._ring, recording._recording, model, chains, warm_up, draws, seed, hear
-        )
+        outcome, drawn = _orbitcal.sample(ring._ring, recording._recording, model, chains, warm_up, draws, seed, hear)
     data = arviz.from_dict(
         posterior={"vars": drawn.pop("vars")},
         sample_stats=drawn,
@@ -78,9 +74,7 @@ def diagnose(
         return DiagnosisResult.of(_orbitcal.diagnose(ring._ring, all_of_them, rf, hear))
 
 
-def compare(
-    before: Recording, after: Recording, *, ring: Ring | None = None, progress: bool = False
-) -> Comparison:
+def compare(before: Recording, after: Recording, *, ring: Ring | None = None, progress: bool = False) -> Comparison:
     """What changed from one recording of a machine to another, or from one measured matrix to another."""
     ring = before.ring if ring is None else ring
     with bar("compare", None, is_shown=progress) as hear:

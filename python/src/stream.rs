@@ -61,7 +61,7 @@ impl Core {
     }
 
     /// The next frame as wire bytes.
-    fn bytes(&mut self, py: Python<'_>, mut frame: Vec<u8>) -> PyResult<Estimate> {
+    fn of_bytes(&mut self, py: Python<'_>, mut frame: Vec<u8>) -> PyResult<Estimate> {
         py.detach(|| self.ingest(&mut frame))
     }
 

@@ -72,7 +72,16 @@ def test_a_feedback_says_its_set_points(booster, paper_vars):
 def test_another_process_is_read_from_shared_memory(last):
     service = f"orbitcal/test-{uuid.uuid4()}"
     subscriber = orbitcal.Subscriber(service)
-    command = [os.environ["ORBITCAL"], "replay", RECORDINGS / "paper-vars", "--service", service, "--name", "night shift", "--quiet"]
+    command = [
+        os.environ["ORBITCAL"],
+        "replay",
+        RECORDINGS / "paper-vars",
+        "--service",
+        service,
+        "--name",
+        "night shift",
+        "--quiet",
+    ]
     with subprocess.Popen([*command, "--rate", "200"]) as publisher:
         read = []
         for estimate in subscriber.stream(timeout=20):

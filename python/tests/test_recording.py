@@ -39,7 +39,10 @@ def test_what_is_wrong_with_a_table_is_said_as_of_a_file(paper_vars, booster):
     frames.loc[3, "x_E4_mm"] = 123.0
     with pytest.raises(orbitcal.InputError) as said:
         orbitcal.Recording.from_pandas(frames, booster, paper_vars.header, name="shift")
-    assert str(said.value) == 'shift/frames.csv, line 5, column x_E4_mm: expected a position from -100 to 100 mm, found "123.0"'
+    assert (
+        str(said.value)
+        == 'shift/frames.csv, line 5, column x_E4_mm: expected a position from -100 to 100 mm, found "123.0"'
+    )
     with pytest.raises(orbitcal.InputError, match="missing field `believed_rf`"):
         header = {key: value for key, value in paper_vars.header.items() if key != "believed_rf"}
         orbitcal.Recording.from_pandas(paper_vars.frames, booster, header)
@@ -78,7 +81,9 @@ def test_numbers_alone_need_an_order(matrix, twelve_cells):
     numbers = np.loadtxt(IMPORTS / "response.txt")
     made = orbitcal.Recording.from_response(numbers, ring, order="planes", **words)
     np.testing.assert_allclose(made.matrix.values, matrix.matrix.values, rtol=0, atol=1e-6)  # decimals of the two files
-    by_name = dict(words, kick={f"{plane}:COR[{n}]": 0.2 if plane == "x" else 0.15 for plane in "xy" for n in range(1, 13)})
+    by_name = dict(
+        words, kick={f"{plane}:COR[{n}]": 0.2 if plane == "x" else 0.15 for plane in "xy" for n in range(1, 13)}
+    )
     assert orbitcal.Recording.from_response(numbers, ring, order="planes", **by_name).matrix.equals(made.matrix)
     with pytest.raises(orbitcal.InputError, match="order"):
         orbitcal.Recording.from_response(numbers, ring, **words)

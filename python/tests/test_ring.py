@@ -74,7 +74,9 @@ def test_the_jacobian_is_the_derivative_of_the_response(booster, rf, effects):
     assert jacobian.dims == ("var", "monitor", "corrector") and jacobian.shape == (48, 33, 48)
     step = 1e-4
     for name in ("A2", "D8", "F7"):
-        more, less = (booster.with_vars({name: np.exp(sign * step)}).response(effects=effects, rf=rf) for sign in (1, -1))
+        more, less = (
+            booster.with_vars({name: np.exp(sign * step)}).response(effects=effects, rf=rf) for sign in (1, -1)
+        )
         numeric = (more - less) / (2 * step)
         # truncation: step^2 times the square of the resonance denominators
         assert abs(jacobian.sel(var=name) - numeric).max() < 1e-5 * abs(jacobian).max()
@@ -156,14 +158,25 @@ def test_a_ring_survives_pickling(booster, twelve_cells):
 def test_errors_are_those_of_the_program(booster, tmp_path):
     said = lambda call: str(pytest.raises(orbitcal.InputError, call).value)
     assert said(lambda: orbitcal.Ring("nowhere.json")) == "nowhere.json: file not found"
-    toy = {"name": "toy", "circumference_m": 3.0, "k1": {}, "reference": {"particle": "muon", "kinetic_energy_GeV": 1.0}, "elements": []}
+    toy = {
+        "name": "toy",
+        "circumference_m": 3.0,
+        "k1": {},
+        "reference": {"particle": "muon", "kinetic_energy_GeV": 1.0},
+        "elements": [],
+    }
     (tmp_path / "toy.json").write_text(json.dumps(toy))
     # docs/machine.md, "What is refused"
-    assert said(lambda: orbitcal.Ring(tmp_path / "toy.json")) == "toy: expected reference.particle proton or electron, found muon"
+    assert (
+        said(lambda: orbitcal.Ring(tmp_path / "toy.json"))
+        == "toy: expected reference.particle proton or electron, found muon"
+    )
     assert said(lambda: booster.with_vars({"Z9": 1.0})) == f'expected a quadrupole of {booster.name}, found "Z9"'
     assert said(lambda: booster.with_vars({"D8": 9.0})) == "var D8: expected 0.5 to 1.5, found 9"
     assert "bpm_gane" in said(lambda: booster.response(effects=["bpm_gane@x_E4"]))
-    assert said(booster.with_vars({name: 0.5 for name in booster.vars.index[:24]}).response).startswith(f"{booster.name}: unstable motion: half trace")
+    assert said(booster.with_vars({name: 0.5 for name in booster.vars.index[:24]}).response).startswith(
+        f"{booster.name}: unstable motion: half trace"
+    )
     assert isinstance(orbitcal.InputError(), ValueError)
     with pytest.raises(orbitcal.InputError, match="no monitors by the types of the elements"):
         orbitcal.Ring.from_lattice(IMPORTS / "twelve-cells.xsuite.json")
