@@ -56,6 +56,8 @@ class Ring:
     @property
     def gradients(self) -> list[float]: ...
     @property
+    def priors(self) -> list[list[float]]: ...
+    @property
     def supplies(self) -> list[str]: ...
     @property
     def elements(self) -> tuple[list[str], list[float]]: ...
@@ -119,6 +121,15 @@ def sample(
 ) -> tuple[Outcome, dict[str, Any]]: ...
 def diagnose(ring: Ring, recordings: list[Recording], rf: str | None, hear: Hear) -> Outcome: ...
 def compare(ring: Ring, before: Recording, after: Recording, hear: Hear) -> Outcome: ...
+
+def simulate(
+    ring: Ring, template: Recording, seed: int, vars: dict[str, float] | None, effects: list[str], exact: bool
+) -> tuple[Recording, list[float]]: ...
+def marginals(ring: Ring, recording: Recording) -> tuple[list[float], list[float]]: ...
+
+class Validation:
+    def __init__(self, ring: Ring, template: Recording) -> None: ...
+    def run(self, kind: str, index: int, seed: int) -> str | None: ...
 
 class Core:
     def __init__(
@@ -204,6 +215,12 @@ class Estimate:
     @property
     def map_params(self) -> Singles:
         """Maximum a posteriori of each `ln var` [N] [1]."""
+    @property
+    def centre(self) -> Singles:
+        """Centre of the normal of each `ln var` before it is truncated to the prior's range [N] [1]."""
+    @property
+    def params_sigma(self) -> Singles:
+        """Its standard deviation [N] [1]."""
     @property
     def clipped(self) -> NDArray[np.bool_]:
         """Whether each var sits at a bound of the prior's range [N]."""

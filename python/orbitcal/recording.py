@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +15,7 @@ import xarray as xr
 
 from . import _orbitcal
 from .header import header_of_text, text_of_header
-from .ring import Ring
+from .ring import Effect, Ring, words
 
 PerInstrument = float | tuple[float, float] | Mapping[str, float]
 
@@ -98,6 +98,27 @@ class Recording:
             rf_frequency,
         )
         return cls(made, ring)
+
+    @classmethod
+    def simulated(
+        cls,
+        template: Recording,
+        seed: int,
+        *,
+        vars: Mapping[str, float] | None = None,
+        effects: Iterable[Effect] = (),
+        exact: bool = True,
+    ) -> tuple[Recording, pd.Series]:
+        """A campaign that a simulated machine would have given, and the vars that it was made with.
+
+        Settings, read-backs and gaps are those of the template. Without `vars` they are drawn from the ring's prior, of rings that keep their beam. `exact`:
+        every frame an exact orbit of misaligned magnets with `effects`, monitors with offsets, noise and jumps, tunes; else the machine of
+        the estimator's model. The seed fixes everything.
+        """
+        named = None if vars is None else {str(name): float(value) for name, value in vars.items()}
+        ring = template.ring
+        made, drawn = _orbitcal.simulate(ring._ring, template._recording, seed, named, words(effects), exact)
+        return cls(made, ring), pd.Series(drawn, pd.Index(ring._ring.vars, name="var"), name="factor")
 
     @property
     def name(self) -> str:

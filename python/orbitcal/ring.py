@@ -160,10 +160,10 @@ class Ring:
         in the JSON of `orbitcal response`.
         """
         if all_places:
-            values = self._ring.full_response(_words(effects), rf)
+            values = self._ring.full_response(words(effects), rf)
             coords = {"plane": ["x", "y"], "monitor": self._ring.places, "corrector": self.correctors}
             return xr.DataArray(values, coords, ("plane", "monitor", "corrector"), "response", _of_response("m/rad"))
-        values = self._ring.response(_words(effects), rf)
+        values = self._ring.response(words(effects), rf)
         if self._labels is None:
             self._labels = Labels(xr.DataArray(values, self._coords(), ("monitor", "corrector")))
         return self._labels.on(values, "response", _of_response("m/rad"))
@@ -193,7 +193,7 @@ class Ring:
         if by not in ("var", "quadrupole"):
             raise _orbitcal.InputError(f"by: expected var or quadrupole, found {by!r}")
         is_of_gradients = by == "quadrupole"
-        values = self._ring.jacobian(is_of_gradients, _words(effects), rf)
+        values = self._ring.jacobian(is_of_gradients, words(effects), rf)
         names = self._ring.quadrupoles if is_of_gradients else self._ring.vars
         unit = "m/rad/(1/m^2)" if is_of_gradients else "m/rad"
         coords = {by: names, **self._coords()}
@@ -205,7 +205,7 @@ class Ring:
         `beta` [m], `phase_advance` [rad], `dispersion` [m] and `orbit` [m] with dimensions `plane` (x, y) and `element` [E + 1];
         coordinate `s` [m]. Attributes: `tune_x`, `tune_y`, `momentum_compaction`, `gamma_transition` [1].
         """
-        made = self._ring.optics(_words(effects))
+        made = self._ring.optics(words(effects))
         names, starts = self._ring.elements
         planes = ("plane", "element")
         of = lambda name, unit: (planes, made[name].reshape(2, -1), {"units": unit})
@@ -268,7 +268,7 @@ def _named(elements: Iterable[str]) -> list[str]:
     return [name or f"drift_{next(drifts)}" for name in elements]
 
 
-def _words(effects: Iterable[Effect]) -> list[str]:
+def words(effects: Iterable[Effect]) -> list[str]:
     """Effects as texts; findings, and dictionaries as of the JSON, have `kind`, `at` and `amplitude`."""
     return [effect if isinstance(effect, str) else _word(effect) for effect in effects]
 

@@ -114,6 +114,18 @@ impl Estimate {
         PyArray1::from_slice(py, &self.record.map_params)
     }
 
+    /// Centre of the normal of each `ln var` before it is truncated to the prior's range [N] [1].
+    #[getter]
+    fn centre<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        PyArray1::from_slice(py, &self.record.centre)
+    }
+
+    /// Its standard deviation [N] [1].
+    #[getter]
+    fn params_sigma<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        PyArray1::from_slice(py, &self.record.params_sigma)
+    }
+
     /// Whether each var sits at a bound of the prior's range [N].
     #[getter]
     fn clipped<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {

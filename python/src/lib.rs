@@ -11,6 +11,7 @@ mod recording;
 mod response;
 mod result;
 mod ring;
+mod simulate;
 mod source;
 mod stream;
 mod subscriber;
@@ -36,6 +37,8 @@ mod _orbitcal {
     use crate::ring::Ring;
     #[pymodule_export]
     use crate::stream::Core;
+    #[pymodule_export]
+    use crate::simulate::{Validation, marginals, simulate};
     #[pymodule_export]
     use crate::subscriber::Subscriber;
     #[pymodule_export]

@@ -58,7 +58,8 @@ impl Ring {
         self.width
     }
 
-    fn effects(&self, words: &[String]) -> PyResult<Vec<Effect>> {
+    /// Effects by their words.
+    pub fn effects(&self, words: &[String]) -> PyResult<Vec<Effect>> {
         let read = |word: &String| word.parse::<EffectText>().and_then(|effect| effect.resolve(&self.ring));
         words.iter().map(read).collect::<Result<_, _>>().map_err(input)
     }
@@ -213,6 +214,13 @@ impl Ring {
     #[getter]
     fn gradients(&self) -> Vec<f64> {
         self.ring.gradients()
+    }
+
+    /// Prior of each var: width, smallest and largest value [N].
+    #[getter]
+    fn priors(&self) -> Vec<[f64; 3]> {
+        let of = |one: &twin::Parameter| [one.prior.width, one.prior.range[0], one.prior.range[1]];
+        self.ring.parameters.iter().map(of).collect()
     }
 
     /// Names of the main supplies [F].
