@@ -36,9 +36,9 @@ mod _orbitcal {
     #[pymodule_export]
     use crate::ring::Ring;
     #[pymodule_export]
-    use crate::stream::Core;
-    #[pymodule_export]
     use crate::simulate::{Validation, marginals, simulate};
+    #[pymodule_export]
+    use crate::stream::Core;
     #[pymodule_export]
     use crate::subscriber::Subscriber;
     #[pymodule_export]
