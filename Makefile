@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python notebooks
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -159,6 +159,19 @@ validate-short: build ## the same with 80 campaigns, four minutes, and an error 
 	rm -f target/validate-short.jsonl
 	$(ORBITCAL) validate recordings/paper-vars --empty 40 --single 18 --pair 4 --unknown 18 --outcomes target/validate-short.jsonl --strict
 
+python: build ## the Python package: its wheel in python/dist, tested in a fresh environment with pyAT, Xsuite and ArviZ, its notebooks executed; minutes
+	cargo fmt --manifest-path python/Cargo.toml --check
+	cargo clippy --locked --release --manifest-path python/Cargo.toml -- -D warnings
+	rm -rf .venv-python python/dist
+	python3 -m venv .venv-python
+	.venv-python/bin/pip install --quiet 'maturin>=1.9,<2'
+	.venv-python/bin/maturin build --quiet --release --locked --manifest-path python/Cargo.toml --out python/dist
+	.venv-python/bin/pip install --quiet "$$(ls python/dist/orbitcal-*.whl)[test]"
+	ORBITCAL=$(CURDIR)/$(ORBITCAL) .venv-python/bin/python -m pytest --quiet python/tests
+
+notebooks: ## the notebooks in docs/python anew, in the environment that make python leaves
+	.venv-python/bin/python python/notebooks/render.py
+
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps
 
@@ -167,4 +180,4 @@ fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv .venv-peers .venv-export .venv-control .venv-iceoryx
+	rm -rf .venv .venv-peers .venv-export .venv-control .venv-iceoryx .venv-python python/target python/dist

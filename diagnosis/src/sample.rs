@@ -3,6 +3,7 @@
 //! In units of prior standard deviations, `-cost/2` is the log-density of u. The vars have coordinates w without bounds (see
 //! [`inference::bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
 
+use core::ops::ControlFlow;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
@@ -33,7 +34,7 @@ pub fn sample(data: &Data, fitted: &Fitted, settings: NutsSettings) -> Result<Nu
     let mut names = data.ring.var_names();
     names.extend((0..unknowns.len()).map(|i| format!("unknown {i}")));
     let extended = Extended { data: data.clone(), fitted: fitted.clone(), spread: inverse.transpose() };
-    explore(Arc::new(extended), &names, settings, |_| ())
+    explore(Arc::new(extended), &names, settings, |_| ControlFlow::Continue(()))
 }
 
 /// `1 + J^T J` in coordinates without bounds, with the curvature of the coordinates near a bound.

@@ -5,6 +5,7 @@
 //!
 //! Source: M. D. Hoffman and A. Gelman, J. Mach. Learn. Res. 15 (2014) 1593; A. Seyboldt, nuts-rs.
 
+use core::ops::ControlFlow;
 use core::time::Duration;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -59,6 +60,9 @@ pub struct NutsRun {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum NutsError {
+    /// Somebody asked for the end.
+    #[error("interrupted")]
+    Interrupted,
     /// The sampler stopped.
     #[error("the sampler stopped: {0}")]
     Sampler(String),
@@ -110,7 +114,7 @@ impl NutsRun {
     }
 }
 
-/// Sample a posterior about its Laplace approximation; `progress` hears of finished draws, warm-up included.
+/// Sample a posterior about its Laplace approximation; `progress` hears of finished draws, warm-up included, every 0.1 s, and may break off.
 ///
 /// # Errors
 /// [`NutsError`].
@@ -119,12 +123,12 @@ pub fn sample(
     laplace: Arc<Laplace>,
     names: &[String],
     settings: NutsSettings,
-    progress: impl FnMut(usize),
+    progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<NutsRun, NutsError> {
     explore(Arc::new(Whitened { posterior, laplace }), names, settings, progress)
 }
 
-/// Sample a density from the origin of its coordinates.
+/// Sample a density from the origin of its coordinates; `progress` as in [`sample`].
 ///
 /// # Errors
 /// [`NutsError`].
@@ -132,7 +136,7 @@ pub fn explore<D: Density>(
     density: Arc<D>,
     names: &[String],
     settings: NutsSettings,
-    mut progress: impl FnMut(usize),
+    mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<NutsRun, NutsError> {
     let options = DiagNutsSettings {
         num_chains: settings.chains,
@@ -149,7 +153,10 @@ pub fn explore<D: Density>(
     let mut sampler = Sampler::new(model, options, HashMapConfig::new(), threads, None).map_err(failed)?;
     let chains = loop {
         let chains = sampler.progress().map_err(failed)?;
-        progress(chains.iter().map(|chain| chain.finished_draws).sum());
+        if progress(chains.iter().map(|chain| chain.finished_draws).sum()).is_break() {
+            sampler.abort().map_err(failed)?;
+            return Err(NutsError::Interrupted);
+        }
         match sampler.wait_timeout(Duration::from_millis(100)) {
             SamplerWaitResult::Trace(chains) => break chains,
             SamplerWaitResult::Timeout(more) => sampler = more,

@@ -1,5 +1,6 @@
 //! Batch fit, posterior and NUTS of rings that are not the Booster: ten cells from another code, and Boosters edited in their two files.
 
+use core::ops::ControlFlow::Continue;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -211,7 +212,8 @@ fn the_posterior_of_family_factors_is_that_of_the_batch_fit() {
     let posterior = Posterior::new(model.clone(), Readings::of_frames(&reduced, &model, TuneUse::LeftOut), prior);
     let laplace = posterior.laplace(&map).unwrap();
     let settings = NutsSettings { chains: 2, warm_up: 200, draws: 1500, seed: 1 };
-    let run = nuts::sample(Arc::new(posterior), Arc::new(laplace), &ring.var_names(), settings, |_| ()).unwrap();
+    let run =
+        nuts::sample(Arc::new(posterior), Arc::new(laplace), &ring.var_names(), settings, |_| Continue(())).unwrap();
     for (i, summary) in run.draws.summary().iter().enumerate() {
         // 3000 draws, 300 independent ones at least: 6 % of a mean's sigma, 4 % of a sigma
         let shift = (summary.mean.ln() - map[i]) / sigma[i];

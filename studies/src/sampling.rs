@@ -1,5 +1,6 @@
 //! What every posterior of a study is sampled with: one campaign, one model, one seed; and how far the whole job is.
 
+use core::ops::ControlFlow;
 use std::sync::Arc;
 
 use serde::Serialize;
@@ -83,6 +84,7 @@ impl<'p> Sampling<'p> {
         let progress = &mut *self.progress;
         let run = nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |done| {
             progress(name, before + done, total);
+            ControlFlow::Continue(())
         });
         let run = run.map_err(|source| StudyError::Nuts { run: name.to_owned(), source })?;
         progress(name, before + each, total);

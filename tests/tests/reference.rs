@@ -1,5 +1,6 @@
 //! The reference: is the density the recording's, is NUTS converged on it, and is the core's Laplace approximation the posterior?
 
+use core::ops::ControlFlow::Continue;
 use std::sync::Arc;
 
 use estimator::{Marginal, Walk};
@@ -32,7 +33,7 @@ fn posterior(reduced: &Reduced, model: ResponseModel) -> Posterior {
 fn sample(reduced: &Reduced, posterior: Posterior, settings: NutsSettings) -> NutsRun {
     let laplace = posterior.laplace(&reduced.fit.map_params).unwrap();
     let names = reduced.campaign.ring.var_names();
-    nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |_| ()).unwrap()
+    nuts::sample(Arc::new(posterior), Arc::new(laplace), &names, settings, |_| Continue(())).unwrap()
 }
 
 /// Twin and surrogate, all frames and the paper's pairs, both priors: in the coordinates that the sampler's are made of, a

@@ -22,9 +22,9 @@ const LEAST: usize = diagnosis::data::LEAST;
 /// Rate of a device's serial line where none is given [baud], and bits of a byte on it.
 const LINE: (f64, f64) = (921_600.0, 10.0);
 
-/// Field names are those of the command's JSON.
+/// What a recording holds. Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
-struct CheckResult {
+pub struct CheckResult {
     recording: String,
     machine: String,
     frames: usize,
@@ -98,17 +98,24 @@ struct Usable {
 pub fn run(options: &Check) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
-    let recording = recording(&options.recording, &ring)?;
-    // columns that are not what the header says may leave no stable ring
-    let campaign = campaign(&ring, &recording).map_err(|error| match Miswired::of(&ring, &recording) {
-        Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
-        _ => error,
-    })?;
-    deliver(&options.common, &CheckResult::of(&ring, &campaign))
+    deliver(&options.common, &CheckResult::of(&ring, &recording(&options.recording, &ring)?)?)
 }
 
 impl CheckResult {
-    fn of(ring: &Ring, campaign: &Campaign) -> Self {
+    /// Of a recording of a ring.
+    ///
+    /// # Errors
+    /// [`CommandError`] if its currents leave no stable ring.
+    pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, CommandError> {
+        // columns that are not what the header says may leave no stable ring
+        let campaign = campaign(ring, recording).map_err(|error| match Miswired::of(ring, recording) {
+            Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
+            _ => error,
+        })?;
+        Ok(Self::of_campaign(ring, &campaign))
+    }
+
+    fn of_campaign(ring: &Ring, campaign: &Campaign) -> Self {
         let Recording { name, rows, .. } = &campaign.recording;
         let tunes = design_tunes(campaign);
         let readings = &campaign.readings;

@@ -1,8 +1,9 @@
 //! `orbitcal compare`: what changed between two measurements of one machine.
 
-use inference::{BatchFit, TuneUse};
+use inference::{BatchFit, Recording, TuneUse};
 use measured::departure::clear;
-use measured::{Folder, Straightened};
+use measured::{Folder, Settings, Straightened};
+use twin::Ring;
 
 use super::{CommandError, campaign, check_outputs, deliver, machine_with, matrix, recording};
 use crate::cli::Compare;
@@ -17,8 +18,20 @@ use crate::result::FitResult;
 pub fn run(options: &Compare) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let compared = match [&options.before, &options.after].map(|path| Folder::is_one(path)) {
-        [true, true] => of_matrices(options)?,
-        [false, false] => Comparison::of(of_recordings(options)?, Vec::new()),
+        [true, true] => {
+            let settings = matrix::settings(None, &options.priors)?;
+            let [before, after] = [&options.before, &options.after].map(|path| Folder::read(path));
+            let spinner = matrix::spinner(&options.common);
+            let compared =
+                of_matrices([&before?, &after?], &settings, &mut |what| spinner.set_message(what.to_owned()));
+            spinner.finish_and_clear();
+            compared?
+        }
+        [false, false] => {
+            let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+            let [before, after] = [&options.before, &options.after].map(|path| recording(path, &ring));
+            of_recordings(&ring, [&before?, &after?], |_| ())?
+        }
         _ => {
             let (a, b) = (options.before.display(), options.after.display());
             return Err(CommandError::Input(format!(
@@ -34,17 +47,21 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
     deliver(&options.common, &compared)
 }
 
-fn of_matrices(options: &Compare) -> Result<Comparison, CommandError> {
-    let settings = matrix::settings(None, &options.priors)?;
-    let (as_measured, after) = (Folder::read(&options.before)?, Folder::read(&options.after)?);
-    let Straightened { folder: before, cables, fit } = matrix::fitted(&as_measured, &settings, &options.common)?;
-    let spinner = matrix::spinner(&options.common);
-    let changes = measured::compare((&before, &cables, &fit), &after, &settings, &mut |what| {
-        spinner.set_message(format!("{}: {what}", after.name))
-    });
-    spinner.finish_and_clear();
+/// Two measured matrices of one ring; `say` hears what is done.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn of_matrices(
+    [as_measured, after]: [&Folder; 2],
+    settings: &Settings,
+    say: &mut dyn FnMut(&str),
+) -> Result<Comparison, CommandError> {
+    let Straightened { folder: before, cables, fit } =
+        Straightened::of(as_measured, settings, &mut |what| say(&format!("{}: {what}", as_measured.name)))?;
+    let changes = measured::compare((&before, &cables, &fit), after, settings, &mut |what| {
+        say(&format!("{}: {what}", after.name));
+    })?;
     let mut all = Vec::new();
-    let changes = changes?;
     for one in &changes.gradients {
         all.extend(one.rows.iter().map(|&row| ChangeOfOne {
             name: before.element(row),
@@ -60,15 +77,21 @@ fn of_matrices(options: &Compare) -> Result<Comparison, CommandError> {
     Ok(Comparison::of(all, cables.chain(changes.others.iter().map(OtherChange::of)).collect()))
 }
 
-/// Each recording is fitted by itself; where a var is known no better than half its prior, the prior would hide a change.
-fn of_recordings(options: &Compare) -> Result<Vec<ChangeOfOne>, CommandError> {
-    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
-    let vars = |path: &std::path::Path| -> Result<_, CommandError> {
-        let campaign = campaign(&ring, &recording(path, &ring)?)?;
-        let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ())?;
+/// Two recordings of a ring; `progress` hears the number of each step. Each is fitted by itself; where a var is known no better than half its prior, the prior would hide a change.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn of_recordings(
+    ring: &Ring,
+    [before, after]: [&Recording; 2],
+    mut progress: impl FnMut(usize),
+) -> Result<Comparison, CommandError> {
+    let mut vars = |recording: &Recording| -> Result<_, CommandError> {
+        let campaign = campaign(ring, recording)?;
+        let fit = BatchFit::of(&campaign, TuneUse::Readings, &mut progress)?;
         Ok(FitResult::of_fit(&campaign, &fit).vars)
     };
-    let (before, after) = (vars(&options.before)?, vars(&options.after)?);
+    let (before, after) = (vars(before)?, vars(after)?);
     let widths = ring.parameters.iter().map(|parameter| parameter.prior.width);
     let change = |((one, other), width): ((_, _), f64)| {
         let (one, other): (crate::result::Var, crate::result::Var) = (one, other);
@@ -82,5 +105,5 @@ fn of_recordings(options: &Compare) -> Result<Vec<ChangeOfOne>, CommandError> {
             index: None,
         }
     };
-    Ok(before.into_iter().zip(after).zip(widths).map(change).collect())
+    Ok(Comparison::of(before.into_iter().zip(after).zip(widths).map(change).collect(), Vec::new()))
 }

@@ -11,6 +11,7 @@ use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::{Diagnosis, Finding, page};
 use inference::Recording;
 use measured::Folder;
+use report::Page;
 use serde::Serialize;
 use twin::{Measured, Ring};
 
@@ -21,9 +22,9 @@ use crate::next_plan::{self, NextPlanError};
 use crate::output::{self, fill, table};
 use crate::result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 
-/// Field names are those of the command's JSON.
+/// What is missing. Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]
-struct DiagnosisResult {
+pub struct DiagnosisResult {
     recording: String,
     /// Those that were analysed together, if several.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -187,9 +188,7 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     let diagnosis = made?;
     let result = DiagnosisResult::of(&ring, recording, &diagnosis)?;
     if let Some(path) = &options.report {
-        let page = page::page(&diagnosis, recording);
-        let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
-        output::bytes(path, page.render().as_bytes())?;
+        output::bytes(path, page_of(&diagnosis, recording)?.render().as_bytes())?;
     }
     deliver(&options.common, &result)?;
     if let Some(path) = options.report.as_ref().filter(|_| options.common.speaks()) {
@@ -199,6 +198,15 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
         write_plan(options, &ring, &diagnosis, [plan, out])?;
     }
     options.model_out.as_deref().map_or(Ok(()), |path| write_model(&diagnosis, path))
+}
+
+/// The page of a diagnosis.
+///
+/// # Errors
+/// [`CommandError::Other`] where the machine that was found is not stable.
+pub fn page_of(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, CommandError> {
+    let page = page::page(diagnosis, recording);
+    page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
 }
 
 /// One recording, or several at whichever energies they were taken.
@@ -257,7 +265,11 @@ fn write_model(diagnosis: &Diagnosis, path: &Path) -> Result<(), CommandError> {
 }
 
 impl DiagnosisResult {
-    fn of(ring: &Ring, recording: &Recording, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
+    /// Of a diagnosis whose first recording this is.
+    ///
+    /// # Errors
+    /// [`CommandError::Other`].
+    pub fn of(ring: &Ring, recording: &Recording, diagnosis: &Diagnosis) -> Result<Self, CommandError> {
         let failed = |error: twin::EffectError| CommandError::Other(format!("{}: {error}", recording.name));
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;

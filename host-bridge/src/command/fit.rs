@@ -1,12 +1,14 @@
 //! `orbitcal fit`: the batch fit, by Gauss-Newton or by NUTS.
 
+use core::ops::ControlFlow;
 use std::sync::Arc;
 
 use indicatif::ProgressBar;
 use inference::campaign::supplies_of;
-use inference::nuts::{self, NutsRun};
-use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::nuts::{self, NutsRun, NutsSettings};
+use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use measured::Folder;
+use report::Page;
 use twin::Ring;
 
 use super::{
@@ -28,13 +30,11 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
     let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let result = match options.method {
-        Method::Map => by_steps(options, &ring, &recording)?,
-        Method::Nuts => by_draws(options, &ring, &recording)?,
+        Method::Map => with_spinner(options, &ring, &recording)?,
+        Method::Nuts => with_bar(options, &ring, &recording)?,
     };
     if let Some(path) = &options.report {
-        let page = fit_page::page(&recording.powered(&ring), &supplies_of(&recording), &result);
-        let page = page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))?;
-        output::bytes(path, page.render().as_bytes())?;
+        output::bytes(path, page(&ring, &recording, &result)?.render().as_bytes())?;
     }
     deliver(&options.common, &result)
 }
@@ -57,32 +57,76 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)
 }
 
-/// Damped Gauss-Newton on the twin.
-fn by_steps(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
-    let (campaign, fit) = fitted(options, ring, recording)?;
+/// The page of a fit.
+///
+/// # Errors
+/// [`CommandError::Other`] where the design or the calibrated ring has no stable motion.
+pub fn page(ring: &Ring, recording: &Recording, result: &FitResult) -> Result<Page, CommandError> {
+    let page = fit_page::page(&recording.powered(ring), &supplies_of(recording), result);
+    page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
+}
+
+fn with_spinner(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
+    let spinner = if options.common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
+    let result = by_steps(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
+    spinner.finish_and_clear();
+    result
+}
+
+fn with_bar(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
+    let settings: NutsSettings = options.sampling.into();
+    let bar = progress(settings.chains * (settings.warm_up + settings.draws), "draws", options.common.quiet);
+    let sampled = by_draws(ring, recording, options.model, settings, |done| {
+        bar.set_position(done as u64);
+        ControlFlow::Continue(())
+    });
+    bar.finish_and_clear();
+    let (result, draws) = sampled?;
+    if let Some(folder) = &options.save_draws {
+        draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
+    }
+    Ok(result)
+}
+
+/// Damped Gauss-Newton on the twin; `progress` hears the number of each step.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn by_steps(ring: &Ring, recording: &Recording, progress: impl FnMut(usize)) -> Result<FitResult, CommandError> {
+    let (campaign, fit) = fitted(ring, recording, progress)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
     Ok(FitResult { notes, ..FitResult::of_fit(&campaign, &fit) })
 }
 
 /// The campaign and its batch fit, measured tunes as readings.
-fn fitted(options: &Fit, ring: &Ring, recording: &Recording) -> Result<(Campaign, BatchFit), CommandError> {
-    let spinner = spinner(options);
+fn fitted(
+    ring: &Ring,
+    recording: &Recording,
+    progress: impl FnMut(usize),
+) -> Result<(Campaign, BatchFit), CommandError> {
     let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, |step| {
-        spinner.set_message(format!("Gauss-Newton step {step}"));
-    });
-    spinner.finish_and_clear();
-    Ok((campaign, fit?))
+    let fit = BatchFit::of(&campaign, TuneUse::Readings, progress)?;
+    Ok((campaign, fit))
 }
 
-/// NUTS about the Laplace approximation.
-fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
+/// NUTS about the Laplace approximation; `progress` as in [`nuts::sample`].
+///
+/// # Errors
+/// [`CommandError`].
+pub fn by_draws(
+    ring: &Ring,
+    recording: &Recording,
+    model: FitModel,
+    settings: NutsSettings,
+    progress: impl FnMut(usize) -> ControlFlow<()>,
+) -> Result<(FitResult, Draws), CommandError> {
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let (campaign, fit) = fitted(options, ring, recording)?;
+    let (campaign, fit) = fitted(ring, recording, |_| ())?;
     let reduced = Reduced::of(campaign, fit)?;
     let ring = &reduced.campaign.ring;
-    let model = match options.model {
+    let is_network = model == FitModel::Resnet;
+    let model = match model {
         FitModel::Twin => ResponseModel::twin(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Green => ResponseModel::green(ring).map_err(|e| failed(e.to_string()))?,
         FitModel::Resnet => ResponseModel::resnet(ring)?,
@@ -92,21 +136,13 @@ fn by_draws(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
     let posterior = Posterior::new(model, readings, Prior::of(ring));
     let laplace = posterior.laplace(&reduced.fit.map_params).map_err(|e| failed(e.to_string()))?;
-    let settings = options.sampling.into();
-    let nuts::NutsSettings { chains, warm_up, draws, .. } = settings;
-    let bar = progress(chains * (warm_up + draws), "draws", options.common.quiet);
     let names = ring.var_names();
     let posterior = Arc::new(posterior);
-    let run =
-        nuts::sample(posterior.clone(), Arc::new(laplace), &names, settings, |done| bar.set_position(done as u64));
-    bar.finish_and_clear();
+    let run = nuts::sample(posterior.clone(), Arc::new(laplace), &names, settings, progress);
     let run = run.map_err(|e| failed(e.to_string()))?;
-    if let Some(folder) = &options.save_draws {
-        run.draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
-    }
     let result = FitResult::of_draws(&reduced, word, &run);
-    let extrapolated = (options.model == FitModel::Resnet).then(|| outside(&posterior, &run));
-    Ok(FitResult { notes: notes(&run), extrapolated, ..result })
+    let extrapolated = is_network.then(|| outside(&posterior, &run));
+    Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))
 }
 
 /// Share of the draws outside the range that the model was made for.
@@ -132,8 +168,4 @@ fn notes(run: &NutsRun) -> Vec<String> {
     );
     let effort = format!("{} evaluations in {:.1} s: {cost:.0} us each on one core", run.evaluations, run.seconds);
     [quality, effort].into_iter().chain(run.divergences.iter().cloned()).collect()
-}
-
-fn spinner(options: &Fit) -> ProgressBar {
-    if options.common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() }
 }

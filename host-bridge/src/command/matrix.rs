@@ -51,6 +51,39 @@ pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
     deliver(&options.common, &result)
 }
 
+/// A fit of a measured matrix as a result, and its page; `say` hears what is done.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn fitted_of(
+    folder: &Folder,
+    settings: &Settings,
+    say: &mut dyn FnMut(&str),
+) -> Result<(MatrixFit, Page), CommandError> {
+    let Straightened { folder, cables, fit } = Straightened::of(folder, settings, say)?;
+    let result = result(&folder, &cables, &fit, settings)?;
+    let page = measured_of(&folder, &fit, &result, settings)?.page()?;
+    Ok((result, page))
+}
+
+/// The same of a diagnosis.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn diagnosed_of(
+    folder: &Folder,
+    settings: &Settings,
+    say: &mut dyn FnMut(&str),
+) -> Result<(MatrixDiagnosis, Page), CommandError> {
+    let Straightened { folder, cables, fit: fitted } = Straightened::of(folder, settings, say)?;
+    let diagnosis = measured::diagnose(&folder, &fitted, settings, say)?;
+    let fit = result(&folder, &cables, &fitted, settings)?;
+    let found = Found { cables: &cables, fitted: &fitted, diagnosis: &diagnosis, against: None };
+    let result = MatrixDiagnosis::of(&folder, settings.rf, &found, fit);
+    let page = measured_of(&folder, &fitted, &result.fit, settings)?.page_of(&result)?;
+    Ok((result, page))
+}
+
 /// Diagnose it.
 ///
 /// # Errors

@@ -105,6 +105,15 @@ impl From<BatchError> for CommandError {
     }
 }
 
+impl std::error::Error for CommandError {}
+
+impl core::fmt::Display for CommandError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let (Self::Input(message) | Self::Other(message)) = self;
+        f.write_str(message)
+    }
+}
+
 impl From<twin::OrbitError> for CommandError {
     fn from(error: twin::OrbitError) -> Self {
         Self::Other(format!("no stable ring: {error}"))
@@ -181,7 +190,7 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
 ///
 /// # Errors
 /// [`CommandError::Input`] if its currents leave no stable ring, with the supply that is furthest from its nominal one.
-fn campaign(ring: &Ring, recording: &Recording) -> Result<Campaign, CommandError> {
+pub fn campaign(ring: &Ring, recording: &Recording) -> Result<Campaign, CommandError> {
     Campaign::of(ring, recording).map_err(|error| {
         let header = &recording.header;
         let mean = |f: usize| recording.rows.iter().map(|row| row.supply[f]).sum::<f64>() / recording.rows.len() as f64;
@@ -212,7 +221,10 @@ fn not_modelled(recording: &Recording) -> Option<String> {
 }
 
 /// The same as an error, where results would be wrong without a word.
-fn expect_modelled(recording: &Recording) -> Result<(), CommandError> {
+///
+/// # Errors
+/// [`CommandError::Input`].
+pub fn expect_modelled(recording: &Recording) -> Result<(), CommandError> {
     not_modelled(recording).map_or(Ok(()), |why| Err(CommandError::Input(why)))
 }
 

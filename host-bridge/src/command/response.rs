@@ -53,14 +53,22 @@ pub(super) fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
     let text = std::fs::read_to_string(path).map_err(|e| wrong(output::unreadable(&e)))?;
     let file: BTreeMap<String, f64> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    by_name(&file, ring).map_err(wrong)
+}
+
+/// Factor of every quadrupole: those that are named, 1 for the others.
+///
+/// # Errors
+/// What is wrong with them.
+pub fn by_name(vars: &BTreeMap<String, f64>, ring: &Ring) -> Result<Vec<f64>, String> {
     let names = ring.var_names();
-    if let Some(unknown) = file.keys().find(|name| !names.contains(name)) {
-        return Err(wrong(format!("expected a quadrupole of {}, found {unknown:?}", ring.name)));
+    if let Some(unknown) = vars.keys().find(|name| !names.contains(name)) {
+        return Err(format!("expected a quadrupole of {}, found {unknown:?}", ring.name));
     }
-    if let Some((name, value)) = file.iter().find(|(_, value)| !(0.5..=1.5).contains(*value)) {
-        return Err(wrong(format!("var {name}: expected 0.5 to 1.5, found {value}")));
+    if let Some((name, value)) = vars.iter().find(|(_, value)| !(0.5..=1.5).contains(*value)) {
+        return Err(format!("var {name}: expected 0.5 to 1.5, found {value}"));
     }
-    Ok(names.iter().map(|name| file.get(name).copied().unwrap_or(1.0)).collect())
+    Ok(names.iter().map(|name| vars.get(name).copied().unwrap_or(1.0)).collect())
 }
 
 impl ResponseResult {

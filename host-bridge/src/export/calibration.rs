@@ -130,7 +130,11 @@ impl Calibration {
         Self::parse(&text, &shown)
     }
 
-    fn parse(text: &str, path: &str) -> Result<Self, CalibrationError> {
+    /// Read the text of a result; `path` appears in errors.
+    ///
+    /// # Errors
+    /// [`CalibrationError`].
+    pub fn parse(text: &str, path: &str) -> Result<Self, CalibrationError> {
         let file: ResultFile =
             serde_json::from_str(text).map_err(|source| CalibrationError::Syntax { path: path.into(), source })?;
         let vars = file.vars.or(file.vars_after).ok_or_else(|| CalibrationError::NoVars { path: path.into() })?;

@@ -106,7 +106,7 @@ impl Lattice {
     }
 
     /// A ring as it is.
-    pub(super) fn plain(ring: &Ring) -> Self {
+    pub fn plain(ring: &Ring) -> Self {
         let mut names = Names::new();
         let (mut elements, mut position, mut remarks, mut drifts) = (Vec::new(), Vec::new(), Vec::new(), 1..);
         for element in &ring.elements {

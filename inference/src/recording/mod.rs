@@ -25,6 +25,10 @@ pub use header::{BelievedRf, Format, Header, at_energy};
 pub use names::Names;
 pub use ramp::{At, Ramp};
 
+/// Names of the two files.
+const HEADER: &str = "header.toml";
+const FRAMES: &str = "frames.csv";
+
 /// One campaign: what it was taken with, and one row a machine cycle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
@@ -44,14 +48,32 @@ impl Recording {
     /// # Errors
     /// The first fault met, the header's before the frames'; last what of the header the frames contradict.
     pub fn read(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        let [file, frames_file] = ["header.toml", "frames.csv"].map(|file| folder.join(file));
-        let header_text = text(&file)?;
-        let ring = powered(ring, header::format(&file, &header_text)?);
+        let header = text(&folder.join(HEADER))?;
+        Self::of_texts(folder, ring, &header, || text(&folder.join(FRAMES)))
+    }
+
+    /// The same from the texts of the two files; `folder` gives the recording its name and appears in errors.
+    ///
+    /// # Errors
+    /// As [`Recording::read`].
+    pub fn parse(folder: &Path, ring: &Ring, header: &str, frames: &str) -> Result<Self, RecordingError> {
+        Self::of_texts(folder, ring, header, || Ok(frames.into()))
+    }
+
+    /// The header comes first: its faults are told even where there are no frames.
+    fn of_texts(
+        folder: &Path,
+        ring: &Ring,
+        header_text: &str,
+        frames: impl FnOnce() -> Result<String, RecordingError>,
+    ) -> Result<Self, RecordingError> {
+        let (file, frames_file) = (folder.join(HEADER), folder.join(FRAMES));
+        let ring = powered(ring, header::format(&file, header_text)?);
         let names = Names::of(&ring);
-        let header = Header::parse(&file, &header_text, &ring, &names)?;
-        let (rows, other) = frames::parse(&frames_file, &text(&frames_file)?, &header, &ring, &names)?;
+        let header = Header::parse(&file, header_text, &ring, &names)?;
+        let (rows, other) = frames::parse(&frames_file, &frames()?, &header, &ring, &names)?;
         let recording = Self { name: name(folder), header, other, rows };
-        let refuse = |(key, what): (&str, String)| header::refuse(&file, &header_text, key, &what);
+        let refuse = |(key, what): (&str, String)| header::refuse(&file, header_text, key, &what);
         plausible::check(&recording).map_err(refuse)?;
         Ok(recording)
     }
@@ -62,7 +84,7 @@ impl Recording {
     /// # Errors
     /// As [`Recording::read`].
     pub fn read_at_its_energy(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        let energy = header::kinetic_energy(&text(&folder.join("header.toml"))?);
+        let energy = header::kinetic_energy(&text(&folder.join(HEADER))?);
         let ring = energy.map_or(Cow::Borrowed(ring), |energy| at_energy(ring, energy));
         Self::read(folder, &ring)
     }

@@ -10,7 +10,7 @@ use super::columns::supply_column;
 use super::error::RecordingError;
 use super::limit::in_milli;
 use super::names::Names;
-use super::{Recording, Row};
+use super::{FRAMES, HEADER, Recording, Row};
 
 impl Recording {
     /// Write `header.toml` and `frames.csv` of a campaign of this ring into a folder, which is made where there is none.
@@ -21,13 +21,23 @@ impl Recording {
     /// # Panics
     /// If the recording is not of this ring.
     pub fn write(&self, folder: &Path, ring: &Ring) -> Result<(), RecordingError> {
-        let names = Names::of(&self.powered(ring));
+        let [header, frames] = self.texts(ring);
         let write = |file: &Path, content: &[u8]| {
             fs::write(file, content).map_err(|error| RecordingError::Unwritable(file.into(), error.kind()))
         };
         fs::create_dir_all(folder).map_err(|error| RecordingError::Unwritable(folder.into(), error.kind()))?;
-        write(&folder.join("header.toml"), self.header.text(&names).as_bytes())?;
-        write(&folder.join("frames.csv"), &self.frames(&names))
+        write(&folder.join(HEADER), header.as_bytes())?;
+        write(&folder.join(FRAMES), frames.as_bytes())
+    }
+
+    /// The texts of `header.toml` and `frames.csv`.
+    ///
+    /// # Panics
+    /// If the recording is not of this ring.
+    pub fn texts(&self, ring: &Ring) -> [String; 2] {
+        let names = Names::of(&self.powered(ring));
+        let frames = String::from_utf8(self.frames(&names)).expect("names and numbers are text");
+        [self.header.text(&names), frames]
     }
 
     fn frames(&self, names: &Names) -> Vec<u8> {

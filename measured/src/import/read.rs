@@ -25,20 +25,28 @@ impl Lattice {
             return at_mat::read(&MatFile::of(&file, bytes)?, name.as_deref());
         }
         let text = String::from_utf8(bytes).map_err(|_| unknown(&file, "bytes that are no text"))?;
+        Self::parse(&file, &text)
+    }
+
+    /// Read the text of a file of any format that is text; `file` appears in errors.
+    ///
+    /// # Errors
+    /// As [`Lattice::read`].
+    pub fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
         if text.trim_start().starts_with('@') {
-            return madx::read(&file, &text);
+            return madx::read(file, text);
         }
-        let value = value(&file, &text)?;
+        let value = value(file, text)?;
         if value.get("atjson").is_some() {
-            at::read(&file, &value)
+            at::read(file, &value)
         } else if value.get("PALS").is_some() {
-            pals::read(&file, &value)
+            pals::read(file, &value)
         } else if value.get("element_names").is_some() {
-            xsuite::read(&file, &value)
+            xsuite::read(file, &value)
         } else {
             let keys = value.as_object().map(|map| map.keys().take(8).cloned().collect::<Vec<_>>().join(", "));
-            let seen = keys.map_or_else(|| first_line(&text), |keys| format!("the keys {keys}"));
-            Err(unknown(&file, &seen))
+            let seen = keys.map_or_else(|| first_line(text), |keys| format!("the keys {keys}"));
+            Err(unknown(file, &seen))
         }
     }
 }

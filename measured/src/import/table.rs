@@ -62,7 +62,11 @@ impl Table {
         }
     }
 
-    fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
+    /// Read the text of a table; `file` appears in errors.
+    ///
+    /// # Errors
+    /// As [`Table::read`].
+    pub fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
         let mut table = Self { file: file.into(), columns: None, rows: Vec::new() };
         for (number, cells) in cells(file, text)? {
             let is_head = table.rows.is_empty() && table.columns.is_none();

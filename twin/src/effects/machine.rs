@@ -10,7 +10,7 @@ use super::{Effect, EffectError};
 use crate::lattice::{Plane, Ring};
 use crate::map::{X, Y};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError};
-use crate::response::Optics;
+use crate::response::{Gradient, Optics};
 use crate::site::Site;
 use crate::tune::Tunes;
 
@@ -128,14 +128,37 @@ impl Machine {
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
         let optics = self.optics()?;
         let mut response = self.held(&self.ring, &optics)?;
-        // the last effect is next to the beam
-        self.correctors.iter().rev().for_each(|kick| kick.of_response(&mut response));
-        let orbit = |monitor: &crate::Monitor| [X, Y].map(|at| optics.orbit(monitor.element)[at]);
-        let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(orbit).collect();
-        self.monitors.iter().for_each(|reading| reading.of_response(&self.ring, &mut base, &mut response));
+        self.measure(&optics, &mut response);
         let dispersion = optics.monitor_places(Plane::X).iter().map(|o| optics.dispersion(o)).collect();
         let [x, y] = response;
         Ok(MachineResponse { x, y, dispersion, tunes: optics.tunes()?, gamma_transition: optics.gamma_transition() })
+    }
+
+    /// Derivative of the response, x and y as [`Machine::response`] has them, with respect to the gradient of each quadrupole `[M]`
+    /// [m/rad per 1/m^2]; of a monitor that is not linear, without what the gradient does to the orbit that it reads.
+    ///
+    /// # Errors
+    /// As [`Machine::response`].
+    pub fn response_jacobian(&self) -> Result<Vec<[DMatrix<f64>; 2]>, OrbitError> {
+        let optics = self.optics()?;
+        let held = self.held_of(&self.ring, &optics)?;
+        let places = [Plane::X, Plane::Y].map(|plane| optics.monitor_places(plane));
+        let sources = optics.correctors();
+        let slope = |gradient: &Gradient| {
+            let mut slope = places.each_ref().map(|places| held.jacobian(&optics, places, &sources, gradient));
+            self.measure(&optics, &mut slope);
+            slope
+        };
+        Ok(optics.quadrupoles().iter().map(slope).collect())
+    }
+
+    /// What monitors and correctors make of a response of x and y at all monitors to all correctors.
+    fn measure(&self, optics: &Optics, response: &mut [DMatrix<f64>; 2]) {
+        // the last effect is next to the beam
+        self.correctors.iter().rev().for_each(|kick| kick.of_response(response));
+        let orbit = |monitor: &crate::Monitor| [X, Y].map(|at| optics.orbit(monitor.element)[at]);
+        let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(orbit).collect();
+        self.monitors.iter().for_each(|reading| reading.of_response(&self.ring, &mut base, response));
     }
 
     /// Linear responses of a ring with what this machine holds constant, given the ring's optics at constant momentum.
@@ -193,6 +216,33 @@ mod tests {
         assert!((mixed.x.row(e4) - plain.x.row(e4) - plain.x.row(e6) * 0.1).abs().max() < 1e-12);
         let shared = respond(&["corrector_crosstalk@H_A2=0.1"]);
         assert!((shared.x.column(0) - plain.x.column(0) - plain.x.column(1) * 0.1).abs().max() < 1e-12);
+    }
+
+    #[test]
+    fn the_jacobian_is_that_of_the_response_with_its_effects() {
+        let effects =
+            ["bpm_gain@x_E4=0.1", "bpm_roll@y_C5=0.05", "corrector_roll@H_A2=0.2", "corrector_swap@H_A2,H_A6"];
+        for rf in [Rf::FixedMomentum, Rf::FixedFrequency] {
+            let machine = |ring: Ring| {
+                let effects: Vec<Effect> = effects.iter().map(|text| Effect::parse(text, &ring).unwrap()).collect();
+                Machine::new(ring, rf, &effects).unwrap()
+            };
+            let ring = Ring::booster();
+            let jacobian = machine(ring.clone()).response_jacobian().unwrap();
+            for (q, (k1, slope)) in ring.gradients().iter().zip(&jacobian).enumerate().step_by(11) {
+                let respond = |change: f64| {
+                    let mut factors = vec![1.0; ring.quadrupoles.len()];
+                    factors[q] += change;
+                    machine(ring.with_strengths(&factors)).response().unwrap()
+                };
+                let (more, less) = (respond(1e-4), respond(-1e-4));
+                let numeric = [(more.x - less.x) / (2e-4 * k1), (more.y - less.y) / (2e-4 * k1)];
+                for (exact, numeric) in slope.iter().zip(&numeric) {
+                    let error = (exact - numeric).abs().max() / exact.abs().max();
+                    assert!(error < 1e-5, "quadrupole {q}: {error:e}"); // truncation: (1e-4)^2 times the resonance denominator
+                }
+            }
+        }
     }
 
     #[test]

@@ -1,0 +1,114 @@
+"""What an ensemble runs: each task is made of a recording and gives a row for a seed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import numpy as np
+
+from .. import _orbitcal
+from ..estimator import Estimator
+from ..recording import Recording
+from ..ring import Ring
+
+Method = Literal["map", "core", "nuts"]
+
+
+class Validation:
+    """A blind campaign through the diagnosis, as of `orbitcal validate`: the seed is the number of the case.
+
+    Classes: `empty` (no effect), `single`, `pair`, `unknown` (physics that the library does not hold). Rows have the words of
+    `validate`'s outcomes: verdict, grade, what was made and found. Other rings take the recording of another ring.
+    """
+
+    def __init__(self, template: Recording, kind: Literal["empty", "single", "pair", "unknown"], *, seed: int = 1) -> None:
+        self.template, self.kind, self.seed = template, kind, seed
+        self.name = "validation"
+        self.says = {"template": template.name, "class": kind, "seed": seed}
+        self._validation: _orbitcal.Validation | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_validation": None}
+
+    def __call__(self, seed: int) -> dict[str, Any]:
+        """The case of this number."""
+        if self._validation is None:
+            self._validation = _orbitcal.Validation(self.template.ring._ring, self.template._recording)
+        made = self._validation.run(self.kind, seed, self.seed)
+        if made is None:
+            return {"verdict": "no beam"}
+        outcome = json.loads(made)
+        return {
+            "verdict": outcome["verdict"],
+            "grade": json.dumps(outcome["grade"]),
+            "made": [one["label"] for one in outcome["truth"]],
+            "found": outcome["found"],
+            "probability": outcome["stated"][1],
+            "is_true": outcome["stated"][2],
+            "oracle_gain": outcome["oracle_gain"],
+            "nees_before": outcome["nees"][0],
+            "nees_after": outcome["nees"][1],
+        }
+
+
+class Calibration:
+    """Simulation-based calibration: vars from the prior, a campaign made with them, and where they lie in each posterior.
+
+    Rows have a list for each method, one number a var: the posterior probability below the true value, of NUTS the share of draws. If the posterior
+    is right they are uniform from 0 to 1 (`uniformity`). Methods: `map` (batch fit), `core` (the no_std core), `nuts`.
+
+    Source: S. Talts, M. Betancourt, D. Simpson, A. Vehtari and A. Gelman, arXiv:1804.06788 (2018).
+    """
+
+    def __init__(self, template: Recording, methods: Iterable[Method] = ("map", "core", "nuts"), *, draws: int = 400) -> None:
+        self.template, self.methods, self.draws = template, tuple(methods), draws
+        self.name = "calibration"
+        self.says = {"template": template.name, "methods": list(self.methods), "draws": draws}
+
+    def __call__(self, seed: int) -> dict[str, Any]:
+        """The probabilities of one campaign."""
+        recording, truth = Recording.simulated(self.template, seed, exact=False)
+        return {method: getattr(self, f"_{method}")(recording, np.log(truth.values), seed) for method in self.methods}
+
+    def _map(self, recording: Recording, params: np.ndarray, _: int) -> list[float]:
+        mean, sigma = _orbitcal.marginals(recording.ring._ring, recording._recording)
+        return _below(recording.ring, params, mean, sigma)
+
+    def _core(self, recording: Recording, params: np.ndarray, _: int) -> list[float]:
+        for estimate in Estimator(recording.ring, recording).stream(recording):
+            last = estimate
+        return _below(recording.ring, params, last.centre, last.params_sigma)
+
+    def _nuts(self, recording: Recording, params: np.ndarray, seed: int) -> list[float]:
+        # one chain, so that a worker takes one core
+        ring, measured = recording.ring._ring, recording._recording
+        _, drawn = _orbitcal.sample(ring, measured, "green", 1, 300, self.draws, seed, None)
+        return (np.log(drawn["vars"][0]) < params).mean(axis=0).tolist()
+
+
+def _below(ring: Ring, params: np.ndarray, mean: Iterable[float], sigma: Iterable[float]) -> list[float]:
+    """Probability of a smaller `ln var`, of normals truncated to the prior's ranges."""
+    of = lambda x, m, s: 0.5 * math.erfc((m - x) / (s * math.sqrt(2)))
+    result = []
+    for theta, m, s, (_, low, high) in zip(params, mean, sigma, ring._ring.priors, strict=True):
+        below, above = (of(math.log(bound), m, s) for bound in (low, high))
+        result.append((of(theta, m, s) - below) / (above - below))
+    return result
+
+
+class TrainingSet:
+    """Training data of a surrogate: vars from the ring's prior and the exact response of the twin to them [B][C] [m/rad]."""
+
+    def __init__(self, template: Recording) -> None:
+        self.template = template
+        self.name = "training set"
+        self.says = {"ring": template.ring.name}
+
+    def __call__(self, seed: int) -> dict[str, Any]:
+        """One ring."""
+        _, vars = Recording.simulated(self.template, seed, exact=False)
+        response = self.template.ring.with_vars(vars).response()
+        return {"vars": vars.tolist(), "response": response.values.ravel().tolist()}

@@ -1,0 +1,212 @@
+"""A recording: frames of a campaign, or a measured response matrix."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from . import _orbitcal
+from .header import header_of_text, text_of_header
+from .ring import Effect, Ring, words
+
+PerInstrument = float | tuple[float, float] | Mapping[str, float]
+
+
+class Recording:
+    """What was measured on a ring: `read`, `from_pandas`, `from_response`; `write` makes the folder that the program reads.
+
+    A recording of frames has `frames` and `header` (docs/recording.md), a measured response matrix has `matrix`
+    (docs/real-rings.md).
+    """
+
+    def __init__(self, recording: _orbitcal.Recording, ring: Ring) -> None:
+        self._recording = recording
+        self.ring = ring
+        """The ring that it was read for."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.is_matrix:
+            raise _orbitcal.InputError(f"{self.name}: a measured matrix cannot be pickled; write() it")
+        return _again, (self.name, self.ring, *self._recording.texts(self.ring._ring))
+
+    @classmethod
+    def read(cls, folder: str | PathLike[str], ring: Ring | None = None, *, any_energy: bool = False) -> Recording:
+        """Read a folder with `header.toml` and `frames.csv`, or with a measured response matrix.
+
+        Without a ring the frames are those of the built-in Booster; a matrix brings its own lattice. Frames that were taken at another energy than
+        the ring's are refused, but for `any_energy`: `diagnose` takes several of different energies together.
+        """
+        ring = Ring.booster() if ring is None else ring
+        return cls(_orbitcal.Recording.read(Path(folder), ring._ring, any_energy), ring)
+
+    @classmethod
+    def from_pandas(
+        cls, frames: pd.DataFrame, ring: Ring, header: Mapping[str, Any], *, name: str = "recording"
+    ) -> Recording:
+        """A recording of format 2 from a table with the columns of `frames.csv`, one row a machine cycle.
+
+        Positions are in mm and currents in A, as the names of the columns say; NaN is an empty cell. `header` has the keys of
+        `header.toml`; those that follow from the ring (`machine`, `lattice`, `particle`, `kinetic_energy_GeV`) may be left out.
+        """
+        text = frames.to_csv(index=False, lineterminator="\n")
+        return cls(_orbitcal.Recording.parse(name, ring._ring, text_of_header(_header(ring, header)), text), ring)
+
+    @classmethod
+    def from_response(
+        cls,
+        matrix: pd.DataFrame | xr.DataArray | np.ndarray,
+        ring: Ring,
+        *,
+        orbit_unit: Literal["m", "mm", "um"],
+        kick: PerInstrument,
+        kick_is: Literal["full", "half"],
+        kick_sign: Literal["x+y+", "x-y+", "x+y-", "x-y-"],
+        noise: PerInstrument,
+        order: Literal["planes", "pairs"] | None = None,
+        dispersion: pd.Series | np.ndarray | None = None,
+        rf_step: float | None = None,
+        rf_frequency: float | None = None,
+        name: str = "matrix",
+    ) -> Recording:
+        """A measured response matrix of a ring that was made of a lattice (`from_pyat`, `from_xsuite`, `from_lattice`).
+
+        Rows are monitors and columns correctors, named as in the lattice with the plane in front (`x:BPM[3]`), or numbers alone
+        with `order`. What the numbers mean is asked for, as by `orbitcal import`: `kick` is the deflection [mrad] that an element
+        of the matrix belongs to, `noise` its standard deviation in `orbit_unit`; each one number, one a plane, or by name. `dispersion`
+        is the change of the orbit when the RF frequency rises by `rf_step` [Hz].
+        """
+        made = _orbitcal.Recording.assemble(
+            ring._ring,
+            name,
+            _table(matrix),
+            order,
+            orbit_unit,
+            _per_instrument(kick),
+            kick_is,
+            kick_sign,
+            _per_instrument(noise),
+            None if dispersion is None else _table(dispersion),
+            rf_step,
+            rf_frequency,
+        )
+        return cls(made, ring)
+
+    @classmethod
+    def simulated(
+        cls,
+        template: Recording,
+        seed: int,
+        *,
+        vars: Mapping[str, float] | None = None,
+        effects: Iterable[Effect] = (),
+        exact: bool = True,
+    ) -> tuple[Recording, pd.Series]:
+        """A campaign that a simulated machine would have given, and the vars that it was made with.
+
+        Settings, read-backs and gaps are those of the template. Without `vars` they are drawn from the ring's prior, of rings that keep their beam. `exact`:
+        every frame an exact orbit of misaligned magnets with `effects`, monitors with offsets, noise and jumps, tunes; else the machine of
+        the estimator's model. The seed fixes everything.
+        """
+        named = None if vars is None else {str(name): float(value) for name, value in vars.items()}
+        ring = template.ring
+        made, drawn = _orbitcal.simulate(ring._ring, template._recording, seed, named, words(effects), exact)
+        return cls(made, ring), pd.Series(drawn, pd.Index(ring._ring.vars, name="var"), name="factor")
+
+    @property
+    def name(self) -> str:
+        """Name of the folder, or that which was given."""
+        return self._recording.name
+
+    @property
+    def is_matrix(self) -> bool:
+        """True of a measured response matrix."""
+        return self._recording.is_matrix
+
+    @property
+    def frames(self) -> pd.DataFrame:
+        """The frames with the columns of `frames.csv`, in format 2; a reading that is missing is NaN."""
+        text = self._recording.texts(self.ring._ring)[1]
+        return pd.read_csv(io.StringIO(text), dtype={"corrector": str, "setting_A": str}, keep_default_na=True)
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """The header with the keys of `header.toml`, in format 2."""
+        return header_of_text(self._recording.texts(self.ring._ring)[0])
+
+    @property
+    def matrix(self) -> xr.DataArray:
+        """Orbit at plus half the kick less that at minus half, dimensions `monitor` and `corrector` [mm]; NaN was not measured.
+
+        Coordinates: `kick` of each corrector [mrad], `noise` of an element in each monitor's row [mm].
+        """
+        monitors, correctors, values, kick, noise = self._recording.matrix()
+        coords = {
+            "monitor": monitors,
+            "corrector": correctors,
+            "kick": ("corrector", kick, {"units": "mrad"}),
+            "noise": ("monitor", noise, {"units": "mm"}),
+        }
+        return xr.DataArray(values, coords, ("monitor", "corrector"), "response_matrix", {"units": "mm"})
+
+    def check(self) -> dict[str, Any]:
+        """What it holds and what can be done with it: the JSON of `orbitcal check`.
+
+        Of a matrix: how many elements, and `agreement` of each plane with the lattice's own, factor and correlation near 1 where units and
+        signs are right.
+        """
+        return json.loads(self._recording.check(self.ring._ring))
+
+    def write(self, folder: str | PathLike[str]) -> Path:
+        """Write the folder that the program reads, and return its path. The folder of a matrix must not be there yet."""
+        self._recording.write(Path(folder), self.ring._ring)
+        return Path(folder)
+
+    def __len__(self) -> int:
+        """Number of frames; 0 of a matrix."""
+        return self._recording.frames()
+
+    def __repr__(self) -> str:
+        what = "a response matrix" if self.is_matrix else f"{len(self)} frames"
+        return f"<orbitcal.Recording {self.name!r}: {what} of {self.ring.name!r}>"
+
+
+def _again(name: str, ring: Ring, header: str, frames: str) -> Recording:
+    return Recording(_orbitcal.Recording.parse(name, ring._ring, header, frames), ring)
+
+
+def _header(ring: Ring, header: Mapping[str, Any]) -> dict[str, Any]:
+    of_ring = {
+        "format": 2,
+        "machine": ring.name,
+        "lattice": ring._ring.file,
+        "particle": ring.particle,
+        "kinetic_energy_GeV": ring.kinetic_energy,
+    }
+    return {**of_ring, **header}
+
+
+def _table(values: Any) -> str:
+    if isinstance(values, xr.DataArray):
+        values = values.to_pandas()
+    if isinstance(values, (pd.DataFrame, pd.Series)):
+        named = values.to_frame("value") if isinstance(values, pd.Series) else values
+        return named.to_csv(lineterminator="\n")
+    numbers = np.atleast_2d(np.asarray(values, dtype=float))
+    numbers = numbers.T if np.ndim(values) == 1 else numbers
+    return "".join(",".join("" if np.isnan(one) else repr(float(one)) for one in row) + "\n" for row in numbers)
+
+
+def _per_instrument(value: PerInstrument) -> str:
+    if isinstance(value, Mapping):
+        return "".join(f"{name},{float(one)!r}\n" for name, one in value.items())
+    if isinstance(value, (tuple, list)):
+        return f"x={float(value[0])!r},y={float(value[1])!r}"
+    return repr(float(value))

@@ -1,0 +1,120 @@
+//! Simulated campaigns whose truth is known, and one case of the validation of the diagnosis; each follows from its seed.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use diagnosis::data::{Data, DataError};
+use diagnosis::hypothesis::Term;
+use diagnosis::scan::candidates;
+use diagnosis::validation::{self, Case, Class};
+use host_bridge::command::response::by_name;
+use host_bridge::command::{self, CommandError};
+use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
+use inference::{BatchFit, TuneUse};
+use pyo3::prelude::*;
+
+use crate::error::{input, other, raised};
+use crate::recording::{Data as Measured, Recording};
+use crate::ring::Ring;
+
+/// Cases of a class are numbered from its place in the list of classes times this.
+const OF_CLASS: usize = 1_000_000;
+
+/// A campaign with settings, read-backs and gaps of a recording, and the vars that it was made with, in the ring's order. Without vars they are
+/// drawn from the ring's prior, rings that keep their beam. Exact: every frame an exact orbit of misaligned magnets, monitors with offsets, noise and jumps, tunes;
+/// else the machine of the estimator's model.
+#[pyfunction]
+pub fn simulate(
+    py: Python<'_>,
+    ring: &Ring,
+    template: &Recording,
+    seed: u64,
+    vars: Option<BTreeMap<String, f64>>,
+    effects: Vec<String>,
+    exact: bool,
+) -> PyResult<(Recording, Vec<f64>)> {
+    let Measured::Frames(template) = &template.data else {
+        return Err(input(format!("{} is a measured matrix and has no frames", template.name())));
+    };
+    let effects = ring.effects(&effects)?;
+    if !effects.is_empty() && !exact {
+        return Err(input("effects need exact=True: the linear machine has none"));
+    }
+    let ring = &ring.ring;
+    py.detach(|| {
+        // streams of their own for vars and noise
+        let mut seeds = simulated::seeds(seed);
+        let mut next = || seeds.next().expect("seeds do not end");
+        let (of_vars, of_noise) = (next(), next());
+        let vars = match vars {
+            Some(vars) => by_name(&vars, ring).map_err(input)?,
+            None => simulated::vars(ring, false, of_vars).map_err(other)?,
+        };
+        let made = if exact {
+            let truth = Truth { vars: &vars, effects: &effects, beyond: &[] };
+            let hardware = Hardware::shipped(ring, template);
+            simulated::campaign(template, ring, &truth, &hardware, of_noise).map_err(other)
+        } else {
+            let instruments = Instruments::healthy(ring, template).map_err(other)?;
+            simulated::like(template, ring, &vars, &instruments, of_noise).map_err(other)
+        };
+        Ok((Recording { data: Measured::Frames(Arc::new(made?)) }, vars))
+    })
+}
+
+/// Mean and standard deviation of the normal of each `ln var` before it is truncated to the prior's range, by the batch fit [N].
+#[pyfunction]
+pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult<(Vec<f32>, Vec<f32>)> {
+    let Measured::Frames(frames) = &recording.data else {
+        return Err(input(format!("{} is a measured matrix and has no frames", recording.name())));
+    };
+    py.detach(|| {
+        let campaign = command::campaign(&ring.ring, frames).map_err(raised)?;
+        let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
+        Ok((fit.marginals.iter().map(|one| one.mean).collect(), fit.marginals.iter().map(|one| one.sigma).collect()))
+    })
+}
+
+/// Blind campaigns through the diagnosis, as of `orbitcal validate`.
+#[pyclass(frozen, module = "orbitcal._orbitcal")]
+pub struct Validation {
+    ring: twin::Ring,
+    template: inference::Recording,
+    terms: Vec<Term>,
+}
+
+#[pymethods]
+impl Validation {
+    /// With settings, read-backs and gaps of a recording.
+    #[new]
+    fn new(ring: &Ring, template: &Recording) -> PyResult<Self> {
+        let Measured::Frames(template) = &template.data else {
+            return Err(input(format!("{} is a measured matrix and has no frames", template.name())));
+        };
+        let (ring, template) = (ring.ring.clone(), (**template).clone());
+        let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
+        let data = Data::of(&campaign).map_err(refused)?;
+        let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
+        Ok(Self { ring, template, terms })
+    }
+
+    /// Simulate, diagnose and score case `index` of a class, that of `orbitcal validate`; JSON, or none where its machine keeps no beam.
+    fn run(&self, py: Python<'_>, kind: &str, index: usize, seed: u64) -> PyResult<Option<String>> {
+        let class = match kind {
+            "empty" => Class::Empty,
+            "single" => Class::Single,
+            "pair" => Class::Pair,
+            "unknown" => Class::Unknown,
+            _ => return Err(input(format!("class: expected empty, single, pair or unknown, found {kind:?}"))),
+        };
+        py.detach(|| {
+            let case = Case::draw(&self.ring, &self.terms, class, class as usize * OF_CLASS + index, seed);
+            let outcome = validation::run(&self.ring, &self.template, &case).map_err(refused)?;
+            outcome.map(|outcome| serde_json::to_string(&outcome).map_err(other)).transpose()
+        })
+    }
+}
+
+fn refused(error: DataError) -> PyErr {
+    raised(CommandError::from(error))
+}

@@ -1,0 +1,108 @@
+"""The core on frames as they come, its feedback, and the shared memory of another process."""
+
+import os
+import subprocess
+import uuid
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import RECORDINGS
+
+import orbitcal
+from orbitcal.estimator import frames_as_bytes
+
+
+@pytest.fixture(scope="module")
+def last(booster, paper_vars):
+    """The estimate after all frames of a recording."""
+    estimates = list(orbitcal.Estimator(booster, paper_vars).stream(paper_vars))
+    assert [one.frames for one in estimates] == list(range(1, 347))
+    return estimates[-1]
+
+
+def test_the_stream_ends_where_the_fit_does(last, fitted, booster):
+    assert last.vars == list(fitted.means.index) and last.monitors == booster.monitors
+    away = abs(last.mean - fitted.means.values) / fitted.table["sigma"].values
+    assert away.max() < 0.1  # README: 0.07 of an error bar
+    np.testing.assert_allclose(np.sqrt(np.diag(last.covariance)), last.sigma, rtol=0.05)  # before truncation
+    assert last.usable and last.mismatch is False and last.publisher is None
+    assert dict(zip(last.monitors, last.monitor_state))["x_C6"] == "noisy"
+    assert "48 vars" in repr(last)
+
+
+def test_bytes_rows_and_recordings_are_the_same_frames(booster, paper_vars, last):
+    by_bytes = orbitcal.Estimator(booster, paper_vars)
+    *_, of_bytes = by_bytes.stream(frames_as_bytes(paper_vars))
+    # a header alone is enough where frames have names
+    by_rows = orbitcal.Estimator(booster, paper_vars.header)
+    *_, of_rows = by_rows.stream(paper_vars.frames)
+    for other in (of_bytes, of_rows):
+        np.testing.assert_array_equal(other.mean, last.mean)
+        np.testing.assert_array_equal(other.covariance, last.covariance)
+    assert 0.9 < by_rows.chi2_per_dof < 1.1 and by_rows.fitted.shape == (33,)
+
+
+def test_a_frame_that_cannot_be_is_refused(booster, paper_vars):
+    estimator = orbitcal.Estimator(booster, paper_vars.header)
+    with pytest.raises(orbitcal.InputError, match="expected a first frame by names"):
+        estimator.update(b"\0")
+    row = paper_vars.frames.iloc[0].drop("x_E4_mm")
+    with pytest.raises(orbitcal.InputError, match="x_E4_mm"):
+        estimator.update(row)
+    estimator.update(paper_vars.frames.iloc[0])
+    with pytest.raises(orbitcal.InputError):
+        estimator.update(b"\1\2\3\0")
+
+
+def test_a_feedback_says_its_set_points(booster, paper_vars):
+    estimator = orbitcal.Estimator(booster, paper_vars)
+    assert estimator.correction is None
+    estimator.steer({"x_E4": 1e-3}, correctors=["H_A4", "H_C4"])
+    for _ in estimator.stream(paper_vars):
+        pass
+    made = estimator.correction
+    assert list(made.setpoint.index) == booster.correctors
+    assert set(made.role[made.role != "unused"].index) <= {"H_A4", "H_C4"}
+    with pytest.raises(orbitcal.InputError, match="has no monitor 'x_Z9'"):
+        estimator.steer({"x_Z9": 0.0})
+
+
+@pytest.mark.skipif("ORBITCAL" not in os.environ, reason="ORBITCAL names the program, as make python does")
+def test_another_process_is_read_from_shared_memory(last):
+    service = f"orbitcal/test-{uuid.uuid4()}"
+    subscriber = orbitcal.Subscriber(service)
+    command = [
+        os.environ["ORBITCAL"],
+        "replay",
+        RECORDINGS / "paper-vars",
+        "--service",
+        service,
+        "--name",
+        "night shift",
+        "--quiet",
+    ]
+    with subprocess.Popen([*command, "--rate", "200"]) as publisher:
+        read = []
+        for estimate in subscriber.stream(timeout=20):
+            read.append(estimate)
+            if estimate.frames == 346:
+                break
+        assert publisher.wait(20) == 0
+    assert type(read[-1]) is orbitcal.Estimate is type(last)
+    assert read[-1].publisher == "night shift" and read[-1].machine == last.machine
+    assert [one.frames for one in read] == list(range(1, 347))
+    np.testing.assert_array_equal(read[-1].mean, last.mean)
+    np.testing.assert_array_equal(read[-1].covariance, last.covariance)
+    assert read[-1].monitor_state == last.monitor_state
+
+
+def test_nothing_published_is_nothing_read():
+    subscriber = orbitcal.Subscriber(f"orbitcal/test-{uuid.uuid4()}")
+    assert subscriber.wait(0.05) == []
+    assert list(subscriber.stream(timeout=0.05)) == []
+
+
+def test_an_estimate_is_a_table_in_one_line(last):
+    table = pd.DataFrame({"mean": last.mean, "sigma": last.sigma}, index=last.vars)
+    assert table.shape == (48, 2) and (table["sigma"] > 0).all()

@@ -1,0 +1,102 @@
+"""Recordings: read, written, from pandas, from a response matrix."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import IMPORTS, RECORDINGS
+
+import orbitcal
+
+
+def test_frames_and_header_are_those_of_the_files(paper_vars):
+    frames = paper_vars.frames
+    known = pd.read_csv(RECORDINGS / "paper-vars/frames.csv")
+    assert len(paper_vars) == len(frames) == len(known) == 346
+    np.testing.assert_allclose(frames["x_E4_mm"], known["x_E4_mm"], rtol=0, atol=1e-12)  # mm to m and back
+    assert paper_vars.header["believed_rf"] == "fixed_momentum" and paper_vars.header["format"] == 2
+
+
+def test_what_is_written_is_read_again(paper_vars, booster, tmp_path):
+    folder = paper_vars.write(tmp_path / "paper-vars")
+    again = orbitcal.Recording.read(folder, booster)
+    pd.testing.assert_frame_equal(again.frames, paper_vars.frames)
+    assert again.header == paper_vars.header
+    pickled = pickle.loads(pickle.dumps(paper_vars))
+    pd.testing.assert_frame_equal(pickled.frames, paper_vars.frames)
+
+
+def test_a_table_of_pandas_is_a_recording(paper_vars, booster, fitted):
+    header = {key: value for key, value in paper_vars.header.items() if key not in ("machine", "lattice", "particle")}
+    made = orbitcal.Recording.from_pandas(paper_vars.frames, booster, header, name="paper-vars")
+    pd.testing.assert_frame_equal(made.frames, paper_vars.frames)
+    assert orbitcal.fit(made).means.equals(fitted.means)
+
+
+def test_what_is_wrong_with_a_table_is_said_as_of_a_file(paper_vars, booster):
+    frames = paper_vars.frames
+    frames.loc[3, "x_E4_mm"] = 123.0
+    with pytest.raises(orbitcal.InputError) as said:
+        orbitcal.Recording.from_pandas(frames, booster, paper_vars.header, name="shift")
+    assert (
+        str(said.value)
+        == 'shift/frames.csv, line 5, column x_E4_mm: expected a position from -100 to 100 mm, found "123.0"'
+    )
+    with pytest.raises(orbitcal.InputError, match="missing field `believed_rf`"):
+        header = {key: value for key, value in paper_vars.header.items() if key != "believed_rf"}
+        orbitcal.Recording.from_pandas(paper_vars.frames, booster, header)
+    with pytest.raises(orbitcal.InputError, match="nowhere/header.toml: file not found"):
+        orbitcal.Recording.read("nowhere", booster)
+
+
+def test_a_check_says_what_can_be_done(paper_vars):
+    checked = paper_vars.check()
+    assert checked["frames"] == 346 and checked["settings"]["correctors"] == [37, 48]
+    assert {one["command"]: one["can"] for one in checked["commands"]}["diagnose"]
+
+
+@pytest.fixture(scope="module")
+def matrix(twelve_cells):
+    """docs/your-own-ring.md, whose numbers these are."""
+    table = pd.read_csv(IMPORTS / "response.csv", index_col=0)
+    dispersion = pd.read_csv(IMPORTS / "dispersion.csv", index_col=0, header=None)[1]
+    ring = orbitcal.Ring.from_pyat(twelve_cells)
+    return orbitcal.Recording.from_response(
+        table, ring, orbit_unit="mm", kick=(0.2, 0.15), kick_is="full", kick_sign="x+y+", noise=0.002,
+        dispersion=dispersion, rf_step=2000.0, name="my-ring",
+    )  # fmt: skip
+
+
+def test_a_response_matrix_is_a_recording(matrix):
+    assert matrix.is_matrix and matrix.matrix.shape == (24, 24) and matrix.matrix.attrs["units"] == "mm"
+    x, y = matrix.check()["agreement"]
+    assert (round(x["factor"], 3), round(x["correlation"], 3)) == (0.626, 0.676)
+    assert (round(y["factor"], 3), round(y["correlation"], 3)) == (0.934, 0.998)
+
+
+def test_numbers_alone_need_an_order(matrix, twelve_cells):
+    words = dict(orbit_unit="mm", kick=(0.2, 0.15), kick_is="full", kick_sign="x+y+", noise=0.002)
+    ring = orbitcal.Ring.from_pyat(twelve_cells)
+    numbers = np.loadtxt(IMPORTS / "response.txt")
+    made = orbitcal.Recording.from_response(numbers, ring, order="planes", **words)
+    np.testing.assert_allclose(made.matrix.values, matrix.matrix.values, rtol=0, atol=1e-6)  # decimals of the two files
+    by_name = dict(
+        words, kick={f"{plane}:COR[{n}]": 0.2 if plane == "x" else 0.15 for plane in "xy" for n in range(1, 13)}
+    )
+    assert orbitcal.Recording.from_response(numbers, ring, order="planes", **by_name).matrix.equals(made.matrix)
+    with pytest.raises(orbitcal.InputError, match="order"):
+        orbitcal.Recording.from_response(numbers, ring, **words)
+    with pytest.raises(orbitcal.InputError, match='kick_sign: expected x\\+y\\+, .* found "up"'):
+        orbitcal.Recording.from_response(numbers, ring, order="planes", **dict(words, kick_sign="up"))
+
+
+def test_a_matrix_is_diagnosed_fitted_and_written(matrix, tmp_path):
+    diagnosis = orbitcal.diagnose(matrix, progress=False)
+    assert diagnosis.verdict == "identified" and diagnosis.findings[0].kind == "bpm_swap"
+    assert diagnosis.findings[0].at == "x_BPM.22,x_BPM.52"
+    result = orbitcal.fit(matrix)
+    assert round(result.means["QF.2"], 4) == 1.0010 and round(result.table.loc["QF.2", "sigma"], 4) == 0.0006
+    assert result.wiring == [{"kind": "bpm_swap", "at": "x_BPM.22,x_BPM.52"}]
+    again = orbitcal.Recording.read(matrix.write(tmp_path / "my-ring"))
+    assert again.matrix.equals(matrix.matrix)
