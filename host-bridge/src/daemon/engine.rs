@@ -153,7 +153,7 @@ impl Engine {
     /// Slices of what prepares for the next frame: one at least, and more until that frame waits; fewer when many do. A feedback without gains comes
     /// before it: where frames come as fast as they are taken, it would never have them.
     pub(super) fn prepare(&mut self) {
-        if !self.owes_gains && self.queue.len() >= BEHIND as usize && self.frames() % BEHIND != 0 {
+        if !self.owes_gains && self.queue.len() >= BEHIND as usize && !self.frames().is_multiple_of(BEHIND) {
             return;
         }
         while !self.is_prepared {
