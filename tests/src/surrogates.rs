@@ -21,11 +21,14 @@ pub use posterior::{Effect, effects};
 const CORRECTORS: usize = 24;
 const FIRST: usize = 15;
 
-/// What predicts all responses at given vars [m/rad].
+/// All responses at given vars [m/rad].
+type Predict = dyn Fn(&[f64]) -> DMatrix<f64>;
+
+/// What predicts them.
 pub struct Surrogate {
     /// Its name in the tables.
     pub name: &'static str,
-    predict: Box<dyn Fn(&[f64]) -> DMatrix<f64>>,
+    predict: Box<Predict>,
     /// Rms error that it states of the orbit of one setting, in x and y [m].
     pub stated: Option<[f64; 2]>,
     /// The same as a model of the host, where there is one.
