@@ -83,8 +83,9 @@ mod tests {
         let mut keeper = Keeper::start(&path, &queue).unwrap();
         assert!(Keeper::start(&path, &queue).unwrap_err().to_string().contains("another daemon keeps it"));
         keeper.offer(checkpoint(1));
-        keeper.finish(checkpoint(2));
-        assert_eq!((std::fs::read(&path).unwrap(), queue.faults().unsaved), (checkpoint(2).encode(), 0));
+        let last = checkpoint(2);
+        keeper.finish(last.clone());
+        assert_eq!((std::fs::read(&path).unwrap(), queue.faults().unsaved), (last.encode(), 0));
         let mut keeper = Keeper::start(&path, &queue).unwrap();
         drop(folder);
         keeper.finish(checkpoint(3));
