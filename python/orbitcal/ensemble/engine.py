@@ -114,7 +114,9 @@ def _one(name: str, seed: int) -> tuple[int, dict[str, Any] | None, str, float, 
     start = time.perf_counter()
     try:
         row, error = task(seed), ""
-    except Exception as raised:
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as raised:  # a panic in Rust is no Exception
         row, error = None, f"{type(raised).__name__}: {raised}"
     return seed, row, error, time.perf_counter() - start, f"{os.uname().nodename}:{os.getpid()}"
 
@@ -138,7 +140,10 @@ def _client(client: Client | None, workers: int | None) -> Iterator[Client]:
 
     count = workers or os.cpu_count() or 1
     # a free port for the dashboard, as another run may have the usual one
-    with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0") as cluster, Local(cluster) as local:
+    with (
+        LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0") as cluster,
+        Local(cluster) as local,
+    ):
         yield local
 
 
