@@ -65,9 +65,12 @@ def test_a_table_does_not_depend_on_who_computed_it(ten_cells, cluster, tmp_path
     thread.start()
     both = ensemble.run(task, range(40), folder, client=cluster, progress=False)
     thread.join()
-    assert killed and ensemble.failures(folder).empty
+    assert killed
     pd.testing.assert_frame_equal(both, alone, check_exact=True)
-    assert list(both["seed"]) == list(range(40))
+    # what cannot be fitted is set aside, the same by both
+    set_aside = ensemble.failures(folder)
+    pd.testing.assert_frame_equal(set_aside, ensemble.failures(tmp_path / "alone"))
+    assert sorted([*both["seed"], *set_aside.get("seed", [])]) == list(range(40)) and len(both) > 35
 
 
 def test_a_run_goes_on_where_it_was(cluster, tmp_path):
@@ -98,11 +101,12 @@ def test_results_of_another_task_are_not_mixed(ten_cells, cluster, tmp_path):
 
 
 def test_a_validation_is_that_of_the_program(booster, cluster, tmp_path):
-    """Case 1000000 of class single, by its number alone."""
+    """Two campaigns of `orbitcal validate recordings/paper-vars --empty 0 --single 2 --pair 0 --unknown 0 --seed 1`, by its outcomes."""
     template = orbitcal.Recording.read(RECORDINGS / "paper-vars", booster)
     table = ensemble.run(ensemble.Validation(template, "single"), [0, 1], tmp_path, client=cluster, progress=False)
-    assert list(table["made"].map(len)) == [1, 1] and set(table["verdict"]) <= {"identified", "consistent", "ambiguous", "unexplained"}
-    assert table["made"].iloc[0][0].startswith("bpm_gain")  # kinds in the order of the library
+    assert [list(one) for one in table["made"]] == [["dipole_sextupole=-0.1495"], ["momentum_offset=-0.0010"]]
+    assert list(table["verdict"]) == ["consistent", "ambiguous"] and list(table["grade"]) == ["missed", "open"]
+    assert list(table["found"].iloc[1]) == ["corrector_crosstalk@V_A1"]
 
 
 def test_a_calibration_of_the_prior_alone_is_uniform(ten_cells):

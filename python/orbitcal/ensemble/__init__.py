@@ -1,7 +1,7 @@
 """Ensembles on `dask.distributed`: a task for each of many seeds, results to Parquet as they come (docs/scale.md).
 
-    from orbitcal import ensemble
-    table = ensemble.run(ensemble.Validation(recording, "single"), range(1000), "target/validation")
+from orbitcal import ensemble
+table = ensemble.run(ensemble.Validation(recording, "single"), range(1000), "target/validation")
 """
 
 from .engine import Costs, costs, failures, run

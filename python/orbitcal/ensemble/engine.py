@@ -40,8 +40,8 @@ def run(
     """Run a task for each seed and return the table of all rows, in the order of the seeds.
 
     `task(seed)` gives a row, the same whoever computes it. Rows are written to `folder/rows/*.parquet` as they come; a run that was
-    stopped takes up the seeds that are missing. A worker that dies loses nothing: its seeds are given to others. A seed whose task raises, or
-    kills its worker four times, is set aside with its error (`failures`). `client` is of any dask cluster; without one there are `workers`
+    stopped takes up the seeds that are missing. A worker that dies loses nothing: its seeds are given to others. A seed whose task raises, or that
+    kills its worker when it is alone, is set aside with its error (`failures`). `client` is of any dask cluster; without one there are `workers`
     processes here, one a core by default. What it took stands in `costs`.
     """
     wanted = list(dict.fromkeys(int(seed) for seed in seeds))
@@ -69,24 +69,34 @@ def costs(folder: str | os.PathLike[str]) -> Costs:
 
 def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: bool, total: int) -> None:
     import cloudpickle
-    from distributed import as_completed
+    from distributed import as_completed, wait
     from tqdm.auto import tqdm
 
     name = f"orbitcal-{uuid.uuid4().hex}"
     client.register_plugin(_carrier(name, cloudpickle.dumps(task)))
     ahead = AHEAD * max(1, len(client.scheduler_info()["workers"]))
     rest = iter(seeds)
-    submit = lambda seed: client.submit(_one, name, seed, key=f"{name}-{seed}", pure=False)
+    submit = lambda seed, word="": client.submit(_one, name, seed, key=f"{name}{word}-{seed}", pure=False)
+    suspects: list[int] = []
     try:
         with tqdm(total=total, initial=total - len(seeds), desc=store.what, disable=not progress) as bar:
             bar.set_postfix_str(client.dashboard_link or "")
             coming = as_completed([submit(seed) for seed in islice(rest, ahead)])
             for future in coming:
-                store.take(*_result(future))
+                if _has_died(future):
+                    suspects.append(_seed(future))
+                else:
+                    store.take(*_result(future))
+                    bar.update()
                 future.release()
-                bar.update()
                 for seed in islice(rest, 1):
                     coming.add(submit(seed))
+            # dask suspects all that a worker held when it died; alone it is seen which of them kills
+            for seed in suspects:
+                future = submit(seed, "-alone")
+                wait(future)
+                store.take(*_result(future))
+                bar.update()
     finally:
         store.flush()
         client.unregister_worker_plugin(name)
@@ -114,18 +124,30 @@ def _one(name: str, seed: int) -> tuple[int, dict[str, Any] | None, str, float, 
     start = time.perf_counter()
     try:
         row, error = task(seed), ""
-    except Exception as raised:
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as raised:  # a panic in Rust is no Exception
         row, error = None, f"{type(raised).__name__}: {raised}"
     return seed, row, error, time.perf_counter() - start, f"{os.uname().nodename}:{os.getpid()}"
+
+
+def _seed(future: Future) -> int:
+    return int(str(future.key).rsplit("-", 1)[1])
+
+
+def _has_died(future: Future) -> bool:
+    """Its worker did, several times."""
+    from distributed import KilledWorker
+
+    return future.status == "error" and isinstance(future.exception(), KilledWorker)
 
 
 def _result(future: Future) -> tuple[int, dict[str, Any] | None, str, float, str]:
     """What a worker said, or that it died."""
     if future.status == "finished":
         return future.result()
-    seed = int(str(future.key).rsplit("-", 1)[1])
     raised = future.exception()
-    return seed, None, f"{type(raised).__name__}: {raised}".splitlines()[0], float("nan"), ""
+    return _seed(future), None, f"{type(raised).__name__}: {raised}".splitlines()[0], float("nan"), ""
 
 
 @contextmanager
@@ -138,7 +160,10 @@ def _client(client: Client | None, workers: int | None) -> Iterator[Client]:
 
     count = workers or os.cpu_count() or 1
     # a free port for the dashboard, as another run may have the usual one
-    with LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0") as cluster, Local(cluster) as local:
+    with (
+        LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0") as cluster,
+        Local(cluster) as local,
+    ):
         yield local
 
 

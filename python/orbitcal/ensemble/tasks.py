@@ -24,7 +24,9 @@ class Validation:
     `validate`'s outcomes: verdict, grade, what was made and found. Other rings take the recording of another ring.
     """
 
-    def __init__(self, template: Recording, kind: Literal["empty", "single", "pair", "unknown"], *, seed: int = 1) -> None:
+    def __init__(
+        self, template: Recording, kind: Literal["empty", "single", "pair", "unknown"], *, seed: int = 1
+    ) -> None:
         self.template, self.kind, self.seed = template, kind, seed
         self.name = "validation"
         self.says = {"template": template.name, "class": kind, "seed": seed}
@@ -43,7 +45,7 @@ class Validation:
         outcome = json.loads(made)
         return {
             "verdict": outcome["verdict"],
-            "grade": json.dumps(outcome["grade"]),
+            "grade": outcome["grade"],
             "made": [one["label"] for one in outcome["truth"]],
             "found": outcome["found"],
             "probability": outcome["stated"][1],
@@ -63,7 +65,9 @@ class Calibration:
     Source: S. Talts, M. Betancourt, D. Simpson, A. Vehtari and A. Gelman, arXiv:1804.06788 (2018).
     """
 
-    def __init__(self, template: Recording, methods: Iterable[Method] = ("map", "core", "nuts"), *, draws: int = 400) -> None:
+    def __init__(
+        self, template: Recording, methods: Iterable[Method] = ("map", "core", "nuts"), *, draws: int = 400
+    ) -> None:
         self.template, self.methods, self.draws = template, tuple(methods), draws
         self.name = "calibration"
         self.says = {"template": template.name, "methods": list(self.methods), "draws": draws}

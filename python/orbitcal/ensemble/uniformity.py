@@ -20,7 +20,7 @@ def uniformity(table: pd.DataFrame, ring: Ring, *, level: float = 0.01) -> pd.Da
     methods = [name for name in table.columns if name not in ("seed",)]
     rows = []
     for method in methods:
-        values = np.stack(table[method].to_numpy())
+        values = np.stack(list(table[method]))
         for at, name in enumerate(ring._ring.vars):
             counts, _ = np.histogram(values[:, at], BINS, (0, 1))
             expected = len(values) / BINS
