@@ -33,7 +33,7 @@ def sample(
     warm_up: int = 1000,
     draws: int = 2000,
     seed: int = 1,
-    model: Literal["twin", "green", "resnet"] = "twin",
+    model: Literal["twin", "green", "resnet", "linear"] = "twin",
     progress: bool = True,
 ) -> arviz.InferenceData:
     """Full NUTS on the posterior of the vars, as ArviZ's InferenceData; nothing is written to disk.

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use diagnosis::Diagnosis;
 use host_bridge::cli::FitModel;
-use host_bridge::command::{CommandError, compare as compared, diagnose as diagnosed, fit as fitted, matrix};
+use host_bridge::command::matrix::{DiagnosedMatrix, FittedMatrix};
+use host_bridge::command::{CommandError, compare as compared, diagnose as diagnosed, fit as fitted};
 use host_bridge::matrix_page::page_of;
 use inference::Draws;
 use inference::nuts::NutsSettings;
@@ -55,8 +56,9 @@ pub fn fit(
         Data::Matrix(folder) => {
             let (settings, folder) = (settings(ring, rf)?, Arc::clone(folder));
             task::run(py, hear, move |progress| {
-                let (result, page) = matrix::fitted_of(&folder, &settings, &mut |what| progress.say(what))?;
-                Outcome::of(&result, move || Ok(page.clone()))
+                let fitted = Arc::new(FittedMatrix::of(&folder, settings, &mut |what| progress.say(what))?);
+                let shown = Arc::clone(&fitted);
+                Outcome::of(&fitted.result, move || shown.page())
             })
         }
     }
@@ -83,7 +85,8 @@ pub fn sample<'py>(
         "twin" => FitModel::Twin,
         "green" => FitModel::Green,
         "resnet" => FitModel::Resnet,
-        _ => return Err(input(format!("model: expected twin, green or resnet, found {model:?}"))),
+        "linear" => FitModel::Linear,
+        _ => return Err(input(format!("model: expected twin, green, resnet or linear, found {model:?}"))),
     };
     for (name, value, least) in [("chains", chains, 1), ("warm_up", warm_up, 50), ("draws", draws, 4)] {
         if value < least {
@@ -142,8 +145,10 @@ pub fn diagnose(
     {
         let (settings, folder) = (settings(ring, rf)?, Arc::clone(folder));
         return task::run(py, hear, move |progress| {
-            let (result, page) = matrix::diagnosed_of(&folder, &settings, &mut |what| progress.say(what))?;
-            Outcome::of(&result, move || Ok(page.clone()))
+            let diagnosed = DiagnosedMatrix::of(&folder, None, settings, &mut |what| progress.say(what))?;
+            let diagnosed = Arc::new(diagnosed);
+            let shown = Arc::clone(&diagnosed);
+            Outcome::of(&diagnosed.result, move || shown.page())
         });
     }
     expect_no_rf(rf)?;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use indicatif::ProgressBar;
-use measured::{Believed, Fit, Folder, MeasuredError, Model, Settings, Straightened, Wiring};
+use measured::{Believed, Folder, MeasuredError, Model, Settings, Straightened};
 use nalgebra::DVector;
 use report::Page;
 use twin::{Hold, Optics, Rf};
@@ -42,46 +42,79 @@ pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
     }
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
-    let Straightened { folder, cables, fit: fitted } =
-        fitted(&Folder::read(&options.recording)?, &settings, &options.common)?;
-    let result = result(&folder, &cables, &fitted, &settings)?;
+    let folder = Folder::read(&options.recording)?;
+    let fitted = with_spinner(&options.common, &folder, |say| FittedMatrix::of(&folder, settings, say))?;
     if let Some(path) = &options.report {
-        write(path, &measured_of(&folder, &fitted, &result, &settings)?.page()?)?;
+        write(path, &fitted.page()?)?;
     }
-    deliver(&options.common, &result)
+    deliver(&options.common, &fitted.result)
 }
 
-/// A fit of a measured matrix as a result, and its page; `say` hears what is done.
-///
-/// # Errors
-/// [`CommandError`].
-pub fn fitted_of(
-    folder: &Folder,
-    settings: &Settings,
-    say: &mut dyn FnMut(&str),
-) -> Result<(MatrixFit, Page), CommandError> {
-    let Straightened { folder, cables, fit } = Straightened::of(folder, settings, say)?;
-    let result = result(&folder, &cables, &fit, settings)?;
-    let page = measured_of(&folder, &fit, &result, settings)?.page()?;
-    Ok((result, page))
+/// A measured matrix with its cables put right, fitted.
+pub struct FittedMatrix {
+    straightened: Straightened,
+    settings: Settings,
+    /// What is said of it.
+    pub result: MatrixFit,
 }
 
-/// The same of a diagnosis.
-///
-/// # Errors
-/// [`CommandError`].
-pub fn diagnosed_of(
-    folder: &Folder,
-    settings: &Settings,
-    say: &mut dyn FnMut(&str),
-) -> Result<(MatrixDiagnosis, Page), CommandError> {
-    let Straightened { folder, cables, fit: fitted } = Straightened::of(folder, settings, say)?;
-    let diagnosis = measured::diagnose(&folder, &fitted, settings, say)?;
-    let fit = result(&folder, &cables, &fitted, settings)?;
-    let found = Found { cables: &cables, fitted: &fitted, diagnosis: &diagnosis, against: None };
-    let result = MatrixDiagnosis::of(&folder, settings.rf, &found, fit);
-    let page = measured_of(&folder, &fitted, &result.fit, settings)?.page_of(&result)?;
-    Ok((result, page))
+impl FittedMatrix {
+    /// Of a measurement as it was made; `say` hears what is done.
+    ///
+    /// # Errors
+    /// [`CommandError`].
+    pub fn of(as_measured: &Folder, settings: Settings, say: &mut dyn FnMut(&str)) -> Result<Self, CommandError> {
+        let straightened = Straightened::of(as_measured, &settings, say)?;
+        let result = result(&straightened, &settings)?;
+        Ok(Self { straightened, settings, result })
+    }
+
+    /// Its page.
+    ///
+    /// # Errors
+    /// [`CommandError`] where the lattice or the fitted ring has no stable motion.
+    pub fn page(&self) -> Result<Page, CommandError> {
+        Ok(measured_of(&self.straightened, &self.result, &self.settings)?.page()?)
+    }
+}
+
+/// A measured matrix with its cables put right, fitted and diagnosed.
+pub struct DiagnosedMatrix {
+    straightened: Straightened,
+    settings: Settings,
+    /// What is said of it.
+    pub result: MatrixDiagnosis,
+}
+
+impl DiagnosedMatrix {
+    /// Of a measurement as it was made, against a model that is believed if there is one; `say` hears what is done.
+    ///
+    /// # Errors
+    /// [`CommandError`].
+    pub fn of(
+        as_measured: &Folder,
+        believed: Option<&Believed>,
+        settings: Settings,
+        say: &mut dyn FnMut(&str),
+    ) -> Result<Self, CommandError> {
+        let straightened = Straightened::of(as_measured, &settings, say)?;
+        let Straightened { folder, cables, fit: fitted } = &straightened;
+        let diagnosis = measured::diagnose(folder, fitted, &settings, say)?;
+        let against = believed.map(|model| measured::against(as_measured, fitted, model, &settings, say));
+        let against = against.transpose()?;
+        let fit = result(&straightened, &settings)?;
+        let found = Found { cables, fitted, diagnosis: &diagnosis, against: against.as_ref() };
+        let result = MatrixDiagnosis::of(folder, settings.rf, &found, fit);
+        Ok(Self { straightened, settings, result })
+    }
+
+    /// Its page.
+    ///
+    /// # Errors
+    /// As [`FittedMatrix::page`].
+    pub fn page(&self) -> Result<Page, CommandError> {
+        Ok(measured_of(&self.straightened, &self.result.fit, &self.settings)?.page_of(&self.result)?)
+    }
 }
 
 /// Diagnose it.
@@ -99,27 +132,18 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let settings = settings(options.rf, &options.priors)?;
     let believed = believed(options)?;
-    let as_measured = Folder::read(path)?;
-    let Straightened { folder, cables, fit: fitted } = fitted(&as_measured, &settings, &options.common)?;
-    let spinner = spinner(&options.common);
-    let mut say = |what: &str| spinner.set_message(what.to_owned());
-    let found = measured::diagnose(&folder, &fitted, &settings, &mut say);
-    let against = believed.map(|model| measured::against(&as_measured, &fitted, &model, &settings, &mut say));
-    spinner.finish_and_clear();
-    let (diagnosis, against) = (found?, against.transpose()?);
-    let fit = result(&folder, &cables, &fitted, &settings)?;
-    let found = Found { cables: &cables, fitted: &fitted, diagnosis: &diagnosis, against: against.as_ref() };
-    let result = MatrixDiagnosis::of(&folder, settings.rf, &found, fit);
+    let folder = Folder::read(path)?;
+    let diagnose = |say: &mut dyn FnMut(&str)| DiagnosedMatrix::of(&folder, believed.as_ref(), settings, say);
+    let diagnosed = with_spinner(&options.common, &folder, diagnose)?;
     if let Some(path) = &options.report {
-        write(path, &measured_of(&folder, &fitted, &result.fit, &settings)?.page_of(&result)?)?;
+        write(path, &diagnosed.page()?)?;
     }
-    deliver(&options.common, &result)
+    deliver(&options.common, &diagnosed.result)
 }
 
 /// A fit with its ring and that of the lattice.
 fn measured_of<'r>(
-    folder: &'r Folder,
-    fit: &'r Fit,
+    Straightened { folder, fit, .. }: &'r Straightened,
     result: &'r MatrixFit,
     settings: &Settings,
 ) -> Result<Measured<'r>, CommandError> {
@@ -158,11 +182,19 @@ pub(super) fn settings(rf: Option<cli::Rf>, priors: &Priors) -> Result<Settings,
 
 /// A matrix with its cables put right, and its fit, with what is done on a terminal.
 pub(super) fn fitted(folder: &Folder, settings: &Settings, common: &Common) -> Result<Straightened, CommandError> {
+    with_spinner(common, folder, |say| Ok(Straightened::of(folder, settings, say)?))
+}
+
+/// Work on a folder, with what is done on a terminal.
+fn with_spinner<T>(
+    common: &Common,
+    folder: &Folder,
+    work: impl FnOnce(&mut dyn FnMut(&str)) -> Result<T, CommandError>,
+) -> Result<T, CommandError> {
     let spinner = spinner(common);
-    let mut say = |what: &str| spinner.set_message(format!("{}: {what}", folder.name));
-    let fitted = Straightened::of(folder, settings, &mut say);
+    let done = work(&mut |what| spinner.set_message(format!("{}: {what}", folder.name)));
     spinner.finish_and_clear();
-    Ok(fitted?)
+    done
 }
 
 pub(super) fn spinner(common: &Common) -> ProgressBar {
@@ -171,8 +203,8 @@ pub(super) fn spinner(common: &Common) -> ProgressBar {
     spinner
 }
 
-fn result(folder: &Folder, cables: &[Wiring], fitted: &Fit, settings: &Settings) -> Result<MatrixFit, CommandError> {
-    let ring = Model::of(folder, &fitted.groups, settings.rf)?.at(&fitted.unknowns, &fitted.values);
+fn result(Straightened { folder, cables, fit }: &Straightened, settings: &Settings) -> Result<MatrixFit, CommandError> {
+    let ring = Model::of(folder, &fit.groups, settings.rf)?.at(&fit.unknowns, &fit.values);
     let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok().and_then(|optics| optics.tunes().ok());
-    Ok(MatrixFit::of(folder, cables, fitted, tunes.map(|tunes| [tunes.x, tunes.y])))
+    Ok(MatrixFit::of(folder, cables, fit, tunes.map(|tunes| [tunes.x, tunes.y])))
 }
