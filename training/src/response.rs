@@ -5,7 +5,7 @@ use nalgebra::DMatrix;
 
 use crate::network::fit::columns;
 use crate::network::layers::{self, Network};
-use crate::network::settings::{self, response_of_core};
+use crate::network::settings::{self, response_of_core, settings};
 use crate::tables::Tables;
 use crate::{in_room, with_stack};
 
@@ -57,11 +57,15 @@ pub(crate) fn network_responses(vars: &[Vec<f64>]) -> Vec<Option<CoreResponse>> 
 
 /// Predictions of networks in f32, beyond the design of those of the core.
 pub(crate) fn network_responses_f32(free: &[Network; 2], vars: &[Vec<f64>]) -> Vec<Option<CoreResponse>> {
-    let outputs = |plane: usize, inputs: &DMatrix<f32>| {
-        let mut pass = layers::Pass::new(&free[plane], inputs.ncols());
-        pass.forward(&free[plane], &columns(inputs, 0, inputs.ncols())).clone()
+    let of_vars = |vars: &Vec<f64>| {
+        let inputs = settings(vars);
+        let [x, y] = free.each_ref().map(|network| {
+            let mut pass = layers::Pass::new(network, inputs.ncols());
+            pass.forward(network, &columns(&inputs, 0, inputs.ncols())).clone()
+        });
+        Some(without_tunes(settings::response([&x, &y])))
     };
-    vars.iter().map(|vars| Some(without_tunes(settings::response(vars, outputs)))).collect()
+    vars.iter().map(of_vars).collect()
 }
 
 fn without_tunes(response: DMatrix<f64>) -> CoreResponse {

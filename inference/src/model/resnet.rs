@@ -70,12 +70,13 @@ impl ResnetModel {
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn at(&self, vars: &[f64]) -> Result<ResnetOptics<'_>, OrbitError> {
-        let pass = |plane: usize| {
-            let mut pass = Pass::new(&self.planes[plane], CORRECTORS);
-            pass.forward(&self.planes[plane], &columns(&settings(vars), 0, CORRECTORS));
+        let inputs = settings(vars);
+        let passes = self.planes.each_ref().map(|network| {
+            let mut pass = Pass::new(network, CORRECTORS);
+            pass.forward(network, &columns(&inputs, 0, CORRECTORS));
             pass
-        };
-        Ok(ResnetOptics { model: self, green: self.green.at(vars)?, passes: [pass(0), pass(1)], vars: vars.to_vec() })
+        });
+        Ok(ResnetOptics { model: self, green: self.green.at(vars)?, passes, vars: vars.to_vec() })
     }
 }
 
@@ -119,7 +120,7 @@ impl ResnetOptics<'_> {
 impl Optics for ResnetOptics<'_> {
     fn response(&self) -> DMatrix<f64> {
         let mut response = self.green.response();
-        let own = settings::response(&self.vars, |plane, _| self.passes[plane].outputs().clone());
+        let own = settings::response(self.passes.each_ref().map(Pass::outputs));
         for plane in [0, 1] {
             let (first, across, monitors) = Self::place(plane);
             let block = ((first, across), (monitors, CORRECTORS));

@@ -21,13 +21,11 @@ pub fn settings(vars: &[f64]) -> DMatrix<f32> {
     })
 }
 
-/// Response of all monitors to all correctors at vars `[N]` [m/rad], by what a plane's network gives for a column of inputs each; zero across the planes.
-pub fn response(vars: &[f64], mut outputs: impl FnMut(usize, &DMatrix<f32>) -> DMatrix<f32>) -> DMatrix<f64> {
-    let inputs = settings(vars);
-    let (correctors, monitors) = (inputs.ncols(), PLANES.each_ref().map(|plane| plane.shape().1));
+/// Response of all monitors to all correctors [m/rad], by what each plane's network gives for the columns of [`settings`]; zero across the planes.
+pub fn response(outputs: [&DMatrix<f32>; 2]) -> DMatrix<f64> {
+    let (correctors, monitors) = (outputs[0].ncols(), outputs.map(|outputs| outputs.nrows()));
     let mut response = DMatrix::zeros(monitors[0] + monitors[1], 2 * correctors);
-    for (plane, network) in PLANES.iter().enumerate() {
-        let outputs = outputs(plane, &inputs);
+    for (plane, (network, outputs)) in PLANES.iter().zip(outputs).enumerate() {
         let own = DMatrix::from_fn(monitors[plane], correctors, |b, c| {
             f64::from((network.design(c, b) + ORBIT * outputs[(b, c)]) / SETTING_KICK)
         });
@@ -38,12 +36,13 @@ pub fn response(vars: &[f64], mut outputs: impl FnMut(usize, &DMatrix<f32>) -> D
 
 /// The same by the networks of the core, in integers.
 pub fn response_of_core(vars: &[f64]) -> DMatrix<f64> {
-    let mut pass = Pass::BLANK;
-    response(vars, |plane, inputs| {
-        let mut outputs = DMatrix::zeros(PLANES[plane].shape().1, inputs.ncols());
+    let (inputs, mut pass) = (settings(vars), Pass::BLANK);
+    let [x, y] = PLANES.each_ref().map(|network| {
+        let mut outputs = DMatrix::zeros(network.shape().1, inputs.ncols());
         for (inputs, mut outputs) in inputs.column_iter().zip(outputs.column_iter_mut()) {
-            PLANES[plane].forward::<Plain>(inputs.as_slice(), &mut pass, outputs.as_mut_slice());
+            network.forward::<Plain>(inputs.as_slice(), &mut pass, outputs.as_mut_slice());
         }
         outputs
-    })
+    });
+    response([&x, &y])
 }
