@@ -156,7 +156,10 @@ pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsErro
 }
 
 /// A factor from its truncated lognormal prior.
-fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
+///
+/// # Panics
+/// If the width is not positive.
+pub fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
     let (mean, precision) = Width::Lognormal(prior.width).normal();
     let normal = Normal::new(mean, precision.sqrt().recip()).expect("a width is positive");
     loop {

@@ -14,7 +14,7 @@ use training::network::settings::response_of_core;
 use training::network::{PLANES, checkpoint};
 use twin::Ring;
 
-pub use errors::{BANDS, Machine, TUNE_CUT, bands, beyond, errors, even, map, prior};
+pub use errors::{BANDS, Machine, bands, beyond, errors, even, map, prior};
 pub use posterior::{Effect, effects};
 
 /// Correctors of a plane, and monitors of x.

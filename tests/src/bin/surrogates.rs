@@ -10,8 +10,9 @@ use std::time::Instant;
 use clap::Parser;
 use report::{Axes, Figure, Map};
 use system_tests::surrogates::{
-    BANDS, Machine, Surrogate, TUNE_CUT, bands, beyond, effects, errors, even, map, prior, surrogates,
+    BANDS, Machine, Surrogate, bands, beyond, effects, errors, even, map, prior, surrogates,
 };
+use training::check::TUNE_CUT;
 use twin::{Hold, Optics, Ring};
 
 #[derive(Parser)]

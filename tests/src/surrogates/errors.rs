@@ -1,18 +1,17 @@
 //! Errors of the difference of the orbits at -22 A and 22 A, over machines within the tune cut of the training set [mm].
 
 use estimator::surrogate::{SETTING_KICK, SPAN};
+use inference::simulate::draw;
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use rand_distr::{Distribution, StandardNormal};
-use twin::{Ring, VariedRing};
+use training::check::TUNE_CUT;
+use twin::{ParameterPrior, Ring, VariedRing};
 
 use super::{CORRECTORS, FIRST, Surrogate};
 
 /// Kick from -22 A to +22 A [rad].
 const SWING: f64 = 2.0 * SETTING_KICK as f64;
-/// Tunes of the training set about the design's.
-pub const TUNE_CUT: f64 = 0.05;
 /// Bands of a tune.
 pub const BANDS: usize = 5;
 /// Width of the prior.
@@ -36,17 +35,9 @@ pub fn even(ring: &Ring, count: usize) -> Vec<Machine> {
 /// Machines of the prior, of vars within the same range.
 pub fn prior(ring: &Ring, count: usize) -> Vec<Machine> {
     let mut random = StdRng::seed_from_u64(19);
-    let mut drawn = || {
-        let normal: f64 = StandardNormal.sample(&mut random);
-        (WIDTH * normal - 0.5 * WIDTH * WIDTH).exp()
-    };
-    let var = || loop {
-        let var = drawn();
-        if (var - 1.0).abs() <= f64::from(SPAN) {
-            return var;
-        }
-    };
-    machines(ring, count, var)
+    let span = f64::from(SPAN);
+    let prior = ParameterPrior { width: WIDTH, range: [1.0 - span, 1.0 + span] };
+    machines(ring, count, || draw(&prior, &mut random))
 }
 
 fn machines(ring: &Ring, count: usize, mut var: impl FnMut() -> f64) -> Vec<Machine> {
