@@ -19,8 +19,7 @@ use crate::source::queue::{Arrived, Queue};
 /// What the posterior expects of readings is worked out as often as this.
 const FITTED: Duration = Duration::from_millis(200);
 
-/// While as many frames wait, only one in so many is followed by a slice of preparation: the orbit is known at 10 kHz, and the core is
-/// linearised anew within a tenth of a second.
+/// While as many frames wait, only one in so many is followed by a slice of preparation, which takes as long as a frame.
 const BEHIND: u32 = 16;
 
 /// Of what a core's state is.
