@@ -94,6 +94,19 @@ def test_poison_is_set_aside_with_its_error(cluster, tmp_path):
     assert len(ensemble.run(task, range(8), tmp_path, client=cluster, progress=False)) == 6
 
 
+def test_a_result_that_was_lost_with_its_worker_is_waited_for():
+    class Lost:
+        key, status = "toy-2", "pending"  # finished before, made again now
+
+        def result(self):
+            return 2, {"square": 4}, "", 0.1, "host:1"
+
+        def exception(self):
+            return None
+
+    assert engine._result(Lost())[1] == {"square": 4}
+
+
 def test_results_of_another_task_are_not_mixed(ten_cells, cluster, tmp_path):
     ensemble.run(Toy(), range(2), tmp_path, client=cluster, progress=False)
     with pytest.raises(orbitcal.InputError, match="expected results of .*calibration.*found those of .*toy"):

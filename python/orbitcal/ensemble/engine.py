@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Task = Callable[[int], dict[str, Any]]
 Costs = pd.DataFrame
+Result = tuple[int, dict[str, Any] | None, str, float, str]  # seed, row, error, seconds, worker
 
 AHEAD = 4  # tasks a worker that are handed out at once
 ROWS = 200  # of a part at most
@@ -69,7 +70,7 @@ def costs(folder: str | os.PathLike[str]) -> Costs:
 
 def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: bool, total: int) -> None:
     import cloudpickle
-    from distributed import as_completed, wait
+    from distributed import KilledWorker, as_completed
     from tqdm.auto import tqdm
 
     name = f"orbitcal-{uuid.uuid4().hex}"
@@ -83,19 +84,20 @@ def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: 
             bar.set_postfix_str(client.dashboard_link or "")
             coming = as_completed([submit(seed) for seed in islice(rest, ahead)])
             for future in coming:
-                if _has_died(future):
-                    suspects.append(_seed(future))
-                else:
+                try:
                     store.take(*_result(future))
                     bar.update()
+                except KilledWorker:
+                    suspects.append(_seed(future))
                 future.release()
                 for seed in islice(rest, 1):
                     coming.add(submit(seed))
             # dask suspects all that a worker held when it died; alone it is seen which of them kills
             for seed in suspects:
-                future = submit(seed, "-alone")
-                wait(future)
-                store.take(*_result(future))
+                try:
+                    store.take(*_result(submit(seed, "-alone")))
+                except KilledWorker as died:
+                    store.take(*_failed(seed, died))
                 bar.update()
     finally:
         store.flush()
@@ -116,7 +118,7 @@ def _carrier(name: str, payload: bytes) -> Any:
     return carrier
 
 
-def _one(name: str, seed: int) -> tuple[int, dict[str, Any] | None, str, float, str]:
+def _one(name: str, seed: int) -> Result:
     """The row of a seed, or its error; on a worker."""
     from distributed import get_worker
 
@@ -135,19 +137,20 @@ def _seed(future: Future) -> int:
     return int(str(future.key).rsplit("-", 1)[1])
 
 
-def _has_died(future: Future) -> bool:
-    """Its worker did, several times."""
+def _result(future: Future) -> Result:
+    """What a worker said; it is waited for where dask makes a result again that was lost with its worker. `KilledWorker` if several have died of it."""
     from distributed import KilledWorker
 
-    return future.status == "error" and isinstance(future.exception(), KilledWorker)
-
-
-def _result(future: Future) -> tuple[int, dict[str, Any] | None, str, float, str]:
-    """What a worker said, or that it died."""
-    if future.status == "finished":
+    try:
         return future.result()
-    raised = future.exception()
-    return _seed(future), None, f"{type(raised).__name__}: {raised}".splitlines()[0], float("nan"), ""
+    except KilledWorker:
+        raise
+    except Exception as raised:
+        return _failed(_seed(future), raised)
+
+
+def _failed(seed: int, raised: Exception) -> Result:
+    return seed, None, f"{type(raised).__name__}: {raised}".splitlines()[0], float("nan"), ""
 
 
 @contextmanager
