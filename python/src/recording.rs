@@ -32,6 +32,19 @@ pub struct Recording {
     pub data: Data,
 }
 
+impl Recording {
+    /// Its frames.
+    ///
+    /// # Errors
+    /// `InputError` of a measured matrix.
+    pub fn expect_frames(&self) -> PyResult<&Arc<inference::Recording>> {
+        match &self.data {
+            Data::Frames(frames) => Ok(frames),
+            Data::Matrix(_) => Err(input(format!("{} is a measured matrix and has no frames", self.name()))),
+        }
+    }
+}
+
 #[pymethods]
 impl Recording {
     /// Read a folder of either sort; frames at the ring's energy, or at whichever they were taken.
@@ -113,10 +126,7 @@ impl Recording {
 
     /// The texts of `header.toml` and `frames.csv`.
     fn texts(&self, ring: &Ring) -> PyResult<[String; 2]> {
-        match &self.data {
-            Data::Frames(frames) => Ok(frames.texts(&ring.ring)),
-            Data::Matrix(_) => Err(input(format!("{} is a measured matrix and has no frames", self.name()))),
-        }
+        Ok(self.expect_frames()?.texts(&ring.ring))
     }
 
     /// Number of frames, 0 of a matrix.

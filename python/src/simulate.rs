@@ -33,9 +33,7 @@ pub fn simulate(
     effects: Vec<String>,
     exact: bool,
 ) -> PyResult<(Recording, Vec<f64>)> {
-    let Measured::Frames(template) = &template.data else {
-        return Err(input(format!("{} is a measured matrix and has no frames", template.name())));
-    };
+    let template = template.expect_frames()?;
     let effects = ring.effects(&effects)?;
     if !effects.is_empty() && !exact {
         return Err(input("effects need exact=True: the linear machine has none"));
@@ -65,9 +63,7 @@ pub fn simulate(
 /// Mean and standard deviation of the normal of each `ln var` before it is truncated to the prior's range, by the batch fit [N].
 #[pyfunction]
 pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult<(Vec<f32>, Vec<f32>)> {
-    let Measured::Frames(frames) = &recording.data else {
-        return Err(input(format!("{} is a measured matrix and has no frames", recording.name())));
-    };
+    let frames = recording.expect_frames()?;
     py.detach(|| {
         let campaign = command::campaign(&ring.ring, frames).map_err(raised)?;
         let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
@@ -88,9 +84,7 @@ impl Validation {
     /// With settings, read-backs and gaps of a recording.
     #[new]
     fn new(ring: &Ring, template: &Recording) -> PyResult<Self> {
-        let Measured::Frames(template) = &template.data else {
-            return Err(input(format!("{} is a measured matrix and has no frames", template.name())));
-        };
+        let template = template.expect_frames()?;
         let (ring, template) = (ring.ring.clone(), (**template).clone());
         let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
         let data = Data::of(&campaign).map_err(refused)?;

@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 
 use crate::error::input;
 use crate::estimate::Estimate;
-use crate::recording::{Data, Recording};
+use crate::recording::Recording;
 use crate::ring::Ring;
 
 /// Metres a micrometre.
@@ -41,9 +41,7 @@ impl Core {
         process_noise: f32,
         baseline_walk: f32,
     ) -> PyResult<Self> {
-        let Data::Frames(like) = &like.data else {
-            return Err(input(format!("{} is a measured matrix and has no frames", like.name())));
-        };
+        let like = like.expect_frames()?;
         let (ring, like) = (ring.ring.clone(), (**like).clone());
         let walk =
             if follow { stream::FOLLOW } else { stream::walk_per_cycle(&like, process_noise, baseline_walk * MICRO) };
@@ -67,9 +65,7 @@ impl Core {
 
     /// The next frame: one of a recording.
     fn of_recording(&mut self, py: Python<'_>, recording: &Recording, frame: usize) -> PyResult<Estimate> {
-        let Data::Frames(frames) = &recording.data else {
-            return Err(input(format!("{} is a measured matrix and has no frames", recording.name())));
-        };
+        let frames = recording.expect_frames()?;
         py.detach(|| self.row(&frames.rows[frame]))
     }
 
@@ -83,9 +79,7 @@ impl Core {
     /// Wire bytes of a frame of a recording.
     #[staticmethod]
     fn wire(recording: &Recording, frame: usize) -> PyResult<Vec<u8>> {
-        let Data::Frames(frames) = &recording.data else {
-            return Err(input(format!("{} is a measured matrix and has no frames", recording.name())));
-        };
+        let frames = recording.expect_frames()?;
         stream::wire(frames, &frames.rows[frame]).map_err(input)
     }
 
