@@ -17,8 +17,8 @@ demo: build ## the main job on a recording that ships with the repository, and i
 	$(ORBITCAL) replay $(RECORDING)
 	$(ORBITCAL) study $(RECORDING) --warm-up 300 --draws 500 --report target/study.html
 
-build: toolchain ## the program, at target/release/orbitcal
-	cargo build --release --locked -p host-bridge
+build: toolchain ## the program, at target/release/orbitcal; with the features that the tests have
+	cargo build --release --locked --workspace --bin orbitcal
 
 setup: toolchain
 	@command -v qemu-system-arm >/dev/null || { apt-get update && apt-get install -y qemu-system-arm; }
@@ -28,10 +28,10 @@ toolchain:
 	@command -v cc >/dev/null || { apt-get update && apt-get install -y build-essential; }
 	@rustup target list --installed | grep -q $(TARGET) || rustup target add $(TARGET) || { sleep 5; rustup target add $(TARGET); }
 
-test: setup ## format, lint, tests in debug and release, docs, and the core for the chip
+test: setup ## format, lint, tests, those of core, ring and device without optimisation too, docs, and the core for the chip
 	cargo fmt --all --check
 	cargo clippy --locked --workspace --all-targets -- -D warnings
-	cargo test --locked --workspace
+	cargo test --locked -p estimator -p twin -p firmware-sim
 	cargo test --locked --workspace --release
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
 	cargo build --locked --release -p estimator --target $(TARGET)
@@ -66,10 +66,10 @@ serve-bench: build ## the daemon from a TCP source on loopback to a subscriber: 
 	cargo run --locked --release -p system-tests --bin serve_bench
 
 serve-kill: toolchain ## kill -9 of the daemon and of a reader, 100 times at random moments: restarts, leaks, frames lost; a minute
-	cargo test --locked --release -p host-bridge --test daemon -- --ignored --exact kills::serve_kill --nocapture
+	cargo test --locked --release --workspace --test daemon -- --ignored --exact kills::serve_kill --nocapture
 
 serve-soak: toolchain ## two million frames with 5 % faults of every kind through the daemon, beside a core in process: estimates bit for bit, memory; ten minutes
-	cargo test --locked --release -p host-bridge --test daemon -- --ignored --exact soak::serve_soak --nocapture
+	cargo test --locked --release --workspace --test daemon -- --ignored --exact soak::serve_soak --nocapture
 
 clients: .venv-iceoryx target/tools/bin/iox2 ## readers of the shared memory that are not ours, against the daemon: the example in Python and iox2 of iceoryx2; minutes, the first time
 	cargo test --locked -p host-bridge --test daemon -- clients:: --nocapture
@@ -92,7 +92,7 @@ network: setup ## the network on the emulated chip beside the host, bit for bit,
 	cargo test --locked --release -p system-tests --test network -- --nocapture
 
 measured: toolchain ## four measured rings beside LOCO's fits of them: the numbers of docs/real-rings.md; three minutes
-	cargo test --locked --release -p system-tests --test measured -- --include-ignored --nocapture --test-threads 2
+	cargo test --locked --release --workspace --test measured -- --include-ignored --nocapture --test-threads 2
 
 figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from the page of its recording
 	cargo run --locked --release -p diagnosis --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence

@@ -6,6 +6,7 @@
 //! For physics that the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
 
 pub mod case;
+pub mod mixes;
 pub mod tables;
 pub mod unmodelled;
 
@@ -15,6 +16,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 use twin::{Effect, EffectKind, Ring};
 
+use crate::alternatives::Competition;
 use crate::data::{Data, DataError};
 use crate::fit::Fitted;
 use crate::hypothesis::{Hypothesis, Term};
@@ -24,6 +26,7 @@ pub use case::{Case, Class};
 use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware};
+use mixes::{Sort, Stated};
 pub use unmodelled::{Unmodelled, UnmodelledKind};
 
 /// The result of one case.
@@ -45,8 +48,8 @@ pub struct Outcome {
     pub grade: Grade,
     /// Kinds and places of the findings, strongest first.
     pub found: Vec<String>,
-    /// Most likely cause (or `nothing`) of the least certain finding, its stated probability, and whether it is true.
-    pub stated: (String, f64, bool),
+    /// Most likely cause (or `nothing`) of the least certain finding.
+    pub stated: Stated,
     /// Probability that the model without effects is complete.
     pub nothing: f64,
     /// Held-out gain and its standard error.
@@ -55,6 +58,8 @@ pub struct Outcome {
     pub pulls: Vec<f64>,
     /// Whether the 95 % stretches of the place of an identified gradient hold (or touch the magnet of) the true one.
     pub covered: Vec<bool>,
+    /// Whether a finding is within the distance of two quadrupoles of the place of physics that the library does not hold.
+    pub near: bool,
     /// NEES per var before and after.
     pub nees: [f64; 2],
     /// Time of the diagnosis [s].
@@ -114,28 +119,50 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         heldout: diagnosis.gain(),
         pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
         covered: covered(ring, &diagnosis, &key),
+        near: case.unmodelled.iter().any(|one| is_near(ring, &diagnosis, one)),
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
         truth: key.effects.iter().map(|effect| Made::of(effect, ring)).collect(),
         seconds,
     }))
 }
 
-/// The most likely cause of the least certain finding, its probability, and whether it is true.
-fn stated(diagnosis: &Diagnosis, key: &Truth) -> (String, f64, bool) {
-    let least =
-        diagnosis.findings.iter().filter(|f| f.term().is_some()).min_by(|a, b| a.probability.total_cmp(&b.probability));
-    let nothing = diagnosis.found.nothing();
+/// The most likely cause of the least certain finding.
+fn stated(diagnosis: &Diagnosis, key: &Truth) -> Stated {
+    let found = &diagnosis.found;
+    let of_library = diagnosis.findings.iter().filter(|f| f.term().is_some());
+    let least = of_library.min_by(|a, b| a.probability.total_cmp(&b.probability));
     match least {
-        Some(finding) if diagnosis.verdict != Verdict::Consistent => {
-            let is_true = key.effects.iter().any(|effect| effect.is(finding));
-            (finding.label(), finding.probability, is_true)
+        _ if diagnosis.verdict == Verdict::Consistent => {
+            let all = found.competitions.iter().chain([&found.next]);
+            let own = all.min_by(|a, b| a.nothing.total_cmp(&b.nothing)).expect("there is a next one");
+            Stated::of("nothing".into(), Sort::Nothing, own.nothing, of_sorts(own), key.effects.is_empty())
         }
-        _ if diagnosis.verdict == Verdict::Consistent => ("nothing".into(), nothing, key.effects.is_empty()),
-        _ => {
-            let unknown = diagnosis.found.next.unknown();
-            ("unknown".into(), unknown, key.effects.iter().any(TrueEffect::is_unmodelled))
+        Some(finding) => {
+            let is_true = key.effects.iter().any(|effect| effect.is(finding));
+            let term = found.best.hypothesis.terms.iter().position(|term| Some(term) == finding.term());
+            let of_sorts = term.map_or_else(|| of_sorts_of(finding), |term| of_sorts(&found.competitions[term]));
+            Stated::of(finding.label(), Sort::Library, finding.probability, of_sorts, is_true)
+        }
+        None => {
+            let is_true = key.effects.iter().any(TrueEffect::is_unmodelled);
+            Stated::of("unknown".into(), Sort::Unknown, found.next.unknown(), of_sorts(&found.next), is_true)
         }
     }
+}
+
+/// Probability of nothing, of the library and of other physics in a competition.
+fn of_sorts(own: &Competition) -> [f64; 3] {
+    [own.nothing, own.library(), own.unknown()]
+}
+
+/// The same of a finding that passes within settings, from the alternatives that it lists.
+fn of_sorts_of(finding: &Finding) -> [f64; 3] {
+    let all = || core::iter::once(finding).chain(&finding.alternatives);
+    let sum = |is_of_library: bool| -> f64 {
+        all().filter(|one| one.term().is_some() == is_of_library).map(|one| one.probability).sum()
+    };
+    let (library, unknown) = (sum(true), sum(false));
+    [(1.0 - library - unknown).max(0.0), library, unknown]
 }
 
 /// Whether the stretches of identified gradients hold the true places.
@@ -157,6 +184,17 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
         }))
     };
     diagnosis.findings.iter().filter(named).filter_map(touches).collect()
+}
+
+/// Whether a finding is nearer to a place than two quadrupoles are to each other, on average.
+fn is_near(ring: &Ring, diagnosis: &Diagnosis, one: &Unmodelled) -> bool {
+    let at = one.site.elements(ring).first().map_or(f64::NAN, |&element| ring.elements[element].s);
+    let away = |s: f64| {
+        let along = (s - at).rem_euclid(ring.circumference);
+        along.min(ring.circumference - along)
+    };
+    let spacing = ring.circumference / ring.quadrupoles.len() as f64;
+    diagnosis.findings.iter().filter_map(|finding| finding.s).any(|s| away(s) < spacing)
 }
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF};
 
+use super::mixes::{Calibration, Reliability};
 use super::{Class, Outcome};
 use crate::Verdict;
 use crate::score::{Fate, Grade};
@@ -33,15 +34,15 @@ pub struct Fates {
     pub absent: usize,
 }
 
-/// How often a stated probability is right.
-#[derive(Debug, Clone, Serialize)]
-pub struct Reliability {
-    /// Stated probability, from and to.
-    pub bin: [f64; 2],
-    /// Mean of what was stated.
-    pub stated: f64,
-    /// How often it was so.
-    pub is_so: Share,
+/// What became of physics outside the library.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Unknown {
+    /// Called unexplained or ambiguous.
+    pub undecided: Share,
+    /// With its place.
+    pub near: Share,
+    /// Named as something else.
+    pub named: usize,
 }
 
 /// All tables.
@@ -55,16 +56,14 @@ pub struct Tables {
     pub by_gain: Vec<([f64; 2], Fates)>,
     /// Campaigns with a false identification, of all but those with unmodelled physics.
     pub wrong: Share,
-    /// Campaigns with physics outside the library that were called unexplained or ambiguous, by oracle gain; and named as something else.
-    pub unknown: Vec<([f64; 2], Share, usize)>,
+    /// Campaigns with physics outside the library, by oracle gain.
+    pub unknown: Vec<([f64; 2], Unknown)>,
     /// Single effects named right, by kind and size (weak, medium, strong thirds of the logarithm).
     pub power: BTreeMap<String, [Share; 3]>,
     /// Wrong names: what it was, what was said.
     pub confused: Vec<(String, String)>,
-    /// Stated probabilities.
-    pub reliability: Vec<Reliability>,
-    /// Brier score of the stated probabilities.
-    pub brier: f64,
+    /// Stated probabilities, in several mixes.
+    pub calibration: Vec<Calibration>,
     /// Pulls of the amplitudes of named effects: number, mean square, and share within 1 and 2 standard deviations.
     pub amplitudes: (usize, f64, [Share; 2]),
     /// 95 % stretches of a gradient's place that hold it.
@@ -81,7 +80,8 @@ pub struct Tables {
 const GAINS: [[f64; 2]; 5] = [[f64::NEG_INFINITY, 4.0], [4.0, 9.0], [9.0, 25.0], [25.0, 100.0], [100.0, f64::INFINITY]];
 /// Thirds of the logarithm of the sizes that are drawn.
 const THIRDS: [f64; 2] = [0.464, 1.077];
-const BINS: [[f64; 2]; 6] = [[0.0, 0.5], [0.5, 0.7], [0.7, 0.85], [0.85, 0.95], [0.95, 0.99], [0.99, 1.01]];
+/// Number of successes below which there are none.
+const ROUNDING: f64 = 1e-9;
 
 impl Share {
     /// Count.
@@ -92,10 +92,17 @@ impl Share {
 
     /// Of some trials.
     pub fn new(of: usize, trials: usize) -> Self {
-        let beta = |a: usize, b: usize, p: f64| Beta::new(a as f64, b as f64).map_or(0.0, |beta| beta.inverse_cdf(p));
-        let lower = if of == 0 { 0.0 } else { beta(of, trials - of + 1, 0.025) };
-        let upper = if of == trials { 1.0 } else { beta(of + 1, trials - of, 0.975) };
-        Self { of, trials, limits: [lower, upper] }
+        Self { of, trials, limits: Self::limits(of as f64, trials as f64) }
+    }
+
+    /// The limits, which fractional numbers have too.
+    pub(super) fn limits(of: f64, trials: f64) -> [f64; 2] {
+        let beta = |a: f64, b: f64, p: f64| Beta::new(a, b).map_or(0.0, |beta| beta.inverse_cdf(p));
+        // shares of a weighted sum are off 0 and 1 by rounding
+        let (none, all) = (of < ROUNDING, trials - of < ROUNDING);
+        let lower = if none { 0.0 } else { beta(of, trials - of + 1.0, 0.025) };
+        let upper = if all { 1.0 } else { beta(of + 1.0, trials - of, 0.975) };
+        [lower, upper]
     }
 
     fn text(&self) -> String {
@@ -151,13 +158,20 @@ impl Tables {
             unknown: GAINS
                 .map(|bin| {
                     let of = || class(Class::Unknown).filter(within(bin));
-                    (bin, Share::of(of(), undecided), of().filter(|o| named(o)).count())
+                    let undecided = Share::of(of(), undecided);
+                    (
+                        bin,
+                        Unknown {
+                            undecided,
+                            near: Share::of(of(), |o| o.near),
+                            named: of().filter(|o| named(o)).count(),
+                        },
+                    )
                 })
                 .into(),
             power: power(class(Class::Single)),
             confused: outcomes.iter().filter(|o| o.grade == Grade::Wrong).map(confusion).collect(),
-            reliability: BINS.iter().filter_map(|&bin| Reliability::of(outcomes, bin)).collect(),
-            brier: mean(outcomes.iter().map(|o| (o.stated.1 - f64::from(u8::from(o.stated.2))).powi(2))),
+            calibration: Calibration::all(outcomes),
             amplitudes: (pulls.len(), mean(pulls.iter().map(|p| p * p)), [inside(1.0), inside(2.0)]),
             places: Share::new(covered.iter().filter(|covered| **covered).count(), covered.len()),
             nees: [0, 1].map(|i| median(right().map(|o| o.nees[i]).collect())),
@@ -196,10 +210,12 @@ impl Tables {
         }
         writeln!(text, "\nCampaigns with a false identification: {}.", self.wrong.text())?;
         writeln!(text, "\nPhysics outside the library:\n")?;
-        writeln!(text, "| oracle gain | called unexplained or ambiguous | named as something else |\n|---|---|---|")?;
-        for (bin, share, wrong) in &self.unknown {
-            writeln!(text, "| {} | {} | {wrong} |", range(bin), share.text())?;
+        writeln!(text, "| oracle gain | called unexplained or ambiguous | its place is | named as something else |")?;
+        writeln!(text, "|---|---|---|---|")?;
+        for (bin, Unknown { undecided, near, named }) in &self.unknown {
+            writeln!(text, "| {} | {} | {} | {named} |", range(bin), undecided.text(), near.text())?;
         }
+        writeln!(text, "\nA place is right within the mean distance of two quadrupoles.")?;
         writeln!(
             text,
             "\nPower: single effects named right, by size (in prior standard deviations; kinds without one: all):\n"
@@ -213,16 +229,8 @@ impl Tables {
         for (truth, said) in &self.confused {
             writeln!(text, "- {truth}, called {said}")?;
         }
-        writeln!(
-            text,
-            "\nStated probability of the most likely cause of the least certain finding, and how often it is true:\n"
-        )?;
-        writeln!(text, "| stated | mean | true |\n|---|---|---|")?;
-        for Reliability { bin, stated, is_so } in &self.reliability {
-            writeln!(text, "| {:.2} to {:.2} | {stated:.3} | {} |", bin[0], bin[1].min(1.0), is_so.text())?;
-        }
+        self.write_calibration(text)?;
         let (number, square, [one, two]) = &self.amplitudes;
-        writeln!(text, "\nBrier score {:.3}.\n", self.brier)?;
         writeln!(text, "| what | measured |\n|---|---|")?;
         writeln!(text, "| amplitudes of named effects: mean square pull | {square:.2} of {number} |")?;
         writeln!(text, "| within one standard deviation | {} |", one.text())?;
@@ -240,14 +248,31 @@ impl Tables {
             self.seconds[0], self.seconds[1]
         )
     }
-}
 
-impl Reliability {
-    fn of(outcomes: &[Outcome], bin: [f64; 2]) -> Option<Self> {
-        let within: Vec<&Outcome> = outcomes.iter().filter(|o| (bin[0]..bin[1]).contains(&o.stated.1)).collect();
-        let stated = mean(within.iter().map(|o| o.stated.1));
-        let is_so = Share::of(within.iter().copied(), |o| o.stated.2);
-        (!within.is_empty()).then_some(Self { bin, stated, is_so })
+    fn write_calibration(&self, text: &mut String) -> core::fmt::Result {
+        writeln!(
+            text,
+            "\nProbability of the most likely cause of the least certain finding, and how often it is true, in three mixes of campaigns: \
+             shares of empty ones, effects of the library and other physics in per cent. The first is what the diagnosis takes for granted; in \
+             the others its probabilities follow from Bayes' rule. All are made of the same campaigns by weights; a share is of effectively as \
+             many campaigns as stand there.\n"
+        )?;
+        writeln!(text, "| mix | stated | mean | true, 95 % limits | effectively |\n|---|---|---|---|---|")?;
+        for Calibration { mix, bins, .. } in &self.calibration {
+            for Reliability { bin, effectively, stated, is_true, limits, .. } in bins {
+                let ([from, to], [lower, upper]) = (bin, limits.map(|limit| 100.0 * limit));
+                writeln!(
+                    text,
+                    "| {} | {from:.2} to {:.2} | {stated:.3} | {:.1} % ({lower:.1} to {upper:.1} %) | {effectively:.0} |",
+                    mix.text(),
+                    to.min(1.0),
+                    100.0 * is_true
+                )?;
+            }
+        }
+        let (bins, outside) = self.calibration.iter().fold((0, 0), |(n, o), c| (n + c.bins.len(), o + c.outside()));
+        let brier: Vec<String> = self.calibration.iter().map(|one| format!("{:.3}", one.brier)).collect();
+        writeln!(text, "\nOutside the limits: {outside} of {bins}. Brier scores {}.\n", brier.join(", "))
     }
 }
 

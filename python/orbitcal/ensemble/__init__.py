@@ -6,6 +6,6 @@ table = ensemble.run(ensemble.Validation(recording, "single"), range(1000), "tar
 
 from .engine import Costs, costs, failures, run
 from .tasks import Calibration, TrainingSet, Validation
-from .uniformity import uniformity
+from .uniformity import histograms, uniformity
 
-__all__ = ["Calibration", "Costs", "TrainingSet", "Validation", "costs", "failures", "run", "uniformity"]
+__all__ = ["Calibration", "Costs", "TrainingSet", "Validation", "costs", "failures", "histograms", "run", "uniformity"]
