@@ -40,9 +40,8 @@ pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
         let reads = planes(&mut folder.monitors.iter().map(|one| (one.at, one.plane)));
         for (kind, plane, s) in [("corrector", kicks, one.s + one.length / 2.0), ("bpm", reads, one.s)] {
             let Some(plane) = plane else { continue };
-            let name = format!("{kind} {name}");
-            elements
-                .push(json!({"name": name, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
+            let own = format!("{kind} {name}");
+            elements.push(json!({"name": own, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
         }
     }
     let rest = folder.meta.particle.rest_energy();

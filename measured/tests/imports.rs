@@ -231,6 +231,70 @@ fn a_roll_by_an_eighth_of_a_turn_leaves_no_normal_gradient() {
     assert_eq!(lattice.left_out.len(), 1);
 }
 
+/// By pyAT: a magnet that is tracked as a drift has no field, and method 0 of an edge no soft one.
+#[test]
+fn a_magnet_that_is_switched_off_has_no_field() {
+    let of = |element: &str| {
+        let (_folder, path) = at(&format!("{BPM}, {COR}, {element}"));
+        imported(&path).unwrap().0.elements[2].clone()
+    };
+    let quadrupole = r#""FamName": "Q", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "PassMethod""#;
+    assert_eq!(of(&format!(r#"{{{quadrupole}: "DriftPass"}}"#)).k1, 0.0);
+    assert_eq!(of(&format!(r#"{{{quadrupole}: "StrMPoleSymplectic4RadPass"}}"#)).k1, 2.0);
+    let dipole = r#""FamName": "B", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "EntranceAngle": 0.05, "FullGap": 0.04, "FringeInt1": 0.5, "FringeInt2": 0.5"#;
+    let whole = of(&format!("{{{dipole}}}"));
+    let half = of(&format!(r#"{{{dipole}, "FringeBendExit": 0}}"#));
+    assert_eq!((whole.fringe, whole.edge_in, half.fringe, half.edge_in), (0.02, 0.05, 0.01, 0.05));
+    let (_folder, path) = at(&format!(r#"{BPM}, {{{quadrupole}: "CavityPass"}}"#));
+    assert!(refused(&path).contains("element Q: pass method CavityPass of a Quadrupole is not known here"));
+    let (_folder, path) = at(&format!(r#"{BPM}, {{{dipole}, "PassMethod": "DriftPass"}}"#));
+    assert!(refused(&path).contains("element B: pass method DriftPass of a dipole"));
+}
+
+/// What moves the orbit is said, since the twin's is straight.
+#[test]
+fn kicks_displacements_and_rolls_are_said() {
+    let kicked = r#"{"FamName": "K", "Class": "Corrector", "Length": 0, "KickAngle": [1e-3, 0]}"#;
+    let dipole = r#"{"FamName": "Q", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [1e-4, 2]}"#;
+    let moved =
+        r#"{"FamName": "M", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "T1": [1e-3, 0, 0, 0, 0, 0]}"#;
+    let rolled = r#"{"FamName": "R", "Class": "Monitor", "Length": 0, "R1": [[0.8, 0, 0.6]]}"#;
+    let (_folder, path) = at(&format!("{BPM}, {COR}, {kicked}, {dipole}, {moved}, {rolled}"));
+    let left_out: Vec<(&str, usize)> = imported(&path).unwrap().0.left_out.into_iter().collect();
+    let begins = ["displacements", "kicks of correctors", "rolls of monitors", "skew gradient"];
+    assert!(left_out.iter().zip(begins).all(|((what, _), begin)| what.starts_with(begin)), "{left_out:?}");
+    assert_eq!(left_out.iter().map(|(_, count)| *count).collect::<Vec<_>>(), [1, 2, 1, 1]);
+}
+
+/// By Xsuite, `line.insert` leaves slices of a drift; an edge may be switched off.
+#[test]
+fn a_line_with_something_inserted_is_read() {
+    let line = |edge: &str| {
+        file(
+            "ring.json",
+            &format!(
+                r#"{{"element_names": ["d..0", "bpm", "d..1", "cor"], "elements": {{"d": {{"__class__": "Drift", "length": 2.0}},
+                "d..0": {{"__class__": "DriftSlice", "parent_name": "d", "weight": 0.25}}, "bpm": {{"__class__": "Marker"}},
+                "d..1": {{"__class__": "DriftSlice", "parent_name": "d", "weight": 0.75, "slice_offset": 0.5}},
+                "cor": {{"__class__": "RBend", "length": 1.0, "angle": 0.1, "shift_x": 0.001, "edge_entry_hgap": 0.02, "edge_entry_fint": 0.5{edge}}}}}}}"#
+            ),
+        )
+    };
+    let read = |edge: &str| {
+        let (_folder, path) = line(edge);
+        imported(&path).unwrap().0
+    };
+    let lattice = read("");
+    let lengths: Vec<f64> = lattice.elements.iter().map(|one| one.length).collect();
+    assert_eq!(lengths, [0.5, 0.0, 1.5, 1.0]);
+    assert_eq!(lattice.left_out.len(), 2, "displaced, and a soft edge at one side only");
+    let edges =
+        |lattice: &Lattice| (lattice.elements[3].edge_in, lattice.elements[3].edge_out, lattice.elements[3].fringe);
+    assert_eq!(edges(&lattice), (0.05, 0.05, 0.01));
+    assert_eq!(edges(&read(r#", "edge_entry_active": 0"#)), (0.0, 0.05, 0.0));
+    assert_eq!(edges(&read(r#", "edge_entry_model": "suppressed", "edge_exit_model": "full""#)), (0.0, 0.05, 0.0));
+}
+
 #[test]
 fn what_the_twin_cannot_carry_is_refused_with_its_element() {
     let thin = r#"{"FamName": "T", "Class": "ThinMultipole", "Length": 0, "PolynomB": [0, 0.3]}"#;

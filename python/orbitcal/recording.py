@@ -41,11 +41,12 @@ class Recording:
     def read(cls, folder: str | PathLike[str], ring: Ring | None = None, *, any_energy: bool = False) -> Recording:
         """Read a folder with `header.toml` and `frames.csv`, or with a measured response matrix.
 
-        Without a ring the frames are those of the built-in Booster; a matrix brings its own lattice. Frames that were taken at another energy than
+        Without a ring the frames are those of the built-in Booster; a matrix has the ring of its own lattice. Frames that were taken at another energy than
         the ring's are refused, but for `any_energy`: `diagnose` takes several of different energies together.
         """
-        ring = Ring.booster() if ring is None else ring
-        return cls(_orbitcal.Recording.read(Path(folder), ring._ring, any_energy), ring)
+        of_frames = Ring.booster() if ring is None else ring
+        made = _orbitcal.Recording.read(Path(folder), of_frames._ring, any_energy)
+        return cls(made, Ring._of(made.ring_of_matrix()) if made.is_matrix and ring is None else of_frames)
 
     @classmethod
     def from_pandas(
@@ -78,8 +79,8 @@ class Recording:
     ) -> Recording:
         """A measured response matrix of a ring that was made of a lattice (`from_pyat`, `from_xsuite`, `from_lattice`).
 
-        Rows are monitors and columns correctors, named as in the lattice with the plane in front (`x:BPM[3]`), or numbers alone
-        with `order`. What the numbers mean is asked for, as by `orbitcal import`: `kick` is the deflection [mrad] that an element
+        Rows are monitors and columns correctors, named as by the ring (`x_BPM.12`) or in the lattice with the plane in front (`x:BPM[3]`), or
+        numbers alone with `order`. The model is the ring with its factors. What the numbers mean is asked for, as by `orbitcal import`: `kick` is the deflection [mrad] that an element
         of the matrix belongs to, `noise` its standard deviation in `orbit_unit`; each one number, one a plane, or by name. `dispersion`
         is the change of the orbit when the RF frequency rises by `rf_step` [Hz].
         """
@@ -179,7 +180,7 @@ class Recording:
 
 
 def _again(name: str, ring: Ring, header: str, frames: str) -> Recording:
-    return Recording(_orbitcal.Recording.parse(name, ring._ring, header, frames), ring)
+    return Recording(_orbitcal.Recording.again(name, ring._ring, header, frames), ring)
 
 
 def _header(ring: Ring, header: Mapping[str, Any]) -> dict[str, Any]:

@@ -199,13 +199,13 @@ class Ring:
         coords = {by: names, **self._coords()}
         return xr.DataArray(values, coords, (by, "monitor", "corrector"), "response_jacobian", _of_response(unit))
 
-    def optics(self, *, effects: Iterable[Effect] = ()) -> xr.Dataset:
-        """Linear optics at the entrance of every element and at the end of the ring.
+    def optics(self, *, effects: Iterable[Effect] = (), rf: Rf = "fixed-momentum") -> xr.Dataset:
+        """Linear optics at the entrance of every element and at the end of the ring, at the momentum that `rf` leaves.
 
         `beta` [m], `phase_advance` [rad], `dispersion` [m] and `orbit` [m] with dimensions `plane` (x, y) and `element` [E + 1];
         coordinate `s` [m]. Attributes: `tune_x`, `tune_y`, `momentum_compaction`, `gamma_transition` [1].
         """
-        made = self._ring.optics(words(effects))
+        made = self._ring.optics(words(effects), rf)
         names, starts = self._ring.elements
         planes = ("plane", "element")
         of = lambda name, unit: (planes, made[name].reshape(2, -1), {"units": unit})

@@ -11,7 +11,7 @@ create_exception!(
     orbitcal,
     InputError,
     PyValueError,
-    "What was given cannot be: where, what was expected and what was found."
+    "An input is wrong: where, what was expected and what was found."
 );
 create_exception!(orbitcal, OrbitcalError, PyRuntimeError, "Anything else that went wrong.");
 

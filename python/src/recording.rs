@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use host_bridge::command::check::CheckResult;
 use measured::import::{
-    Conventions, KickIs, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, agreement, assemble,
+    Conventions, KickIs, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, agreement, assemble, table_names,
 };
+use measured::lattice::machine;
 use measured::{Folder, MeasuredError};
 use numpy::PyArray2;
 use pyo3::prelude::*;
@@ -25,22 +26,78 @@ pub enum Data {
     Matrix(Arc<Folder>),
 }
 
+/// Relative difference of circumferences that is rounding of a file.
+const SAME: f64 = 1e-6;
+
 /// A recording; see `orbitcal.Recording`.
 #[pyclass(frozen, module = "orbitcal._orbitcal")]
 pub struct Recording {
     /// What was measured.
     pub data: Data,
+    /// The machine on which, of frames; a matrix has a lattice of its own.
+    machine: Option<Machine>,
+}
+
+/// What tells rings apart whose strengths and priors may be others.
+#[derive(Debug, Clone, PartialEq)]
+struct Machine {
+    name: String,
+    circumference: f64,
+    monitors: Vec<String>,
+    correctors: Vec<String>,
+}
+
+impl Machine {
+    fn of(ring: &twin::Ring) -> Self {
+        let (name, circumference) = (ring.name.clone(), ring.circumference);
+        Self { name, circumference, monitors: ring.monitor_names(), correctors: ring.corrector_names() }
+    }
+
+    fn text(&self) -> String {
+        let Self { name, circumference, monitors, correctors } = self;
+        format!("{name} ({circumference} m, {} monitors, {} correctors)", monitors.len(), correctors.len())
+    }
 }
 
 impl Recording {
-    /// Its frames.
+    /// Frames of a ring.
+    pub fn of_frames(frames: inference::Recording, ring: &twin::Ring) -> Self {
+        Self { data: Data::Frames(Arc::new(frames)), machine: Some(Machine::of(ring)) }
+    }
+
+    fn of_matrix(folder: Folder) -> Self {
+        Self { data: Data::Matrix(Arc::new(folder)), machine: None }
+    }
+
+    /// Its frames, for a ring.
     ///
     /// # Errors
-    /// `InputError` of a measured matrix.
-    pub fn expect_frames(&self) -> PyResult<&Arc<inference::Recording>> {
-        match &self.data {
-            Data::Frames(frames) => Ok(frames),
-            Data::Matrix(_) => Err(input(format!("{} is a measured matrix and has no frames", self.name()))),
+    /// `InputError` of a measured matrix, and of a recording of another ring.
+    pub fn frames_of(&self, ring: &twin::Ring) -> PyResult<&Arc<inference::Recording>> {
+        let Data::Frames(frames) = &self.data else {
+            return Err(input(format!("{} is a measured matrix and has no frames", self.name())));
+        };
+        self.expect(ring)?;
+        Ok(frames)
+    }
+
+    /// That it is of a ring.
+    ///
+    /// # Errors
+    /// `InputError`.
+    pub fn expect(&self, ring: &twin::Ring) -> PyResult<()> {
+        let found = Machine::of(ring);
+        let expected = match &self.data {
+            Data::Matrix(folder) => {
+                let circumference = folder.meta.circumference;
+                let is_same = (circumference / ring.circumference - 1.0).abs() < SAME;
+                (!is_same).then(|| format!("{circumference} m"))
+            }
+            Data::Frames(_) => self.machine.as_ref().filter(|own| **own != found).map(Machine::text),
+        };
+        match expected {
+            None => Ok(()),
+            Some(own) => Err(input(format!("{}: expected its ring, {own}, found {}", self.name(), found.text()))),
         }
     }
 }
@@ -51,18 +108,24 @@ impl Recording {
     #[staticmethod]
     fn read(folder: PathBuf, ring: &Ring, any_energy: bool) -> PyResult<Self> {
         if Folder::is_one(&folder) {
-            return Ok(Self { data: Data::Matrix(Arc::new(Folder::read(&folder).map_err(input)?)) });
+            return Ok(Self::of_matrix(Folder::read(&folder).map_err(input)?));
         }
         let read = if any_energy { inference::Recording::read_at_its_energy } else { inference::Recording::read };
-        let frames = read(&folder, &ring.ring).map_err(input)?;
-        Ok(Self { data: Data::Frames(Arc::new(frames)) })
+        Ok(Self::of_frames(read(&folder, &ring.ring).map_err(input)?, &ring.ring))
     }
 
     /// The texts of `header.toml` and `frames.csv`; `name` appears in errors.
     #[staticmethod]
     fn parse(name: &str, ring: &Ring, header: &str, frames: &str) -> PyResult<Self> {
         let frames = inference::Recording::parse(Path::new(name), &ring.ring, header, frames).map_err(input)?;
-        Ok(Self { data: Data::Frames(Arc::new(frames)) })
+        Ok(Self::of_frames(frames, &ring.ring))
+    }
+
+    /// The same at whichever energy they were taken.
+    #[staticmethod]
+    fn again(name: &str, ring: &Ring, header: &str, frames: &str) -> PyResult<Self> {
+        let frames = inference::Recording::parse_at_its_energy(Path::new(name), &ring.ring, header, frames);
+        Ok(Self::of_frames(frames.map_err(input)?, &ring.ring))
     }
 
     /// A response matrix of a ring that was made of a lattice, as text of a table; words as of `orbitcal import`.
@@ -96,17 +159,35 @@ impl Recording {
             signs: word("kick_sign", kick_sign, &SIGNS)?,
             noise: per_instrument("noise", noise)?,
         };
-        let table = Table::parse(name, table).map_err(input)?;
-        let dispersion = dispersion.map(|text| Table::parse("dispersion", text)).transpose().map_err(input)?;
+        if dispersion.is_some() != rf_step.is_some() {
+            return Err(input("expected dispersion and rf_step together, found one of them"));
+        }
+        let (lattice, instruments) = &*imported.of;
+        let [monitors, correctors] = table_names(lattice, instruments);
+        // tables may have the names of the ring
+        let monitors: Vec<_> = ring.ring.monitor_names().into_iter().zip(monitors).collect();
+        let correctors: Vec<_> = ring.ring.corrector_names().into_iter().zip(correctors).collect();
+        let read =
+            |name, text| Ok::<_, PyErr>(Table::parse(name, text).map_err(input)?.renamed(&monitors, &correctors));
+        let (table, dispersion) = (read(name, table)?, dispersion.map(|text| read("dispersion", text)).transpose()?);
         let measured = Measurement {
             matrix: &table,
             dispersion: dispersion.as_ref().zip(rf_step),
             order: order.map(|order| word("order", order, &ORDERS)).transpose()?,
             conventions: &conventions,
         };
-        let (lattice, instruments) = &*imported.of;
-        let folder = assemble(lattice, instruments, rf_frequency, &measured).map_err(input)?;
-        Ok(Self { data: Data::Matrix(Arc::new(Folder { name: name.into(), ..folder })) })
+        let mut folder = assemble(lattice, instruments, rf_frequency, &measured).map_err(input)?;
+        folder.name = name.into();
+        ring.strengthen(&mut folder);
+        Ok(Self::of_matrix(folder))
+    }
+
+    /// The ring of a matrix that was read, on its own lattice.
+    fn ring_of_matrix(&self) -> PyResult<Ring> {
+        match &self.data {
+            Data::Matrix(folder) => Ring::machine(machine(folder, &[]).to_string(), folder.name.clone()),
+            Data::Frames(_) => Err(input(format!("{} is a recording of frames, not a measured matrix", self.name()))),
+        }
     }
 
     /// Its name.
@@ -126,7 +207,7 @@ impl Recording {
 
     /// The texts of `header.toml` and `frames.csv`.
     fn texts(&self, ring: &Ring) -> PyResult<[String; 2]> {
-        Ok(self.expect_frames()?.texts(&ring.ring))
+        Ok(self.frames_of(&ring.ring)?.texts(&ring.ring))
     }
 
     /// Number of frames, 0 of a matrix.
@@ -163,6 +244,7 @@ impl Recording {
 
     /// What it holds, as JSON.
     fn check(&self, py: Python<'_>, ring: &Ring) -> PyResult<String> {
+        self.expect(&ring.ring)?;
         py.detach(|| match &self.data {
             Data::Frames(frames) => {
                 let result = CheckResult::of(&ring.ring, frames).map_err(raised)?;

@@ -6,6 +6,7 @@ use host_bridge::cli::Format;
 use host_bridge::command::response::by_name;
 use host_bridge::export::{Calibration, Lattice, text};
 use inference::with_priors;
+use measured::Folder;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -58,6 +59,19 @@ impl Ring {
         self.width
     }
 
+    /// The range of every var, if the ring was told one.
+    pub fn range(&self) -> Option<[f64; 2]> {
+        self.range
+    }
+
+    /// Give a measurement of the lattice that the ring was made of the ring's gradients.
+    pub fn strengthen(&self, folder: &mut Folder) {
+        let named: BTreeMap<String, f64> = self.quadrupoles().into_iter().zip(self.ring.gradients()).collect();
+        let of_row: Vec<Option<f64>> =
+            (0..folder.lattice.len()).map(|row| named.get(&folder.element(row)).copied()).collect();
+        folder.lattice.iter_mut().zip(of_row).for_each(|(row, k1)| row.k1 = k1.unwrap_or(row.k1));
+    }
+
     /// Effects by their words.
     pub fn effects(&self, words: &[String]) -> PyResult<Vec<Effect>> {
         let read = |word: &String| word.parse::<EffectText>().and_then(|effect| effect.resolve(&self.ring));
@@ -99,7 +113,7 @@ impl Ring {
 
     /// The ring of a machine file's text; `file` appears in errors.
     #[staticmethod]
-    fn machine(text: String, file: String) -> PyResult<Self> {
+    pub fn machine(text: String, file: String) -> PyResult<Self> {
         Self::of(Source::Machine { text, file }, None, None, None)
     }
 
@@ -284,8 +298,8 @@ impl Ring {
     }
 
     /// Optics at the entrance of every element and at the end, as arrays by name.
-    fn optics<'py>(&self, py: Python<'py>, effects: Vec<String>) -> PyResult<Bound<'py, PyDict>> {
-        let made = py.detach(|| self.with_machine((&effects, "fixed-momentum"), |machine, _| table(machine)))?;
+    fn optics<'py>(&self, py: Python<'py>, effects: Vec<String>, rf: &str) -> PyResult<Bound<'py, PyDict>> {
+        let made = py.detach(|| self.with_machine((&effects, rf), |machine, _| table(machine)))?;
         let result = PyDict::new(py);
         let planes = |of: &dyn Fn(usize, usize) -> f64| {
             let values = (0..2).flat_map(|plane| (0..made.twiss.len()).map(move |at| (plane, at)));

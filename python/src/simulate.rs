@@ -14,8 +14,9 @@ use inference::{BatchFit, TuneUse};
 use pyo3::prelude::*;
 
 use crate::error::{input, other, raised};
-use crate::recording::{Data as Measured, Recording};
+use crate::recording::Recording;
 use crate::ring::Ring;
+use crate::task;
 
 /// Cases of a class are numbered from its place in the list of classes times this.
 const OF_CLASS: usize = 1_000_000;
@@ -33,7 +34,7 @@ pub fn simulate(
     effects: Vec<String>,
     exact: bool,
 ) -> PyResult<(Recording, Vec<f64>)> {
-    let template = template.expect_frames()?;
+    let template = template.frames_of(&ring.ring)?;
     let effects = ring.effects(&effects)?;
     if !effects.is_empty() && !exact {
         return Err(input("effects need exact=True: the linear machine has none"));
@@ -56,14 +57,14 @@ pub fn simulate(
             let instruments = Instruments::healthy(ring, template).map_err(other)?;
             simulated::like(template, ring, &vars, &instruments, of_noise).map_err(other)
         };
-        Ok((Recording { data: Measured::Frames(Arc::new(made?)) }, vars))
+        Ok((Recording::of_frames(made?, ring), vars))
     })
 }
 
 /// Mean and standard deviation of the normal of each `ln var` before it is truncated to the prior's range, by the batch fit [N].
 #[pyfunction]
 pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult<(Vec<f32>, Vec<f32>)> {
-    let frames = recording.expect_frames()?;
+    let frames = recording.frames_of(&ring.ring)?;
     py.detach(|| {
         let campaign = command::campaign(&ring.ring, frames).map_err(raised)?;
         let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
@@ -73,23 +74,26 @@ pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult
 
 /// Blind campaigns through the diagnosis, as of `orbitcal validate`.
 #[pyclass(frozen, module = "orbitcal._orbitcal")]
+#[derive(Clone)]
 pub struct Validation {
     ring: twin::Ring,
     template: inference::Recording,
-    terms: Vec<Term>,
+    terms: Arc<[Term]>,
 }
 
 #[pymethods]
 impl Validation {
     /// With settings, read-backs and gaps of a recording.
     #[new]
-    fn new(ring: &Ring, template: &Recording) -> PyResult<Self> {
-        let template = template.expect_frames()?;
+    fn new(py: Python<'_>, ring: &Ring, template: &Recording) -> PyResult<Self> {
+        let template = template.frames_of(&ring.ring)?;
         let (ring, template) = (ring.ring.clone(), (**template).clone());
-        let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
-        let data = Data::of(&campaign).map_err(refused)?;
-        let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
-        Ok(Self { ring, template, terms })
+        py.detach(|| {
+            let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
+            let data = Data::of(&campaign).map_err(refused)?;
+            let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
+            Ok(Self { ring, template, terms: terms.into() })
+        })
     }
 
     /// Simulate, diagnose and score case `index` of a class, that of `orbitcal validate`; JSON, or none where its machine keeps no beam.
@@ -101,10 +105,13 @@ impl Validation {
             "unknown" => Class::Unknown,
             _ => return Err(input(format!("class: expected empty, single, pair or unknown, found {kind:?}"))),
         };
-        py.detach(|| {
-            let case = Case::draw(&self.ring, &self.terms, class, class as usize * OF_CLASS + index, seed);
-            let outcome = validation::run(&self.ring, &self.template, &case).map_err(refused)?;
-            outcome.map(|outcome| serde_json::to_string(&outcome).map_err(other)).transpose()
+        let this = self.clone();
+        task::run(py, None, move |_| {
+            let case = Case::draw(&this.ring, &this.terms, class, class as usize * OF_CLASS + index, seed);
+            let outcome = validation::run(&this.ring, &this.template, &case)?;
+            let text =
+                |outcome| serde_json::to_string(&outcome).map_err(|error| CommandError::Other(error.to_string()));
+            outcome.map(text).transpose()
         })
     }
 }

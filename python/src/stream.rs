@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 
 use crate::error::input;
 use crate::estimate::Estimate;
-use crate::recording::Recording;
+use crate::recording::{Data, Recording};
 use crate::ring::Ring;
 
 /// Metres a micrometre.
@@ -41,7 +41,7 @@ impl Core {
         process_noise: f32,
         baseline_walk: f32,
     ) -> PyResult<Self> {
-        let like = like.expect_frames()?;
+        let like = like.frames_of(&ring.ring)?;
         let (ring, like) = (ring.ring.clone(), (**like).clone());
         let walk =
             if follow { stream::FOLLOW } else { stream::walk_per_cycle(&like, process_noise, baseline_walk * MICRO) };
@@ -65,8 +65,9 @@ impl Core {
 
     /// The next frame: one of a recording.
     fn of_recording(&mut self, py: Python<'_>, recording: &Recording, frame: usize) -> PyResult<Estimate> {
-        let frames = recording.expect_frames()?;
-        py.detach(|| self.row(&frames.rows[frame]))
+        let frames = recording.frames_of(&self.ring)?;
+        let row = row_of(frames, frame)?;
+        py.detach(|| self.row(row))
     }
 
     /// The next frame: the only row of the text of a `frames.csv`.
@@ -79,8 +80,10 @@ impl Core {
     /// Wire bytes of a frame of a recording.
     #[staticmethod]
     fn wire(recording: &Recording, frame: usize) -> PyResult<Vec<u8>> {
-        let frames = recording.expect_frames()?;
-        stream::wire(frames, &frames.rows[frame]).map_err(input)
+        let Data::Frames(frames) = &recording.data else {
+            return Err(input(format!("{} is a measured matrix and has no frames", recording.name())));
+        };
+        stream::wire(frames, row_of(frames, frame)?).map_err(input)
     }
 
     /// How well the model describes the frames so far: chi-square and its degrees of freedom.
@@ -133,6 +136,14 @@ impl Core {
         result.set_item("role", correction.role.iter().map(|role| *role as u32).collect::<Vec<_>>())?;
         Ok(Some(result))
     }
+}
+
+fn row_of(frames: &inference::Recording, frame: usize) -> PyResult<&Row> {
+    let count = frames.rows.len();
+    frames
+        .rows
+        .get(frame)
+        .ok_or_else(|| input(format!("{}: expected a frame below {count}, found {frame}", frames.name)))
 }
 
 impl Core {

@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use crate::error::other;
 use crate::estimate::Estimate;
 
-/// How often signals are looked at.
-const OFTEN: Duration = Duration::from_millis(50);
+/// How often the shared memory is looked at: it belongs to this thread, which sleeps in between, so that others have Python.
+const OFTEN: Duration = Duration::from_millis(1);
 
 /// A reader of published estimates; see `orbitcal.Subscriber`.
 #[pyclass(unsendable, module = "orbitcal._orbitcal")]
@@ -25,21 +25,19 @@ impl Subscriber {
         Ok(Self { subscriber: shared_memory::Subscriber::try_new(service).map_err(other)? })
     }
 
-    /// Everything that has arrived, in order; waits for something until the time [s] is over. Other threads of Python wait with it for up to
-    /// 0.05 s: the shared memory belongs to this thread.
+    /// Everything that has arrived, in order; waits for something until the time [s] is over, while other threads of Python run.
     fn wait(&mut self, py: Python<'_>, timeout: f64) -> PyResult<Vec<Estimate>> {
         let end = Instant::now() + Duration::from_secs_f64(timeout.clamp(0.0, 1e9));
         loop {
+            let published = self.subscriber.wait(Duration::ZERO).map_err(other)?;
             let left = end.saturating_duration_since(Instant::now());
-            let published = self.subscriber.wait(left.min(OFTEN)).map_err(other)?;
-            py.check_signals()?;
             if !published.is_empty() || left.is_zero() {
                 let each =
                     published.into_iter().map(|one| Estimate::of(one.record, Some(one.stamp.publisher.to_string())));
                 return Ok(each.collect());
             }
-            // let another thread have its turn
-            py.detach(|| ());
+            py.detach(|| std::thread::sleep(left.min(OFTEN)));
+            py.check_signals()?;
         }
     }
 }

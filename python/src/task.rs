@@ -11,7 +11,7 @@ use std::thread::JoinHandle;
 use host_bridge::command::CommandError;
 use pyo3::prelude::*;
 
-use crate::error::raised;
+use crate::error::{other, raised};
 
 /// How often signals are looked at.
 const OFTEN: Duration = Duration::from_millis(50);
@@ -24,7 +24,7 @@ enum News<T> {
     Result(Result<T, CommandError>),
 }
 
-/// Where work says how far it is; it ends there once nobody waits for it any more.
+/// Where work says how far it is; it ends there when its result is no longer wanted.
 pub struct Progress<T> {
     news: Sender<News<T>>,
     is_over: Arc<AtomicBool>,
@@ -100,10 +100,10 @@ fn wait<T: Send>(py: Python<'_>, heard: &mut Receiver<News<T>>) -> Result<News<T
     py.detach(move || heard.recv_timeout(OFTEN))
 }
 
-/// A worker that has not said its result has panicked, and so does this.
+/// A worker that has not said its result has panicked: a fault of the program, as an exception that `except Exception` hears.
 fn panicked(worker: JoinHandle<()>) -> PyErr {
-    match worker.join() {
-        Err(panic) => resume_unwind(panic),
-        Ok(()) => unreachable!("a worker ends with a result"),
-    }
+    let said = worker.join().err().and_then(|panic| {
+        panic.downcast_ref::<String>().cloned().or_else(|| panic.downcast_ref::<&str>().map(|&text| text.to_owned()))
+    });
+    other(format!("a fault of the program: {}", said.unwrap_or_else(|| "it has no words".into())))
 }

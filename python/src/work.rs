@@ -22,6 +22,9 @@ use crate::task;
 
 /// How a measured matrix is fitted.
 fn settings(ring: &Ring, rf: Option<&str>) -> PyResult<Settings> {
+    if let Some([low, high]) = ring.range() {
+        return Err(input(format!("a matrix is fitted without a range of the vars, found {low} to {high}")));
+    }
     let mut settings = Settings { rf: rf.map_or(Ok(twin::Rf::FixedFrequency), rf_of)?, ..Settings::default() };
     settings.widths.strength = ring.width().unwrap_or(settings.widths.strength);
     Ok(settings)
@@ -43,6 +46,7 @@ pub fn fit(
     rf: Option<&str>,
     hear: Option<Bound<'_, PyAny>>,
 ) -> PyResult<Outcome> {
+    recording.expect(&ring.ring)?;
     match &recording.data {
         Data::Frames(frames) => {
             expect_no_rf(rf)?;
@@ -78,9 +82,7 @@ pub fn sample<'py>(
     seed: u64,
     hear: Option<Bound<'py, PyAny>>,
 ) -> PyResult<(Outcome, Bound<'py, PyDict>)> {
-    let Data::Frames(frames) = &recording.data else {
-        return Err(input(format!("sample is for a recording; {} is a measured matrix", recording.name())));
-    };
+    let frames = recording.frames_of(&ring.ring)?;
     let model = match model {
         "twin" => FitModel::Twin,
         "green" => FitModel::Green,
@@ -140,6 +142,7 @@ pub fn diagnose(
     rf: Option<&str>,
     hear: Option<Bound<'_, PyAny>>,
 ) -> PyResult<Outcome> {
+    recordings.iter().try_for_each(|one| one.expect(&ring.ring))?;
     if let [one] = recordings.as_slice()
         && let Data::Matrix(folder) = &one.data
     {
@@ -180,17 +183,17 @@ pub fn compare(
     hear: Option<Bound<'_, PyAny>>,
 ) -> PyResult<Outcome> {
     let names = [before.name().to_owned(), after.name().to_owned()];
-    let (ring_of, settings) = (ring.ring.clone(), settings(ring, None)?);
+    [before, after].into_iter().try_for_each(|one| one.expect(&ring.ring))?;
     match (&before.data, &after.data) {
         (Data::Frames(before), Data::Frames(after)) => {
-            let (before, after) = (Arc::clone(before), Arc::clone(after));
+            let (ring, before, after) = (ring.ring.clone(), Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let step = |step| progress.step("Gauss-Newton", step);
-                with_page(compared::of_recordings(&ring_of, [&before, &after], step)?, names)
+                with_page(compared::of_recordings(&ring, [&before, &after], step)?, names)
             })
         }
         (Data::Matrix(before), Data::Matrix(after)) => {
-            let (before, after) = (Arc::clone(before), Arc::clone(after));
+            let (settings, before, after) = (settings(ring, None)?, Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let mut say = |what: &str| progress.say(what);
                 with_page(compared::of_matrices([&before, &after], &settings, &mut say)?, names)

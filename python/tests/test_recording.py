@@ -91,6 +91,59 @@ def test_numbers_alone_need_an_order(matrix, twelve_cells):
         orbitcal.Recording.from_response(numbers, ring, order="planes", **dict(words, kick_sign="up"))
 
 
+WORDS = dict(orbit_unit="mm", kick=(0.2, 0.15), kick_is="full", kick_sign="x+y+", noise=0.002)
+
+
+def test_names_of_the_ring_are_those_of_findings_and_tables(twelve_cells):
+    ring = orbitcal.Ring.from_pyat(twelve_cells)
+    assert ring.monitors[0].startswith("x_BPM.") and ring.correctors[-1].startswith("V_COR.")
+    response = ring.response().to_pandas()
+    made = orbitcal.Recording.from_response(0.2 * response, ring, **dict(WORDS, kick=0.2))
+    assert list(made.matrix.monitor.values) == ring.monitors
+    x, y = made.check()["agreement"]
+    assert abs(x["factor"] - 1) < 0.1 and abs(y["factor"] - 1) < 1e-6  # in x the path length is held, by default
+    ring.response(effects=[{"kind": "bpm_gain", "at": ring.monitors[3], "amplitude": 0.1}])
+
+
+def test_a_matrix_is_modelled_by_the_ring_with_its_factors(twelve_cells):
+    ring = orbitcal.Ring.from_pyat(twelve_cells)
+    stronger = ring.with_vars({name: 1.003 for name in ring.vars.index[:4]})
+    made = orbitcal.Recording.from_response(0.2 * stronger.response().to_pandas(), stronger, **dict(WORDS, kick=0.2))
+    of_file = orbitcal.Recording.from_response(0.2 * stronger.response().to_pandas(), ring, **dict(WORDS, kick=0.2))
+    of = lambda one: one.check()["agreement"][1]["largest_difference_mm"]
+    assert of(made) < 1e-9 < 1e-3 < of(of_file)
+
+
+def test_what_a_matrix_cannot_use_is_refused(matrix, twelve_cells, booster):
+    ring = orbitcal.Ring.from_pyat(twelve_cells)
+    numbers = np.loadtxt(IMPORTS / "response.txt")
+    with pytest.raises(orbitcal.InputError, match="expected dispersion and rf_step together"):
+        orbitcal.Recording.from_response(numbers, ring, order="planes", dispersion=np.zeros(24), **WORDS)
+    with pytest.raises(orbitcal.InputError, match="a matrix is fitted without a range"):
+        orbitcal.fit(matrix, ring.with_priors(range=(0.9, 1.1)))
+    with pytest.raises(orbitcal.InputError, match="expected its ring, .* found AGS Booster"):
+        orbitcal.fit(matrix, booster)
+
+
+def test_a_recording_of_another_ring_is_refused(paper_vars):
+    ten_cells = orbitcal.Ring(RECORDINGS / "ten-cells/ring.json")
+    for work in (orbitcal.fit, orbitcal.sample, lambda one, ring: orbitcal.diagnose(one, ring=ring)):
+        with pytest.raises(orbitcal.InputError, match="paper-vars: expected its ring, AGS Booster .* found"):
+            work(paper_vars, ten_cells)
+    with pytest.raises(orbitcal.InputError, match="expected its ring"):
+        orbitcal.Estimator(ten_cells, paper_vars)
+
+
+def test_a_recording_of_another_energy_is_pickled(paper_vars, booster, tmp_path):
+    folder = paper_vars.write(tmp_path / "earlier")
+    header = (folder / "header.toml").read_text().replace("kinetic_energy_GeV = 1.5", "kinetic_energy_GeV = 1.0")
+    (folder / "header.toml").write_text(header)
+    earlier = orbitcal.Recording.read(folder, booster, any_energy=True)
+    again = pickle.loads(pickle.dumps(earlier))
+    assert again.header["kinetic_energy_GeV"] == 1.0
+    pd.testing.assert_frame_equal(again.frames, earlier.frames)
+
+
 def test_a_matrix_is_diagnosed_fitted_and_written(matrix, tmp_path):
     diagnosis = orbitcal.diagnose(matrix, progress=False)
     assert diagnosis.verdict == "identified" and diagnosis.findings[0].kind == "bpm_swap"
@@ -100,3 +153,8 @@ def test_a_matrix_is_diagnosed_fitted_and_written(matrix, tmp_path):
     assert result.wiring == [{"kind": "bpm_swap", "at": "x_BPM.22,x_BPM.52"}]
     again = orbitcal.Recording.read(matrix.write(tmp_path / "my-ring"))
     assert again.matrix.equals(matrix.matrix)
+    # its ring is that of its lattice, and takes the fit
+    assert again.ring.monitors == matrix.ring.monitors
+    calibrated = again.ring.with_vars(orbitcal.fit(again))
+    assert calibrated.vars["QF.2"] == result.means["QF.2"]
+    again.ring.to_pyat(orbitcal.fit(again))

@@ -107,6 +107,13 @@ def test_optics_are_those_of_pyat(booster):
     np.testing.assert_allclose(own.dispersion.values[0], of_pyat.dispersion[:, 0], rtol=1e-4)
 
 
+def test_optics_are_those_at_the_momentum_that_the_rf_leaves(booster):
+    effect = ["momentum_offset=0.002"]
+    moved, plain = booster.optics(effects=effect), booster.optics(rf="fixed-frequency")
+    assert abs(moved.attrs["tune_x"] - plain.attrs["tune_x"]) > 1e-4
+    assert booster.optics().attrs["tune_x"] == plain.attrs["tune_x"], "without an effect the frequency is the design's"
+
+
 def test_a_pyat_lattice_comes_in_and_goes_out(twelve_cells):
     ring = orbitcal.Ring.from_pyat(twelve_cells)
     assert (len(ring.monitors), len(ring.correctors), len(ring.quadrupoles)) == (24, 24, 24)

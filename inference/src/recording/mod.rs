@@ -84,9 +84,15 @@ impl Recording {
     /// # Errors
     /// As [`Recording::read`].
     pub fn read_at_its_energy(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        let energy = header::kinetic_energy(&text(&folder.join(HEADER))?);
-        let ring = energy.map_or(Cow::Borrowed(ring), |energy| at_energy(ring, energy));
-        Self::read(folder, &ring)
+        Self::read(folder, &at_its_energy(ring, &text(&folder.join(HEADER))?))
+    }
+
+    /// The same from the texts of the two files, as [`Recording::parse`].
+    ///
+    /// # Errors
+    /// As [`Recording::read`].
+    pub fn parse_at_its_energy(folder: &Path, ring: &Ring, header: &str, frames: &str) -> Result<Self, RecordingError> {
+        Self::parse(folder, &at_its_energy(ring, header), header, frames)
     }
 
     /// The ring as the recording's supplies power it: its own in format 2; in format 1 one for the focusing quadrupoles and
@@ -118,6 +124,11 @@ impl Recording {
         let largest = if self.rows.iter().any(|row| !row.correctors.is_empty()) { set } else { read_back() };
         if largest > IDLE { largest } else { 1.0 }
     }
+}
+
+/// The ring at the energy that a header states.
+fn at_its_energy<'r>(ring: &'r Ring, header: &str) -> Cow<'r, Ring> {
+    header::kinetic_energy(header).map_or(Cow::Borrowed(ring), |energy| at_energy(ring, energy))
 }
 
 /// Kick below which a corrector is idle [rad]: the scatter of its read-back.

@@ -8,7 +8,7 @@
 use serde_json::Value;
 
 use super::element::{Element, Format, Lattice, Role};
-use super::fields::{Fields, Strengths, give};
+use super::fields::{DISPLACED, Fields, KICKS, NONE, ROLLED, Strengths, give};
 use crate::error::MeasuredError;
 use crate::folder::Particle;
 
@@ -34,6 +34,9 @@ const FIELD_FREE: [&str; 14] = [
 /// Classes of magnets.
 const MAGNETS: [&str; 8] =
     ["Dipole", "Bend", "Quadrupole", "Sextupole", "Octupole", "Multipole", "ThinMultipole", "VariableThinMultipole"];
+
+/// What the names of pass methods contain that track a magnet's field.
+const FIELDS: [&str; 4] = ["Pole", "Bend", "Bnd", "Quad"];
 
 /// Read it.
 pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> {
@@ -83,24 +86,49 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         lattice.elements.push(one);
         return Ok(());
     }
-    if MAGNETS.contains(&class) {
+    displaced(lattice, &one, fields);
+    let pass = fields.value.get("PassMethod").and_then(Value::as_str).unwrap_or_default();
+    let is_off = ["IdentityPass", "DriftPass", "ExactDriftPass"].contains(&pass);
+    if MAGNETS.contains(&class) && !is_off {
+        if !pass.is_empty() && !FIELDS.iter().any(|part| pass.contains(part)) {
+            return Err(fields.wrong(format!("pass method {pass} of a {class} is not known here")));
+        }
         dipole(&mut one, fields)?;
         return give(lattice, one, strengths(fields)?);
     }
-    let does_nothing = fields.value.get("PassMethod").and_then(Value::as_str) == Some("IdentityPass");
-    if FIELD_FREE.contains(&class) || does_nothing {
+    if FIELD_FREE.contains(&class) || is_off {
+        if is_off && fields.number("BendingAngle")? != 0.0 {
+            return Err(fields.wrong(format!("pass method {pass} of a dipole, whose angle the reference orbit needs")));
+        }
         lattice.elements.push(one);
         return Ok(());
     }
     Err(fields.wrong(format!("class {class} acts on the orbit and is not known here")))
 }
 
+/// What moves the orbit that the twin begins with is said.
+fn displaced(lattice: &mut Lattice, one: &Element, fields: &Fields) {
+    if fields.has_from("KickAngle", 0) {
+        lattice.leave_out(KICKS);
+    }
+    if fields.has_from("T1", 0) || fields.has_from("T2", 0) {
+        lattice.leave_out(DISPLACED);
+    }
+    if one.role != Role::Other && tilt(fields).abs() > NONE {
+        lattice.leave_out(ROLLED);
+    }
+}
+
 fn dipole(one: &mut Element, fields: &Fields) -> Result<(), MeasuredError> {
     one.bend = fields.number("BendingAngle")?;
     one.edge_in = fields.number("EntranceAngle")?;
     one.edge_out = fields.number("ExitAngle")?;
-    let (first, last) = (fields.number("FringeInt1")?, fields.number("FringeInt2")?);
-    one.set_fringe(fields.number("FullGap")? * first, fields.number("FullGap")? * last);
+    // method 0 of a side leaves the soft edge out, and keeps the angle
+    let soft = |side: &str, integral: &str| {
+        let is_on = fields.maybe(&format!("FringeBend{side}"))? != Some(0.0);
+        Ok::<_, MeasuredError>(if is_on { fields.number("FullGap")? * fields.number(integral)? } else { 0.0 })
+    };
+    one.set_fringe(soft("Entrance", "FringeInt1")?, soft("Exit", "FringeInt2")?);
     Ok(())
 }
 
@@ -116,6 +144,7 @@ fn strengths(fields: &Fields) -> Result<Strengths, MeasuredError> {
     Ok(Strengths {
         k1,
         k2: of(2)?.map(|one| 2.0 * one),
+        is_dipole: of(0)?.iter().any(|field| field.abs() > NONE),
         is_higher: fields.has_from("PolynomB", 3) || fields.has_from("PolynomA", 3),
         tilt: tilt(fields),
     })

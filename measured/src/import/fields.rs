@@ -8,6 +8,14 @@ use crate::error::MeasuredError;
 /// Below this a stray number is rounding, and no field.
 pub(super) const NONE: f64 = 1e-12;
 
+/// Left out: what moves the orbit about which the response is measured.
+pub(super) const KICKS: &str =
+    "kicks of correctors and dipole fields beside the reference orbit's (the orbit is straight)";
+/// See [`KICKS`].
+pub(super) const DISPLACED: &str = "displacements (magnets stand on the reference orbit)";
+/// Left out of an instrument.
+pub(super) const ROLLED: &str = "rolls of monitors and correctors";
+
 /// One element's object.
 pub(super) struct Fields<'a> {
     pub file: &'a str,
@@ -67,6 +75,8 @@ pub(super) struct Strengths {
     pub k1: [f64; 2],
     /// Field index 2: normal, skew.
     pub k2: [f64; 2],
+    /// It has a dipole field besides that of the reference orbit.
+    pub is_dipole: bool,
     /// It has higher fields.
     pub is_higher: bool,
     /// Angle by which it is rolled from x to y [rad].
@@ -98,6 +108,9 @@ pub(super) fn give(lattice: &mut Lattice, mut element: Element, of: Strengths) -
     }
     if element.is_fringe_uneven {
         lattice.leave_out("soft edges unlike at entrance and exit (their mean is at both)");
+    }
+    if of.is_dipole {
+        lattice.leave_out(KICKS);
     }
     if of.is_higher {
         lattice.leave_out("octupole or higher field (none to first order on the reference orbit)");

@@ -155,6 +155,13 @@ pub(super) fn names(lattice: &Lattice) -> Vec<String> {
     numbered.collect()
 }
 
+/// Names of monitors and of correctors in a table, in the order in which the ring of the lattice has them.
+pub fn table_names(lattice: &Lattice, instruments: &Instruments) -> [Vec<String>; 2] {
+    let names = names(lattice);
+    [&instruments.monitors, &instruments.correctors]
+        .map(|all| in_order(all, Order::Planes).into_iter().map(|channel| label(channel, &names)).collect())
+}
+
 /// Name of a channel in a table: `x:BPM[3]`.
 pub(super) fn label((element, plane): Channel, names: &[String]) -> String {
     format!("{}:{}", if plane == Plane::X { "x" } else { "y" }, names[element])

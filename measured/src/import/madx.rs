@@ -185,9 +185,11 @@ impl Row<'_> {
     fn strengths(&self, length: f64) -> Result<Strengths, MeasuredError> {
         let per = if length > 0.0 { length } else { 1.0 };
         let of = |column: &str| Ok::<_, MeasuredError>(self.number(column)? / per);
+        let kicks = [self.optional("HKICK")?, self.optional("VKICK")?];
         Ok(Strengths {
             k1: [of("K1L")?, of("K1SL")?],
             k2: [of("K2L")?, 0.0],
+            is_dipole: kicks.into_iter().flatten().any(|kick| kick != 0.0),
             is_higher: self.number("K3L")?.abs() > NONE,
             tilt: self.number("TILT")?,
         })

@@ -31,7 +31,7 @@ pub use assemble::{Measurement, assemble, bare};
 pub use conventions::{Conventions, KickIs, Missing, OrbitUnit, PerInstrument, Signs};
 pub use element::{Element, Format, Lattice, Role};
 pub use input::Input;
-pub use instruments::{Instrument, Instruments, Order};
+pub use instruments::{Instrument, Instruments, Order, table_names};
 pub use loco::{Lacking, Loco};
 pub use pattern::Pattern;
 pub use table::Table;

@@ -185,5 +185,5 @@ fn strengths(fields: &Fields, length: f64) -> Result<Strengths, MeasuredError> {
     };
     let both = |order| Ok::<_, MeasuredError>([of(order, "n")?, of(order, "s")?]);
     let tilt = fields.group("BodyShiftP").number("z_rot")? + fields.group("BendP").number("tilt_ref")?;
-    Ok(Strengths { k1: both(1)?, k2: both(2)?, is_higher: both(3)? != [0.0; 2], tilt })
+    Ok(Strengths { k1: both(1)?, k2: both(2)?, is_dipole: both(0)? != [0.0; 2], is_higher: both(3)? != [0.0; 2], tilt })
 }

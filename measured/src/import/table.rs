@@ -81,6 +81,21 @@ impl Table {
         Ok(table)
     }
 
+    /// With other names of lines and columns: pairs of the name that stands there and that which shall; the rest stay.
+    #[must_use]
+    pub fn renamed(mut self, lines: &[(String, String)], columns: &[(String, String)]) -> Self {
+        let of = |all: &[(String, String)], name: &String| {
+            all.iter().find(|(from, _)| from == name).map(|(_, to)| to.clone())
+        };
+        for row in &mut self.rows {
+            row.name = row.name.take().map(|name| of(lines, &name).unwrap_or(name));
+        }
+        for name in self.columns.iter_mut().flatten() {
+            *name = of(columns, name).unwrap_or_else(|| name.clone());
+        }
+        self
+    }
+
     fn line(&self, number: usize, mut cells: Vec<String>) -> Result<Line, MeasuredError> {
         let name = (!is_number(&cells[0])).then(|| cells.remove(0));
         let values = cells.iter().map(|cell| match cell.as_str() {

@@ -8,7 +8,7 @@
 use serde_json::{Map, Value};
 
 use super::element::{Element, Format, Lattice, Role};
-use super::fields::{Fields, NONE, Strengths, give};
+use super::fields::{DISPLACED, Fields, NONE, Strengths, give};
 use crate::error::MeasuredError;
 use crate::folder::Particle;
 
@@ -30,7 +30,11 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
             return lattice
                 .refuse(format!("element {name} of element_names, or what it replicates, is not among the elements"));
         };
-        element(&mut lattice, &Fields { file, name, value })?;
+        let fields = Fields { file, name, value };
+        match class(value) {
+            "DriftSlice" | "DriftExactSlice" => lattice.elements.push(slice(&fields, elements)?),
+            _ => element(&mut lattice, &fields)?,
+        }
     }
     Ok(lattice)
 }
@@ -69,6 +73,9 @@ fn reference(lattice: &mut Lattice, value: &Value) -> Result<(), MeasuredError> 
 
 fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> {
     let class = class(fields.value);
+    if fields.number("shift_x")? != 0.0 || fields.number("shift_y")? != 0.0 {
+        lattice.leave_out(DISPLACED);
+    }
     let mut one = Element {
         name: fields.name.into(),
         kind: class.into(),
@@ -112,20 +119,45 @@ fn bend(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result<(), 
             one.bend
         )));
     }
-    let rectangular = if class(fields.value) == "RBend" { one.bend / 2.0 } else { 0.0 };
-    one.edge_in = rectangular + fields.number("edge_entry_angle")?;
-    one.edge_out = rectangular + fields.number("edge_exit_angle")?;
-    let soft = |side: &str| {
-        Ok::<_, MeasuredError>(
-            2.0 * fields.number(&format!("edge_{side}_fint"))? * fields.number(&format!("edge_{side}_hgap"))?,
-        )
-    };
-    one.set_fringe(soft("entry")?, soft("exit")?);
+    let (edge_in, soft_in) = edge(fields, "entry", one.bend)?;
+    let (edge_out, soft_out) = edge(fields, "exit", one.bend)?;
+    (one.edge_in, one.edge_out) = (edge_in, edge_out);
+    one.set_fringe(soft_in, soft_out);
     let strengths = strengths(fields, one.length)?;
     if strengths.k1[0] != 0.0 && fields.value.get("rbend_model").and_then(Value::as_str) == Some("straight-body") {
         lattice.leave_out("the straight body of a dipole with a gradient (taken as curved)");
     }
     give(lattice, one, strengths)
+}
+
+/// Angle of an edge against a sector dipole's [rad], and fringe integral times full gap [m]; none of an edge that is switched off.
+fn edge(fields: &Fields, side: &str, bend: f64) -> Result<(f64, f64), MeasuredError> {
+    let key = |what: &str| format!("edge_{side}_{what}");
+    let switch = fields.value.get(&key("active"));
+    let is_off = switch.is_some_and(|on| on.as_f64() == Some(0.0) || on.as_bool() == Some(false));
+    let model = fields.value.get(&key("model")).and_then(Value::as_str).unwrap_or("linear");
+    match model {
+        "linear" | "full" | "dipole-only" if !is_off => {
+            let rectangular = if class(fields.value) == "RBend" { bend / 2.0 } else { 0.0 };
+            let soft = 2.0 * fields.number(&key("fint"))? * fields.number(&key("hgap"))?;
+            Ok((rectangular + fields.number(&key("angle"))?, soft))
+        }
+        "linear" | "full" | "dipole-only" | "suppressed" => Ok((0.0, 0.0)),
+        _ => {
+            Err(fields
+                .wrong(format!("{}: expected linear, full, dipole-only or suppressed, found {model}", key("model"))))
+        }
+    }
+}
+
+/// What is left of a drift where something was inserted.
+fn slice(fields: &Fields, elements: &Map<String, Value>) -> Result<Element, MeasuredError> {
+    let whole = fields.value.get("parent_name").and_then(Value::as_str).unwrap_or_default();
+    let Some(value) = elements.get(whole) else {
+        return Err(fields.wrong(format!("expected its drift {whole:?} among the elements")));
+    };
+    let length = Fields { value, ..*fields }.number("length")? * fields.number("weight")?;
+    Ok(Element { name: fields.name.into(), kind: class(fields.value).into(), length, ..Element::default() })
 }
 
 /// Thin, or thick and field-free where it has no strengths.
@@ -153,5 +185,7 @@ fn strengths(fields: &Fields, length: f64) -> Result<Strengths, MeasuredError> {
         ])
     };
     let is_higher = fields.has_from("knl", 3) || fields.has_from("ksl", 3) || of(3)? != [0.0; 2];
-    Ok(Strengths { k1: of(1)?, k2: of(2)?, is_higher, tilt: fields.number("rot_s_rad")? })
+    let dipole = [fields.at("knl", 0)?, fields.at("ksl", 0)?, fields.number("k0s")?];
+    let is_dipole = dipole.iter().any(|field| field.abs() > NONE);
+    Ok(Strengths { k1: of(1)?, k2: of(2)?, is_dipole, is_higher, tilt: fields.number("rot_s_rad")? })
 }
