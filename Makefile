@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python notebooks
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -168,6 +168,10 @@ python: build ## the Python package: its wheel in python/dist, tested in a fresh
 	.venv-python/bin/maturin build --quiet --release --locked --manifest-path python/Cargo.toml --out python/dist
 	.venv-python/bin/pip install --quiet "$$(ls python/dist/orbitcal-*.whl)[test]"
 	ORBITCAL=$(CURDIR)/$(ORBITCAL) .venv-python/bin/python -m pytest --quiet python/tests
+
+slurm: ## an ensemble over dask-jobqueue on a Slurm of one node, one of two jobs cancelled halfway, in the environment that make python leaves; two minutes
+	@[ -x /usr/sbin/slurmctld ] || { apt-get update && apt-get install -y --no-install-recommends slurm-wlm munge; }
+	.venv-python/bin/python -m pytest --quiet python/tests/test_slurm.py
 
 notebooks: ## the notebooks in docs/python anew, in the environment that make python leaves
 	.venv-python/bin/python python/notebooks/render.py
