@@ -84,6 +84,24 @@ def test_a_run_goes_on_where_it_was(cluster, tmp_path):
     assert len(ensemble.run(Toy(), range(20), tmp_path, client=cluster, progress=False)) == 20
 
 
+def test_workers_that_come_late_have_work_too(tmp_path):
+    """A cluster gives its workers when it has them: here none is there at first, and then six."""
+
+    def task(seed):
+        start = time.time()
+        time.sleep(0.3)
+        return {"start": start, "end": time.time()}
+
+    with (
+        LocalCluster(n_workers=0, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
+        Client(cluster) as client,
+    ):
+        threading.Timer(1.0, cluster.scale, [6]).start()
+        table = ensemble.run(task, range(48), tmp_path, client=client, progress=False)
+    at_once = [((table["start"] <= start) & (start < table["end"])).sum() for start in table["start"]]
+    assert max(at_once) == 6
+
+
 def test_poison_is_set_aside_with_its_error(cluster, tmp_path):
     task = Toy(raising=[5], killing=[3])
     table = ensemble.run(task, range(8), tmp_path, client=cluster, progress=False)

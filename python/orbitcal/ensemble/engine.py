@@ -23,7 +23,8 @@ Task = Callable[[int], dict[str, Any]]
 Costs = pd.DataFrame
 Result = tuple[int, dict[str, Any] | None, str, float, str]  # seed, row, error, seconds, worker
 
-AHEAD = 4  # tasks a worker that are handed out at once
+AHEAD = 4  # tasks a thread of a worker that are handed out at once
+LOOK = 1.0  # seconds after which the threads are counted again
 ROWS = 200  # of a part at most
 SECONDS = 10.0  # after which what has come is written, if it is less
 FOLDERS = ("rows", "costs", "failures")
@@ -75,14 +76,14 @@ def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: 
 
     name = f"orbitcal-{uuid.uuid4().hex}"
     client.register_plugin(_carrier(name, cloudpickle.dumps(task)))
-    ahead = AHEAD * max(1, len(client.scheduler_info()["workers"]))
+    ahead = _Ahead(client)
     rest = iter(seeds)
     submit = lambda seed, word="": client.submit(_one, name, seed, key=f"{name}{word}-{seed}", pure=False)
     suspects: list[int] = []
     try:
         with tqdm(total=total, initial=total - len(seeds), desc=store.what, disable=not progress) as bar:
             bar.set_postfix_str(client.dashboard_link or "")
-            coming = as_completed([submit(seed) for seed in islice(rest, ahead)])
+            coming = as_completed([submit(seed) for seed in islice(rest, ahead.count())])
             for future in coming:
                 try:
                     store.take(*_result(future))
@@ -90,7 +91,7 @@ def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: 
                 except KilledWorker:
                     suspects.append(_seed(future))
                 future.release()
-                for seed in islice(rest, 1):
+                for seed in islice(rest, max(0, ahead.count() - coming.count())):
                     coming.add(submit(seed))
             # dask suspects all that a worker held when it died; alone it is seen which of them kills
             for seed in suspects:
@@ -102,6 +103,19 @@ def _all(task: Task, seeds: list[int], client: Client, store: _Store, progress: 
     finally:
         store.flush()
         client.unregister_worker_plugin(name)
+
+
+class _Ahead:
+    """How many tasks may be out: workers come when a cluster has them, and go."""
+
+    def __init__(self, client: Client) -> None:
+        self.client, self._count, self._looked = client, 0, float("-inf")
+
+    def count(self) -> int:
+        if time.monotonic() - self._looked > LOOK:
+            self._count = AHEAD * max(1, sum(self.client.nthreads().values()))
+            self._looked = time.monotonic()
+        return self._count
 
 
 def _carrier(name: str, payload: bytes) -> Any:
