@@ -45,7 +45,7 @@ def test_bytes_rows_and_recordings_are_the_same_frames(booster, paper_vars, last
 
 def test_a_frame_that_cannot_be_is_refused(booster, paper_vars):
     estimator = orbitcal.Estimator(booster, paper_vars.header)
-    with pytest.raises(orbitcal.InputError, match="expected a first frame by names"):
+    with pytest.raises(orbitcal.InputError, match="expected a first frame with the names of its columns"):
         estimator.update(b"\0")
     row = paper_vars.frames.iloc[0].drop("x_E4_mm")
     with pytest.raises(orbitcal.InputError, match="x_E4_mm"):
@@ -55,13 +55,27 @@ def test_a_frame_that_cannot_be_is_refused(booster, paper_vars):
         estimator.update(b"\1\2\3\0")
 
 
+def test_an_empty_cell_is_a_missing_reading(booster, paper_vars):
+    """As NaN, as None and as pandas' NA."""
+    means = []
+    for empty in (np.nan, None, pd.NA):
+        row = paper_vars.frames.iloc[0].astype(object)
+        row["x_E4_mm"] = empty
+        estimate = orbitcal.Estimator(booster, paper_vars.header).update(row)
+        assert estimate.reading[booster.monitors.index("x_E4")] == 0
+        means.append(estimate.mean)
+    np.testing.assert_array_equal(means[1:], [means[0], means[0]])
+
+
 def test_a_feedback_says_its_set_points(booster, paper_vars):
     estimator = orbitcal.Estimator(booster, paper_vars)
     assert estimator.correction is None
+    made = []
     estimator.steer({"x_E4": 1e-3}, correctors=["H_A4", "H_C4"])
     for _ in estimator.stream(paper_vars):
-        pass
-    made = estimator.correction
+        made.append(estimator.correction)
+    print(made[-1].role[made[-1].role!="unused"], made[-1].hold, made[-1].setpoint.abs().max(), [m.hold for m in made][::30], max(abs(m.setpoint).max() for m in made))
+    made = made[-1]
     assert list(made.setpoint.index) == booster.correctors
     assert set(made.role[made.role != "unused"].index) <= {"H_A4", "H_C4"}
     with pytest.raises(orbitcal.InputError, match="has no monitor 'x_Z9'"):

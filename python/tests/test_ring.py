@@ -50,6 +50,12 @@ def test_the_response_with_every_effect_is_that_of_pyat(booster):
         assert abs(response.values - known).max() < 2e-3, name
 
 
+def test_one_effect_need_not_be_a_list(booster):
+    rolled = booster.response(effects=["quad_roll@D8=0.01"])
+    for one in ("quad_roll@D8=0.01", {"kind": "quad_roll", "at": "D8", "amplitude": 0.01}):
+        np.testing.assert_array_equal(booster.response(effects=one), rolled)
+
+
 def test_own_planes_are_rows_of_all_places(booster):
     for effects in ([], ["bpm_gain@x_E4=0.1"], ["quad_roll@D8=0.01"]):
         own, places = booster.response(effects=effects), booster.response(effects=effects, all_places=True)
