@@ -115,6 +115,7 @@ def test_poison_is_set_aside_with_its_error(cluster, tmp_path):
     table = ensemble.run(task, range(8), tmp_path, client=cluster, progress=False)
     assert list(table["seed"]) == [0, 1, 2, 4, 6, 7]
     said = ensemble.failures(tmp_path).set_index("seed")["error"]
+    assert list(said.index) == [3, 5]
     assert said[5] == "ValueError: seed 5 is odd" and said[3].startswith("KilledWorker")
     # and is not tried again
     assert len(ensemble.run(task, range(8), tmp_path, client=cluster, progress=False)) == 6

@@ -106,7 +106,8 @@ def _results(
     """What each seed came to, as it comes, `ahead()` of them out at once; what dask has cancelled or lost is given out again."""
     from distributed import as_completed
 
-    rest, out, lost = iter(seeds), {}, Counter[int]()
+    rest, lost = iter(seeds), Counter[int]()
+    out: dict[Any, int] = {}  # seed of each key
     coming = as_completed(loop=client.loop)  # the client need not be dask's default
     while True:
         for seed in islice(rest, max(0, ahead() - len(out))):
@@ -171,20 +172,20 @@ def _carried(client: Client, task: Task) -> Iterator[str]:
     import cloudpickle
     from distributed import WorkerPlugin
 
-    payload = cloudpickle.dumps(task)
+    payload, key = cloudpickle.dumps(task), f"orbitcal-{uuid.uuid4().hex}"
 
     class Carrier(WorkerPlugin):
+        name = key
+
         def setup(self, worker: Any) -> None:
             self.task = cloudpickle.loads(payload)
 
-    carrier = Carrier()
-    carrier.name = f"orbitcal-{uuid.uuid4().hex}"
-    client.register_plugin(carrier)
+    client.register_plugin(Carrier())
     try:
-        yield carrier.name
+        yield key
     finally:
         with suppress(Exception):  # a worker that has just started has not got it yet, or the scheduler is gone
-            client.unregister_worker_plugin(carrier.name)
+            client.unregister_worker_plugin(key)
 
 
 def _one(name: str, seed: int) -> Result:
@@ -205,11 +206,11 @@ def _task(name: str) -> Task:
     from distributed import get_worker
 
     worker, end = get_worker(), time.monotonic() + PATIENCE
-    while not hasattr(carrier := worker.plugins.get(name), "task"):
+    while (task := getattr(worker.plugins.get(name), "task", None)) is None:
         if time.monotonic() > end:
             raise RuntimeError(f"{worker.address} was not given the task; its log may say why")
         time.sleep(0.05)
-    return carrier.task
+    return task
 
 
 def _killed(seed: int, died: KilledWorker) -> Result:
