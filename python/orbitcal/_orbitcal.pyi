@@ -14,7 +14,7 @@ Reals = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 class InputError(ValueError):
-    """What was given cannot be: where, what was expected and what was found."""
+    """An input is wrong: where, what was expected and what was found."""
 
 class OrbitcalError(RuntimeError):
     """Anything else that went wrong."""

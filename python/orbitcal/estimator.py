@@ -145,7 +145,7 @@ class Estimator:
         """The core, made for the first frame where there was only a header."""
         if self._core is None:
             if text is None or self._header is None:
-                raise _orbitcal.InputError("expected a first frame by names: a header says nothing of wire bytes")
+                raise _orbitcal.InputError("expected a first frame with the names of its columns: a header does not say which readings wire bytes have")
             like = _orbitcal.Recording.parse("stream", self.ring._ring, self._header, text)
             self._core = _orbitcal.Core(self.ring._ring, like, *self._options)
             if self._feedback is not None:
@@ -190,7 +190,7 @@ def _text_of_frame(frame: Mapping[str, Any] | pd.Series) -> str:
 
 
 def _cell(value: Any) -> str:
-    if value is None or isinstance(value, float | np.floating) and np.isnan(value):
+    if pd.isna(value):  # None, NaN and pandas' NA
         return ""
     if isinstance(value, np.generic):
         value = value.item()

@@ -7,6 +7,10 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from ._orbitcal import InputError
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -28,6 +32,8 @@ def _key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_key(str(key))} = {_value(one)}" for key, one in value.items()) + " }"
     if isinstance(value, (list, tuple)):
@@ -38,4 +44,6 @@ def _value(value: Any) -> str:
         return str(value)
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
-    return repr(float(value))
+    if isinstance(value, float):
+        return repr(value)
+    raise InputError(f"header: expected texts, numbers, lists and tables of these, found {value!r}")

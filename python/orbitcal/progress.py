@@ -10,7 +10,7 @@ Hear = Callable[[str, int], None]
 
 @contextmanager
 def bar(what: str, total: int | None, *, is_shown: bool) -> Iterator[Hear | None]:
-    """What work calls with the name of each step and how much is done; `total` is none where nobody knows."""
+    """What work calls with the name of each step and how much is done; `total` is none where it is not known."""
     if not is_shown:
         yield None
         return
@@ -24,3 +24,6 @@ def bar(what: str, total: int | None, *, is_shown: bool) -> Iterator[Hear | None
             shown.refresh()
 
         yield hear
+        if total:  # the work ends between two steps
+            shown.n = total
+            shown.refresh()

@@ -17,7 +17,7 @@ from . import _orbitcal
 from .header import header_of_text, text_of_header
 from .ring import Effect, Ring, words
 
-PerInstrument = float | tuple[float, float] | Mapping[str, float]
+PerInstrument = float | tuple[float, float] | Mapping[str, float] | pd.Series
 
 
 class Recording:
@@ -90,10 +90,10 @@ class Recording:
             _table(matrix),
             order,
             orbit_unit,
-            _per_instrument(kick),
+            _per_instrument("kick", kick),
             kick_is,
             kick_sign,
-            _per_instrument(noise),
+            _per_instrument("noise", noise),
             None if dispersion is None else _table(dispersion),
             rf_step,
             rf_frequency,
@@ -107,12 +107,12 @@ class Recording:
         seed: int,
         *,
         vars: Mapping[str, float] | None = None,
-        effects: Iterable[Effect] = (),
+        effects: Iterable[Effect] | Effect = (),
         exact: bool = True,
     ) -> tuple[Recording, pd.Series]:
         """A campaign that a simulated machine would have given, and the vars that it was made with.
 
-        Settings, read-backs and gaps are those of the template. Without `vars` they are drawn from the ring's prior, of rings that keep their beam. `exact`:
+        Settings, read-backs and gaps are those of the template. Without `vars` they are drawn from the ring's prior, of rings with stable motion. `exact`:
         every frame an exact orbit of misaligned magnets with `effects`, monitors with offsets, noise and jumps, tunes; else the machine of
         the estimator's model. The seed fixes everything.
         """
@@ -133,9 +133,15 @@ class Recording:
 
     @property
     def frames(self) -> pd.DataFrame:
-        """The frames with the columns of `frames.csv`, in format 2; a reading that is missing is NaN."""
+        """The frames with the columns of `frames.csv`, in format 2; a reading that is missing is NaN.
+
+        `setting_A` is a number, or a text such as `22;-22` in all rows where a frame has several correctors.
+        """
         text = self._recording.texts(self.ring._ring)[1]
-        return pd.read_csv(io.StringIO(text), dtype={"corrector": str, "setting_A": str}, keep_default_na=True)
+        frames = pd.read_csv(io.StringIO(text), dtype={"corrector": str, "setting_A": str}, keep_default_na=True)
+        if not frames["setting_A"].str.contains(";", na=False).any():
+            frames["setting_A"] = pd.to_numeric(frames["setting_A"])
+        return frames
 
     @property
     def header(self) -> dict[str, Any]:
@@ -174,6 +180,10 @@ class Recording:
         """Number of frames; 0 of a matrix."""
         return self._recording.frames()
 
+    def __bool__(self) -> bool:
+        """True, though a matrix has no frames."""
+        return True
+
     def __repr__(self) -> str:
         what = "a response matrix" if self.is_matrix else f"{len(self)} frames"
         return f"<orbitcal.Recording {self.name!r}: {what} of {self.ring.name!r}>"
@@ -205,9 +215,17 @@ def _table(values: Any) -> str:
     return "".join(",".join("" if np.isnan(one) else repr(float(one)) for one in row) + "\n" for row in numbers)
 
 
-def _per_instrument(value: PerInstrument) -> str:
-    if isinstance(value, Mapping):
+def _per_instrument(what: str, value: PerInstrument) -> str:
+    try:
+        return _text_per_instrument(value)
+    except (TypeError, ValueError, IndexError):
+        raise _orbitcal.InputError(f"{what}: expected a number, two (x, y), or numbers by name, found {value!r}") from None
+
+
+def _text_per_instrument(value: PerInstrument) -> str:
+    if isinstance(value, (Mapping, pd.Series)):
         return "".join(f"{name},{float(one)!r}\n" for name, one in value.items())
     if isinstance(value, (tuple, list)):
-        return f"x={float(value[0])!r},y={float(value[1])!r}"
+        x, y = value
+        return f"x={float(x)!r},y={float(y)!r}"
     return repr(float(value))

@@ -141,7 +141,7 @@ class Ring:
         return self._ring.supplies
 
     def with_vars(self, vars: Mapping[str, float] | pd.Series | FitResult) -> Ring:
-        """The same ring with factors on its gradients, 1 for those that are not named; of a fit its means."""
+        """The same ring with factors on its gradients, 1 for those that are not named. Of a fit, the factors are its means."""
         if hasattr(vars, "means"):
             vars = vars.means
         return Ring._of(self._ring.with_vars({str(name): float(value) for name, value in vars.items()}))
@@ -151,7 +151,7 @@ class Ring:
         return Ring._of(self._ring.with_priors(width, range))
 
     def response(
-        self, *, effects: Iterable[Effect] = (), rf: Rf = "fixed-momentum", all_places: bool = False
+        self, *, effects: Iterable[Effect] | Effect = (), rf: Rf = "fixed-momentum", all_places: bool = False
     ) -> xr.DataArray:
         """Closed-orbit response to small kicks [m/rad].
 
@@ -182,7 +182,7 @@ class Ring:
         self,
         *,
         by: Literal["var", "quadrupole"] = "var",
-        effects: Iterable[Effect] = (),
+        effects: Iterable[Effect] | Effect = (),
         rf: Rf = "fixed-momentum",
     ) -> xr.DataArray:
         """Exact derivative of `response`, with dimensions (`by`, `monitor`, `corrector`).
@@ -199,7 +199,7 @@ class Ring:
         coords = {by: names, **self._coords()}
         return xr.DataArray(values, coords, (by, "monitor", "corrector"), "response_jacobian", _of_response(unit))
 
-    def optics(self, *, effects: Iterable[Effect] = (), rf: Rf = "fixed-momentum") -> xr.Dataset:
+    def optics(self, *, effects: Effect | Iterable[Effect] = (), rf: Rf = "fixed-momentum") -> xr.Dataset:
         """Linear optics at the entrance of every element and at the end of the ring, at the momentum that `rf` leaves.
 
         `beta` [m], `phase_advance` [rad], `dispersion` [m] and `orbit` [m] with dimensions `plane` (x, y) and `element` [E + 1];
@@ -268,8 +268,10 @@ def _named(elements: Iterable[str]) -> list[str]:
     return [name or f"drift_{next(drifts)}" for name in elements]
 
 
-def words(effects: Iterable[Effect]) -> list[str]:
-    """Effects as texts; findings, and dictionaries as of the JSON, have `kind`, `at` and `amplitude`."""
+def words(effects: Iterable[Effect] | Effect) -> list[str]:
+    """Effects, or one alone, as texts; findings, and dictionaries as of the JSON, have `kind`, `at` and `amplitude`."""
+    if isinstance(effects, (str, Mapping)) or not isinstance(effects, Iterable):
+        effects = [effects]
     return [effect if isinstance(effect, str) else _word(effect) for effect in effects]
 
 

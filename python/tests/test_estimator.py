@@ -45,7 +45,7 @@ def test_bytes_rows_and_recordings_are_the_same_frames(booster, paper_vars, last
 
 def test_a_frame_that_cannot_be_is_refused(booster, paper_vars):
     estimator = orbitcal.Estimator(booster, paper_vars.header)
-    with pytest.raises(orbitcal.InputError, match="expected a first frame by names"):
+    with pytest.raises(orbitcal.InputError, match="expected a first frame with the names of its columns"):
         estimator.update(b"\0")
     row = paper_vars.frames.iloc[0].drop("x_E4_mm")
     with pytest.raises(orbitcal.InputError, match="x_E4_mm"):
@@ -55,15 +55,46 @@ def test_a_frame_that_cannot_be_is_refused(booster, paper_vars):
         estimator.update(b"\1\2\3\0")
 
 
+def test_an_empty_cell_is_a_missing_reading(booster, paper_vars):
+    """As NaN, as None and as pandas' NA."""
+    means = []
+    for empty in (np.nan, None, pd.NA):
+        row = paper_vars.frames.iloc[0].astype(object)
+        row["x_E4_mm"] = empty
+        estimate = orbitcal.Estimator(booster, paper_vars.header).update(row)
+        assert estimate.reading[booster.monitors.index("x_E4")] == 0
+        means.append(estimate.mean)
+    np.testing.assert_array_equal(means[1:], [means[0], means[0]])
+
+
 def test_a_feedback_says_its_set_points(booster, paper_vars):
+    """Two correctors whose currents follow bring an orbit back that one of them has moved by 2 A."""
     estimator = orbitcal.Estimator(booster, paper_vars)
     assert estimator.correction is None
-    estimator.steer({"x_E4": 1e-3}, correctors=["H_A4", "H_C4"])
     for _ in estimator.stream(paper_vars):
         pass
-    made = estimator.correction
+    frames, columns = paper_vars.frames, [f"{name}_mm" for name in booster.monitors]
+    row = frames[frames["setting_A"] == 0].iloc[-1].copy()
+    row["seq"], row["time_s"] = frames[["seq", "time_s"]].iloc[-1]
+    before = row[columns].to_numpy(dtype=float)
+    wanted = dict(zip(booster.monitors, 1e-3 * before, strict=True))
+    estimator.steer(wanted, correctors=["H_A4", "H_C4"], patience=10.0)  # frames are 4 s apart
+    response = booster.response().to_pandas()[["H_A4", "H_C4"]] * paper_vars.header["kick_mrad_per_A"]  # mm/A
+    currents, random, followed = pd.Series(0.0, response.columns), np.random.default_rng(1), []
+    for _ in range(40):
+        row["seq"], row["time_s"] = row["seq"] + 1, row["time_s"] + 4.0
+        row["ic_A4_A"], row["ic_C4_A"] = currents
+        row[columns] = random.normal(before + response @ currents + 2.0 * response["H_A4"], 0.15)
+        estimator.update(row)
+        currents = estimator.correction.setpoint[currents.index]
+        if estimator.correction.hold is None:
+            followed.append(estimator.correction)
+    assert len(followed) > 10  # others are frames that surprise: the vars are not those of the design
+    made = followed[-1]
     assert list(made.setpoint.index) == booster.correctors
-    assert set(made.role[made.role != "unused"].index) <= {"H_A4", "H_C4"}
+    assert dict(made.role[made.role != "unused"]) == {"H_A4": "used", "H_C4": "used"}
+    assert made.limited == made.left_out == 0
+    assert abs(made.setpoint["H_A4"] + 2.0) < 1.0 and abs(made.setpoint["H_C4"]) < 1.0
     with pytest.raises(orbitcal.InputError, match="has no monitor 'x_Z9'"):
         estimator.steer({"x_Z9": 0.0})
 

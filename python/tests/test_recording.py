@@ -1,5 +1,6 @@
 """Recordings: read, written, from pandas, from a response matrix."""
 
+import datetime
 import pickle
 
 import numpy as np
@@ -158,3 +159,36 @@ def test_a_matrix_is_diagnosed_fitted_and_written(matrix, tmp_path):
     calibrated = again.ring.with_vars(orbitcal.fit(again))
     assert calibrated.vars["QF.2"] == result.means["QF.2"]
     again.ring.to_pyat(orbitcal.fit(again))
+
+
+def test_settings_are_numbers_where_they_can_be(paper_vars, booster):
+    assert paper_vars.frames["setting_A"].dtype == float and set(paper_vars.frames["setting_A"].dropna()) == {-22, 0, 22}
+    frames = paper_vars.frames.astype({"setting_A": object})
+    row = frames.index[frames["setting_A"] == 22][0]
+    frames.loc[row, ["corrector", "setting_A"]] = ["H_A4;H_C4", "22;-22"]
+    several = orbitcal.Recording.from_pandas(frames, booster, paper_vars.header)
+    assert several.frames.loc[row, "setting_A"] == "22;-22"
+
+
+def test_a_recording_is_true(paper_vars, matrix):
+    assert matrix and paper_vars and len(matrix) == 0
+
+
+def test_numbers_of_numpy_and_pandas_are_numbers(paper_vars, booster, matrix, twelve_cells):
+    header = paper_vars.header
+    own = header | {
+        "format": np.int64(2),
+        "bpm_sigma_mm": np.float64(header["bpm_sigma_mm"]),
+        "quad_transfer": np.array(header["quad_transfer"]),
+    }
+    assert orbitcal.Recording.from_pandas(paper_vars.frames, booster, own).header == header
+    with pytest.raises(orbitcal.InputError, match="header: expected texts, numbers, .* found datetime"):
+        orbitcal.Recording.from_pandas(paper_vars.frames, booster, header | {"note": datetime.date(2026, 1, 1)})
+    ring, numbers = orbitcal.Ring.from_pyat(twelve_cells), np.loadtxt(IMPORTS / "response.txt")
+    words = dict(orbit_unit="mm", kick=(0.2, 0.15), kick_is="full", kick_sign="x+y+", order="planes")
+    by_name = pd.Series({f"{plane}:BPM[{n}]": 0.002 for plane in "xy" for n in range(1, 13)})
+    made = orbitcal.Recording.from_response(numbers, ring, noise=by_name, **words)
+    assert made.matrix.equals(orbitcal.Recording.from_response(numbers, ring, noise=0.002, **words).matrix)
+    for noise in (np.zeros(3), (0.1, 0.2, 0.3), "loud", None):
+        with pytest.raises(orbitcal.InputError, match="noise: expected a number, two"):
+            orbitcal.Recording.from_response(numbers, ring, noise=noise, **words)

@@ -6,6 +6,7 @@ import pickle
 import at
 import numpy as np
 import pytest
+import xarray as xr
 import xtrack
 from conftest import IMPORTS, ROOT
 
@@ -48,6 +49,36 @@ def test_the_response_with_every_effect_is_that_of_pyat(booster):
         assert response.shape == (2, 48, 48)
         # the bars of tests/tests: kicks of 0.2 mrad and pyAT's integrator, on a displaced orbit its sextupoles too
         assert abs(response.values - known).max() < 2e-3, name
+
+
+def test_a_response_is_what_xarray_s_constructor_makes(booster):
+    """The labels are put together by private names of xarray."""
+    made = booster.response()
+    by_hand = xr.DataArray(made.values, booster._coords(), made.dims, made.name, made.attrs)
+    xr.testing.assert_identical(made, by_hand)
+    assert made.xindexes.keys() == by_hand.xindexes.keys()
+    for array in (made.copy(), pickle.loads(pickle.dumps(made)), made.isel(monitor=slice(None, None, -1)) * 1.0):
+        xr.testing.assert_equal(array.sel(monitor="x_E4"), by_hand.sel(monitor="x_E4"))
+    xr.testing.assert_identical((made - by_hand.isel(monitor=slice(5, 9))).monitor, by_hand.isel(monitor=slice(5, 9)).monitor)
+    assert made.rename(monitor="bpm").sel(bpm="x_E4").sizes == {"corrector": 48}
+
+
+def test_a_response_may_be_written_to(booster):
+    """What is changed in one is not changed in the next."""
+    made, known = booster.response(), booster.response().copy(deep=True)
+    made[0, 0] = 1.0
+    made.s_monitor[0] = 3.0
+    assert made.s_monitor[0] == 3.0
+    made.monitor.attrs["axis"] = "BPM"
+    made.s_corrector.attrs["units"] = "mm"
+    made.attrs["units"] = "mm/rad"
+    xr.testing.assert_identical(booster.response(), known)
+
+
+def test_one_effect_need_not_be_a_list(booster):
+    rolled = booster.response(effects=["quad_roll@D8=0.01"])
+    for one in ("quad_roll@D8=0.01", {"kind": "quad_roll", "at": "D8", "amplitude": 0.01}):
+        np.testing.assert_array_equal(booster.response(effects=one), rolled)
 
 
 def test_own_planes_are_rows_of_all_places(booster):

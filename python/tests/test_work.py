@@ -106,8 +106,9 @@ def system_threads():
 def test_ctrl_c_stops_it(paper_vars, open_10, work):
     """The signal comes while the work is under way, and is heard long before its end."""
     long = {
-        "sample": lambda: orbitcal.sample(paper_vars, draws=1_000_000, progress=False),
-        "diagnose": lambda: [orbitcal.diagnose(open_10, progress=False) for _ in range(100)],
+        # long, and yet it ends where the signal is not heard
+        "sample": lambda: orbitcal.sample(paper_vars, draws=20_000, progress=False),
+        "diagnose": lambda: [orbitcal.diagnose(open_10, progress=False) for _ in range(5)],
     }[work]
     before = system_threads()
     timer = threading.Timer(0.5, signal.raise_signal, [signal.SIGINT])
@@ -116,8 +117,10 @@ def test_ctrl_c_stops_it(paper_vars, open_10, work):
         long()
     timer.join()
     # the worker ends at its next step; a step of the diagnosis takes seconds
-    while system_threads() > before:
+    end = time.monotonic() + 60
+    while system_threads() > before and time.monotonic() < end:
         time.sleep(0.1)
+    assert system_threads() <= before
 
 
 def test_other_threads_run_beside_it(open_10):
@@ -140,16 +143,21 @@ def test_other_threads_run_beside_it(open_10):
 def test_progress_is_heard_to_the_end(paper_vars, monkeypatch):
     import tqdm.auto
 
-    drawn = []
+    drawn, closed = [], []
 
     class Bar(tqdm.auto.tqdm):
         def refresh(self, *arguments, **named):
             drawn.append((self.n, self.total))
             return super().refresh(*arguments, **named)
 
+        def close(self):
+            closed.append(self.n)
+            super().close()
+
     monkeypatch.setattr(tqdm.auto, "tqdm", Bar)
     orbitcal.sample(paper_vars, model="green", chains=1, warm_up=50, draws=200, progress=True)
-    assert drawn and all(total == 250 for _, total in drawn) and drawn == sorted(drawn)
+    assert all(total == 250 for _, total in drawn) and drawn == sorted(drawn)
+    assert drawn[-1] == (250, 250) and closed[0] == 250
 
 
 def test_an_error_in_a_bar_ends_the_work(paper_vars):

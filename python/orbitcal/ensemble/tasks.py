@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable
@@ -17,6 +18,17 @@ from ..ring import Ring
 Method = Literal["map", "core", "nuts"]
 
 
+def _of(template: Recording) -> dict[str, str]:
+    """What results depend on beside a task's own options: header and frames of its recording, its ring with vars and priors, the package."""
+    ring = template.ring._ring
+    made_of = json.dumps([template._recording.texts(ring), ring.state()])
+    return {
+        "template": template.name,
+        "sha256": hashlib.sha256(made_of.encode()).hexdigest(),
+        "orbitcal": _orbitcal.__version__,
+    }
+
+
 class Validation:
     """A blind campaign through the diagnosis, as of `orbitcal validate`: the seed is the number of the case.
 
@@ -24,12 +36,24 @@ class Validation:
     `validate`'s outcomes: verdict, grade, what was made and found. Other rings take the recording of another ring.
     """
 
+    COLUMNS = (
+        "verdict",
+        "grade",
+        "made",
+        "found",
+        "probability",
+        "is_true",
+        "oracle_gain",
+        "nees_before",
+        "nees_after",
+    )
+
     def __init__(
         self, template: Recording, kind: Literal["empty", "single", "pair", "unknown"], *, seed: int = 1
     ) -> None:
         self.template, self.kind, self.seed = template, kind, seed
         self.name = "validation"
-        self.says = {"template": template.name, "class": kind, "seed": seed}
+        self.says = {**_of(template), "class": kind, "seed": seed}
         self._validation: _orbitcal.Validation | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -41,19 +65,19 @@ class Validation:
             self._validation = _orbitcal.Validation(self.template.ring._ring, self.template._recording)
         made = self._validation.run(self.kind, seed, self.seed)
         if made is None:
-            return {"verdict": "no beam"}
+            return dict.fromkeys(self.COLUMNS) | {"verdict": "no beam"}
         outcome = json.loads(made)
-        return {
-            "verdict": outcome["verdict"],
-            "grade": outcome["grade"],
-            "made": [one["label"] for one in outcome["truth"]],
-            "found": outcome["found"],
-            "probability": outcome["stated"]["probability"],
-            "is_true": outcome["stated"]["is_true"],
-            "oracle_gain": outcome["oracle_gain"],
-            "nees_before": outcome["nees"][0],
-            "nees_after": outcome["nees"][1],
-        }
+        values = (
+            outcome["verdict"],
+            outcome["grade"],
+            [one["label"] for one in outcome["truth"]],
+            outcome["found"],
+            outcome["stated"]["probability"],
+            outcome["stated"]["is_true"],
+            outcome["oracle_gain"],
+            *outcome["nees"],
+        )
+        return dict(zip(self.COLUMNS, values, strict=True))
 
 
 class Calibration:
@@ -70,7 +94,7 @@ class Calibration:
     ) -> None:
         self.template, self.methods, self.draws = template, tuple(methods), draws
         self.name = "calibration"
-        self.says = {"template": template.name, "methods": list(self.methods), "draws": draws}
+        self.says = {**_of(template), "methods": list(self.methods), "draws": draws}
 
     def __call__(self, seed: int) -> dict[str, Any]:
         """The probabilities of one campaign."""
@@ -109,7 +133,7 @@ class TrainingSet:
     def __init__(self, template: Recording) -> None:
         self.template = template
         self.name = "training set"
-        self.says = {"ring": template.ring.name}
+        self.says = _of(template)
 
     def __call__(self, seed: int) -> dict[str, Any]:
         """One ring."""
