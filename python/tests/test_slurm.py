@@ -16,7 +16,7 @@ import pytest
 from distributed import Client
 
 from orbitcal import ensemble
-from orbitcal.ensemble import engine
+from orbitcal.ensemble import store
 
 PATH = os.environ["PATH"] + ":/usr/sbin"  # where Debian has the daemons
 MISSING = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if not shutil.which(name, path=PATH)]
@@ -94,7 +94,7 @@ def client(slurm):
 @pytest.mark.parametrize("how", [[], ["--signal=KILL", "--full"]], ids=["cancelled", "killed"])
 def test_a_job_that_ends_halfway_changes_no_bit(client, how, tmp_path, monkeypatch):
     """`scancel` asks the worker to stop first; a signal to all of a job is as if its node had died."""
-    monkeypatch.setattr(engine, "ROWS", 1)  # a part after each row, so that halfway is known
+    monkeypatch.setattr(store, "ROWS", 1)  # a part after each row, so that halfway is known
 
     def walk(seed):
         time.sleep(0.2)
