@@ -125,15 +125,17 @@ def test_what_dask_cancels_is_run_again(cluster, tmp_path):
     """All that is out is cancelled while the run goes on; no seed is to blame."""
 
     def cancel():
-        while not (out := [key for key, state in list(cluster.futures.items()) if state.status == "pending"]):
+        end = time.monotonic() + 60
+        while not cancelled and time.monotonic() < end:
             time.sleep(0.05)
-        cluster.cancel([Future(key, cluster) for key in out], force=True)
+            cancelled.extend(key for key, state in list(cluster.futures.items()) if state.status == "pending")
+        cluster.cancel([Future(key, cluster) for key in cancelled], force=True)
 
-    thread = threading.Thread(target=cancel)
+    cancelled, thread = [], threading.Thread(target=cancel)
     thread.start()
     table = ensemble.run(Toy(waiting=0.2), range(12), tmp_path, client=cluster, progress=False)
     thread.join()
-    assert len(table) == 12 and ensemble.failures(tmp_path).empty
+    assert cancelled and len(table) == 12 and ensemble.failures(tmp_path).empty
 
 
 def test_what_is_lost_on_its_way_is_run_again(cluster, tmp_path, monkeypatch):
