@@ -133,9 +133,9 @@ fn bend(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result<(), 
 /// Angle of an edge against a sector dipole's [rad], and fringe integral times full gap [m]; none of an edge that is switched off.
 fn edge(fields: &Fields, side: &str, bend: f64) -> Result<(f64, f64), MeasuredError> {
     let key = |what: &str| format!("edge_{side}_{what}");
-    let switch = fields.value.get(&key("active"));
+    let switch = fields.value.get(key("active"));
     let is_off = switch.is_some_and(|on| on.as_f64() == Some(0.0) || on.as_bool() == Some(false));
-    let model = fields.value.get(&key("model")).and_then(Value::as_str).unwrap_or("linear");
+    let model = fields.value.get(key("model")).and_then(Value::as_str).unwrap_or("linear");
     match model {
         "linear" | "full" | "dipole-only" if !is_off => {
             let rectangular = if class(fields.value) == "RBend" { bend / 2.0 } else { 0.0 };
