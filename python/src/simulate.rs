@@ -22,7 +22,7 @@ use crate::task;
 const OF_CLASS: usize = 1_000_000;
 
 /// A campaign with settings, read-backs and gaps of a recording, and the vars that it was made with, in the ring's order. Without vars they are
-/// drawn from the ring's prior, rings that keep their beam. Exact: every frame an exact orbit of misaligned magnets, monitors with offsets, noise and jumps, tunes;
+/// drawn from the ring's prior, rings with stable motion. Exact: every frame an exact orbit of misaligned magnets, monitors with offsets, noise and jumps, tunes;
 /// else the machine of the estimator's model.
 #[pyfunction]
 pub fn simulate(
