@@ -1,7 +1,7 @@
 //! Whether stated probabilities are true, in several mixes of campaigns.
 //!
 //! A probability is stated for the shares of empty campaigns, effects of the library and other physics that the search takes for granted
-//! ([`ASSUMED`]). Among campaigns of other shares `q` the same evidence gives `P' = P f_c / (sum over c of P_c f_c)`, `f_c = q_c/p_c`, with `c` the
+//! (`ASSUMED`). Among campaigns of other shares `q` the same evidence gives `P' = P f_c / (sum over c of P_c f_c)`, `f_c = q_c/p_c`, with `c` the
 //! sort of the cause that is stated and `P_c` the probability of each sort. A mix is made of the campaigns at hand, each counted with the weight
 //! `q_c/(share of its sort among them)`; of weighted campaigns there are effectively `(sum w)^2/(sum w^2)`.
 //!
