@@ -247,3 +247,20 @@ fn without_a_kick_or_a_reading_the_result_is_the_prior_and_says_so() {
     let (_, whole) = fit(&ring, &recording, TuneUse::Readings);
     assert_eq!(whole.lack, None);
 }
+
+/// Vars of the prior bring a ring near a resonance, where derivatives are so large that rounding leaves the screening without best params:
+/// its fit ends, with a maximum or with an error.
+#[test]
+fn a_ring_near_a_resonance_does_not_stop_the_screening() {
+    let (ring, template, _) = ten_cells("plain");
+    let mut seeds = simulate::seeds(7);
+    let mut next = || seeds.next().unwrap();
+    let vars = simulate::vars(&ring, false, next()).unwrap();
+    let instruments = Instruments::healthy(&ring, &template).unwrap();
+    let recording = simulate::like(&template, &ring, &vars, &instruments, next()).unwrap();
+    let campaign = Campaign::of(&ring, &recording).unwrap();
+    match BatchFit::of(&campaign, TuneUse::Readings, |_| ()) {
+        Ok(fit) => println!("chi2/dof {:.3}, {} steps, {:?}", fit.chi2_per_dof, fit.steps, fit.tunes),
+        Err(error) => println!("{error}"),
+    }
+}

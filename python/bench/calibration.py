@@ -12,8 +12,10 @@ template, folder, *rest = sys.argv[1:]
 count, methods = int(rest[0]) if rest else 2000, rest[1:] or ["map", "core", "nuts"]
 recording = orbitcal.Recording.read(template)
 
+DRAWS = 100  # of NUTS; 20 bins need no more
+
 if __name__ == "__main__":
-    table = ensemble.run(ensemble.Calibration(recording, methods), range(count), folder)
+    table = ensemble.run(ensemble.Calibration(recording, methods, draws=DRAWS), range(count), folder)
     tested = ensemble.uniformity(table, recording.ring)
     print(f"{len(table)} campaigns, {len(ensemble.failures(folder))} set aside, {len(tested)} tests")
     for method, of_method in tested.groupby(level="method"):

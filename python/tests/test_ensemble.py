@@ -20,7 +20,7 @@ from scipy.stats import kstest, norm
 
 import orbitcal
 from orbitcal import ensemble
-from orbitcal.ensemble import engine, store
+from orbitcal.ensemble import engine, store, tasks
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,8 @@ def ten_cells():
 
 @pytest.fixture(scope="module")
 def cluster():
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster) as client:
+    """Two workers, as `run` starts them."""
+    with engine._client(None, 2) as client:
         yield client
 
 
@@ -119,6 +120,14 @@ def test_poison_is_set_aside_with_its_error(cluster, tmp_path):
     assert said[5] == "ValueError: seed 5 is odd" and said[3].startswith("KilledWorker")
     # and is not tried again
     assert len(ensemble.run(task, range(8), tmp_path, client=cluster, progress=False)) == 6
+
+
+def test_workers_that_are_gone_are_replaced(tmp_path):
+    """A worker that dies as it starts takes its nanny with it; here both nannies have ended before the run."""
+    with engine._client(None, 2) as client:
+        for nanny in list(client.cluster.workers.values()):
+            client.cluster.sync(nanny.close)
+        assert len(ensemble.run(Toy(), range(8), tmp_path, client=client, progress=False)) == 8
 
 
 def test_what_dask_cancels_is_run_again(cluster, tmp_path):
@@ -357,6 +366,26 @@ def test_a_calibration_is_uniform(ten_cells, cluster, tmp_path):
         assert kstest(made.ravel(), "uniform").pvalue > 1e-4
         narrow = norm.cdf(2 * norm.ppf(made.ravel()))
         assert kstest(narrow, "uniform").pvalue < 1e-10
+
+
+def test_places_among_few_draws_are_uniform():
+    """Of a value among draws of its own distribution, 3 a value: by their number alone 20 bins would be filled in four places."""
+    values, draws = np.random.default_rng(5).normal(size=(20_000, 1)), np.random.default_rng(6).normal(size=(20_000, 3))
+    below = (draws < values).sum(axis=1)
+    made = np.array(tasks._place(below, 3, seed=7))
+    assert kstest(made, "uniform").pvalue > 1e-4
+    assert (np.floor(made * 4) == below).all()
+    assert kstest(below / 3, "uniform").pvalue < 1e-10
+
+
+def test_probabilities_far_outside_the_prior_are_numbers(ten_cells):
+    """A posterior whose normal lies 30 widths beyond the range still has probabilities: those of its tail."""
+    ring = ten_cells.ring
+    low, high = np.log(ring._ring.priors[0][1:])
+    middle = np.full(len(ring.vars), (low + high) / 2)
+    for mean, expected in ((high + 3.0, 0.0), (low - 3.0, 1.0)):
+        made = tasks._below(ring, middle, np.full(middle.shape, mean), np.full(middle.shape, 0.1))
+        assert np.allclose(made, expected, atol=1e-6), made
 
 
 def test_uniformity_sees_a_posterior_that_is_too_narrow(ten_cells):

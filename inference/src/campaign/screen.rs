@@ -219,7 +219,7 @@ impl<'c> Screening<'c> {
             monitors: of.noise.iter().map(expecting).collect(),
             repeats: vec![vec![Repeats::default(); monitors]; of.settings.count],
             accepted: DMatrix::from_element(frames, monitors, false),
-            best: Best::of(of, &model, &normal),
+            best: Best::of(of, &model, &normal).expect("a prior's precision is positive"),
             model,
             normal,
             stale: false,
@@ -250,7 +250,7 @@ impl<'c> Screening<'c> {
             self.judge_frame(frame, &rejected);
         }
         self.learn(frame);
-        self.best = Best::of(self.of, &self.model, &self.normal);
+        self.solve();
     }
 
     /// Add the readings of a frame that count to the normal equations.
@@ -368,14 +368,15 @@ impl<'c> Screening<'c> {
         for halvings in 0..HALVINGS {
             let Ok(model) = self.of.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
             self.model = model;
-            self.rebuild(frames);
-            if self.best.cost <= highest {
+            if self.rebuild(frames) && self.best.cost <= highest {
                 return;
             }
         }
         if let Ok(model) = self.of.model(from) {
             self.model = model;
-            self.rebuild(frames);
+            if !self.rebuild(frames) {
+                self.best.step.fill(0.0);
+            }
         }
     }
 
@@ -393,8 +394,8 @@ impl<'c> Screening<'c> {
         self.rebuild(frames);
     }
 
-    /// The normal equations of the accepted readings of the first frames.
-    fn rebuild(&mut self, frames: usize) {
+    /// The normal equations of the accepted readings of the first frames; false if they have no best params.
+    fn rebuild(&mut self, frames: usize) -> bool {
         let monitors = self.monitors.len();
         self.normal = Normal::new(self.of.prior, &self.model.params, self.of.channels(), COMMON);
         for b in 0..monitors {
@@ -405,7 +406,16 @@ impl<'c> Screening<'c> {
             }
             self.normal.add(&self.model.slope[b], &sums);
         }
-        self.best = Best::of(self.of, &self.model, &self.normal);
+        self.solve()
+    }
+
+    /// The best params. At a resonance derivatives are so large that rounding leaves the normal equations without any: then those of
+    /// before stay, and this is false.
+    fn solve(&mut self) -> bool {
+        let best = Best::of(self.of, &self.model, &self.normal);
+        let is_solved = best.is_some();
+        best.into_iter().for_each(|best| self.best = best);
+        is_solved
     }
 }
 
@@ -427,12 +437,13 @@ impl Repeats {
 }
 
 impl Best {
-    fn of(of: &Screener, model: &Model, normal: &Normal) -> Self {
+    /// None if the matrix of the normal equations is not positive.
+    fn of(of: &Screener, model: &Model, normal: &Normal) -> Option<Self> {
         let (cost, quadratic) = normal.eliminated();
-        let factor = quadratic.factor().expect("a prior's precision is positive");
+        let factor = quadratic.factor()?;
         let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
         let baselines = normal.baselines(&step);
-        Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost }
+        Some(Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost })
     }
 }
 

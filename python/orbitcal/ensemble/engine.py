@@ -232,4 +232,6 @@ def _client(client: Client | None, workers: int | None) -> Iterator[Client]:
     except RuntimeError as failed:
         raise OrbitcalError(GUARD) from failed
     with cluster, Local(cluster) as local:
+        # dask starts no other worker in place of one that dies as it starts; this does, 15 s later
+        cluster.adapt(minimum=count, maximum=count)
         yield local

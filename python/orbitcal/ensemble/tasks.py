@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -83,8 +82,8 @@ class Validation:
 class Calibration:
     """Simulation-based calibration: vars from the prior, a campaign made with them, and where they lie in each posterior.
 
-    Rows have a list for each method, one number a var: the posterior probability below the true value, of NUTS the share of draws. If the posterior
-    is right they are uniform from 0 to 1 (`uniformity`). Methods: `map` (batch fit), `core` (the no_std core), `nuts`.
+    Rows have a list for each method, one number a var: the posterior probability below the true value, of NUTS the true value's place among the
+    draws. If the posterior is right they are uniform from 0 to 1 (`uniformity`). Methods: `map` (batch fit), `core` (the no_std core), `nuts`.
 
     Source: S. Talts, M. Betancourt, D. Simpson, A. Vehtari and A. Gelman, arXiv:1804.06788 (2018).
     """
@@ -114,17 +113,24 @@ class Calibration:
         # one chain, so that a worker takes one core
         ring, measured = recording.ring._ring, recording._recording
         _, drawn = _orbitcal.sample(ring, measured, "green", 1, 300, self.draws, seed, None)
-        return (np.log(drawn["vars"][0]) < params).mean(axis=0).tolist()
+        return _place((np.log(drawn["vars"][0]) < params).sum(axis=0), self.draws, seed)
 
 
 def _below(ring: Ring, params: np.ndarray, mean: Iterable[float], sigma: Iterable[float]) -> list[float]:
     """Probability of a smaller `ln var`, of normals truncated to the prior's ranges."""
-    of = lambda x, m, s: 0.5 * math.erfc((m - x) / (s * math.sqrt(2)))
-    result = []
-    for theta, m, s, (_, low, high) in zip(params, mean, sigma, ring._ring.priors, strict=True):
-        below, above = (of(math.log(bound), m, s) for bound in (low, high))
-        result.append((of(theta, m, s) - below) / (above - below))
-    return result
+    from scipy.stats import truncnorm
+
+    mean, sigma = np.asarray(mean, float), np.asarray(sigma, float)
+    low, high = (np.log([prior[bound] for prior in ring._ring.priors]) for bound in (1, 2))
+    return truncnorm.cdf(params, (low - mean) / sigma, (high - mean) / sigma, mean, sigma).tolist()
+
+
+def _place(below: np.ndarray, draws: int, seed: int) -> list[float]:
+    """The place from 0 to 1 of a value that is above so many of the draws: by chance within one of the `draws + 1` equal parts.
+
+    The number itself has `draws + 1` values, of which the bins of a histogram hold unlike many.
+    """
+    return ((below + np.random.default_rng(seed).random(len(below))) / (draws + 1)).tolist()
 
 
 class TrainingSet:
