@@ -164,16 +164,16 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         let channel = reading.channel;
         let (mut d, baseline_variance) = self.effective(channel, reading.slope);
         moves.wait_for(channel, staged.rows(), staged.count(), |gain, row| add(&mut d, -gain, row));
-        let s = f64::from(reading.variance) + own(&d) + baseline_variance;
+        let s = f64::from(reading.variance) + own(&d) + (baseline_variance - moves.variance(channel));
         let e = f64::from(reading.innovation) - self.baseline(channel);
         add(&mut self.vector, e / s, &d);
         self.cost += e * e / s;
         self.volume += ln_density(s);
-        match self.covariance.condition(channel, s) {
+        match self.covariance.condition(channel, s, moves) {
             Gain::Own(gain) => self.move_baseline(channel, gain, e, &d),
             Gain::All(gain) => {
                 add(&mut self.baseline, e, &gain);
-                moves.push(staged.count(), &gain);
+                moves.push(staged.count(), &gain, s);
             }
         }
         staged.push(&d, 1.0 / s);
@@ -184,7 +184,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     #[inline(never)]
     fn settle(&mut self, staged: &mut Staged<N>, moves: &mut Moves<B>) {
-        V::settle(moves, &mut self.slope, staged.rows());
+        self.covariance.settle(moves, &mut self.slope, staged.rows());
         staged.settle(&mut self.information);
     }
 
