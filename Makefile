@@ -167,6 +167,7 @@ python: build ## the Python package: its wheel in python/dist, tested in a fresh
 	.venv-python/bin/pip install --quiet 'maturin>=1.9,<2'
 	.venv-python/bin/maturin build --quiet --release --locked --manifest-path python/Cargo.toml --out python/dist
 	.venv-python/bin/pip install --quiet "$$(ls python/dist/orbitcal-*.whl)[test]"
+	.venv-python/bin/python -m mypy.stubtest orbitcal._orbitcal
 	ORBITCAL=$(CURDIR)/$(ORBITCAL) .venv-python/bin/python -m pytest --quiet python/tests
 
 slurm: ## an ensemble over dask-jobqueue on a Slurm of one node, one of two jobs cancelled halfway, in the environment that make python leaves; two minutes

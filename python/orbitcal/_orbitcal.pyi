@@ -2,16 +2,36 @@
 
 from collections.abc import Callable
 from os import PathLike
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
+
+__all__ = [
+    "Core",
+    "Estimate",
+    "InputError",
+    "OrbitcalError",
+    "Outcome",
+    "Recording",
+    "Ring",
+    "Subscriber",
+    "Validation",
+    "__version__",
+    "compare",
+    "diagnose",
+    "fit",
+    "marginals",
+    "sample",
+    "simulate",
+]
 
 __version__: str
 
-Hear = Callable[[str, int], None] | None
-Reals = NDArray[np.float64]
-Singles = NDArray[np.float32]
+_Hear = Callable[[str, int], None] | None
+_Reals = NDArray[np.float64]
+_Singles = NDArray[np.float32]
 
 class InputError(ValueError):
     """An input is wrong: where, what was expected and what was found."""
@@ -19,6 +39,7 @@ class InputError(ValueError):
 class OrbitcalError(RuntimeError):
     """Anything else that went wrong."""
 
+@final
 class Ring:
     @staticmethod
     def booster() -> Ring: ...
@@ -65,12 +86,13 @@ class Ring:
     def positions(self) -> tuple[list[float], list[float]]: ...
     @property
     def left_out(self) -> list[tuple[str, int]]: ...
-    def response(self, effects: list[str], rf: str) -> Reals: ...
-    def full_response(self, effects: list[str], rf: str) -> Reals: ...
-    def jacobian(self, by_gradient: bool, effects: list[str], rf: str) -> Reals: ...
+    def response(self, effects: list[str], rf: str) -> _Reals: ...
+    def full_response(self, effects: list[str], rf: str) -> _Reals: ...
+    def jacobian(self, by_gradient: bool, effects: list[str], rf: str) -> _Reals: ...
     def optics(self, effects: list[str], rf: str) -> dict[str, Any]: ...
     def export(self, format: str, result: str | None) -> str: ...
 
+@final
 class Recording:
     @staticmethod
     def read(folder: str | PathLike[str], ring: Ring, any_energy: bool) -> Recording: ...
@@ -100,10 +122,11 @@ class Recording:
     def is_matrix(self) -> bool: ...
     def texts(self, ring: Ring) -> list[str]: ...
     def frames(self) -> int: ...
-    def matrix(self) -> tuple[list[str], list[str], Reals, list[float], list[float]]: ...
+    def matrix(self) -> tuple[list[str], list[str], _Reals, list[float], list[float]]: ...
     def write(self, folder: str | PathLike[str], ring: Ring) -> None: ...
     def check(self, ring: Ring) -> str: ...
 
+@final
 class Outcome:
     @property
     def json(self) -> str: ...
@@ -111,7 +134,7 @@ class Outcome:
     def text(self) -> str: ...
     def report(self, path: str | PathLike[str]) -> None: ...
 
-def fit(ring: Ring, recording: Recording, rf: str | None, hear: Hear) -> Outcome: ...
+def fit(ring: Ring, recording: Recording, rf: str | None, hear: _Hear) -> Outcome: ...
 def sample(
     ring: Ring,
     recording: Recording,
@@ -120,30 +143,32 @@ def sample(
     warm_up: int,
     draws: int,
     seed: int,
-    hear: Hear,
+    hear: _Hear,
 ) -> tuple[Outcome, dict[str, Any]]: ...
-def diagnose(ring: Ring, recordings: list[Recording], rf: str | None, hear: Hear) -> Outcome: ...
-def compare(ring: Ring, before: Recording, after: Recording, hear: Hear) -> Outcome: ...
+def diagnose(ring: Ring, recordings: list[Recording], rf: str | None, hear: _Hear) -> Outcome: ...
+def compare(ring: Ring, before: Recording, after: Recording, hear: _Hear) -> Outcome: ...
 def simulate(
     ring: Ring, template: Recording, seed: int, vars: dict[str, float] | None, effects: list[str], exact: bool
 ) -> tuple[Recording, list[float]]: ...
 def marginals(ring: Ring, recording: Recording) -> tuple[list[float], list[float]]: ...
 
+@final
 class Validation:
-    def __init__(self, ring: Ring, template: Recording) -> None: ...
+    def __new__(cls, ring: Ring, template: Recording) -> Self: ...
     def run(self, kind: str, index: int, seed: int) -> str | None: ...
 
+@final
 class Core:
-    def __init__(
-        self, ring: Ring, like: Recording, model: str, follow: bool, process_noise: float, baseline_walk: float
-    ) -> None: ...
+    def __new__(
+        cls, ring: Ring, like: Recording, model: str, follow: bool, process_noise: float, baseline_walk: float
+    ) -> Self: ...
     def of_bytes(self, frame: bytes) -> Estimate: ...
     def of_recording(self, recording: Recording, frame: int) -> Estimate: ...
     def of_text(self, frames: str) -> Estimate: ...
     @staticmethod
     def wire(recording: Recording, frame: int) -> bytes: ...
     def fit_quality(self) -> list[float]: ...
-    def fitted(self) -> Singles: ...
+    def fitted(self) -> _Singles: ...
     def steer(
         self,
         orbit: list[float],
@@ -158,10 +183,12 @@ class Core:
     ) -> None: ...
     def correction(self) -> dict[str, Any] | None: ...
 
+@final
 class Subscriber:
-    def __init__(self, service: str) -> None: ...
+    def __new__(cls, service: str) -> Self: ...
     def wait(self, timeout: float) -> list[Estimate]: ...
 
+@final
 class Estimate:
     """Vars with error bars and covariance, and the state of every monitor, after one frame; what docs/shared-memory.md has."""
 
@@ -206,22 +233,22 @@ class Estimate:
     @property
     def remarks(self) -> list[str]: ...
     @property
-    def mean(self) -> Singles:
+    def mean(self) -> _Singles:
         """Mean of each var [N] [1]."""
     @property
-    def sigma(self) -> Singles:
+    def sigma(self) -> _Singles:
         """Standard deviation of each var [N] [1]."""
     @property
-    def covariance(self) -> Singles:
+    def covariance(self) -> _Singles:
         """Covariance of the vars [N][N] [1]."""
     @property
-    def map_params(self) -> Singles:
+    def map_params(self) -> _Singles:
         """Maximum a posteriori of each `ln var` [N] [1]."""
     @property
-    def centre(self) -> Singles:
+    def centre(self) -> _Singles:
         """Centre of the normal of each `ln var` before it is truncated to the prior's range [N] [1]."""
     @property
-    def params_sigma(self) -> Singles:
+    def params_sigma(self) -> _Singles:
         """Its standard deviation [N] [1]."""
     @property
     def clipped(self) -> NDArray[np.bool_]:
@@ -233,7 +260,7 @@ class Estimate:
     def monitor_state(self) -> list[str]:
         """`ok`, `noisy`, `jumps` or `dead` [B]."""
     @property
-    def monitor_sigma(self) -> Singles:
+    def monitor_sigma(self) -> _Singles:
         """Noise of one reading of each monitor [B] [m]."""
     @property
     def monitor_rejected(self) -> NDArray[np.uint32]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .results import DiagnosisResult, Finding, FitResult
 
 Effect: TypeAlias = "str | Finding | Mapping[str, Any]"
+Patterns: TypeAlias = "str | Iterable[str]"
 Rf = Literal["fixed-momentum", "fixed-frequency"]
 Format = Literal["madx", "bmad", "at", "xsuite", "pals"]
 
@@ -63,22 +64,22 @@ class Ring:
         return cls._of(_orbitcal.Ring.booster())
 
     @classmethod
-    def from_pyat(cls, lattice: at.Lattice, *, monitors: Iterable[str] = (), correctors: Iterable[str] = ()) -> Ring:
+    def from_pyat(cls, lattice: at.Lattice, *, monitors: Patterns = (), correctors: Patterns = ()) -> Ring:
         """The ring of a pyAT lattice in memory.
 
         Monitors and correctors are elements of the classes `Monitor` and `Corrector`, or those whose names match the patterns:
-        `monitors=["BPM*"]`, `correctors=["x:CH*", "y:CV*"]`. What the twin leaves out is said in a warning.
+        `monitors="BPM*"`, `correctors=["x:CH*", "y:CV*"]`. What the twin leaves out is said in a warning.
         """
         return cls._of_lattice(codes.text_of_pyat(lattice), codes.name_of(lattice), monitors, correctors)
 
     @classmethod
-    def from_xsuite(cls, line: xtrack.Line, *, monitors: Iterable[str] = (), correctors: Iterable[str] = ()) -> Ring:
+    def from_xsuite(cls, line: xtrack.Line, *, monitors: Patterns = (), correctors: Patterns = ()) -> Ring:
         """The ring of an Xsuite line in memory, before slicing; patterns as in `from_pyat`."""
         return cls._of_lattice(codes.text_of_xsuite(line), codes.name_of(line), monitors, correctors)
 
     @classmethod
     def from_lattice(
-        cls, path: str | PathLike[str], *, monitors: Iterable[str] = (), correctors: Iterable[str] = ()
+        cls, path: str | PathLike[str], *, monitors: Patterns = (), correctors: Patterns = ()
     ) -> Ring:
         """The ring of a lattice file of text: JSON by pyAT or Xsuite, a table by MAD-X, or PALS (docs/your-own-ring.md)."""
         path = Path(path)
@@ -89,8 +90,10 @@ class Ring:
         return cls._of_lattice(text, str(path), monitors, correctors)
 
     @classmethod
-    def _of_lattice(cls, text: str, name: str, monitors: Iterable[str], correctors: Iterable[str]) -> Ring:
-        ring = cls._of(_orbitcal.Ring.lattice(text, name, list(monitors), list(correctors)))
+    def _of_lattice(cls, text: str, name: str, monitors: Patterns, correctors: Patterns) -> Ring:
+        # a text is one pattern, not a list of letters
+        listed = ([one] if isinstance(one, str) else list(one) for one in (monitors, correctors))
+        ring = cls._of(_orbitcal.Ring.lattice(text, name, *listed))
         for what, elements in ring._ring.left_out:
             warnings.warn(f"{name}: left out of {elements} elements: {what}", stacklevel=3)
         return ring

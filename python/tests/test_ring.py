@@ -170,6 +170,46 @@ def test_an_xsuite_line_comes_in_and_goes_out():
     assert abs(again.response().values - ring.response().values).max() < 1e-9  # decimals of the file
 
 
+@pytest.mark.parametrize("active", [True, False])
+@pytest.mark.parametrize("bend", ["sector", "straight"])
+def test_edges_that_xsuite_has_switched_off_are_none(bend, active):
+    """Eight cells with sixteen bends, whose edges change a tune by 0.7; markers are monitors, one pattern may be a text."""
+    angle = 2 * np.pi / 16
+    made = {
+        "sector": lambda: xtrack.Bend(
+            length=1.5, angle=angle, k0_from_h=True, edge_entry_angle=angle / 2, edge_exit_angle=angle / 2
+        ),
+        "straight": lambda: xtrack.RBend(length_straight=1.5, angle=angle, k0_from_h=True),
+    }[bend]
+
+    def dipole():
+        one = made()
+        one.edge_entry_active = one.edge_exit_active = active
+        return one
+
+    elements, names = [], []
+    for cell in range(8):
+        of_cell = {
+            "qf": xtrack.Quadrupole(length=0.3, k1=0.9),
+            "da": xtrack.Drift(length=0.4),
+            "ba": dipole(),
+            "monitor": xtrack.Marker(),
+            "corrector": xtrack.Multipole(knl=[0.0], ksl=[0.0]),
+            "db": xtrack.Drift(length=0.4),
+            "qd": xtrack.Quadrupole(length=0.3, k1=-0.8),
+            "dc": xtrack.Drift(length=0.4),
+            "bb": dipole(),
+            "dd": xtrack.Drift(length=0.4),
+        }
+        elements += of_cell.values()
+        names += [f"{name}{cell}" for name in of_cell]
+    line = xtrack.Line(elements=elements, element_names=names)
+    line.particle_ref = xtrack.Particles(p0c=2e9, mass0=xtrack.PROTON_MASS_EV)
+    twiss = line.twiss4d()
+    optics = orbitcal.Ring.from_xsuite(line, monitors="monitor*", correctors="corrector*").optics().attrs
+    assert abs(twiss.qx - optics["tune_x"]) < TUNE and abs(twiss.qy - optics["tune_y"]) < TUNE
+
+
 def test_what_the_twin_leaves_out_is_said(twelve_cells):
     lattice = twelve_cells.deepcopy()
     for one in lattice[at.Quadrupole][:3]:
