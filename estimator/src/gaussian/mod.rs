@@ -396,18 +396,23 @@ mod tests {
         assert!((before.log_evidence - after.log_evidence).abs() < 1e-9);
     }
 
-    /// The readings, with something done to the params before some of them.
+    /// The readings in frames of seven, so that some wait for others, with something done to the params before some of them.
     fn conditioned_with(
         moves: Moves,
         mut act: impl FnMut(&mut Gaussian<2, 2, 3, Correlated<2, 3>>, &mut Solved, [f64; 2]),
     ) {
-        let (mut gaussian, mut solution) = (prior(), Solved::BLANK);
-        for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
-            for (_, sigma) in moves.iter().filter(|(at, _)| *at == i) {
+        let (mut gaussian, mut solution, readings) = (prior(), Solved::BLANK, readings());
+        let mut from = 0;
+        while from < readings.len() {
+            for (_, sigma) in moves.iter().filter(|(at, _)| *at == from) {
                 solution.solve(&gaussian, |_| WIDE);
                 act(&mut gaussian, &mut solution, *sigma);
             }
-            gaussian.condition([reading(b, innovation, &h)], &|_| 0.0);
+            let ends = moves.iter().map(|(at, _)| *at).chain([from + 7, readings.len()]);
+            let to = ends.filter(|end| *end > from).min().unwrap();
+            let frame = readings[from..to].iter().map(|(b, innovation, h)| reading(*b, *innovation, h));
+            gaussian.condition(frame, &|_| 0.0);
+            from = to;
         }
         assert_equal(&gaussian, moves);
     }
