@@ -97,7 +97,7 @@ function vars(state) {
 }
 
 function map(state) {
-  const size = Math.min(width("ring"), 560), middle = size / 2, radius = 0.36 * size;
+  const size = Math.min(width("ring"), 560), middle = size / 2, radius = 0.33 * size;
   const svg = picture(size, size, "The ring");
   const at = (s, r) => { const angle = 2 * Math.PI * s / ring.place.circumference; return [middle + r * Math.sin(angle), middle - r * Math.cos(angle)]; };
   svg.append(node("circle", { class: "axis", cx: middle, cy: middle, r: radius }));
@@ -112,7 +112,12 @@ function map(state) {
       svg.append(bar);
     }
   });
-  const label = (spot, s, r) => { const [x, y] = at(s, r); svg.append(node("text", { x, y: y + 4, "text-anchor": "middle", class: "pale" }, spot.name)); };
+  // outside of its mark, on either side
+  const label = (spot, s, r) => {
+    const [x, y] = at(s, r), aside = Math.sin(2 * Math.PI * s / ring.place.circumference) * Math.sign(r - radius);
+    const anchor = Math.abs(aside) < 0.4 ? "middle" : aside > 0 ? "start" : "end";
+    svg.append(node("text", { x, y: y + 4, "text-anchor": anchor, class: "pale" }, spot.name));
+  };
   ring.place.monitors.forEach((spot, i) => {
     const well = state.monitors[i].state === "ok", s = spot.s[0], [cx, cy] = at(s, radius * (spot.name.startsWith("y") ? 1.27 : 1.22));
     const dot = node("circle", { class: well ? "usual hollow" : "faulty", cx, cy, r: well ? 2.5 : 5 });
