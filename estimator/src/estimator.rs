@@ -407,7 +407,11 @@ impl<
         self.past.campaign.clear();
         self.past.reference = Reference::ZERO;
         self.past.recent.clear();
-        self.forget_loose(model);
+        let calibration = model.setup.tune_calibration.unwrap_or(1.0);
+        self.past.loose.reset(
+            |i| prior_of::<G, B, C, F, N>(model, i),
+            |channel| if channel < K - 2 { BASELINE } else { calibration },
+        );
         self.posterior.gaussian.copy(&self.past.loose);
         self.posterior.gaussian.recentre(&[0.0; N]);
         self.solve(model);
@@ -527,9 +531,7 @@ impl<
         self.sequence.forget();
     }
 
-    /// Go over to another model of the same machine, all slices at once: frames of settings and recent ones are weighed anew by it, even if
-    /// params have walked since, whose error bars are then widened by all of their walk. Older frames without a setting are forgotten: they were
-    /// weighed by a model that no longer holds.
+    /// Go over to another model of the same machine, all slices at once: all frames so far are weighed anew by it.
     ///
     /// # Errors
     /// [`Unstable`] if it has no ring at the vars at hand; the former model is then to be adopted again.
@@ -539,22 +541,7 @@ impl<
             return Ok(());
         }
         self.linearise_design(model)?;
-        self.forget_loose(model);
-        self.anew.is_of_another_model = true;
-        let adopted = self.settle_anew(model);
-        self.anew.is_of_another_model = false;
-        adopted?;
-        self.posterior.outdate(&model.setup.walk);
-        Ok(())
-    }
-
-    /// Nothing but the prior is counted of frames that cannot be linearised anew.
-    fn forget_loose(&mut self, model: &Model<'_, G, B, C, F>) {
-        let calibration = model.setup.tune_calibration.unwrap_or(1.0);
-        self.past.loose.reset(
-            |i| prior_of::<G, B, C, F, N>(model, i),
-            |channel| if channel < K - 2 { BASELINE } else { calibration },
-        );
+        self.linearise_anew(model)
     }
 
     /// Linearise at vars = 1, all steps at once, and keep how orbits follow the gradients there.

@@ -118,16 +118,6 @@ impl Stream {
         }
     }
 
-    /// A recording of the repository, whose machine does not change.
-    ///
-    /// # Errors
-    /// If it cannot be read.
-    pub fn still(name: &str, ring: &Ring) -> Result<Self, Box<dyn Error>> {
-        let folder = format!("recordings/{name}");
-        let recording = Recording::read(&repository(&folder), ring)?;
-        Ok(Self { recording, changes: Changes::default(), start: truth(&folder, ring) })
-    }
-
     /// True vars in a frame.
     pub fn vars(&self, frame: usize) -> Vec<f64> {
         self.changes.vars(&self.start, frame as f64 / self.recording.rows.len() as f64)

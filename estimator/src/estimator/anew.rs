@@ -27,8 +27,6 @@ const MOVED: f32 = 0.5;
 const UPHILL: f64 = 1.0;
 /// Attempts at a step, each half as long as the one before; the next one goes back to the origin.
 const ATTEMPTS: u32 = 4;
-/// Steps at most by which the MAP of another model is sought.
-const STEPS: usize = 4;
 /// Frames that can wait to be counted. With a further one all is counted anew.
 const LATE: usize = 2;
 
@@ -53,8 +51,6 @@ pub(super) struct Anew<
     attempts: u32,
     /// The past was due to be weighted anew: its chi-square has no value to compare with.
     reweighted: bool,
-    /// What has been counted was counted by another model.
-    pub is_of_another_model: bool,
     pub tangent: Tangent<L, F>,
     pub work: Work<P, S, K, N, T>,
     /// Frames that came after what they belong to had been counted.
@@ -81,7 +77,6 @@ impl<
             to: [0.0; N],
             attempts: 0,
             reweighted: false,
-            is_of_another_model: false,
             tangent: Tangent::blank(unlinearised),
             work: Work::Past(Pooling::BLANK),
             late: Deque::new(),
@@ -104,14 +99,15 @@ impl<
 {
     /// True if the MAP has left the origin, or a past that still counts has to be weighted anew.
     pub(super) fn is_due(&self, model: &Model<'_, G, B, C, F>) -> bool {
-        (self.past.stale && self.posterior.is_still(&model.setup.walk)) || self.has_left_origin()
-    }
-
-    /// True if a param's MAP has moved away from where the model is linearised.
-    fn has_left_origin(&self) -> bool {
-        let solution = &self.posterior.solution;
-        let each = solution.map_params.iter().zip(self.posterior.gaussian.origin()).zip(&solution.sigma);
-        each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
+        let each = self
+            .posterior
+            .solution
+            .map_params
+            .iter()
+            .zip(self.posterior.gaussian.origin())
+            .zip(&self.posterior.solution.sigma);
+        let stale = self.past.stale && self.posterior.is_still(&model.setup.walk);
+        stale || each.into_iter().any(|((map, origin), sigma)| (map - origin).abs() > MOVED * sigma)
     }
 
     /// Begin to linearise at the MAP.
@@ -166,10 +162,9 @@ impl<
         Prepared::Slice
     }
 
-    /// Count a part of the past, or go over to the new linearisation. While the params walk, the past stays counted as it was, unless that was
-    /// by another model.
+    /// Count a part of the past, or go over to the new linearisation. While the params walk, the past stays counted as it was.
     fn count_past(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
-        if !self.posterior.is_still(&model.setup.walk) && !self.anew.is_of_another_model {
+        if !self.posterior.is_still(&model.setup.walk) {
             self.posterior.gaussian.recentre(&self.anew.to);
             return self.go_over(model);
         }
@@ -194,20 +189,6 @@ impl<
         self.anew.under_way = false;
         self.solve(model);
         Prepared::Linearised
-    }
-
-    /// Linearise anew at once, and again until the MAP stays.
-    ///
-    /// # Errors
-    /// [`Unstable`] if there is no ring even at the origin.
-    pub(super) fn settle_anew(&mut self, model: &Model<'_, G, B, C, F>) -> Result<(), Unstable> {
-        for _ in 0..STEPS {
-            self.linearise_anew(model)?;
-            if !self.has_left_origin() {
-                break;
-            }
-        }
-        Ok(())
     }
 
     /// Linearise anew at once.

@@ -149,14 +149,6 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         true
     }
 
-    /// What counts was counted anew, as of frames of one ring: let baselines walk for all the time since the beginning, and params before the
-    /// next frame; after a step these are unknown.
-    pub fn outdate(&mut self, walk: &Walk) {
-        let baselines = f64::from(walk.baselines * walk.baselines);
-        self.gaussian.spread_baselines(baselines * self.walked, Self::BASELINES);
-        self.owed = if self.stepped { f32::MAX } else { self.walked as f32 };
-    }
-
     /// Take note of what is expected of the next frame.
     pub fn expect(&mut self) {
         self.drift.expect(&self.gaussian, &self.solution);
