@@ -1,6 +1,6 @@
 """An ensemble by one worker, and by one a core of which one is killed -9 halfway: the same table, bit for bit, and how much sooner.
 
-Usage: scaling.py RECORDING FOLDER [campaigns]
+Usage: scaling.py RECORDING FOLDER [campaigns [MACHINE]]      MACHINE: the machine file, if it is not the Booster
 """
 
 import os
@@ -17,14 +17,15 @@ from orbitcal import ensemble
 
 template, folder, *rest = sys.argv[1:]
 count = int(rest[0]) if rest else 1000
+ring = orbitcal.Ring(rest[1]) if rest[1:] else None
 
 
 def timed(workers, is_killed):
     """The table, the seconds that it took, and the seconds that its tasks took in sum."""
     to = f"{folder}/{workers}-{'killed' if is_killed else 'whole'}"
     shutil.rmtree(to, ignore_errors=True)
-    with LocalCluster(workers, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster) as client:
-        task = ensemble.Calibration(orbitcal.Recording.read(template), ["map", "core"])
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster) as client:
+        task = ensemble.Calibration(orbitcal.Recording.read(template, ring), ["map", "core"])
         if is_killed:
             threading.Thread(target=kill, args=(client, to), daemon=True).start()
         start = time.perf_counter()
