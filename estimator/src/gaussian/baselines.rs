@@ -2,7 +2,7 @@
 
 use core::marker::PhantomData;
 
-use crate::linear::{Real, add_four, add_four_to_each, dot};
+use crate::linear::{Real, add, add_four_to_each, dot};
 use crate::state::{State, state};
 use crate::triangle::Triangle;
 
@@ -26,11 +26,11 @@ pub trait Covariance<const B: usize>: Copy + State {
     /// Add to the variance of a monitor's.
     fn spread(&mut self, b: usize, variance: f64);
 
-    /// Take a reading of monitor `b` off, of innovation variance `s`; what it does to all baselines waits.
-    fn condition(&mut self, b: usize, s: f64, moves: &Moves<B>) -> Gain<B>;
+    /// Take a reading of monitor `b` off, of innovation variance `s`.
+    fn condition(&mut self, b: usize, s: f64) -> Gain<B>;
 
-    /// Take off what readings of these rows have made wait, and move slopes by it; nothing, where each has moved its own.
-    fn settle<const N: usize>(&mut self, _: &mut Moves<B>, _: &mut [[Self::Slope; N]; B], _: &[[f64; N]; 4]) {}
+    /// Move slopes by what readings of these rows have made wait; nothing, where each has moved its own.
+    fn settle<const N: usize>(_: &mut Moves<B>, _: &mut [[Self::Slope; N]; B], _: &[[f64; N]; 4]) {}
 }
 
 /// What a reading moves baselines by, per unit of innovation.
@@ -42,47 +42,21 @@ pub enum Gain<const B: usize> {
     All([f64; B]),
 }
 
-/// Gains of all baselines by as many readings as are staged, and innovation variances of these; zero for those that have moved their own at
-/// once.
+/// Gains of all baselines by as many readings as are staged; zero for those that have moved their own at once.
 #[derive(Debug, Clone)]
 pub struct Moves<const B: usize> {
     gain: [[f64; B]; 4],
-    s: [f64; 4],
     any: bool,
 }
 
 impl<const B: usize> Moves<B> {
     /// None wait.
-    pub const NONE: Self = Self { gain: [[0.0; B]; 4], s: [0.0; 4], any: false };
+    pub const NONE: Self = Self { gain: [[0.0; B]; 4], any: false };
 
     /// Those of the reading at a place.
-    pub fn push(&mut self, at: usize, gain: &[f64; B], s: f64) {
-        if let (Some(to), Some(its)) = (self.gain.get_mut(at), self.s.get_mut(at)) {
-            (*to, *its) = (*gain, s);
-            self.any = true;
-        }
-    }
-
-    /// How much less variance what waits leaves a baseline [m^2].
-    pub fn variance(&self, b: usize) -> f64 {
-        let of = |(gain, s): (&[f64; B], &f64)| gain.get(b).map_or(0.0, |gain| gain * gain * s);
-        if self.any { self.gain.iter().zip(&self.s).map(of).sum() } else { 0.0 }
-    }
-
-    /// What a row of the covariance is moved by, per gain.
-    fn factors(&self, b: usize) -> [f64; 4] {
-        let mut factors = self.of(b);
-        factors.iter_mut().zip(&self.s).for_each(|(gain, s)| *gain *= -s);
-        factors
-    }
-
-    /// The gains of a baseline.
-    fn of(&self, b: usize) -> [f64; 4] {
-        self.gain.each_ref().map(|gain| gain.get(b).copied().unwrap_or(0.0))
-    }
-
-    fn gains(&self) -> [&[f64]; 4] {
-        self.gain.each_ref().map(<[f64; B]>::as_slice)
+    pub fn push(&mut self, at: usize, gain: &[f64; B]) {
+        self.gain.get_mut(at).into_iter().for_each(|to| *to = *gain);
+        self.any = true;
     }
 
     /// By how much the readings at the first `count` places move the slope of a baseline; `rows` are theirs.
@@ -94,14 +68,20 @@ impl<const B: usize> Moves<B> {
         mut each: impl FnMut(f64, &[f64; N]),
     ) {
         if self.any {
-            self.of(b).into_iter().zip(rows).take(count).for_each(|(gain, row)| each(gain, row));
+            let gains = self.gain.iter().map(|gain| gain.get(b).copied().unwrap_or(0.0));
+            gains.zip(rows).take(count).for_each(|(gain, row)| each(gain, row));
         }
     }
 
     /// Move the slopes of all baselines by what waits.
-    fn move_slopes<const N: usize>(&self, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
+    fn settle<const N: usize>(&mut self, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
+        if !core::mem::take(&mut self.any) {
+            return;
+        }
         let rows = rows.each_ref().map(<[f64; N]>::as_slice);
-        add_four_to_each(slopes.iter_mut().enumerate().map(|(b, slope)| (slope.as_mut_slice(), self.of(b))), rows);
+        let of = |b: usize| self.gain.each_ref().map(|gain| gain.get(b).copied().unwrap_or(0.0));
+        add_four_to_each(slopes.iter_mut().enumerate().map(|(b, slope)| (slope.as_mut_slice(), of(b))), rows);
+        self.gain = [[0.0; B]; 4];
     }
 }
 
@@ -147,7 +127,7 @@ impl<const B: usize, R: Real> Covariance<B> for Independent<B, R> {
         self.variance.get_mut(b).into_iter().for_each(|own| *own += variance);
     }
 
-    fn condition(&mut self, b: usize, s: f64, _: &Moves<B>) -> Gain<B> {
+    fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
         let Some(variance) = self.variance.get_mut(b) else { return Gain::Own(0.0) };
         let gain = *variance / s;
         *variance -= gain * *variance;
@@ -178,7 +158,7 @@ impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
         self.matrix.row_mut(b).last_mut().into_iter().for_each(|own| *own += variance);
     }
 
-    fn condition(&mut self, b: usize, s: f64, moves: &Moves<B>) -> Gain<B> {
+    fn condition(&mut self, b: usize, s: f64) -> Gain<B> {
         if !self.walked {
             let Some(variance) = self.matrix.row_mut(b).last_mut() else { return Gain::Own(0.0) };
             let gain = *variance / s;
@@ -187,17 +167,15 @@ impl<const B: usize, const U: usize> Covariance<B> for Correlated<B, U> {
         }
         let mut gain = [0.0; B];
         self.matrix.copy_row(b, &mut gain);
-        add_four(&mut gain, moves.factors(b), moves.gains());
         gain.iter_mut().for_each(|gain| *gain /= s);
+        for (row, g) in self.matrix.rows_mut().zip(&gain) {
+            add(row, -g * s, &gain);
+        }
         Gain::All(gain)
     }
 
-    fn settle<const N: usize>(&mut self, moves: &mut Moves<B>, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
-        if moves.any {
-            self.matrix.add_products(|b| moves.factors(b), moves.gains());
-            moves.move_slopes(slopes, rows);
-            *moves = Moves::NONE;
-        }
+    fn settle<const N: usize>(moves: &mut Moves<B>, slopes: &mut [[f64; N]; B], rows: &[[f64; N]; 4]) {
+        moves.settle(slopes, rows);
     }
 }
 

@@ -164,16 +164,16 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         let channel = reading.channel;
         let (mut d, baseline_variance) = self.effective(channel, reading.slope);
         moves.wait_for(channel, staged.rows(), staged.count(), |gain, row| add(&mut d, -gain, row));
-        let s = f64::from(reading.variance) + own(&d) + (baseline_variance - moves.variance(channel));
+        let s = f64::from(reading.variance) + own(&d) + baseline_variance;
         let e = f64::from(reading.innovation) - self.baseline(channel);
         add(&mut self.vector, e / s, &d);
         self.cost += e * e / s;
         self.volume += ln_density(s);
-        match self.covariance.condition(channel, s, moves) {
+        match self.covariance.condition(channel, s) {
             Gain::Own(gain) => self.move_baseline(channel, gain, e, &d),
             Gain::All(gain) => {
                 add(&mut self.baseline, e, &gain);
-                moves.push(staged.count(), &gain, s);
+                moves.push(staged.count(), &gain);
             }
         }
         staged.push(&d, 1.0 / s);
@@ -184,7 +184,7 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     #[inline(never)]
     fn settle(&mut self, staged: &mut Staged<N>, moves: &mut Moves<B>) {
-        self.covariance.settle(moves, &mut self.slope, staged.rows());
+        V::settle(moves, &mut self.slope, staged.rows());
         staged.settle(&mut self.information);
     }
 
@@ -396,23 +396,18 @@ mod tests {
         assert!((before.log_evidence - after.log_evidence).abs() < 1e-9);
     }
 
-    /// The readings in frames of seven, so that some wait for others, with something done to the params before some of them.
+    /// The readings, with something done to the params before some of them.
     fn conditioned_with(
         moves: Moves,
         mut act: impl FnMut(&mut Gaussian<2, 2, 3, Correlated<2, 3>>, &mut Solved, [f64; 2]),
     ) {
-        let (mut gaussian, mut solution, readings) = (prior(), Solved::BLANK, readings());
-        let mut from = 0;
-        while from < readings.len() {
-            for (_, sigma) in moves.iter().filter(|(at, _)| *at == from) {
+        let (mut gaussian, mut solution) = (prior(), Solved::BLANK);
+        for (i, (b, innovation, h)) in readings().into_iter().enumerate() {
+            for (_, sigma) in moves.iter().filter(|(at, _)| *at == i) {
                 solution.solve(&gaussian, |_| WIDE);
                 act(&mut gaussian, &mut solution, *sigma);
             }
-            let ends = moves.iter().map(|(at, _)| *at).chain([from + 7, readings.len()]);
-            let to = ends.filter(|end| *end > from).min().unwrap();
-            let frame = readings[from..to].iter().map(|(b, innovation, h)| reading(*b, *innovation, h));
-            gaussian.condition(frame, &|_| 0.0);
-            from = to;
+            gaussian.condition([reading(b, innovation, &h)], &|_| 0.0);
         }
         assert_equal(&gaussian, moves);
     }

@@ -340,7 +340,7 @@ impl<
     fn tune(&self, at: &Self::Linearised, plane: usize, strength: &[f32; F]) -> (f32, [f32; N]) {
         let (tune, slopes) = if plane == 0 { (at.x.tune, &at.x.tune_slope) } else { (at.y.tune, &at.y.tune_slope) };
         let (mut by_param, mut by_supply) = ([0.0; N], [0.0; F]);
-        self.spread(slopes, &mut by_param, &mut by_supply);
+        self.spread(slopes.iter().copied(), &mut by_param, &mut by_supply);
         (tune + dot(&by_supply, strength), by_param)
     }
 
@@ -439,16 +439,10 @@ impl<
     /// Add derivatives with respect to `ln` of each quadrupole's strength to those of its param and of its supply. ([`NONE`] as
     /// an index is beyond any list.)
     #[inline]
-    fn spread(&self, slopes: &[f32; M], by_param: &mut [f32], by_supply: &mut [f32]) {
-        for (slope, param) in slopes.iter().zip(&self.param) {
+    fn spread(&self, slopes: impl Iterator<Item = f32>, by_param: &mut [f32], by_supply: &mut [f32]) {
+        for (slope, (param, supply)) in slopes.zip(self.param.iter().zip(&self.supply)) {
             by_param.get_mut(*param as usize).into_iter().for_each(|to| *to += slope);
-        }
-        // a sum for each run of quadrupoles with one supply: one through memory waits for every store
-        let mut slopes = slopes.iter();
-        for run in self.supply.chunk_by(|a, b| a == b) {
-            let sum: f32 = slopes.by_ref().take(run.len()).sum();
-            let supply = run.first().copied().unwrap_or(NONE);
-            by_supply.get_mut(supply as usize).into_iter().for_each(|to| *to += sum);
+            by_supply.get_mut(*supply as usize).into_iter().for_each(|to| *to += slope);
         }
     }
 
@@ -461,15 +455,12 @@ impl<
         by_supply: &mut [[f32; F]],
     ) {
         let push = push.as_chunks::<2>().0;
-        let mut slopes = [0.0; M];
         for ((by_param, by_supply), seen) in jacobian.chunks_exact_mut(N).zip(by_supply).zip(&plane.seen) {
             by_param.fill(0.0);
             by_supply.fill(0.0);
             let codes = seen.codes.as_chunks::<2>().0.iter().zip(push);
-            for (slope, (z, x)) in slopes.iter_mut().zip(codes) {
-                *slope = seen.scale * (f32::from(z[0]) * x[0] + f32::from(z[1]) * x[1]);
-            }
-            self.spread(&slopes, by_param, by_supply);
+            let slopes = codes.map(|(z, x)| seen.scale * (f32::from(z[0]) * x[0] + f32::from(z[1]) * x[1]));
+            self.spread(slopes, by_param, by_supply);
         }
     }
 
@@ -483,14 +474,11 @@ impl<
         by_supply: &mut [[f32; F]],
     ) {
         let each = jacobian.chunks_exact_mut(N).zip(by_supply).zip(&at.monitor_dispersion);
-        let mut slopes = [0.0; M];
         for ((by_param, by_supply), dispersion) in each {
             let scale = dispersion * scale / at.slip;
             let nodes = at.node_dispersion.as_chunks::<2>().0.iter().zip(&at.slope);
-            for (slope, (d, k)) in slopes.iter_mut().zip(nodes) {
-                *slope = scale * (k * d[0] * d[0] + k * d[1] * d[1]);
-            }
-            self.spread(&slopes, by_param, by_supply);
+            let slopes = nodes.map(|(d, k)| scale * (k * d[0] * d[0] + k * d[1] * d[1]));
+            self.spread(slopes, by_param, by_supply);
         }
     }
 
