@@ -183,9 +183,10 @@ pub fn compare(
     hear: Option<Bound<'_, PyAny>>,
 ) -> PyResult<Outcome> {
     let names = [before.name().to_owned(), after.name().to_owned()];
-    [before, after].into_iter().try_for_each(|one| one.expect(&ring.ring))?;
+    let are_of_the_ring = || [before, after].into_iter().try_for_each(|one| one.expect(&ring.ring));
     match (&before.data, &after.data) {
         (Data::Frames(before), Data::Frames(after)) => {
+            are_of_the_ring()?;
             let (ring, before, after) = (ring.ring.clone(), Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let step = |step| progress.step("Gauss-Newton", step);
@@ -193,6 +194,7 @@ pub fn compare(
             })
         }
         (Data::Matrix(before), Data::Matrix(after)) => {
+            are_of_the_ring()?;
             let (settings, before, after) = (settings(ring, None)?, Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let mut say = |what: &str| progress.say(what);

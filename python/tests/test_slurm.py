@@ -4,6 +4,7 @@ import getpass
 import os
 import random
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -73,7 +74,10 @@ def slurm(tmp_path_factory):
 @pytest.fixture
 def client(slurm):
     """Two jobs of one worker."""
+    handler = signal.getsignal(signal.SIGINT)
     from dask_jobqueue import SLURMCluster
+
+    signal.signal(signal.SIGINT, handler)  # its import has Ctrl-C end the process, that of the tests after this one too
 
     with (
         SLURMCluster(
