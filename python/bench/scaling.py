@@ -49,8 +49,9 @@ if __name__ == "__main__":
     for is_killed in (False, True):
         table, seconds, costs = timed(cores, is_killed)
         pd.testing.assert_frame_equal(table, alone, check_exact=True)
+        busy = costs["seconds"].sum() / (cores * seconds)
         slower = costs["seconds"].median() / costs_alone["seconds"].median()
         print(
             f"{len(table)} campaigns, the same bits: 1 worker {seconds_alone:.1f} s, {cores} workers{', one killed,' if is_killed else ''} {seconds:.1f} s: "
-            f"{100 * seconds_alone / (cores * seconds):.0f} % of linear; a task takes {slower:.2f} times as long beside another"
+            f"{100 * seconds_alone / (cores * seconds):.0f} % of linear; workers are busy {100 * busy:.0f} % of the time, a task takes {slower:.2f} times as long beside another"
         )

@@ -114,7 +114,7 @@ function map(state) {
   });
   // outside of its mark, on either side
   const label = (spot, s, r) => {
-    const [x, y] = at(s, r), aside = Math.sin(2 * Math.PI * s / ring.place.circumference) * Math.sign(r - radius);
+    const [x, y] = at(s, r), aside = (x - middle) / r * Math.sign(r - radius);
     const anchor = Math.abs(aside) < 0.4 ? "middle" : aside > 0 ? "start" : "end";
     svg.append(node("text", { x, y: y + 4, "text-anchor": anchor, class: "pale" }, spot.name));
   };

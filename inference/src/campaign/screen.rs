@@ -412,10 +412,9 @@ impl<'c> Screening<'c> {
     /// The best params. At a resonance derivatives are so large that rounding leaves the normal equations without any: then those of
     /// before stay, and this is false.
     fn solve(&mut self) -> bool {
-        let best = Best::of(self.of, &self.model, &self.normal);
-        let is_solved = best.is_some();
-        best.into_iter().for_each(|best| self.best = best);
-        is_solved
+        let Some(best) = Best::of(self.of, &self.model, &self.normal) else { return false };
+        self.best = best;
+        true
     }
 }
 

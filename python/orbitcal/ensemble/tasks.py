@@ -121,14 +121,14 @@ def _below(ring: Ring, params: np.ndarray, mean: Iterable[float], sigma: Iterabl
     from scipy.stats import truncnorm
 
     mean, sigma = np.asarray(mean, float), np.asarray(sigma, float)
-    low, high = (np.log([prior[bound] for prior in ring._ring.priors]) for bound in (1, 2))
+    low, high = np.log(np.array(ring._ring.priors)[:, 1:]).T
     return truncnorm.cdf(params, (low - mean) / sigma, (high - mean) / sigma, mean, sigma).tolist()
 
 
 def _place(below: np.ndarray, draws: int, seed: int) -> list[float]:
     """The place from 0 to 1 of a value that is above so many of the draws: by chance within one of the `draws + 1` equal parts.
 
-    The number itself has `draws + 1` values, of which the bins of a histogram hold unlike many.
+    The number itself has `draws + 1` values, and 20 bins would not have equally many of these.
     """
     return ((below + np.random.default_rng(seed).random(len(below))) / (draws + 1)).tolist()
 
