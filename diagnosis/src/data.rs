@@ -18,9 +18,9 @@
 use core::ops::Range;
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, DVectorView, DVectorViewMut, RowVector2};
+use nalgebra::{DMatrix, DVector, DVectorView, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
-    Cycle, Drives, Effect, EffectError, Hold, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
+    Cycle, Drives, EffectError, Hold, Holding, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
     Tracked,
 };
 
@@ -79,8 +79,8 @@ pub struct Data {
     mixing: Mixing,
     /// A constant taken off each monitor's readings before those of a pool are mixed, about their mean; 0 where none are [B] [m].
     centre: DVector<f64>,
-    /// The constraint that the header states instead of a fixed momentum.
-    pub believed: Vec<Effect>,
+    /// What the header states to be held.
+    pub believed: Holding,
     /// Common terms of each monitor's readings, in standard deviations, without those of RF frequency and drift [frames][factors] [m].
     shared: Vec<DMatrix<f64>>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
@@ -97,6 +97,8 @@ struct Frames {
     readings: DMatrix<f64>,
     /// `ln` of each supply's factor off its mean, columns supplies.
     fluctuation: DMatrix<f64>,
+    /// What kicks do to the tunes where what the header states is held, already taken off `recorded`.
+    tune_shift: MatrixXx2<f64>,
     /// Noise of one frame's tune, of a tune that was read.
     tune_noise: [Option<f64>; 2],
 }
@@ -175,7 +177,7 @@ impl Data {
         let mut drives = drives_of(campaign);
         let believed = recording.header.believed(ring)?;
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
-        let design = Machine::new(at_supplies, Rf::FixedMomentum, &believed)?;
+        let design = Machine::new(at_supplies, believed, &[])?;
         let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
         let shift = tune_shift::by_kicks(&design.without_memory(), &drives)?;
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
@@ -215,6 +217,7 @@ impl Data {
                 recorded: beside(recorded, &recorded_tunes),
                 readings: beside(recorded, &recorded_tunes),
                 fluctuation: campaign.fluctuation.clone(),
+                tune_shift: shift,
                 tune_noise: [None; 2],
             },
         };
@@ -240,12 +243,26 @@ impl Data {
         let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);
         let mut of_monitors = readings.columns_mut(0, monitors);
         of_monitors -= off_first_order;
+        let mut of_tunes = readings.columns_mut(monitors, 2);
+        of_tunes -= self.tune_shift_beside(machine)?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();
         Ok(self
             .whiten(|c, pool| if c < monitors { self.readings[(pool, c)] - before[(pool, c)] } else { 0.0 })
             .norm_squared())
+    }
+
+    /// What kicks do to the tunes besides, where a machine does not hold what the header states: the momentum moves with them, and the tunes by
+    /// the chromaticity. Rows frames.
+    fn tune_shift_beside(&self, machine: &Machine) -> Result<MatrixXx2<f64>, EffectError> {
+        if machine.holding().effect() == self.believed.effect() {
+            return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
+        }
+        let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
+        let machine = machine.without_memory();
+        let first_order = machine.readings(&frames)?.2;
+        Ok(tune_shift::by_kicks(&machine, &frames)? - first_order - &self.frames.tune_shift)
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
@@ -467,7 +484,7 @@ impl Data {
     fn effect_on(&self, signature: &Signature, c: usize, pool: usize) -> f64 {
         match c.checked_sub(self.monitors()) {
             None => signature.readings[(pool, c)],
-            Some(plane) => signature.tunes[plane] + signature.tune_drift[plane] * self.drives.time[pool],
+            Some(plane) => signature.tune(plane, pool),
         }
     }
 

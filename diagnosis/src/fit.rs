@@ -271,7 +271,7 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
-        Ok(self.predicted_at(data, campaign, &self.u)?.by_frame(&data.campaign(campaign).drives.time))
+        Ok(self.predicted_at(data, campaign, &self.u)?.by_frame())
     }
 
     /// Whitened residuals of some data at the best point of this fit, which may be of others.
@@ -459,8 +459,8 @@ fn machine_at(
 
 /// What a machine predicts.
 fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
-    let (readings, tunes, tune_drift) = machine.readings(drives)?;
-    Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_drift })
+    let (readings, tunes, tune_changes) = machine.readings(drives)?;
+    Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }
 
 /// The sum of the signatures of effects that share an amplitude, each by the scale of its kind.

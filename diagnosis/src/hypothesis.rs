@@ -1,6 +1,6 @@
 //! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Rf, Ring, Site};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
 use super::ordinary::Family;
@@ -185,7 +185,7 @@ impl Hypothesis {
         let own = data.campaign(campaign);
         let scaled = |term: &Term, amplitude: f64| term.effect(amplitude * data.scale(campaign, term.kind));
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
-        effects.extend(self.given.iter().chain(&own.believed));
+        effects.extend(&self.given);
         let mut drives = own.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
@@ -200,7 +200,7 @@ impl Hypothesis {
             }
         }
         let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
-        Ok((Machine::new(ring, Rf::FixedMomentum, &effects)?, drives))
+        Ok((Machine::new(ring, own.believed, &effects)?, drives))
     }
 
     /// `kind@place + kind@place`, or `nothing`.

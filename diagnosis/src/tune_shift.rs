@@ -2,7 +2,7 @@
 //! the kick. The tune meter sees that in the mean of many frames, so that tunes of a campaign in which correctors and signs take turns seem to
 //! drift.
 
-use nalgebra::DMatrix;
+use nalgebra::MatrixXx2;
 use twin::{Cycle, Drives, EffectError, Machine, Tracked};
 
 use super::settings::Settings;
@@ -11,14 +11,14 @@ use super::settings::Settings;
 ///
 /// # Errors
 /// [`EffectError`] if the machine keeps no beam without kicks.
-pub fn by_kicks(machine: &Machine, drives: &Drives) -> Result<DMatrix<f64>, EffectError> {
+pub fn by_kicks(machine: &Machine, drives: &Drives) -> Result<MatrixXx2<f64>, EffectError> {
     let settings = Settings::of(drives);
     let means = settings.means(drives);
     let strength = vec![0.0; machine.ring().quadrupoles.len()];
     let tracked = Tracked::of(machine.clone(), drives.nominal_kick)?;
     let tunes = |kick: Vec<f64>| tracked.cycle(&Cycle { kick, strength: strength.clone(), rf_offset: 0.0, time: 0.0 });
     let (_, plain) = tunes(vec![0.0; drives.kick.ncols()])?;
-    let mut shift = DMatrix::zeros(settings.count(), 2);
+    let mut shift = MatrixXx2::zeros(settings.count());
     for (mut row, kick) in shift.row_iter_mut().zip(means.kick.row_iter()) {
         if let Ok((_, kicked)) = tunes(kick.iter().copied().collect()) {
             row.copy_from_slice(&[kicked.x - plain.x, kicked.y - plain.y]);

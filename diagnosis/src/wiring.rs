@@ -16,7 +16,7 @@
 use core::fmt;
 
 use nalgebra::{DMatrix, DMatrixView, DVector, Matrix2, Vector2};
-use twin::{Effect, EffectError, EffectKind, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring};
+use twin::{EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring};
 
 use inference::recording::Recording;
 use inference::{Drive, Prior};
@@ -198,13 +198,11 @@ impl<'m> Designs<'m> {
 
 /// The ring with what the header believes to be held, and with what else may be.
 fn machines(ring: &Ring, recording: &Recording) -> Result<Vec<Machine>, EffectError> {
-    let header = &recording.header;
-    let frequency = Effect::at(EffectKind::FixedRfFrequency, "", 1.0, ring)?;
-    let pair = header.radial_loop_monitors.as_ref();
-    let radial = pair.and_then(|pair| Effect::at(EffectKind::RadialLoop, &pair.join(","), 1.0, ring).ok());
-    let other = [frequency].into_iter().chain(radial).map(|effect| vec![effect]);
-    let held = [header.believed(ring)?, Vec::new()].into_iter().chain(other);
-    held.map(|effects| Machine::new(ring.clone(), Rf::FixedMomentum, &effects)).collect()
+    let held = [recording.header.believed(ring)?, Rf::FixedMomentum.into(), Rf::FixedFrequency.into()];
+    let radial_loop = recording.header.radial_loop(ring).and_then(Result::ok);
+    let known = held.into_iter().map(|holding| Machine::new(ring.clone(), holding, &[]));
+    let unknown = radial_loop.map(|effect| Machine::new(ring.clone(), Rf::FixedMomentum, &[effect]));
+    known.chain(unknown).collect()
 }
 
 /// Relative change of each quadrupole's gradient that moves both tunes by 1, to first order: one factor for the focusing ones and one for

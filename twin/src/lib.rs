@@ -32,8 +32,8 @@ mod varied;
 pub use calibrated::CalibratedOptics;
 pub use effects::{
     Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect, Held,
-    HoldEffect, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin, Tracked,
-    Unit,
+    HoldEffect, Holding, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin,
+    Tracked, Unit,
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,

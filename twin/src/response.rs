@@ -95,6 +95,11 @@ pub struct Optics<'r> {
     pub(crate) dispersive: Vector6<f64>,
 }
 
+/// `T^-1 E T` of a gradient.
+fn normal(back: &Matrix6<f64>, map: &Matrix6<f64>) -> Matrix6<f64> {
+    back.column(PX) * map.row(X) - back.column(PY) * map.row(Y)
+}
+
 /// `T^-1 E T` of a skew gradient, as a kick taken away.
 fn skew(back: &Matrix6<f64>, map: &Matrix6<f64>) -> Matrix6<f64> {
     -(back.column(PX) * map.row(Y) + back.column(PY) * map.row(X))
@@ -209,7 +214,7 @@ impl<'r> Optics<'r> {
 
     /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one.
     pub fn gradient(&self, element: usize) -> Gradient {
-        self.change(element, |back, map| back.column(PX) * map.row(X) - back.column(PY) * map.row(Y))
+        self.change(element, normal)
     }
 
     /// Derivative with respect to the skew gradient of an element, units as in [`Optics::gradient`]: `x' += k1s y`,
@@ -218,11 +223,16 @@ impl<'r> Optics<'r> {
         self.change(element, skew)
     }
 
+    /// Derivative with respect to an integrated gradient [1/m] in the middle of an element, in the ring's axes whatever its roll.
+    pub(crate) fn gradient_middle(&self, element: usize) -> Gradient {
+        let (place, map) = self.transfer_to_middle(element);
+        Gradient { place, kernel: normal(&inverse(&map), &map) }
+    }
+
     /// Derivative with respect to an integrated gradient [1/m] at one place.
     pub fn thin_gradient(&self, place: Place) -> Gradient {
         let map = self.transfer_into(place);
-        let back = inverse(&map);
-        Gradient { place, kernel: back.column(PX) * map.row(X) - back.column(PY) * map.row(Y) }
+        Gradient { place, kernel: normal(&inverse(&map), &map) }
     }
 
     /// Derivative with respect to an integrated skew gradient [1/m] at one place.

@@ -35,14 +35,12 @@ impl<'f> Partial<'f> {
         let data = fitted.data(data);
         let (vars, u) = (fitted.params.len(), fitted.guess(data, &without));
         let (machine, drives) = without.machine(data, &fitted.params, &u.as_slice()[vars..])?;
-        let (readings, Tunes { x, y }, tune_drift) = machine.readings(&drives)?;
-        let signature = Signature { readings, tunes: [x, y], tune_drift };
+        let (readings, Tunes { x, y }, tune_changes) = machine.readings(&drives)?;
+        let signature = Signature { readings, tunes: [x, y], tune_changes };
         let measured = data.residual(&signature);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
-        let tunes = [0, 1].map(|plane| {
-            let (tune, drift) = (signature.tunes[plane], signature.tune_drift[plane]);
-            tune - drift..=tune + drift
-        });
+        let (first, last) = (drives.time.imin(), drives.time.imax());
+        let tunes = [0, 1].map(|plane| signature.tune(plane, first)..=signature.tune(plane, last));
         Ok(Self { fitted, data, measured, predicted, tunes })
     }
 

@@ -15,7 +15,9 @@
 mod differences;
 mod signals;
 
-use nalgebra::{DMatrix, DVector};
+use core::ops::Range;
+
+use nalgebra::{DMatrix, DMatrixView, DVector};
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -202,29 +204,32 @@ impl<'c> Within<'c> {
         let slopes: Vec<DMatrix<f64>> = self.terms.iter().map(|&term| self.slope(&signals, term, 0.0)).collect();
         let first_order = self.weights(&slopes, &self.white);
         let (of_former, of_terms) = first_order.split_last()?;
-        let fits = self.leaders(of_terms);
-        let best = fits.iter().map(|fit| of_terms[fit.at]).fold(*of_former, f64::max);
+        let (fits, unmodelled) = (self.leaders(of_terms), self.former_orbit(&signals));
+        let of_former = unmodelled.as_ref().map_or(f64::NEG_INFINITY, |_| *of_former);
+        let best = fits.iter().map(|fit| of_terms[fit.at]).fold(of_former, f64::max);
         let chance = if best > 0.0 { self.by_chance(&slopes, best) } else { 1.0 };
         if chance > RARE {
             return None;
         }
         let mut weights: Vec<(Alternative, f64)> =
             fits.iter().map(|fit| (fit.alternative(), fit.log_bayes + self.log_prior(fit.term))).collect();
-        let discrepancy = self.former_orbit(&signals);
-        let (at, of_unmodelled) = (discrepancy.at.clone(), discrepancy.log_bayes + log_prior_unmodelled());
-        weights.push((Alternative::unmodelled(discrepancy), of_unmodelled));
+        weights.extend(unmodelled.map(|one| {
+            let weight = one.log_bayes + log_prior_unmodelled();
+            (Alternative::unmodelled(one), weight)
+        }));
         let Weighed { alternatives, nothing, .. } = Weighed::of(weights);
         if 1.0 - nothing < SUSPICIOUS {
             return None;
         }
-        let leading = alternatives.first()?.term().and_then(|term| fits.iter().find(|fit| fit.term == *term));
-        let tested = leading.map(|fit| Tested { gain: fit.gain, of_choice: None, chance: Some(chance) });
-        let (shown, without) = match leading {
-            Some(fit) => (self.shown(&(&fit.signal / fit.amplitude)), self.less(&fit.signal)),
-            None => {
-                let Location::FirstFrames { from, to } = at else { return None };
-                (self.shown(&signals.of_former_orbit()), self.without_first_frames(from, to))
+        let leading = &alternatives.first()?.cause;
+        let fit = fits.iter().find(|fit| leading.is(&Cause::Effect(fit.term)));
+        let tested = fit.map(|fit| Tested { gain: fit.gain, of_choice: None, chance: Some(chance) });
+        let (shown, without) = match (fit, leading) {
+            (Some(fit), _) => (self.shown(&(&fit.signal / fit.amplitude)), self.less(&fit.signal)),
+            (None, Cause::Unmodelled(Discrepancy { at: Location::FirstFrames { from, to }, .. })) => {
+                (self.shown(&signals.of_former_orbit()), self.without_first_frames(*from, *to))
             }
+            (None, _) => return None,
         };
         Some((Transient { alternatives, tested, shown }, without))
     }
@@ -234,7 +239,7 @@ impl<'c> Within<'c> {
         let mut order: Vec<usize> = (0..weights.len()).filter(|&i| weights[i] > 0.0).collect();
         order.sort_by(|&one, &other| weights[other].total_cmp(&weights[one]));
         let fits = order.into_iter().map(|at| self.fit(at));
-        fits.filter(|fit| fit.gain.0 > VALIDATED * fit.gain.1).take(LEADERS).collect()
+        fits.filter(|fit| is_validated(fit.gain)).take(LEADERS).collect()
     }
 
     /// Whitened derivative of a signal.
@@ -274,14 +279,20 @@ impl<'c> Within<'c> {
         Stretch { log_bayes: best.0 + mean.ln(), frames: best.1, share: best.2 }
     }
 
-    /// The share of the former orbit, its size that in the readings.
-    fn former_orbit(&self, signals: &Signals) -> Discrepancy {
+    /// The share of the former orbit, its size that in the readings; none where what some monitors show does not predict the others, as where
+    /// one reading jumps.
+    fn former_orbit(&self, signals: &Signals) -> Option<Discrepancy> {
         let Stretch { log_bayes, frames: (from, to), share } = self.stretch(&self.white);
+        let (signal, data) = (self.former.rows_range(from..=to), self.white.rows_range(from..=to));
+        let monitors = (0..signal.ncols()).map(|b| (0..signal.nrows(), b..b + 1));
+        if !is_validated(held_out(&signal, &data, share, monitors)) {
+            return None;
+        }
         let orbit = signals.of_former_orbit();
         let some: Vec<f64> = orbit.rows_range(from..=to).iter().copied().filter(|x| *x != 0.0).collect();
         let rms = (some.iter().map(|x| x * x).sum::<f64>() / some.len().max(1) as f64).sqrt();
         let at = Location::FirstFrames { from, to };
-        Discrepancy { at, campaign: 0, log_bayes, size: share * rms, sites: 1, adapted: None }
+        Some(Discrepancy { at, campaign: 0, log_bayes, size: share * rms, sites: 1, adapted: None })
     }
 
     /// Variance of the readings along the signal of an effect.
@@ -317,7 +328,8 @@ impl<'c> Within<'c> {
         let power = width.powi(2) * slope.norm_squared() / spread;
         let gained = (self.white.norm_squared() - left.norm_squared()) / spread;
         let log_bayes = 0.5 * (gained - (amplitude / width).powi(2) - power.ln_1p());
-        let gain = self.held_out(term, &slope, &(&left + &slope * amplitude));
+        let runs = self.differences.runs.iter().map(|run| (run.clone(), 0..slope.ncols()));
+        let gain = held_out(&slope.as_view(), &(&left + &slope * amplitude).as_view(), width, runs);
         Fit { at, term, amplitude, sigma: width / (1.0 + power).sqrt(), log_bayes, gain, signal }
     }
 
@@ -337,24 +349,6 @@ impl<'c> Within<'c> {
             exceeding += usize::from(self.weights(slopes, &shuffled).iter().any(|weight| *weight >= best));
         }
         (1 + exceeding) as f64 / (1 + SHUFFLES) as f64
-    }
-
-    /// Gain of log predictive density by the amplitude fitted to all other runs, and its standard error over the readings: a corrector that
-    /// settles has few runs and many readings. `whole`: whitened readings, the signal linear. The amplitude's own error is left out, which is
-    /// small where it matters.
-    fn held_out(&self, term: Term, slope: &DMatrix<f64>, whole: &DMatrix<f64>) -> (f64, f64) {
-        let (pull, power) = (slope.dot(whole), slope.norm_squared());
-        let of_run = |run: &core::ops::Range<usize>| {
-            let (slope, data) = (slope.rows_range(run.clone()), whole.rows_range(run.clone()));
-            let information = power - slope.norm_squared() + width(term).powi(-2);
-            let predicted = slope * ((pull - slope.dot(&data)) / information);
-            let gain = data.zip_map(&predicted, |data, predicted| predicted * (data - 0.5 * predicted));
-            gain.iter().copied().collect::<Vec<f64>>()
-        };
-        let gains: Vec<f64> = self.differences.runs.iter().flat_map(of_run).collect();
-        let (n, sum) = (gains.len() as f64, gains.iter().sum::<f64>());
-        let spread: f64 = gains.iter().map(|gain| (gain - sum / n).powi(2)).sum();
-        (sum, (spread * n / (n - 1.0).max(1.0)).sqrt())
     }
 
     /// First frames less the later ones of their run, where a signal is, per unit of its amplitude [m].
@@ -434,7 +428,7 @@ fn steady(campaign: &Campaign) -> DMatrix<f64> {
 /// Variance of whitened readings along the former orbits, where the frame after takes the place of each: 1 for white noise, more where monitors share
 /// noise or a ripple. By the median over the runs, of which few hold an effect.
 fn spread(differences: &Differences, former: &DMatrix<f64>, white: &DMatrix<f64>) -> f64 {
-    let of_run = |run: &core::ops::Range<usize>| {
+    let of_run = |run: &Range<usize>| {
         let next = |frame: usize| if frame + 1 < run.end { frame + 1 } else { run.start };
         let pull: f64 = run.clone().map(|frame| former.row(frame).dot(&white.row(next(frame)))).sum();
         let power = former.rows_range(run.clone()).norm_squared();
@@ -442,6 +436,35 @@ fn spread(differences: &Differences, former: &DMatrix<f64>, white: &DMatrix<f64>
     };
     let mut squares: Vec<f64> = differences.runs.iter().filter_map(of_run).collect();
     (median(&mut squares) / MEDIAN_SQUARE).max(1.0)
+}
+
+/// Gain of log predictive density of each block of readings (frames, monitors) by the amplitude fitted to all others, and its standard error
+/// over the readings: a corrector that settles has few runs and many readings. `whole`: whitened readings, the signal linear. The
+/// amplitude's own error is left out, which is small where it matters.
+fn held_out(
+    slope: &DMatrixView<f64>,
+    whole: &DMatrixView<f64>,
+    width: f64,
+    blocks: impl Iterator<Item = (Range<usize>, Range<usize>)>,
+) -> (f64, f64) {
+    let (pull, power) = (slope.dot(whole), slope.norm_squared());
+    let of_block = |(frames, monitors): (Range<usize>, Range<usize>)| {
+        let within = |all: &DMatrixView<f64>| all.view_range(frames.clone(), monitors.clone()).into_owned();
+        let (slope, data) = (within(slope), within(whole));
+        let information = power - slope.norm_squared() + width.powi(-2);
+        let predicted = &slope * ((pull - slope.dot(&data)) / information);
+        let gain = data.zip_map(&predicted, |data, predicted| predicted * (data - 0.5 * predicted));
+        gain.iter().copied().collect::<Vec<f64>>()
+    };
+    let gains: Vec<f64> = blocks.flat_map(of_block).collect();
+    let (n, sum) = (gains.len() as f64, gains.iter().sum::<f64>());
+    let spread: f64 = gains.iter().map(|gain| (gain - sum / n).powi(2)).sum();
+    (sum, (spread * n / (n - 1.0).max(1.0)).sqrt())
+}
+
+/// True for a gain of more than two standard errors.
+fn is_validated((gain, sigma): (f64, f64)) -> bool {
+    gain > VALIDATED * sigma
 }
 
 /// `ln` Bayes factor of an amplitude of standard deviation `width`, to first order.

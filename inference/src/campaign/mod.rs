@@ -15,7 +15,7 @@ use core::f64::consts::FRAC_1_SQRT_2;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{Machine, OrbitError, Rf, Ring, ripple_of_misaligned, spurious_dispersion};
+use twin::{Machine, OrbitError, Ring, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
 use crate::recording::Recording;
@@ -89,7 +89,7 @@ impl Campaign {
     pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let ring = recording.powered(ring).into_owned();
         let believed = recording.header.believed(&ring).expect("the header is checked against its ring");
-        let held = Machine::new(ring.clone(), Rf::FixedMomentum, &believed).expect("its sites are resolved");
+        let held = Machine::new(ring.clone(), believed, &[]).expect("there is no effect");
         let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
         let supplies = drive::mean_supplies(&drives);
         let times = Times::of(recording);

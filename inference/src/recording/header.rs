@@ -11,7 +11,7 @@ use std::path::Path;
 
 use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
-use twin::{Effect, EffectError, EffectKind, Ring};
+use twin::{Effect, EffectError, EffectKind, Holding, Rf, Ring};
 
 use super::error::{Part, Place, RecordingError};
 use super::limit::{POSITIVE, from_milli, in_milli};
@@ -177,21 +177,26 @@ impl Header {
         transfer(current / self.nominal[supply]) / transfer(1.0)
     }
 
-    /// What is believed to be held instead of the momentum, as an effect.
+    /// What is believed to be held while correctors kick.
     ///
     /// # Errors
     /// [`EffectError`] if the ring does not have the monitors of a radial loop.
-    pub fn believed(&self, ring: &Ring) -> Result<Vec<Effect>, EffectError> {
-        let held = match self.believed_rf {
-            BelievedRf::FixedMomentum => return Ok(Vec::new()),
-            BelievedRf::FixedFrequency => Some(Effect::at(EffectKind::FixedRfFrequency, "", 1.0, ring)),
-            BelievedRf::RadialLoop => self.radial_loop(ring),
-        };
-        held.into_iter().collect()
+    ///
+    /// # Panics
+    /// If a radial loop is believed on and its monitors are not known, which no header that was read is.
+    pub fn believed(&self, ring: &Ring) -> Result<Holding, EffectError> {
+        match self.believed_rf {
+            BelievedRf::FixedMomentum => Ok(Rf::FixedMomentum.into()),
+            BelievedRf::FixedFrequency => Ok(Rf::FixedFrequency.into()),
+            BelievedRf::RadialLoop => {
+                let known = self.radial_loop(ring).expect("where a loop is believed on its monitors are known");
+                Holding::mean_of(ring, known?.site)
+            }
+        }
     }
 
-    /// A loop that holds the monitors that are named, if they are.
-    fn radial_loop(&self, ring: &Ring) -> Option<Result<Effect, EffectError>> {
+    /// The loop that would hold the monitors that are named, if they are.
+    pub fn radial_loop(&self, ring: &Ring) -> Option<Result<Effect, EffectError>> {
         let pair = self.radial_loop_monitors.as_ref()?;
         Some(Effect::at(EffectKind::RadialLoop, &pair.join(","), 1.0, ring))
     }

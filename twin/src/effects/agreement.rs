@@ -1,9 +1,9 @@
 //! The three descriptions of every effect against each other: exact closed orbits ([`Tracked`]), linear optics about the
 //! orbit ([`Machine::readings`]) and derivatives ([`Signatures`]).
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, MatrixXx2};
 
-use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signatures, Tracked};
+use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signature, Signatures, Tracked};
 use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
 use crate::site::Site;
@@ -99,8 +99,8 @@ fn tracked(machine: Machine, drives: &Drives) -> DMatrix<f64> {
     read(1.0) - read(0.0)
 }
 
-/// Central difference of readings, tunes and their drift about a machine; the whole change of what is there or not.
-fn difference(ring: &Ring, about: &[Effect], effect: &Effect, drives: &Drives) -> (DMatrix<f64>, [f64; 2], [f64; 2]) {
+/// Central difference of readings, tunes and their changes about a machine; the whole change of what is there or not.
+fn difference(ring: &Ring, about: &[Effect], effect: &Effect, drives: &Drives) -> Signature {
     let with = |amplitude: f64| {
         let all = [about, &[Effect { amplitude, ..*effect }]].concat();
         machine(ring, &all).readings(drives).unwrap()
@@ -110,8 +110,7 @@ fn difference(ring: &Ring, about: &[Effect], effect: &Effect, drives: &Drives) -
         Some(scale) => (with(1e-2 * scale), with(-1e-2 * scale), 2e-2 * scale),
     };
     let tunes = [up.1.x - down.1.x, up.1.y - down.1.y].map(|change| change / width);
-    let drift = [0, 1].map(|plane| (up.2[plane] - down.2[plane]) / width);
-    ((up.0 - down.0) / width, tunes, drift)
+    Signature { readings: (up.0 - down.0) / width, tunes, tune_changes: (up.2 - down.2) / width }
 }
 
 fn assert_derivatives(ring: &Ring, about: &[Effect], which: &[Effect], tolerance: f64) {
@@ -120,11 +119,11 @@ fn assert_derivatives(ring: &Ring, about: &[Effect], which: &[Effect], tolerance
     let signatures = Signatures::of(&about_machine, &drives).unwrap();
     for effect in which {
         let signature = signatures.of_effect(effect.kind, effect.site).unwrap();
-        let (readings, tunes, drift) = difference(ring, about, effect, &drives);
-        let error = (&signature.readings - &readings).abs().max() / readings.abs().max();
+        let known = difference(ring, about, effect, &drives);
+        let error = (&signature.readings - &known.readings).abs().max() / known.readings.abs().max();
         assert!(error < tolerance, "{effect:?}: {error:e}");
-        let pairs = signature.tunes.iter().zip(tunes).chain(signature.tune_drift.iter().zip(drift));
-        for (ours, known) in pairs {
+        let changes = signature.tune_changes.iter().zip(&known.tune_changes);
+        for (ours, known) in signature.tunes.iter().zip(&known.tunes).chain(changes) {
             // a tune rounds at 1e-13, the smallest width is 2e-5
             assert!((ours - known).abs() < tolerance * known.abs() + 1e-7, "{effect:?}: {ours} of {known}");
         }
@@ -164,19 +163,22 @@ fn signatures_hold_about_a_machine_with_effects() {
 /// Largest error of the linear change against the exact one, in frames with kicks and in those with an RF offset, the
 /// largest change, and the error of the tunes.
 fn compare(aligned: &Ring, real: &Ring, effect: &Effect) -> [f64; 4] {
-    let linear = |effects: &[Effect]| {
+    let linear = |effects: &[Effect], change: fn(Drives) -> Drives| {
         let real = machine(real, effects);
-        let drives = drives(aligned, orbit(real.ring(), real.hold.delta));
+        let drives = change(drives(aligned, orbit(real.ring(), real.hold.delta)));
         machine(aligned, effects).readings(&drives).unwrap()
     };
     let exact = |effects: &[Effect]| tracked(machine(real, effects), &drives(aligned, Vec::new()));
     let one = core::slice::from_ref(effect);
-    let ((with, tunes, drift), change) = (linear(one), exact(one) - exact(&[]));
-    let error = &change - (with - linear(&[]).0);
-    let cycle =
-        |time: f64| Cycle { kick: vec![0.0; real.correctors.len()], strength: vec![0.0; 48], rf_offset: 0.0, time };
+    let change = exact(one) - exact(&[]);
+    let error = &change - (linear(one, |drives| drives).0 - linear(&[], |drives| drives).0);
     let still = Tracked::of(machine(real, one), NOMINAL).unwrap();
-    let [middle, end] = [0.0, 1.0].map(|time| still.cycle(&cycle(time)).unwrap().1);
+    let at =
+        |time: f64| Cycle { kick: vec![0.0; real.correctors.len()], strength: vec![0.0; 48], rf_offset: 0.0, time };
+    let [middle, end] = [0.0, 1.0].map(|time| still.cycle(&at(time)).unwrap().1);
+    let (_, tunes, changes) =
+        linear(one, |drives| Drives { kick: drives.kick * 0.0, rf_offset: drives.rf_offset * 0.0, ..drives });
+    let drift = changes.row(7); // the end of the campaign
     let missed = [middle.x - tunes.x, middle.y - tunes.y, end.x - middle.x - drift[0], end.y - middle.y - drift[1]];
     let tune = missed.map(f64::abs).into_iter().fold(0.0, f64::max);
     [error.rows(0, 6).abs().max(), error.rows(6, 2).abs().max(), change.abs().max(), tune]
@@ -224,6 +226,32 @@ fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
         // measured 0.061: the dispersion of the two displaced quadrupoles
         assert!(rf < 0.1 * change, "{effect:?}: {rf:e} of {change:e}");
         assert!(tune < 1e-3, "{effect:?}: {tune:e}");
+    }
+}
+
+#[test]
+fn what_crosses_sextupole_fields_moves_the_tunes() {
+    let ring = Ring::booster();
+    let drives = Drives { rf_offset: DVector::zeros(8), ..drives(&ring, orbit(&ring, 0.0)) };
+    let exact = |effects: &[Effect]| {
+        let tracked = Tracked::of(machine(&ring, effects), NOMINAL).unwrap();
+        let cycle = |i: usize| Cycle {
+            kick: drives.kick.row(i).iter().copied().collect(),
+            strength: vec![0.0; 48],
+            rf_offset: 0.0,
+            time: 0.0,
+        };
+        let tunes: Vec<_> = (0..6).map(|i| tracked.cycle(&cycle(i)).unwrap().1).collect();
+        MatrixXx2::from_fn(6, |i, plane| [tunes[i].x, tunes[i].y][plane])
+    };
+    // where a loop is on, the dispersion crosses them too; it moves the tunes of a ring without them as well
+    for (held, text) in [("", "sextupole_error@SX_F4=2"), ("radial_loop@x_D8,x_E6", "dipole_sextupole=0.1")] {
+        let about: Vec<Effect> = held.split_whitespace().map(|text| Effect::parse(text, &ring).unwrap()).collect();
+        let with = [about.as_slice(), &[Effect::parse(text, &ring).unwrap()]].concat();
+        let change = exact(&with) - exact(&about);
+        let error = &change - machine(&ring, &with).readings(&drives).unwrap().2.rows(0, 6);
+        // second order in the kicks and the field
+        assert!(error.amax() < 0.1 * change.amax(), "{text}: {:e} of {:e}", error.amax(), change.amax());
     }
 }
 

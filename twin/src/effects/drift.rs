@@ -3,7 +3,7 @@
 //! Every gradient is `k1 (1 + a t)` in a cycle at time t, from -1 to 1; per frame that is the parabola in t through the machines at the start, in
 //! the middle and at the end, and its derivative at none is `t (dR/dln k1) k`. A response, which is the machine in mid-campaign, does not move.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, RowVector2};
 
 use super::drives::{Drives, Seen};
 use super::mechanism::{Measured, Mechanism, Unit};
@@ -104,7 +104,8 @@ pub(super) fn of_frames(
 fn of_gradients(about: &Signatures) -> Signature {
     let mut sum = about.nothing();
     (0..about.machine.ring.quadrupoles.len()).for_each(|at| sum += about.of_quadrupole(at));
-    Signature { readings: in_time(sum.readings, about.drives), tunes: [0.0; 2], tune_drift: sum.tunes }
+    let tune_changes = &about.drives.time * RowVector2::from(sum.tunes);
+    Signature { readings: in_time(sum.readings, about.drives), tunes: [0.0; 2], tune_changes }
 }
 
 /// Rows times the time of their frame.

@@ -46,15 +46,14 @@ impl Machine {
 
     /// The same, given the ring's optics at this momentum.
     pub(super) fn seen_by(&self, ring: &Ring, optics: &Optics) -> Result<Seen, OrbitError> {
-        let response = self.held(ring, optics)?;
-        let eta = optics.slip_factor();
+        let held = self.held_of(ring, optics)?;
+        let sources = optics.correctors();
         let with_rf = |plane: Plane| {
-            let response = &response[plane.index()];
             let places = optics.monitor_places(plane);
-            let rf = DVector::from_iterator(places.len(), places.iter().map(|o| -optics.dispersion(o) / eta));
+            let response = held.response(optics, &places, &sources);
             let at = response.ncols();
-            let mut all = response.clone().insert_column(at, 0.0);
-            all.set_column(at, &rf);
+            let mut all = response.insert_column(at, 0.0);
+            all.set_column(at, &held.rf_response(optics, &places));
             all
         };
         Ok(Seen { response: [Plane::X, Plane::Y].map(with_rf), tunes: optics.tunes()? })

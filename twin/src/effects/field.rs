@@ -4,7 +4,7 @@
 //! that passes it: to a small deviation it is a gradient and a skew gradient ([`Machine::on_orbit`]), to larger ones curved ([`Crossed`]).
 //! The derivative is one formula for all gradients, `dR = -a (W + step) Q (W + step) c` of [`crate::response`].
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, MatrixXx2, RowVector2};
 
 use super::drives::Drives;
 use super::hold::Held;
@@ -307,7 +307,7 @@ fn sextupole(about: &Signatures, at: usize) -> Signature {
     // a skew gradient moves no tune to first order
     signature.readings += about.of_gradient(&about.optics.skew_gradient(at), y * per_length).readings;
     let crossed = Crossed::of(&about.optics, &about.held, &[(at, 1.0)], about.drives, &about.kick);
-    signature.readings += ring.own_planes(&crossed.seen(&crossed.kicks(&crossed.orbit)));
+    crossed.add_to(&mut signature, ring);
     signature
 }
 
@@ -318,8 +318,13 @@ fn in_dipoles(about: &Signatures) -> Signature {
     let mut signature = about.of_gradients(dipoles(ring).map(of));
     let fields: Vec<(usize, f64)> = dipoles(ring).map(|at| (at, 1.0)).collect();
     let crossed = Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick);
-    signature.readings += ring.own_planes(&crossed.seen(&crossed.kicks(&crossed.orbit)));
+    crossed.add_to(&mut signature, ring);
     signature
+}
+
+/// Change of both tunes by x in a sextupole field (element, K2L), a gradient `K2L x` [1/m].
+fn tune_slope(optics: &Optics, &(element, k2l): &(usize, f64)) -> [f64; 2] {
+    optics.tune_slope(&optics.gradient_middle(element)).map(|slope| slope * k2l)
 }
 
 /// The orbit (x, y) across an element, mean of both ends [m].
@@ -365,6 +370,8 @@ const SETTLED: f64 = 1e-11;
 pub(super) struct Crossed {
     /// K2L [1/m^2] and S [1/m] of each.
     strengths: Vec<[f64; 2]>,
+    /// Change of both tunes by x in the middle of each [1/m].
+    tune_slopes: Vec<[f64; 2]>,
     /// Orbit that correctors and RF offset make in their middles: rows frames, columns x and y of each [m].
     orbit: DMatrix<f64>,
     /// Orbit there by kicks there [m/rad].
@@ -384,14 +391,29 @@ impl Crossed {
             sources.extend(optics.kick_middle(element));
         }
         let mut orbit = kick * held.response(optics, &observers, &optics.correctors()).transpose();
-        let rf = optics.dispersion_of(&observers) / -optics.slip_factor();
-        orbit.ger(1.0, &drives.rf_offset, &rf, 1.0);
+        orbit.ger(1.0, &drives.rf_offset, &held.rf_response(optics, &observers), 1.0);
         Self {
+            tune_slopes: fields.iter().map(|field| tune_slope(optics, field)).collect(),
             strengths: fields.iter().map(|&(at, k2l)| [k2l, k2l * skew(at)]).collect(),
             orbit,
             back: held.response(optics, &observers, &sources),
             monitors: [Plane::X, Plane::Y].map(|plane| held.response(optics, &optics.monitor_places(plane), &sources)),
         }
+    }
+
+    /// What the orbit of each frame does to the tunes by its feed-down, rows frames.
+    pub fn tune_changes(&self) -> MatrixXx2<f64> {
+        let mut changes = MatrixXx2::zeros(self.orbit.nrows());
+        for (i, slope) in self.tune_slopes.iter().enumerate() {
+            changes += self.orbit.column(2 * i) * RowVector2::from(*slope);
+        }
+        changes
+    }
+
+    /// Add the kicks of the orbit, without what these do to the orbit in turn, and its changes of the tunes.
+    fn add_to(&self, signature: &mut Signature, ring: &Ring) {
+        signature.readings += ring.own_planes(&self.seen(&self.kicks(&self.orbit)));
+        signature.tune_changes += self.tune_changes();
     }
 
     /// Kicks of an orbit, same shape [rad].

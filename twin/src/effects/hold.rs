@@ -6,12 +6,16 @@
 //!
 //! `R - D m`, `m = a (R_i + R_j)/(D_i + D_j)` the momentum that brings the mean back.
 //!
-//! Exact orbits close at the momentum that follows in the same way; the derivative is a difference of two machines.
+//! A loop also takes back its share of a step of the RF frequency, which moves the orbit by `-D/eta`: `1 - a` of it is left. A loop that the
+//! operators have on they open for such a step, since they could not measure the dispersion otherwise.
+//!
+//! Exact orbits close at the momentum that follows in the same way, from the momentum at which the frequency, or the mean of the pair, is
+//! exactly held; the derivative is a difference of two machines.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use super::mechanism::{Measured, Mechanism, Unit};
-use super::{EffectError, Machine};
+use super::{EffectError, EffectKind, Machine};
 use crate::lattice::{Plane, Ring};
 use crate::map::{DELTA, X};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError};
@@ -39,19 +43,60 @@ pub enum Rf {
 }
 
 /// What a machine holds.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Holding {
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Holding {
     /// Momentum of the beam on average.
-    pub delta: f64,
+    pub(super) delta: f64,
     /// Share of the response at fixed RF frequency.
     frequency_share: f64,
-    /// Monitors whose mean is held, and the share.
-    radial_loop: Option<([usize; 2], f64)>,
+    radial_loop: Option<RadialLoop>,
+}
+
+/// A loop that holds the mean of two monitors.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct RadialLoop {
+    pair: [usize; 2],
+    /// Share of what kicks do to the mean that it takes back.
+    of_kicks: f64,
+    /// The same of what a step of the RF frequency does.
+    of_rf_steps: f64,
 }
 
 impl From<Rf> for Holding {
     fn from(rf: Rf) -> Self {
         Self { frequency_share: if rf == Rf::FixedFrequency { 1.0 } else { 0.0 }, ..Self::default() }
+    }
+}
+
+impl Holding {
+    /// The mean of two horizontal monitors, by a loop that is open while the RF frequency is stepped.
+    ///
+    /// # Errors
+    /// [`EffectError::Place`] if the site is no such pair.
+    pub fn mean_of(ring: &Ring, site: Site) -> Result<Self, EffectError> {
+        let pair = HoldEffect::RadialLoop.pair(ring, site)?;
+        Ok(Self { radial_loop: Some(RadialLoop { pair, of_kicks: 1.0, of_rf_steps: 0.0 }), ..Self::default() })
+    }
+
+    /// The effect that it would be if nobody knew of it; none where the momentum is held.
+    pub fn effect(&self) -> Option<EffectKind> {
+        let frequency = (self.frequency_share != 0.0).then_some(EffectKind::FixedRfFrequency);
+        frequency.or(self.radial_loop.map(|_| EffectKind::RadialLoop))
+    }
+
+    /// Share of a step of the RF frequency that reaches the beam.
+    fn share_of_rf_steps(&self) -> f64 {
+        1.0 - self.radial_loop.map_or(0.0, |one| one.of_rf_steps)
+    }
+}
+
+impl HoldEffect {
+    /// The two monitors of a loop.
+    fn pair(self, ring: &Ring, site: Site) -> Result<[usize; 2], EffectError> {
+        match site {
+            Site::MonitorPair(one, other) if is_horizontal(ring, [one, other]) => Ok([one, other]),
+            _ => Err(self.misplaced(ring, site.name(ring))),
+        }
     }
 }
 
@@ -110,9 +155,12 @@ impl Mechanism for HoldEffect {
         match (self, site) {
             (Self::Momentum, Site::Ring) => hold.delta += amplitude,
             (Self::Frequency, Site::Ring) => hold.frequency_share += amplitude,
-            (Self::RadialLoop, Site::MonitorPair(one, other)) if is_horizontal(ring, [one, other]) => {
-                let held = hold.radial_loop.filter(|(pair, _)| *pair == [one, other]).map_or(0.0, |(_, share)| share);
-                hold.radial_loop = Some(([one, other], held + amplitude));
+            (Self::RadialLoop, _) => {
+                let pair = self.pair(ring, site)?;
+                let known = hold.radial_loop.filter(|one| one.pair == pair);
+                let mut one = known.unwrap_or(RadialLoop { pair, of_kicks: 0.0, of_rf_steps: 0.0 });
+                (one.of_kicks, one.of_rf_steps) = (one.of_kicks + amplitude, one.of_rf_steps + amplitude);
+                hold.radial_loop = Some(one);
             }
             _ => return Err(self.misplaced(ring, site.name(ring))),
         }
@@ -147,6 +195,8 @@ pub struct Held<'r> {
     frequency: Option<(Optics<'r>, f64)>,
     /// The two monitors, and the share of the loop.
     radial: Option<([Observer; 2], f64)>,
+    /// Share of a step of the RF frequency that reaches the beam.
+    of_rf_steps: f64,
 }
 
 impl<'r> Held<'r> {
@@ -157,8 +207,19 @@ impl<'r> Held<'r> {
         let held = || Ok((Optics::of(ring, Hold::Frequency { offset })?, share));
         let frequency = (share != 0.0).then(held).transpose()?;
         let observer = |at: usize| optics.observe(ring.monitors[at].element, Plane::X);
-        let radial = holding.radial_loop.map(|(pair, share)| (pair.map(observer), share));
-        Ok(Self { frequency, radial })
+        let radial = holding.radial_loop.map(|one| (one.pair.map(observer), one.of_kicks));
+        Ok(Self { frequency, radial, of_rf_steps: holding.share_of_rf_steps() })
+    }
+
+    /// What observers see of a relative step of the RF frequency [m].
+    pub fn rf_response(&self, optics: &Optics, observers: &[Observer]) -> DVector<f64> {
+        optics.dispersion_of(observers) * (-self.of_rf_steps / optics.slip_factor())
+    }
+
+    /// Its derivative with respect to a gradient.
+    pub fn rf_jacobian(&self, optics: &Optics, observers: &[Observer], gradient: &Gradient) -> DVector<f64> {
+        let whole = optics.rf_jacobian(observers, core::slice::from_ref(gradient)).column(0).into_owned();
+        whole * self.of_rf_steps
     }
 
     /// Orbit response, rows observers, columns sources [m/rad].
@@ -221,33 +282,106 @@ impl Closing {
     /// About the orbit without kicks.
     pub fn of(ring: &Ring, holding: Holding) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: holding.delta })?;
-        let radial = holding.radial_loop.map_or([0.0, 1.0], |(pair, _)| {
+        let radial = holding.radial_loop.map_or([0.0, 1.0], |RadialLoop { pair, .. }| {
             let dispersion = pair.map(|at| optics.dispersion(&optics.observe(ring.monitors[at].element, Plane::X)));
             [mean(ring, pair, optics.closed_orbit()), 0.5 * (dispersion[0] + dispersion[1])]
         });
         Ok(Self { holding, plain: optics.closed_orbit().clone(), frequency: optics.frequency_offset(), radial })
     }
 
-    /// The orbit on which the beam runs in a ring that kicks have changed; a step of the RF frequency overrides whatever is held.
+    /// The orbit on which the beam runs in a ring that kicks have changed; a step of the RF frequency sets the momentum, of which a loop takes
+    /// back its share.
     pub fn orbit(&self, ring: &Ring, rf_offset: f64) -> Result<ClosedOrbit, OrbitError> {
         let Holding { delta, frequency_share, radial_loop } = self.holding;
         let at = |hold: Hold| ClosedOrbit::near(ring, hold, &self.plain);
         let at_frequency = |offset: f64| at(Hold::Frequency { offset: self.frequency + offset });
         let at_momentum = |delta: f64| at(Hold::Momentum { delta });
-        if rf_offset != 0.0 {
-            return at_frequency(rf_offset);
-        }
-        if frequency_share != 0.0 {
+        let orbit = if rf_offset != 0.0 {
+            at_frequency(rf_offset)?
+        } else if frequency_share != 0.0 {
             let full = at_frequency(0.0)?.at[0][DELTA];
-            return at_momentum(delta + frequency_share * (full - delta));
+            at_momentum(delta + frequency_share * (full - delta))?
+        } else {
+            at_momentum(delta)?
+        };
+        let Some(one) = radial_loop else { return Ok(orbit) };
+        let share = if rf_offset == 0.0 { one.of_kicks } else { one.of_rf_steps };
+        if share == 0.0 {
+            return Ok(orbit);
         }
-        let orbit = at_momentum(delta)?;
-        let Some((pair, share)) = radial_loop else { return Ok(orbit) };
-        at_momentum(delta - share * (mean(ring, pair, &orbit) - self.radial[0]) / self.radial[1])
+        let free = orbit.at[0][DELTA];
+        at_momentum(free + share * (self.by_loop(ring, one.pair, orbit)? - free))
+    }
+
+    /// Momentum at which the mean of a pair is that without kicks, from the orbit at another momentum: secant steps, the first along the dispersion.
+    fn by_loop(&self, ring: &Ring, pair: [usize; 2], mut orbit: ClosedOrbit) -> Result<f64, OrbitError> {
+        let [held, mut slope] = self.radial;
+        for _ in 0..STEPS {
+            let miss = mean(ring, pair, &orbit) - held;
+            if miss.abs() < HELD {
+                break;
+            }
+            let delta = orbit.at[0][DELTA] - miss / slope;
+            let next = ClosedOrbit::near(ring, Hold::Momentum { delta }, &orbit)?;
+            slope = (mean(ring, pair, &next) - held - miss) / (delta - orbit.at[0][DELTA]);
+            orbit = next;
+        }
+        Ok(orbit.at[0][DELTA])
     }
 }
+
+/// Distance of a mean from that held at which a radial loop has settled [m], a thousandth of a monitor's noise, and steps until then at most:
+/// three where kicks move the orbit by millimetres.
+const HELD: f64 = 1e-7;
+const STEPS: usize = 8;
 
 /// Mean horizontal orbit of two monitors.
 fn mean(ring: &Ring, pair: [usize; 2], orbit: &ClosedOrbit) -> f64 {
     0.5 * pair.map(|at| orbit.at[ring.monitors[at].element][X]).iter().sum::<f64>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::effects::{Cycle, Effect, Tracked};
+
+    const PAIR: &str = "radial_loop@x_D8,x_E6";
+
+    fn effect(text: &str) -> Effect {
+        Effect::parse(text, &Ring::booster()).unwrap()
+    }
+
+    /// Mean of the pair in exact orbits, for a strong kick or a step of the RF frequency [m].
+    fn mean_of_pair(holding: impl Into<Holding>, effects: &[Effect], kick: f64, rf_offset: f64) -> f64 {
+        let ring = Ring::booster();
+        let pair = HoldEffect::RadialLoop.pair(&ring, effect(PAIR).site).unwrap();
+        let reads = pair.map(|at| ring.read_monitors.iter().position(|&read| read == at).unwrap());
+        let (mut kicks, strength) = (vec![0.0; ring.correctors.len()], vec![0.0; ring.quadrupoles.len()]);
+        kicks[16] = kick;
+        let machine = Machine::new(ring, holding, effects).unwrap();
+        let cycle = Cycle { kick: kicks, strength, rf_offset, time: 0.0 };
+        let readings = Tracked::of(machine, 2e-4).unwrap().readings(&cycle).unwrap();
+        0.5 * reads.map(|b| readings[b]).iter().sum::<f64>()
+    }
+
+    #[test]
+    fn a_full_loop_holds_the_mean_of_exact_orbits() {
+        let free = mean_of_pair(Rf::FixedMomentum, &[], 1e-3, 0.0);
+        let held = mean_of_pair(Rf::FixedMomentum, &[effect(PAIR)], 1e-3, 0.0);
+        // one step along the dispersion alone leaves its second order
+        assert!(free.abs() > 5e-3 && held.abs() < HELD, "{free:e} {held:e}");
+    }
+
+    #[test]
+    fn an_unknown_loop_takes_back_its_share_of_a_frequency_step() {
+        let (ring, step) = (Ring::booster(), 2e-4);
+        let free = mean_of_pair(Rf::FixedMomentum, &[], 0.0, step);
+        let most = mean_of_pair(Rf::FixedMomentum, &[Effect { amplitude: 0.8, ..effect(PAIR) }], 0.0, step);
+        // second order of a momentum of 2e-3
+        assert!((most / free - 0.2).abs() < 0.02, "{most:e} of {free:e}");
+        let known = Holding::mean_of(&ring, effect(PAIR).site).unwrap();
+        assert_eq!(mean_of_pair(known, &[], 0.0, step), free, "it is opened for the step");
+        assert!(mean_of_pair(known, &[], 1e-3, 0.0).abs() < HELD);
+        assert!(Holding::mean_of(&ring, Site::Ring).is_err());
+    }
 }

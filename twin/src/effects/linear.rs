@@ -9,7 +9,7 @@
 //! against the orbit without kicks, whose own reading is unknown and constant. A sextupole field and a cubic term depend on
 //! that orbit: it is part of [`Drives`].
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, MatrixXx2, RowVector2};
 
 use super::drift;
 use super::drives::Drives;
@@ -20,30 +20,32 @@ use crate::response::Optics;
 use crate::tune::Tunes;
 
 impl Machine {
-    /// Readings of the read monitors, rows frames, columns monitors [m], the tunes in mid-campaign, and how much they change
-    /// from there to the end.
+    /// Readings of the read monitors, rows frames, columns monitors [m], the tunes on the orbit without kicks in mid-campaign, and how much those
+    /// of each frame differ, rows frames: by the drift, and by the orbit that crosses sextupole fields.
     ///
     /// # Errors
     /// [`OrbitError`] if the machine is unstable.
-    pub fn readings(&self, drives: &Drives) -> Result<(DMatrix<f64>, Tunes, [f64; 2]), OrbitError> {
+    pub fn readings(&self, drives: &Drives) -> Result<(DMatrix<f64>, Tunes, MatrixXx2<f64>), OrbitError> {
         let ring = self.on_orbit(&drives.orbit).ring;
         let optics = Optics::of(&ring, Hold::Momentum { delta: self.hold.delta })?;
         let seen = self.seen_by(&ring, &optics)?;
         let kick = self.kicks(drives);
         let mut positions = drives.positions(&seen, &kick);
-        let mut tune_drift = [0.0; 2];
+        let mut tune_changes = MatrixXx2::zeros(kick.nrows());
         if self.drift != 0.0 {
             let (change, of_tunes) = drift::of_frames(self, &ring, drives, &kick, &positions)?;
             add(&mut positions, change);
-            tune_drift = of_tunes;
+            tune_changes += &drives.time * RowVector2::from(of_tunes);
         }
         if !self.sextupoles.is_empty() {
             let held = self.held_of(&ring, &optics)?;
-            add(&mut positions, Crossed::of(&optics, &held, &self.sextupoles, drives, &kick).curved());
+            let crossed = Crossed::of(&optics, &held, &self.sextupoles, drives, &kick);
+            add(&mut positions, crossed.curved());
+            tune_changes += crossed.tune_changes();
         }
         let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(|monitor| drives.orbit[monitor.element]).collect();
         self.monitors.iter().for_each(|reading| reading.of_changes(&self.ring, &mut base, &mut positions));
-        Ok((self.ring.own_planes(&positions), seen.tunes, tune_drift))
+        Ok((self.ring.own_planes(&positions), seen.tunes, tune_changes))
     }
 }
 

@@ -3,7 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::corrector::Kick;
-use super::hold::{Held, Holding, Rf};
+use super::hold::{Held, Holding};
 use super::mechanism::Mechanism;
 use super::monitor::Reading;
 use super::{Effect, EffectError};
@@ -46,14 +46,14 @@ pub struct MachineResponse {
 }
 
 impl Machine {
-    /// Apply effects to a ring whose momentum (on average) is the reference's, and is held, or the frequency.
+    /// Apply effects to a ring whose momentum (on average) is the reference's, and what it holds while its correctors kick.
     ///
     /// # Errors
     /// [`EffectError::Place`] if a site is none where its kind can act.
-    pub fn new(ring: Ring, rf: Rf, effects: &[Effect]) -> Result<Self, EffectError> {
+    pub fn new(ring: Ring, hold: impl Into<Holding>, effects: &[Effect]) -> Result<Self, EffectError> {
         let mut machine = Self {
             ring,
-            hold: rf.into(),
+            hold: hold.into(),
             monitors: Vec::new(),
             correctors: Vec::new(),
             sextupoles: Vec::new(),
@@ -103,6 +103,11 @@ impl Machine {
         self.drift
     }
 
+    /// What it holds.
+    pub fn holding(&self) -> Holding {
+        self.hold
+    }
+
     /// The same machine with a factor on the gradient of each quadrupole `[M]`.
     ///
     /// # Panics
@@ -127,7 +132,9 @@ impl Machine {
     /// [`OrbitError`] if the machine is unstable.
     pub fn response(&self) -> Result<MachineResponse, OrbitError> {
         let optics = self.optics()?;
-        let mut response = self.held(&self.ring, &optics)?;
+        let (held, sources) = (self.held_of(&self.ring, &optics)?, optics.correctors());
+        let of = |plane: Plane| held.response(&optics, &optics.monitor_places(plane), &sources);
+        let mut response = [Plane::X, Plane::Y].map(of);
         self.measure(&optics, &mut response);
         let dispersion = optics.monitor_places(Plane::X).iter().map(|o| optics.dispersion(o)).collect();
         let [x, y] = response;
@@ -168,18 +175,12 @@ impl Machine {
     pub fn held_of<'r>(&self, ring: &'r Ring, optics: &Optics) -> Result<Held<'r>, OrbitError> {
         Held::of(ring, optics, self.hold)
     }
-
-    /// Response of x and y at the monitors with what this machine holds constant.
-    pub(super) fn held(&self, ring: &Ring, optics: &Optics) -> Result<[DMatrix<f64>; 2], OrbitError> {
-        let held = self.held_of(ring, optics)?;
-        let sources = optics.correctors();
-        Ok([Plane::X, Plane::Y].map(|plane| held.response(optics, &optics.monitor_places(plane), &sources)))
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::effects::Rf;
 
     fn respond(effects: &[&str]) -> MachineResponse {
         respond_on(Ring::booster(), effects)

@@ -29,7 +29,7 @@ pub use corrector::CorrectorEffect;
 pub use drift::DriftEffect;
 pub use drives::Drives;
 pub use field::{FieldEffect, Thin};
-pub use hold::{Held, HoldEffect, Rf};
+pub use hold::{Held, HoldEffect, Holding, Rf};
 pub use machine::{Machine, MachineResponse};
 pub use mechanism::{Measured, Mechanism, Unit};
 pub use monitor::MonitorEffect;

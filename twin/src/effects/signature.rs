@@ -3,7 +3,7 @@
 //! Each class has its formula for it in its own file; one without a formula is a difference of two machines. An effect without an
 //! amplitude (a reversed corrector, exchanged monitors, a held frequency) has its whole change instead.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, MatrixXx2};
 
 use super::drives::{Drives, Seen};
 use super::field::{self, Thin};
@@ -41,17 +41,15 @@ pub struct Signature {
     pub readings: DMatrix<f64>,
     /// To the tunes.
     pub tunes: [f64; 2],
-    /// To the tunes at the end of the campaign against its middle.
-    pub tune_drift: [f64; 2],
+    /// To the tunes of each frame besides, rows frames.
+    pub tune_changes: MatrixXx2<f64>,
 }
 
 impl core::ops::AddAssign for Signature {
     fn add_assign(&mut self, other: Self) {
         self.readings += other.readings;
-        for plane in 0..2 {
-            self.tunes[plane] += other.tunes[plane];
-            self.tune_drift[plane] += other.tune_drift[plane];
-        }
+        (0..2).for_each(|plane| self.tunes[plane] += other.tunes[plane]);
+        self.tune_changes += other.tune_changes;
     }
 }
 
@@ -59,11 +57,10 @@ impl core::ops::Sub for Signature {
     type Output = Self;
 
     fn sub(self, other: Self) -> Self {
-        let less = |one: [f64; 2], other: [f64; 2]| core::array::from_fn(|plane| one[plane] - other[plane]);
         Self {
             readings: self.readings - other.readings,
-            tunes: less(self.tunes, other.tunes),
-            tune_drift: less(self.tune_drift, other.tune_drift),
+            tunes: [0, 1].map(|plane| self.tunes[plane] - other.tunes[plane]),
+            tune_changes: self.tune_changes - other.tune_changes,
         }
     }
 }
@@ -72,21 +69,29 @@ impl core::ops::Mul<f64> for Signature {
     type Output = Self;
 
     fn mul(self, factor: f64) -> Self {
-        let times = |pair: [f64; 2]| pair.map(|one| one * factor);
-        Self { readings: self.readings * factor, tunes: times(self.tunes), tune_drift: times(self.tune_drift) }
+        let Self { readings, tunes, tune_changes } = self;
+        Self {
+            readings: readings * factor,
+            tunes: tunes.map(|tune| tune * factor),
+            tune_changes: tune_changes * factor,
+        }
     }
 }
 
 impl Signature {
     /// Readings and, as two more columns, the tunes of every frame.
-    pub fn by_frame(self, time: &DVector<f64>) -> DMatrix<f64> {
+    pub fn by_frame(self) -> DMatrix<f64> {
         let monitors = self.readings.ncols();
         let mut all = self.readings.insert_columns(monitors, 2, 0.0);
         for plane in 0..2 {
-            let tune = time.map(|t| self.tunes[plane] + self.tune_drift[plane] * t);
-            all.set_column(monitors + plane, &tune);
+            all.set_column(monitors + plane, &self.tune_changes.column(plane).add_scalar(self.tunes[plane]));
         }
         all
+    }
+
+    /// Change of a tune in a frame.
+    pub fn tune(&self, plane: usize, frame: usize) -> f64 {
+        self.tunes[plane] + self.tune_changes[(frame, plane)]
     }
 }
 
@@ -167,7 +172,7 @@ impl<'m> Signatures<'m> {
         let slope = |plane| {
             let observer = self.optics.observe_slope(element, plane);
             let response = self.held.response(&self.optics, &[observer], &self.sources);
-            let rf = -self.optics.dispersion(&observer) / self.optics.slip_factor();
+            let rf = self.held.rf_response(&self.optics, &[observer])[0];
             (&self.kick * response.transpose() + &self.drives.rf_offset * rf).column(0).into_owned()
         };
         DMatrix::from_columns(&[position(plane), slope(plane), position(crossed), slope(crossed)])
@@ -200,7 +205,11 @@ impl<'m> Signatures<'m> {
     /// No change.
     pub(super) fn nothing(&self) -> Signature {
         let readings = DMatrix::zeros(self.kick.nrows(), self.observers.len());
-        Signature { readings, tunes: [0.0; 2], tune_drift: [0.0; 2] }
+        Signature { readings, tunes: [0.0; 2], tune_changes: self.no_tune_changes() }
+    }
+
+    fn no_tune_changes(&self) -> MatrixXx2<f64> {
+        MatrixXx2::zeros(self.kick.nrows())
     }
 
     /// A change of gradient by `scale`.
@@ -215,13 +224,13 @@ impl<'m> Signatures<'m> {
         let mut tunes = [0.0; 2];
         for (gradient, scale) in gradients {
             response += self.held.jacobian(&self.optics, &self.observers, &self.sources, &gradient) * scale;
-            rf += self.optics.rf_jacobian(&self.observers, core::slice::from_ref(&gradient)).column(0) * scale;
+            rf += self.held.rf_jacobian(&self.optics, &self.observers, &gradient) * scale;
             let slope = self.optics.tune_slope(&gradient);
             tunes.iter_mut().zip(slope).for_each(|(to, slope)| *to += slope * scale);
         }
         let mut readings = &self.kick * response.transpose();
         readings.ger(1.0, &self.drives.rf_offset, &rf, 1.0);
-        Signature { readings, tunes, tune_drift: [0.0; 2] }
+        Signature { readings, tunes, tune_changes: self.no_tune_changes() }
     }
 
     /// Difference of the linear optics of two machines, per unit of the amplitude: central, or against none without one.
@@ -243,6 +252,7 @@ impl<'m> Signatures<'m> {
         let (up, down) = (seen(&up)?, seen(down)?);
         let readings = |seen: &Seen| self.machine.ring.own_planes(&self.drives.positions(seen, &self.kick));
         let tunes = [up.tunes.x - down.tunes.x, up.tunes.y - down.tunes.y].map(|change| change / width);
-        Ok(Signature { readings: (readings(&up) - readings(&down)) / width, tunes, tune_drift: [0.0; 2] })
+        let readings = (readings(&up) - readings(&down)) / width;
+        Ok(Signature { readings, tunes, tune_changes: self.no_tune_changes() })
     }
 }
