@@ -156,6 +156,9 @@ pub enum DataError {
     Fit(#[from] FitError),
 }
 
+/// Distance at which the range of a var ends here over that of its prior, in `ln var`: five standard deviations instead of two, where the machine
+/// file says nothing else. A quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
+const REACH: f64 = 2.5;
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
 /// Whitened residual above which a reading of a faulty monitor is dropped.
@@ -197,7 +200,7 @@ impl Data {
             others: Vec::new(),
             momentum: ring.particle.momentum() * ramped.map_or(1.0, |at| at.momentum),
             ring: ring.clone(),
-            units: Units::of(&campaign.prior),
+            units: Units::of(&campaign.prior.reaching(REACH)),
             screened,
             supplies: supplies.clone(),
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),

@@ -61,6 +61,12 @@ impl Units {
         params.iter().enumerate().map(|(i, theta)| (theta - self.mean[i]) / self.sigma[i])
     }
 
+    /// Smallest and largest factor of each param.
+    pub fn ranges(&self) -> Vec<[f64; 2]> {
+        let factor = |(i, range): (usize, &[f64; 2])| range.map(|u| (self.mean[i] + self.sigma[i] * u).exp());
+        self.range.iter().enumerate().map(factor).collect()
+    }
+
     /// Bounds of some unknowns, the params first; the others have none.
     pub fn bounds(&self, unknowns: usize) -> Vec<[f64; 2]> {
         let free = core::iter::repeat([f64::NEG_INFINITY, f64::INFINITY]);

@@ -12,6 +12,7 @@
 pub mod alternatives;
 pub mod average;
 pub mod baseline;
+pub mod beyond;
 pub mod chance;
 mod channel;
 pub mod choice;
@@ -64,6 +65,7 @@ mod testing;
 use twin::{Effect, Ring};
 
 use average::Vars;
+use beyond::Beyond;
 use data::{Data, DataError};
 use heldout::Score;
 use hypothesis::Term;
@@ -100,6 +102,8 @@ pub struct Diagnosis {
     pub vars_before: Vars,
     /// Vars, averaged over the competing causes.
     pub vars_after: Vars,
+    /// Vars beyond the range of their prior.
+    pub beyond: Vec<Beyond>,
     /// The measurement that would best separate the leading causes, for an ambiguous verdict.
     pub next_measurement: Option<String>,
 }
@@ -168,8 +172,9 @@ impl Diagnosis {
         progress("what to measure next");
         // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
-        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions);
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
+        let beyond = Beyond::all(&data.ring, &vars_after);
+        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
         Ok(Self {
             found,
             contradictions,
@@ -182,6 +187,7 @@ impl Diagnosis {
             correctors,
             vars_before,
             vars_after,
+            beyond,
             next_measurement,
         })
     }

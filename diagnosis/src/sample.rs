@@ -87,7 +87,7 @@ impl Density for Extended {
     }
 
     fn ranges(&self) -> Vec<[f64; 2]> {
-        self.data.ring.parameters.iter().map(|parameter| parameter.prior.range).collect()
+        self.data.units.ranges()
     }
 
     fn expand(&self, position: &[f64]) -> Vec<f64> {

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
+use super::beyond::Beyond;
 use super::chance;
 use super::choice::Choice;
 use super::data::Data;
@@ -357,6 +358,7 @@ pub fn sentence(
     verdict: Verdict,
     findings: &[Finding],
     contradictions: &[Contradiction],
+    beyond: &[Beyond],
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
@@ -388,6 +390,7 @@ pub fn sentence(
     let large: Vec<String> =
         ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
     let large = if large.is_empty() { String::new() } else { format!("; larger than ordinary: {}", large.join(", ")) };
+    let beyond: String = beyond.iter().map(|one| format!("; {one}")).collect();
     let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
     let of_one = |one: &Contradiction| match data.is_joint() {
         true => format!("; in {} {one}", one.recording),
@@ -398,7 +401,7 @@ pub fn sentence(
         true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
         false => String::new(),
     };
-    capitalised(&format!("{text}{contradicted}{large}{noise}{faulty}{together}"))
+    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{faulty}{together}"))
 }
 
 /// What is missing and not in the library.

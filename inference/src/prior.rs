@@ -58,6 +58,13 @@ impl Prior {
         }
     }
 
+    /// The same with its range `factor` times as far off zero in theta, on both sides.
+    #[must_use]
+    pub fn reaching(&self, factor: f64) -> Self {
+        let range = self.range.iter().map(|range| range.map(|bound| factor * bound)).collect();
+        Self { range, ..self.clone() }
+    }
+
     /// Number of params.
     pub fn len(&self) -> usize {
         self.range.len()

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use comfy_table::ColumnConstraint;
 use diagnosis::average::Vars;
+use diagnosis::beyond::Beyond;
 use diagnosis::data::DataError;
 use diagnosis::heldout::Score;
 use diagnosis::imperfection::{Imperfection, Measure};
@@ -39,6 +40,9 @@ pub struct DiagnosisResult {
     fit: Fits,
     vars_before: Vec<Var>,
     vars_after: Vec<Var>,
+    /// Vars beyond the range of their prior.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    beyond_range: Vec<BeyondResult>,
     /// Of the machine that was found.
     tunes: Option<Tunes>,
     tunes_measured: TunesMeasured,
@@ -47,6 +51,21 @@ pub struct DiagnosisResult {
     probabilities: Probabilities,
     /// Ordinary imperfections of the machine.
     imperfections: Vec<ImperfectionResult>,
+}
+
+/// A var beyond its range.
+#[derive(Debug, Serialize)]
+struct BeyondResult {
+    name: String,
+    mean: f64,
+    sigma: f64,
+    range: [f64; 2],
+}
+
+impl From<&Beyond> for BeyondResult {
+    fn from(one: &Beyond) -> Self {
+        Self { name: one.name.clone(), mean: one.var.value, sigma: one.var.sigma, range: one.range }
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -308,6 +327,7 @@ impl DiagnosisResult {
             },
             vars_before: vars(ring, &diagnosis.vars_before),
             vars_after: vars(ring, &diagnosis.vars_after),
+            beyond_range: diagnosis.beyond.iter().map(Into::into).collect(),
             tunes_measured: TunesMeasured::of_recording(recording, tunes.map(|tunes| [tunes.x, tunes.y])),
             tunes,
             next_measurement: diagnosis.next_measurement.clone(),

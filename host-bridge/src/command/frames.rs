@@ -4,7 +4,7 @@ use inference::recording::{BelievedRf, Format, Header, Ramp, Recording, Row};
 use measured::named::named;
 use measured::{Calibrated, Fit, Folder, Model, RawOrbits, Straightened, calibrated, unknowns};
 use training::extended;
-use twin::{Plane, Rf, Ring};
+use twin::{Effect, EffectError, EffectKind, Plane, Rf, Ring};
 
 use super::matrix::{fitted, settings};
 use super::{CommandError, check_outputs, deliver};
@@ -35,8 +35,8 @@ pub fn run(options: &Frames) -> Result<(), CommandError> {
     let calibrated = Calibrated::of(&folder, &fitted);
     let ring = Ring::parse(&calibrated.machine.to_string(), &folder.name)?;
     let recording = recording(&ring, &calibrated, &raw, settings.rf)?;
-    let believed = recording.header.believed(&ring).map_err(CommandError::other)?;
-    let model = extended::tables(&ring, &believed, &vars(&ring, &folder, &fitted)).map_err(CommandError::other)?;
+    let held = held(&ring, settings.rf).map_err(CommandError::other)?;
+    let model = extended::tables(&ring, &held, &vars(&ring, &folder, &fitted)).map_err(CommandError::other)?;
 
     recording.write(out, &ring)?;
     output::json(&out.join(MACHINE), &calibrated.machine)?;
@@ -46,6 +46,12 @@ pub fn run(options: &Frames) -> Result<(), CommandError> {
         &Written::of(out, &recording, &calibrated, &raw, mean_kick(&calibrated) * model.missing)
             .with_vars(&folder, &fitted),
     )
+}
+
+/// What the core's tables hold instead of the momentum.
+fn held(ring: &Ring, rf: Rf) -> Result<Vec<Effect>, EffectError> {
+    let frequency = (rf == Rf::FixedFrequency).then(|| Effect::at(EffectKind::FixedRfFrequency, "", 1.0, ring));
+    frequency.into_iter().collect()
 }
 
 /// What a corrector kicks in a frame, on average [rad].

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use nalgebra::DMatrix;
 use serde::Serialize;
-use twin::{EffectError, Machine, MachineResponse, Ring};
+use twin::{EffectError, Machine, MachineResponse, Rf, Ring};
 
 use super::{CommandError, check_outputs, deliver, machine};
 use crate::cli::Response;
@@ -42,7 +42,7 @@ pub fn run(options: &Response) -> Result<(), CommandError> {
     let input = |error: EffectError| CommandError::Input(error.to_string());
     let effects = options.effects.iter().map(|effect| effect.resolve(&ring)).collect::<Result<Vec<_>, _>>();
     let effects = effects.map_err(input)?;
-    let machine = Machine::new(ring.clone(), options.rf.into(), &effects).map_err(input)?;
+    let machine = Machine::new(ring.clone(), Rf::from(options.rf), &effects).map_err(input)?;
     let response = machine.response().map_err(|error| CommandError::Input(format!("{}: {error}", ring.name)))?;
     let effects = effects.iter().map(|effect| effect.text(&ring).to_string()).collect();
     deliver(&options.common, &ResponseResult::of(&ring, effects, &response))
