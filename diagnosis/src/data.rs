@@ -328,12 +328,21 @@ impl Data {
         data
     }
 
-    /// The same recording where monitors wander.
+    /// The same recordings where all monitors wander.
     pub fn wandering(&self, walk: Measured) -> Self {
         let mut data = self.clone();
         data.noise.slow.walk = walk;
         data.prepare();
         data.others.iter_mut().for_each(|other| *other = other.wandering(walk));
+        data
+    }
+
+    /// The same recordings where one monitor wanders in one of them.
+    pub fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
+        let mut data = self.clone();
+        let own = if campaign == 0 { &mut data } else { &mut data.others[campaign - 1] };
+        own.noise.wandering.push((monitor, walk));
+        own.prepare();
         data
     }
 

@@ -18,8 +18,8 @@ pub struct Imperfection {
     pub name: &'static str,
     /// A word for it: that of the kind of effect where there is one.
     pub kind: &'static str,
-    /// The instruments or magnets that have it: `x`, `y`, `H`, `V` or `all`.
-    pub at: &'static str,
+    /// The instruments or magnets that have it: `x`, `y`, `H`, `V`, `all`, or the name of one.
+    pub at: String,
     /// What the number is.
     pub measure: Measure,
     /// Value and standard deviation.
@@ -78,7 +78,7 @@ mod tests {
         let one = |value: f64| Imperfection {
             name: "gains of monitors",
             kind: "bpm_gain",
-            at: "all",
+            at: "all".into(),
             measure: Measure::Scatter,
             measured: Measured { value, sigma: 0.004 },
             unit: Unit::PERCENT,

@@ -215,7 +215,15 @@ impl Diagnosis {
     /// What was learnt of the machine besides.
     pub fn imperfections(&self) -> Vec<Imperfection> {
         let Found { data, best, .. } = &self.found;
-        ordinary::rows(data, best).into_iter().chain(data.noise.rows()).collect()
+        let noise = data.noise.rows(&data.ring.monitor_names());
+        ordinary::rows(data, best).into_iter().chain(noise).collect()
+    }
+
+    /// Names of the monitors that wander by themselves.
+    pub fn wandering(&self) -> Vec<String> {
+        let names = self.found.data.ring.monitor_names();
+        let of_one = |own: &Data| own.noise.wandering.iter().map(|(b, _)| names[*b].clone()).collect::<Vec<_>>();
+        self.found.data.campaigns().flat_map(of_one).collect()
     }
 
     /// Least probability that all effects in the fitted model are there: each has its own, given the others, so that all of them hold with

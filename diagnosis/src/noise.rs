@@ -54,6 +54,8 @@ pub struct Noise {
     pub kurtosis: Measured,
     /// Noise of each monitor's readings that is its own [B] [m].
     pub own: Vec<f64>,
+    /// Monitors that wander by themselves, by index, with the walk of each [m per root frame].
+    pub wandering: Vec<(usize, Measured)>,
     /// Ordinary walk of a monitor: as far as it is noisy, over the campaign [m per root frame].
     pub ordinary_walk: f64,
     /// Ordinary jitter of the momentum: the orbit's is that of the noise where the dispersion is largest [1].
@@ -150,6 +152,7 @@ impl Noise {
             sound: Vec::new(),
             kurtosis: Measured { value: NORMAL, sigma: 0.0 },
             own: (0..monitors).map(|b| campaign.noise(b)).collect(),
+            wandering: Vec::new(),
             ordinary_walk: 0.0,
             ordinary_momentum: 0.0,
             modes: Modes::none(monitors),
@@ -359,22 +362,27 @@ impl Noise {
 
     /// What the noise of a monitor remembers.
     pub(super) fn memory(&self, b: usize) -> Memory {
-        self.slow.memory(self.own[b])
+        let own = self.wandering.iter().find(|(at, _)| *at == b);
+        let walk = own.map_or(self.slow.walk, |(_, walk)| *walk);
+        Slow { walk, ..self.slow }.memory(self.own[b])
     }
 
     /// True if everything is as the header says.
     pub fn is_as_stated(&self) -> bool {
-        self.slow.is_none() && self.modes.is_none() && self.scale.iter().all(|scale| *scale == 1.0)
+        self.slow.is_none()
+            && self.wandering.is_empty()
+            && self.modes.is_none()
+            && self.scale.iter().all(|scale| *scale == 1.0)
     }
 
-    /// The rows of a table.
-    pub fn rows(&self) -> Vec<Imperfection> {
+    /// The rows of a table; `names` of the monitors.
+    pub fn rows(&self, names: &[String]) -> Vec<Imperfection> {
         const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
         let off = Measured { value: self.common_scale.value - 1.0, ..self.common_scale };
         let row = |(name, kind), measured, unit, ordinary| Imperfection {
             name,
             kind,
-            at: "all",
+            at: "all".into(),
             measure: Measure::Scatter,
             measured,
             unit,
@@ -400,6 +408,10 @@ impl Noise {
             mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
         ];
         rows.extend(varying);
+        rows.extend(self.wandering.iter().map(|&(b, walk)| Imperfection {
+            at: names[b].clone(),
+            ..row(("walk of one monitor per root frame", "walk"), walk, LENGTH, self.ordinary_walk)
+        }));
         rows
     }
 }

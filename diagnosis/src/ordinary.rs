@@ -302,7 +302,7 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         rows.push(Imperfection {
             name: family.name,
             kind: family.kind.word(),
-            at: family.place(),
+            at: family.place().into(),
             measure: if family.is_learnt() { Measure::Scatter } else { Measure::Mean },
             measured: Measured { value, sigma },
             unit: family.kind.unit(),

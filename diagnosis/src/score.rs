@@ -134,6 +134,9 @@ impl Truth {
         let library = self.effects.iter().all(|effect| !effect.is_unmodelled());
         match diagnosis.verdict {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
+            Verdict::Consistent if self.effects.iter().all(|effect| effect.is_of(&diagnosis.wandering())) => {
+                Grade::Open
+            }
             Verdict::Consistent => Grade::Missed,
             Verdict::Identified
                 if self.effects.len() == effects.len()
@@ -215,6 +218,11 @@ impl TrueEffect {
             (TrueCause::Unmodelled { at, .. }, None) => *at == finding.at,
             (TrueCause::Effect(_) | TrueCause::Kind(_), None) | (TrueCause::Unmodelled { .. }, Some(_)) => false,
         }
+    }
+
+    /// True for physics that the library does not hold, of one of some monitors.
+    fn is_of(&self, monitors: &[String]) -> bool {
+        matches!(&self.cause, TrueCause::Unmodelled { at, .. } if monitors.contains(at))
     }
 
     /// True for physics that the library does not hold.

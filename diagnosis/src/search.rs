@@ -25,6 +25,7 @@ use super::hypothesis::{Hypothesis, Term, Unknown};
 use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
 use super::scan::{Candidate, scan};
+use super::slow::OWN;
 use inference::bounded::softplus;
 
 /// Prior odds of one (more) effect.
@@ -48,6 +49,8 @@ const WORTH: f64 = 3.0;
 
 /// Walks that are tried.
 const WALKS: usize = 12;
+/// `ln` odds of 95 %, by which another change of one monitor has to be more likely than its walk, which is no physics.
+const DOUBT: f64 = 2.94;
 /// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
 const PASSES: usize = 4;
 const CURVED: f64 = 4.0;
@@ -123,10 +126,7 @@ impl Search {
     /// # Errors
     /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
-        let mut found = self.without_effects(data)?;
-        if let Some(wandering) = wandering(&found)? {
-            found = self.without_effects(wandering)?;
-        }
+        let mut found = self.with_noise(self.without_effects(data)?)?;
         // one effect can make another unnecessary, so that there may be more steps than effects
         for _ in 0..2 * MOST {
             let is_over = found.competitions.len() >= MOST || self.held.get() >= COMPETITIONS;
@@ -145,7 +145,15 @@ impl Search {
             if found.next.library() <= found.next.unknown() && self.log_weight(&further) < self.log_weight(&found) {
                 break;
             }
-            found = further;
+            found = self.with_noise(further)?;
+        }
+        Ok(found)
+    }
+
+    /// The same, begun anew with monitors that wander as long as that is the most likely of what is left.
+    fn with_noise(&self, mut found: Found) -> Result<Found, FitError> {
+        while let Some(wandering) = wandering(&found)? {
+            found = self.without_effects(wandering)?;
         }
         Ok(found)
     }
@@ -359,24 +367,29 @@ fn settled(data: &Data, mut fitted: Fitted) -> Fitted {
     fitted
 }
 
-/// The recording with monitors that wander, where that is more likely than any other cause. A walk too small to be seen in repeats shows in what a
-/// fit leaves, since it then has all settings to compare.
+/// The recordings with monitors that wander, all or one, where that is more likely than any other cause. A walk too small to be seen in repeats
+/// shows in what a fit leaves, since it then has all settings to compare.
 fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
-    let Found { data, null, next, .. } = found;
-    let Some(leader) = next.alternatives.first() else { return Ok(None) };
-    let is_of_time = matches!(&leader.cause, Cause::Unmodelled(one) if one.at == Location::Time);
-    if !is_of_time || !next.is_suspicious() || data.noise.slow.walk.value > 0.0 {
-        return Ok(None);
-    }
-    let exactly = |value: f64| data.wandering(Measured { value, sigma: 0.0 });
-    let log_likelihood = |walk: f64| {
-        Fitted::of(&exactly(walk), &null.hypothesis, &null.u).map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
+    let Found { data, best, next, .. } = found;
+    let leader = next.alternatives.first().filter(|_| next.is_suspicious() && !best.is_gross());
+    let Some(Alternative { cause: Cause::Unmodelled(leading), probability, .. }) = leader else { return Ok(None) };
+    let noise = &data.campaign(leading.campaign).noise;
+    let is_known = |b: &usize| noise.wandering.iter().any(|(at, _)| at == b);
+    let (with, favour): (&dyn Fn(Measured) -> Data, f64) = match &leading.at {
+        Location::Time if noise.slow.walk.value == 0.0 => (&|walk| data.wandering(walk), 0.0),
+        Location::MonitorInTime(b) if !is_known(b) && noise.wandering.len() < MOST => {
+            (&|walk| data.with_wandering(leading.campaign, *b, walk), OWN.ln() + DOUBT)
+        }
+        _ => return Ok(None),
     };
-    let posterior = HalfNormal::of(log_likelihood, data.noise.ordinary_walk, WALKS);
-    let gain = posterior.log_evidence - null.log_evidence;
-    let of_leader = (leader.probability / next.nothing.max(f64::MIN_POSITIVE)).ln();
-    let walk = Measured { value: posterior.mean, sigma: posterior.sigma() };
-    Ok((gain > of_leader).then(|| data.wandering(walk)))
+    let log_likelihood = |value: f64| {
+        let fitted = Fitted::of(&with(Measured { value, sigma: 0.0 }), &best.hypothesis, &best.u);
+        fitted.map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
+    };
+    let posterior = HalfNormal::of(log_likelihood, noise.ordinary_walk, WALKS);
+    let gain = posterior.log_evidence - best.log_evidence + favour;
+    let of_leader = (probability / next.nothing.max(f64::MIN_POSITIVE)).ln();
+    Ok((gain > of_leader).then(|| with(Measured { value: posterior.mean, sigma: posterior.sigma() })))
 }
 
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.

@@ -28,7 +28,7 @@ pub struct Slow {
 }
 
 /// Probability that the noise of a monitor is of its own kind: one or two of some tens are faulty in a way that screening does not see.
-const OWN: f64 = 0.03;
+pub(super) const OWN: f64 = 0.03;
 /// Width of the prior of the share: electronics with more slow noise than a quarter are not ordinary.
 pub const SHARE: f64 = 0.25;
 /// Largest share: some noise is white.

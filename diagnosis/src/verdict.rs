@@ -392,6 +392,7 @@ pub fn sentence(
     let large = if large.is_empty() { String::new() } else { format!("; larger than ordinary: {}", large.join(", ")) };
     let beyond: String = beyond.iter().map(|one| format!("; {one}")).collect();
     let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
+    let wandering: String = data.campaigns().flat_map(wandering).map(|said| format!("; {said}")).collect();
     let of_one = |one: &Contradiction| match data.is_joint() {
         true => format!("; in {} {one}", one.recording),
         false => format!("; {one}"),
@@ -401,7 +402,16 @@ pub fn sentence(
         true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
         false => String::new(),
     };
-    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{faulty}{together}"))
+    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{wandering}{faulty}{together}"))
+}
+
+/// Monitors of a recording that wander by themselves, and how far over the campaign.
+fn wandering(own: &Data) -> Vec<String> {
+    let names = own.ring.monitor_names();
+    let steps = (own.pools.of_frame.len() as f64).sqrt();
+    let far = |walk: &Measured| Measured { value: walk.value * steps, sigma: walk.sigma * steps }.size(1e3);
+    let said = |(b, walk): &(usize, Measured)| format!("monitor {} wanders by {} mm rms", names[*b], far(walk));
+    own.noise.wandering.iter().map(said).collect()
 }
 
 /// What is missing and not in the library.

@@ -140,7 +140,7 @@ struct Probabilities {
 #[derive(Debug, Serialize)]
 struct ImperfectionResult {
     kind: &'static str,
-    at: &'static str,
+    at: String,
     /// What the members have in common, in the unit.
     mean: f64,
     /// Rms of the members about it.
@@ -154,13 +154,13 @@ struct ImperfectionResult {
 
 impl From<&Imperfection> for ImperfectionResult {
     fn from(one: &Imperfection) -> Self {
-        let Imperfection { kind, at, measure, measured, unit, .. } = *one;
+        let Imperfection { kind, measure, measured, unit, .. } = *one;
         let [mean, scatter] = match measure {
             Measure::Mean => [measured.value, 0.0],
             Measure::Scatter => [0.0, measured.value],
         };
         let row = one.is_seen().then(|| one.row());
-        Self { kind, at, mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
+        Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
     }
 }
 
