@@ -10,6 +10,7 @@
 //! not fitted to ([`heldout`]); [`verdict`] puts the result into one word and one sentence.
 
 pub mod alternatives;
+pub mod aside;
 pub mod average;
 pub mod baseline;
 pub mod beyond;

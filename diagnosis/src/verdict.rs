@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
+use super::aside::Aside;
 use super::beyond::Beyond;
 use super::chance;
 use super::choice::Choice;
@@ -392,6 +393,10 @@ pub fn sentence(
     let large = if large.is_empty() { String::new() } else { format!("; larger than ordinary: {}", large.join(", ")) };
     let beyond: String = beyond.iter().map(|one| format!("; {one}")).collect();
     let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
+    let aside: String = Aside::all(data)
+        .iter()
+        .map(|one| if data.is_joint() { format!("; in {}: {one}", one.recording) } else { format!("; {one}") })
+        .collect();
     let wandering: String = data.campaigns().flat_map(wandering).map(|said| format!("; {said}")).collect();
     let of_one = |one: &Contradiction| match data.is_joint() {
         true => format!("; in {} {one}", one.recording),
@@ -402,7 +407,7 @@ pub fn sentence(
         true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
         false => String::new(),
     };
-    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{wandering}{faulty}{together}"))
+    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{wandering}{aside}{faulty}{together}"))
 }
 
 /// Monitors of a recording that wander by themselves, and how far over the campaign.

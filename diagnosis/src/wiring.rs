@@ -527,6 +527,7 @@ mod tests {
 
     use super::*;
     use inference::simulate::{self, Hardware, Truth};
+    use twin::{Effect, EffectKind};
 
     fn folder() -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings")
