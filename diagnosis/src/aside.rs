@@ -16,8 +16,10 @@ pub struct Aside {
     pub frames: Vec<usize>,
 }
 
-/// Share of the sound monitors whose readings are put aside in such a frame: few of them jump at once, which says nothing of the beam.
+/// Share of the sound monitors whose readings are put aside in such a frame, and their number at least: few of them jump at once, which says nothing of the
+/// beam.
 const MANY: f64 = 0.2;
+const FEWEST: usize = 3;
 /// Frames that are named.
 const NAMED: usize = 4;
 
@@ -30,11 +32,11 @@ impl Aside {
     fn of(own: &Data) -> Option<Self> {
         let sound = |b: &usize| own.health()[*b].state == MonitorState::Ok;
         let monitors: Vec<usize> = own.active_monitors().into_iter().filter(sound).collect();
-        let share = |frame: usize| {
-            let dropped = monitors.iter().filter(|&&b| !own.screened.accepted[(frame, b)]).count();
-            dropped as f64 / monitors.len().max(1) as f64
+        let is_one = |frame: &usize| {
+            let dropped = monitors.iter().filter(|&&b| own.is_aside(*frame, b)).count();
+            dropped >= FEWEST && dropped as f64 > MANY * monitors.len() as f64
         };
-        let frames: Vec<usize> = (0..own.pools.of_frame.len()).filter(|&frame| share(frame) > MANY).collect();
+        let frames: Vec<usize> = (0..own.pools.of_frame.len()).filter(is_one).collect();
         (!frames.is_empty()).then(|| Self { recording: own.name.clone(), frames })
     }
 }
@@ -65,6 +67,8 @@ mod tests {
         let other = broken.rows[120].reading.clone();
         broken.rows[30].reading = other;
         broken.rows[90].reading.iter_mut().enumerate().for_each(|(b, r)| *r = r.map(|_| 1e-3 * (b as f64 - 16.0)));
+        // what was not read is not put aside
+        broken.rows[150].reading.fill(None);
         let told = Aside::all(&data(&broken));
         assert_eq!(told.len(), 1);
         assert_eq!(told[0].to_string(), "in frames 30, 90 many readings are not those of the setting, and left out");

@@ -14,6 +14,8 @@ use super::average::Vars;
 pub struct Beyond {
     /// Name of the param.
     pub name: String,
+    /// The quadrupoles that it scales.
+    pub quadrupoles: usize,
     /// Its var [1].
     pub var: Measured,
     /// Smallest and largest of the range [1].
@@ -31,7 +33,8 @@ impl Beyond {
             let [lower, upper] = parameter.prior.range.map(f64::ln);
             let is_outside = (mean - upper).max(lower - mean) > CERTAIN * sigma;
             let var = Measured { value: mean.exp(), sigma: sigma * mean.exp() };
-            is_outside.then(|| Self { name: parameter.name.clone(), var, range: parameter.prior.range })
+            let (name, quadrupoles) = (parameter.name.clone(), parameter.quadrupoles.len());
+            is_outside.then(|| Self { name, quadrupoles, var, range: parameter.prior.range })
         };
         ring.parameters.iter().enumerate().filter_map(of).collect()
     }
@@ -40,8 +43,10 @@ impl Beyond {
 impl fmt::Display for Beyond {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let off = Measured { value: self.var.value - 1.0, sigma: self.var.sigma }.signed(100.0);
-        let [lower, upper] = self.range.map(|bound| 100.0 * (bound - 1.0));
-        write!(f, "quadrupole {} is off by {off} %, its range ends at {lower:+.0} and {upper:+.0} %", self.name)
+        let who = if self.quadrupoles == 1 { "quadrupole" } else { "quadrupole family" };
+        // no more digits than it was written with
+        let [lower, upper] = self.range.map(|bound| (1e4 * (bound - 1.0)).round() / 100.0);
+        write!(f, "{who} {} is off by {off} %, its range ends at {lower:+} and {upper:+} %", self.name)
     }
 }
 

@@ -93,7 +93,8 @@ struct Frames {
     drives: Drives,
     /// As recorded, columns monitors [m] and the two tunes, these less what the kicks do to them; NaN for what is missing.
     recorded: DMatrix<f64>,
-    /// The same at the mean supply currents, at the drives of the pool and without the terms above first order.
+    /// The same at the mean supply currents, at the drives of the pool and without the terms above first order, the tunes without what kicks do to
+    /// them where the machine holds something else than the header says.
     readings: DMatrix<f64>,
     /// `ln` of each supply's factor off its mean, columns supplies.
     fluctuation: DMatrix<f64>,
@@ -156,9 +157,9 @@ pub enum DataError {
     Fit(#[from] FitError),
 }
 
-/// Distance at which the range of a var ends here over that of its prior, in `ln var`: five standard deviations instead of two, where the machine
-/// file says nothing else. A quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
-const REACH: f64 = 2.5;
+/// Prior standard deviations of a var up to which its range reaches here, where it ends before: at two, unless the machine file says something else. A
+/// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
+const REACH: f64 = 5.0;
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
 /// Whitened residual above which a reading of a faulty monitor is dropped.
@@ -232,8 +233,8 @@ impl Data {
 
     /// Linearise the recorded readings and tunes about a machine: subtract the effect of the supplies' fluctuations on the kicked orbit,
     /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
-    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. Returns the
-    /// chi-square of the change of the readings.
+    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. From the tunes what kicks do to
+    /// them besides, where the machine holds something else than the header says. Returns the chi-square of the change of all.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
@@ -251,18 +252,18 @@ impl Data {
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();
-        Ok(self
-            .whiten(|c, pool| if c < monitors { self.readings[(pool, c)] - before[(pool, c)] } else { 0.0 })
-            .norm_squared())
+        Ok(self.whiten(|c, pool| self.readings[(pool, c)] - before[(pool, c)]).norm_squared())
     }
 
     /// What kicks do to the tunes besides, where a machine does not hold what the header states: the momentum moves with them, and the tunes by
     /// the chromaticity. Rows frames.
     fn tune_shift_beside(&self, machine: &Machine) -> Result<MatrixXx2<f64>, EffectError> {
-        if machine.holding().effect() == self.believed.effect() {
+        if machine.holding().is_like(&self.believed) {
             return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
         }
-        let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
+        // a drift is no effect of the kicks
+        let time = DVector::zeros(self.frames.drives.time.len());
+        let frames = Drives { time, orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
         let machine = machine.without_memory();
         let first_order = machine.readings(&frames)?.2;
         Ok(tune_shift::by_kicks(&machine, &frames)? - first_order - &self.frames.tune_shift)
@@ -340,7 +341,7 @@ impl Data {
     /// The same recordings where one monitor wanders in one of them.
     pub fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
         let mut data = self.clone();
-        let own = if campaign == 0 { &mut data } else { &mut data.others[campaign - 1] };
+        let own = data.campaign_mut(campaign);
         own.noise.wandering.push((monitor, walk));
         own.prepare();
         data
@@ -701,6 +702,11 @@ impl Data {
             common += row;
         }
         (alone, common)
+    }
+
+    /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
+    pub fn is_aside(&self, frame: usize, b: usize) -> bool {
+        !self.frames.recorded[(frame, b)].is_nan() && !self.screened.accepted[(frame, b)]
     }
 
     /// True if a frame's reading of a monitor, or of a tune after the last of them, counts.

@@ -55,6 +55,14 @@ impl Data {
         index.checked_sub(1).map_or(self, |other| &self.others[other])
     }
 
+    /// The same, to be changed.
+    pub(super) fn campaign_mut(&mut self, index: usize) -> &mut Self {
+        match index.checked_sub(1) {
+            None => self,
+            Some(other) => &mut self.others[other],
+        }
+    }
+
     /// How many there are.
     pub fn count(&self) -> usize {
         1 + self.others.len()

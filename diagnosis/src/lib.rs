@@ -216,8 +216,9 @@ impl Diagnosis {
     /// What was learnt of the machine besides.
     pub fn imperfections(&self) -> Vec<Imperfection> {
         let Found { data, best, .. } = &self.found;
-        let noise = data.noise.rows(&data.ring.monitor_names());
-        ordinary::rows(data, best).into_iter().chain(noise).collect()
+        let names = data.ring.monitor_names();
+        let of_others = data.campaigns().skip(1).flat_map(|own| own.noise.of_wandering(&names));
+        ordinary::rows(data, best).into_iter().chain(data.noise.rows(&names)).chain(of_others).collect()
     }
 
     /// Names of the monitors that wander by themselves.
@@ -246,6 +247,28 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+
+    /// 0.24 mm until the end, beside a gain and alone.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn a_monitor_that_wanders_is_said_and_hides_nothing() {
+        let (ring, recording) = testing::template();
+        let y_d5 = ring.monitor_names().iter().position(|name| name == "y_D5").unwrap();
+        let white = testing::Coloured::white(&ring, &recording, 11);
+        let noise = testing::Coloured { wandering: Some((y_d5, 13e-6)), ..white };
+        let gain = Effect::parse("bpm_gain@x_E6=0.15", &ring).unwrap();
+        for (effects, verdict) in [(vec![], Verdict::Consistent), (vec![gain], Verdict::Identified)] {
+            let made = noise.campaign(&ring, &recording, &effects);
+            let found = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+            assert_eq!(found.verdict, verdict, "{}", found.sentence);
+            assert_eq!(found.wandering(), ["y_D5"]);
+            assert!(found.sentence.contains("monitor y_D5 wanders"), "{}", found.sentence);
+            assert_eq!(found.findings.iter().filter_map(Finding::term).count(), effects.len());
+            let rows = found.imperfections();
+            let walk = rows.iter().find(|row| row.at == "y_D5").unwrap().measured;
+            assert!((walk.value - 13e-6).abs() < 3.0 * walk.sigma, "{walk:?}");
+        }
+    }
 
     /// A recording of format 2 need not name the correctors that were set: held-out settings and correctors are those of the read-backs.
     #[test]

@@ -2,8 +2,9 @@
 //!
 //! Of each monitor the scale of its noise; of all together what the noise remembers ([`super::slow`]), the jitter of the momentum and
 //! what crates of monitors have in common (`jitter.rs`), and any other pattern that they share ([`super::frame_to_frame`]). Everything comes from differences between readings of the same setting
-//! (`repeats.rs`), so that physics that the model lacks does not enter, with one exception: what changes with time alone, such as
-//! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size.
+//! (`repeats.rs`), so that physics that the model lacks does not enter, with two exceptions: what changes with time alone, such as
+//! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size; and the walk of one
+//! monitor is learnt from what a fit leaves ([`super::search`]).
 //!
 //! Scales are root mean squares of the readings that count. Tails are those of the readings that the screening accepts: it drops
 //! what is far from its repeats. Weighting the rest by how far each lies from its repeats would gain up to a third of the information for
@@ -76,6 +77,7 @@ pub struct Source<'c> {
     pub shapes: &'c [Shape],
 }
 
+const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
 /// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
 const FEWEST: f64 = 20.0;
 /// Ratio to the common noise above which the screening calls a monitor noisy.
@@ -377,7 +379,6 @@ impl Noise {
 
     /// The rows of a table; `names` of the monitors.
     pub fn rows(&self, names: &[String]) -> Vec<Imperfection> {
-        const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
         let off = Measured { value: self.common_scale.value - 1.0, ..self.common_scale };
         let row = |(name, kind), measured, unit, ordinary| Imperfection {
             name,
@@ -408,11 +409,22 @@ impl Noise {
             mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
         ];
         rows.extend(varying);
-        rows.extend(self.wandering.iter().map(|&(b, walk)| Imperfection {
-            at: names[b].clone(),
-            ..row(("walk of one monitor per root frame", "walk"), walk, LENGTH, self.ordinary_walk)
-        }));
+        rows.extend(self.of_wandering(names));
         rows
+    }
+
+    /// Those of the monitors that wander by themselves.
+    pub fn of_wandering(&self, names: &[String]) -> Vec<Imperfection> {
+        let row = |&(b, measured): &(usize, Measured)| Imperfection {
+            name: "walk of one monitor per root frame",
+            kind: "walk",
+            at: names[b].clone(),
+            measure: Measure::Scatter,
+            measured,
+            unit: LENGTH,
+            ordinary: self.ordinary_walk,
+        };
+        self.wandering.iter().map(row).collect()
     }
 }
 

@@ -134,9 +134,7 @@ impl Truth {
         let library = self.effects.iter().all(|effect| !effect.is_unmodelled());
         match diagnosis.verdict {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
-            Verdict::Consistent if self.effects.iter().all(|effect| effect.is_of(&diagnosis.wandering())) => {
-                Grade::Open
-            }
+            Verdict::Consistent if self.effects.iter().all(|effect| effect.is_told(diagnosis)) => Grade::Open,
             Verdict::Consistent => Grade::Missed,
             Verdict::Identified
                 if self.effects.len() == effects.len()
@@ -166,6 +164,7 @@ impl Truth {
         };
         let fate = |truth: &TrueEffect| match diagnosis.verdict {
             Verdict::Identified if findings.iter().any(|f| truth.is(f)) => Fate::Named,
+            _ if truth.is_told(diagnosis) => Fate::Listed,
             Verdict::Consistent | Verdict::Identified => Fate::Absent,
             _ if findings.iter().any(|f| together(truth, f)) => Fate::Together,
             _ if findings.iter().any(|f| listed(truth, f)) => Fate::Listed,
@@ -220,9 +219,9 @@ impl TrueEffect {
         }
     }
 
-    /// True for physics that the library does not hold, of one of some monitors.
-    fn is_of(&self, monitors: &[String]) -> bool {
-        matches!(&self.cause, TrueCause::Unmodelled { at, .. } if monitors.contains(at))
+    /// True for physics that the library does not hold, of a monitor that is said to wander.
+    pub fn is_told(&self, diagnosis: &Diagnosis) -> bool {
+        matches!(&self.cause, TrueCause::Unmodelled { at, .. } if diagnosis.wandering().contains(at))
     }
 
     /// True for physics that the library does not hold.

@@ -47,8 +47,9 @@ const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order suffices.
 const WORTH: f64 = 3.0;
 
-/// Walks that are tried.
+/// Walks that are tried, and monitors of a recording that may wander by themselves: with more it is something that they share.
 const WALKS: usize = 12;
+const WANDERERS: usize = 4;
 /// `ln` odds of 95 %, by which another change of one monitor has to be more likely than its walk, which is no physics.
 const DOUBT: f64 = 2.94;
 /// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
@@ -150,9 +151,11 @@ impl Search {
         Ok(found)
     }
 
-    /// The same, begun anew with monitors that wander as long as that is the most likely of what is left.
+    /// The same, begun anew with monitors that wander as long as that is the most likely of what is left: what was found without knowing of them has to
+    /// be found again.
     fn with_noise(&self, mut found: Found) -> Result<Found, FitError> {
         while let Some(wandering) = wandering(&found)? {
+            self.held.set(0);
             found = self.without_effects(wandering)?;
         }
         Ok(found)
@@ -367,29 +370,62 @@ fn settled(data: &Data, mut fitted: Fitted) -> Fitted {
     fitted
 }
 
-/// The recordings with monitors that wander, all or one, where that is more likely than any other cause. A walk too small to be seen in repeats
-/// shows in what a fit leaves, since it then has all settings to compare.
+/// Which monitors wander.
+enum Wander {
+    All,
+    /// One, in one of several recordings.
+    One(usize, usize),
+}
+
+impl Wander {
+    /// Those that the leading cause of what is left is about, where nothing is known of their walk yet and repeats say what is ordinary.
+    fn of(data: &Data, leading: &Discrepancy) -> Option<Self> {
+        let noise = &data.campaign(leading.campaign).noise;
+        let is_known = |b: usize| noise.wandering.iter().any(|(at, _)| *at == b);
+        let steady = data.campaigns().all(|own| own.noise.slow.walk.value == 0.0);
+        match leading.at {
+            _ if noise.ordinary_walk <= 0.0 => None,
+            Location::Time if steady => Some(Self::All),
+            Location::MonitorInTime(b) if !is_known(b) && noise.wandering.len() < WANDERERS => {
+                Some(Self::One(leading.campaign, b))
+            }
+            _ => None,
+        }
+    }
+
+    fn with(&self, data: &Data, walk: Measured) -> Data {
+        match *self {
+            Self::All => data.wandering(walk),
+            Self::One(campaign, b) => data.with_wandering(campaign, b, walk),
+        }
+    }
+
+    /// `ln` prior odds against none, and `ln` odds by which another cause has to be more likely.
+    fn odds(&self) -> (f64, f64) {
+        match self {
+            Self::All => (0.0, 0.0),
+            Self::One(..) => (OWN.ln(), DOUBT),
+        }
+    }
+}
+
+/// The recordings with monitors that wander, all or one, where that is more likely than none and than any other cause. A walk too small to be seen
+/// in repeats shows in what a fit leaves, since it then has all settings to compare.
 fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
     let Found { data, best, next, .. } = found;
     let leader = next.alternatives.first().filter(|_| next.is_suspicious() && !best.is_gross());
     let Some(Alternative { cause: Cause::Unmodelled(leading), probability, .. }) = leader else { return Ok(None) };
-    let noise = &data.campaign(leading.campaign).noise;
-    let is_known = |b: &usize| noise.wandering.iter().any(|(at, _)| at == b);
-    let (with, favour): (&dyn Fn(Measured) -> Data, f64) = match &leading.at {
-        Location::Time if noise.slow.walk.value == 0.0 => (&|walk| data.wandering(walk), 0.0),
-        Location::MonitorInTime(b) if !is_known(b) && noise.wandering.len() < MOST => {
-            (&|walk| data.with_wandering(leading.campaign, *b, walk), OWN.ln() + DOUBT)
-        }
-        _ => return Ok(None),
-    };
+    let Some(wander) = Wander::of(data, leading) else { return Ok(None) };
     let log_likelihood = |value: f64| {
-        let fitted = Fitted::of(&with(Measured { value, sigma: 0.0 }), &best.hypothesis, &best.u);
+        let fitted = Fitted::of(&wander.with(data, Measured { value, sigma: 0.0 }), &best.hypothesis, &best.u);
         fitted.map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
     };
-    let posterior = HalfNormal::of(log_likelihood, noise.ordinary_walk, WALKS);
-    let gain = posterior.log_evidence - best.log_evidence + favour;
+    let posterior = HalfNormal::of(log_likelihood, data.campaign(leading.campaign).noise.ordinary_walk, WALKS);
+    let (prior, doubt) = wander.odds();
+    let of_walk = posterior.log_evidence - best.log_evidence + prior;
     let of_leader = (probability / next.nothing.max(f64::MIN_POSITIVE)).ln();
-    Ok((gain > of_leader).then(|| with(Measured { value: posterior.mean, sigma: posterior.sigma() })))
+    let walk = Measured { value: posterior.mean, sigma: posterior.sigma() };
+    Ok((of_walk > (of_leader - doubt).max(0.0)).then(|| wander.with(data, walk)))
 }
 
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.

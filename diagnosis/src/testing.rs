@@ -50,6 +50,8 @@ pub struct Coloured {
     /// The vars of the machine, and its dispersion at the read monitors [m].
     pub vars: Vec<f64>,
     pub dispersion: DVector<f64>,
+    /// A monitor that walks by itself, and its walk [m per root frame].
+    pub wandering: Option<(usize, f64)>,
     pub seed: u64,
 }
 
@@ -62,7 +64,8 @@ impl Coloured {
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         let noise = recording.header.noise[0];
         let common = DMatrix::zeros(0, 0);
-        Self { noise, slow: (0.0, 10.0), walk: 0.0, momentum: 0.0, crate_share: 0.0, common, vars, dispersion, seed }
+        let (slow, wandering) = ((0.0, 10.0), None);
+        Self { noise, slow, walk: 0.0, momentum: 0.0, crate_share: 0.0, common, vars, dispersion, wandering, seed }
     }
 
     /// A campaign with this noise, with the faulty monitors of the shipped recordings.
@@ -91,6 +94,13 @@ impl Beyond for Coloured {
             for reading in &mut column {
                 *reading += self.noise * self.slow.0.sqrt() * slow + self.walk * walk;
                 slow = decay * slow + (1.0 - decay * decay).sqrt() * normal();
+                walk += normal();
+            }
+        }
+        if let Some((b, step)) = self.wandering {
+            let mut walk = 0.0;
+            for reading in &mut readings.column_mut(b) {
+                *reading += step * walk;
                 walk += normal();
             }
         }

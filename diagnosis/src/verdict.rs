@@ -383,39 +383,48 @@ pub fn sentence(
             format!("{named}{last}")
         }
     };
+    let remarks = remarks(data, found, contradictions, beyond);
+    capitalised(&core::iter::once(text).chain(remarks).collect::<Vec<_>>().join("; "))
+}
+
+/// What is said besides: of read-backs, vars out of range, ordinary imperfections, noise, frames and monitors.
+fn remarks(data: &Data, found: &Found, contradictions: &[Contradiction], beyond: &[Beyond]) -> Vec<String> {
+    let within = |recording: &str, said: String| match data.is_joint() {
+        true => format!("in {recording} {said}"),
+        false => said,
+    };
+    let mut remarks: Vec<String> = contradictions.iter().map(|one| within(&one.recording, one.to_string())).collect();
+    remarks.extend(beyond.iter().map(Beyond::to_string));
+    let large: Vec<String> =
+        ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
+    if !large.is_empty() {
+        remarks.push(format!("larger than ordinary: {}", large.join(", ")));
+    }
+    remarks.extend(data.noise.remark());
+    for own in data.campaigns() {
+        remarks.extend(wandering(own).into_iter().map(|said| within(&own.name, said)));
+    }
+    remarks.extend(Aside::all(data).iter().map(|one| within(&one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
         .collect();
-    let faulty = if faulty.is_empty() { String::new() } else { format!("; faulty monitors: {}", faulty.join(", ")) };
-    let large: Vec<String> =
-        ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
-    let large = if large.is_empty() { String::new() } else { format!("; larger than ordinary: {}", large.join(", ")) };
-    let beyond: String = beyond.iter().map(|one| format!("; {one}")).collect();
-    let noise = data.noise.remark().map_or(String::new(), |remark| format!("; {remark}"));
-    let aside: String = Aside::all(data)
-        .iter()
-        .map(|one| if data.is_joint() { format!("; in {}: {one}", one.recording) } else { format!("; {one}") })
-        .collect();
-    let wandering: String = data.campaigns().flat_map(wandering).map(|said| format!("; {said}")).collect();
-    let of_one = |one: &Contradiction| match data.is_joint() {
-        true => format!("; in {} {one}", one.recording),
-        false => format!("; {one}"),
-    };
-    let contradicted: String = contradictions.iter().map(of_one).collect();
-    let together = match data.is_joint() {
-        true => format!("; {} recordings analysed together: {}", data.count(), data.names(", ")),
-        false => String::new(),
-    };
-    capitalised(&format!("{text}{contradicted}{beyond}{large}{noise}{wandering}{aside}{faulty}{together}"))
+    if !faulty.is_empty() {
+        remarks.push(format!("faulty monitors: {}", faulty.join(", ")));
+    }
+    if data.is_joint() {
+        remarks.push(format!("{} recordings analysed together: {}", data.count(), data.names(", ")));
+    }
+    remarks
 }
 
-/// Monitors of a recording that wander by themselves, and how far over the campaign.
+/// Monitors of a recording that wander by themselves, and how far until its end.
 fn wandering(own: &Data) -> Vec<String> {
     let names = own.ring.monitor_names();
-    let steps = (own.pools.of_frame.len() as f64).sqrt();
-    let far = |walk: &Measured| Measured { value: walk.value * steps, sigma: walk.sigma * steps }.size(1e3);
-    let said = |(b, walk): &(usize, Measured)| format!("monitor {} wanders by {} mm rms", names[*b], far(walk));
+    let root_frames = (own.pools.of_frame.len() as f64).sqrt();
+    let far = |walk: &Measured| Measured { value: walk.value * root_frames, sigma: walk.sigma * root_frames }.size(1e3);
+    let said =
+        |(b, walk): &(usize, Measured)| format!("monitor {} wanders, by {} mm until the end", names[*b], far(walk));
     own.noise.wandering.iter().map(said).collect()
 }
 

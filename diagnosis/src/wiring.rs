@@ -235,9 +235,9 @@ fn responses(machine: &Machine, ring: &Ring) -> Result<[[DMatrix<f64>; 2]; 2], O
         let direction = |plane| if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
         ring.correctors.iter().map(|one| optics.kick(one.element, direction(turned(one.plane, other)))).collect()
     });
-    let eta = optics.slip_factor();
     Ok(observers.each_ref().map(|observers| {
-        let rf = optics.dispersion_of(observers) / -eta;
+        // as if a loop were open for the steps
+        let rf = optics.dispersion_of(observers) / -optics.slip_factor();
         sources.each_ref().map(|sources| {
             let response = held.response(&optics, observers, sources);
             let at = response.ncols();

@@ -58,11 +58,17 @@ impl Prior {
         }
     }
 
-    /// The same with its range `factor` times as far off zero in theta, on both sides.
+    /// The same with a range that ends nowhere within some standard deviations of the mean; a flat density ends where it did.
     #[must_use]
-    pub fn reaching(&self, factor: f64) -> Self {
-        let range = self.range.iter().map(|range| range.map(|bound| factor * bound)).collect();
-        Self { range, ..self.clone() }
+    pub fn reaching(&self, deviations: f64) -> Self {
+        let wider = |(i, &[lower, upper]): (usize, &[f64; 2])| match self.precision[i] {
+            0.0 => [lower, upper],
+            precision => {
+                let reach = deviations / precision.sqrt();
+                [lower.min(self.mean[i] - reach), upper.max(self.mean[i] + reach)]
+            }
+        };
+        Self { range: self.range.iter().enumerate().map(wider).collect(), ..self.clone() }
     }
 
     /// Number of params.
@@ -111,6 +117,17 @@ pub fn with_priors(ring: &Ring, width: Option<f64>, range: Option<[f64; 2]>) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_range_reaches_as_far_as_it_is_told_and_no_less_than_it_did() {
+        let ring = with_priors(&Ring::booster(), None, Some([0.8, 1.06]));
+        let prior = Prior::of(&ring);
+        let far = prior.reaching(5.0).range[7];
+        assert_eq!(far[0], 0.8_f64.ln(), "beyond five deviations already");
+        assert!((far[1] - (prior.mean[7] + 5.0 / prior.precision[7].sqrt())).abs() < 1e-15);
+        let flat = Prior::of_width(&ring, Width::Loguniform);
+        assert_eq!(flat.reaching(5.0), flat);
+    }
 
     /// The lognormal's mean is 1 for any width: integrated over ln var.
     #[test]

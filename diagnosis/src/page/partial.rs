@@ -2,6 +2,7 @@
 
 use core::ops::RangeInclusive;
 
+use super::tunes;
 use nalgebra::{DMatrix, DVector};
 use twin::{Signature, Tunes};
 
@@ -20,7 +21,7 @@ pub struct Partial<'f> {
     pub measured: DVector<f64>,
     /// Whitened change of the readings that the effects make, as predicted.
     pub predicted: DVector<f64>,
-    /// Tunes predicted without the effects, from the start of the campaign to its end.
+    /// Tunes on the orbit without kicks, predicted without the effects, from the start of the campaign to its end.
     pub tunes: [RangeInclusive<f64>; 2],
 }
 
@@ -39,8 +40,7 @@ impl<'f> Partial<'f> {
         let signature = Signature { readings, tunes: [x, y], tune_changes };
         let measured = data.residual(&signature);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
-        let (first, last) = (drives.time.imin(), drives.time.imax());
-        let tunes = [0, 1].map(|plane| signature.tune(plane, first)..=signature.tune(plane, last));
+        let tunes = tunes::ends(&machine, &drives)?;
         Ok(Self { fitted, data, measured, predicted, tunes })
     }
 

@@ -10,6 +10,7 @@ use crate::fit::Fitted;
 use crate::verdict::capitalised;
 use inference::campaign::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
+use twin::{Drives, EffectError, Machine, Tunes};
 
 /// Stretches of time.
 const STRETCHES: usize = 8;
@@ -22,7 +23,8 @@ struct Predicted(String, RangeInclusive<f64>);
 /// # Errors
 /// [`FitError`].
 pub fn figures(finding: &Finding, partial: &Partial) -> Result<Vec<(String, Figure)>, FitError> {
-    let with = ends(partial.data, partial.fitted)?;
+    let (machine, drives) = partial.fitted.machine(partial.data)?;
+    let with = ends(&machine, &drives)?;
     let of_plane = |plane: usize| {
         let models = [
             Predicted("model without the effect".into(), partial.tunes[plane].clone()),
@@ -38,17 +40,25 @@ pub fn figures(finding: &Finding, partial: &Partial) -> Result<Vec<(String, Figu
 /// # Errors
 /// [`FitError`].
 pub fn of_model(data: &Data, fitted: &Fitted, what: &str) -> Result<Vec<(String, Figure)>, FitError> {
-    let ends = ends(data, fitted)?;
+    let (machine, drives) = fitted.machine(data)?;
+    let ends = ends(&machine, &drives)?;
     let of_plane = |plane: usize| figure(data, fitted, plane, &[Predicted("model".into(), ends[plane].clone())], what);
     [0, 1].into_iter().filter_map(|plane| of_plane(plane).transpose()).collect()
 }
 
-/// Tunes of a fit at the start of the campaign and at its end.
-fn ends(data: &Data, fitted: &Fitted) -> Result<[RangeInclusive<f64>; 2], FitError> {
-    let predicted = fitted.predicted(data)?;
-    let (monitors, time) = (data.monitors(), &data.drives.time);
-    let (first, last) = (time.imin(), time.imax());
-    Ok([0, 1].map(|plane| predicted[(first, monitors + plane)]..=predicted[(last, monitors + plane)]))
+/// Tunes of a machine on the orbit without kicks at the start of the campaign and at its end.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn ends(machine: &Machine, drives: &Drives) -> Result<[RangeInclusive<f64>; 2], EffectError> {
+    let still = Drives { kick: &drives.kick * 0.0, rf_offset: &drives.rf_offset * 0.0, ..drives.clone() };
+    let (_, Tunes { x, y }, changes) = machine.readings(&still)?;
+    let (first, last) = (drives.time.imin(), drives.time.imax());
+    let of_plane = |plane: usize| {
+        let tune = [x, y][plane];
+        tune + changes[(first, plane)]..=tune + changes[(last, plane)]
+    };
+    Ok([0, 1].map(of_plane))
 }
 
 fn figure(

@@ -134,8 +134,9 @@ fn stated(diagnosis: &Diagnosis, key: &Truth) -> Stated {
     match least {
         _ if diagnosis.verdict == Verdict::Consistent => {
             let all = found.competitions.iter().chain([&found.next]);
+            let is_true = key.effects.iter().all(|effect| effect.is_told(diagnosis));
             let own = all.min_by(|a, b| a.nothing.total_cmp(&b.nothing)).expect("there is a next one");
-            Stated::of("nothing".into(), Sort::Nothing, own.nothing, of_sorts(own), key.effects.is_empty())
+            Stated::of("nothing".into(), Sort::Nothing, own.nothing, of_sorts(own), is_true)
         }
         Some(finding) => {
             let is_true = key.effects.iter().any(|effect| effect.is(finding));

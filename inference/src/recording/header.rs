@@ -190,7 +190,7 @@ impl Header {
             BelievedRf::FixedFrequency => Ok(Rf::FixedFrequency.into()),
             BelievedRf::RadialLoop => {
                 let known = self.radial_loop(ring).expect("where a loop is believed on its monitors are known");
-                Holding::mean_of(ring, known?.site)
+                Holding::radial_loop(ring, known?.site)
             }
         }
     }
