@@ -194,6 +194,7 @@ class DiagnosisResult(_Result):
     fit: dict[str, Any] = field(default_factory=dict)
     vars_before: list[Var] = field(default_factory=list)
     vars_after: list[Var] = field(default_factory=list)
+    beyond_range: list[dict[str, Any]] = field(default_factory=list)
     tunes: tuple[float, float] | None = None
     tunes_measured: dict[str, Any] | None = None
     joint_probability: float | None = None
