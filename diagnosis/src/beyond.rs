@@ -34,7 +34,7 @@ impl Beyond {
             let is_outside = (mean - upper).max(lower - mean) > CERTAIN * sigma;
             let var = Measured { value: mean.exp(), sigma: sigma * mean.exp() };
             let (name, quadrupoles) = (parameter.name.clone(), parameter.quadrupoles.len());
-            is_outside.then(|| Self { name, quadrupoles, var, range: parameter.prior.range })
+            is_outside.then_some(Self { name, quadrupoles, var, range: parameter.prior.range })
         };
         ring.parameters.iter().enumerate().filter_map(of).collect()
     }
