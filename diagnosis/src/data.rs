@@ -261,15 +261,17 @@ impl Data {
     /// What kicks do to the tunes besides, where a machine does not hold what the header states, so that the momentum moves with them, and the tunes by
     /// the chromaticity; and beyond first order where it has strong sextupole fields. Rows frames.
     fn tune_shift_beside(&self, machine: &Machine) -> Result<MatrixXx2<f64>, EffectError> {
+        let machine = machine.without_memory();
+        let mut displaced = machine.clone();
+        self.baseline.displace(&mut displaced)?;
         // a drift is no effect of the kicks
         let time = DVector::zeros(self.frames.drives.time.len());
-        let frames = Drives { time, orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
-        let machine = machine.without_memory();
+        let frames = Drives { time, orbit: displaced.orbit()?, ..self.frames.drives.clone() };
         let first_order = machine.readings(&frames)?.2;
         if machine.holding().is_like(&self.believed) && first_order.amax() < FIRST_ORDER {
             return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
         }
-        Ok(tune_shift::by_kicks(&machine, &frames)? - first_order - &self.frames.tune_shift)
+        Ok(tune_shift::by_kicks(&displaced, &frames)? - first_order - &self.frames.tune_shift)
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
