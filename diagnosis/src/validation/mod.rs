@@ -119,7 +119,8 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         heldout: diagnosis.gain(),
         pulls: if diagnosis.verdict == Verdict::Identified { key.pulls(&diagnosis) } else { Vec::new() },
         covered: covered(ring, &diagnosis, &key),
-        near: case.unmodelled.iter().any(|one| is_near(ring, &diagnosis, one)),
+        near: case.unmodelled.iter().any(|one| is_near(ring, &diagnosis, one))
+            || key.effects.iter().any(|effect| effect.is_told(&diagnosis)),
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
         truth: key.effects.iter().map(|effect| Made::of(effect, ring)).collect(),
         seconds,

@@ -37,7 +37,7 @@ pub struct Fates {
 /// What became of physics outside the library.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Unknown {
-    /// Called unexplained or ambiguous.
+    /// Called unexplained or ambiguous, or a monitor said to wander.
     pub undecided: Share,
     /// With its place.
     pub near: Share,
@@ -144,7 +144,7 @@ impl Tables {
         };
         let within = |[from, to]: [f64; 2]| move |o: &&Outcome| (from..to).contains(&o.oracle_gain);
         let named = |outcome: &Outcome| outcome.verdict == Verdict::Identified;
-        let undecided = |outcome: &Outcome| matches!(outcome.verdict, Verdict::Unexplained | Verdict::Ambiguous);
+        let undecided = |outcome: &Outcome| outcome.grade == Grade::Open;
         let right = || outcomes.iter().filter(|o| o.grade == Grade::Right && o.class != Class::Empty);
         let pulls: Vec<f64> = outcomes.iter().flat_map(|o| o.pulls.iter().copied()).collect();
         let inside = |limit: f64| Share::new(pulls.iter().filter(|p| p.abs() < limit).count(), pulls.len());
@@ -210,7 +210,10 @@ impl Tables {
         }
         writeln!(text, "\nCampaigns with a false identification: {}.", self.wrong.text())?;
         writeln!(text, "\nPhysics outside the library:\n")?;
-        writeln!(text, "| oracle gain | called unexplained or ambiguous | its place is | named as something else |")?;
+        writeln!(
+            text,
+            "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else |"
+        )?;
         writeln!(text, "|---|---|---|---|")?;
         for (bin, Unknown { undecided, near, named }) in &self.unknown {
             writeln!(text, "| {} | {} | {} | {named} |", range(bin), undecided.text(), near.text())?;
