@@ -5,7 +5,7 @@ campaign as a folder with ``header.toml``, ``frames.csv`` and ``truth.json``.  W
 it is written comes from an existing recording, the template; currents, readings and tunes are new.  The program shares no code with
 the program that reads the campaigns: orbits, tunes and the gains in ``truth.json`` all come from tracking with Xsuite.
 
-    python blind_xsuite.py --machine booster.json --template RECORDING_FOLDER --out DIR [NAME ...]
+    python blind_xsuite.py --machine booster.json --template RECORDING_FOLDER --out DIR [--seed N] [NAME ...]
 
 Without names it writes all 52 campaigns: a01 to a10 are machines with ordinary imperfections only; b01 to b12 have one effect of the
 diagnosis's own table in addition, c01 to c24 one that is invented, d01 to d06 two of the table.
@@ -1002,6 +1002,7 @@ def main():
     parser.add_argument("--machine", required=True, metavar="FILE", help="booster.json")
     parser.add_argument("--template", required=True, metavar="RECORDING_FOLDER", help="recording whose settings and times are taken")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the campaigns")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="other machines and noise, their effects of about the same gains")
     parser.add_argument("names", nargs="*", metavar="NAME", help="campaigns to write, all if none is given")
     options = parser.parse_args()
     with open(options.machine) as f:
@@ -1018,7 +1019,8 @@ def main():
         with_solenoid = any(e["kind"] == "axial_field" for e, _, _ in wanted)
         if with_solenoid not in trackers:
             trackers[with_solenoid] = Tracker(plan, with_solenoid)
-        truth = make_campaign(trackers[with_solenoid], os.path.join(options.out, name), seed, ordinary, wanted)
+        folder = os.path.join(options.out, name)
+        truth = make_campaign(trackers[with_solenoid], folder, seed + 10_000 * options.seed, ordinary, wanted)
         what = ", ".join(f"{e['kind']}@{e['at'] or '-'}={e.get('amplitude', '-')}" for e in truth["effects"]) or "no effect"
         print(f"{name} {what} gain {truth['oracle_gain']} orbit {truth['baseline_max_mm']} mm tunes {truth['base_tunes']} "
               f"{time.time() - start:.1f} s", flush=True)
