@@ -104,6 +104,24 @@ struct Frames {
     tune_noise: [Option<f64>; 2],
 }
 
+/// A machine whose settings do not follow each other in time, and the same with its quadrupoles displaced so that the orbit without kicks is the one
+/// that the monitors' baselines tell.
+struct Displaced {
+    machine: Machine,
+    displaced: Machine,
+    orbit: Vec<[f64; 2]>,
+}
+
+impl Displaced {
+    fn of(machine: &Machine, baseline: &Baseline) -> Result<Self, OrbitError> {
+        let machine = machine.without_memory();
+        let mut displaced = machine.clone();
+        baseline.displace(&mut displaced)?;
+        let orbit = displaced.orbit()?;
+        Ok(Self { machine, displaced, orbit })
+    }
+}
+
 /// Why a recording cannot be diagnosed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -244,14 +262,15 @@ impl Data {
     pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
         let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
         let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&self.drives)?.0);
-        let off_first_order = within + self.higher_orders(machine)?;
+        let displaced = Displaced::of(machine, &self.baseline)?;
+        let off_first_order = within + self.higher_orders(&displaced)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
         let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);
         let mut of_monitors = readings.columns_mut(0, monitors);
         of_monitors -= off_first_order;
         let mut of_tunes = readings.columns_mut(monitors, 2);
-        of_tunes -= self.tune_shift_beside(machine)?;
+        of_tunes -= self.tune_shift_beside(&displaced)?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();
@@ -260,18 +279,18 @@ impl Data {
 
     /// What kicks do to the tunes besides, where a machine does not hold what the header states, so that the momentum moves with them, and the tunes by
     /// the chromaticity; and beyond first order where it has strong sextupole fields. Rows frames.
-    fn tune_shift_beside(&self, machine: &Machine) -> Result<MatrixXx2<f64>, EffectError> {
-        let machine = machine.without_memory();
-        let mut displaced = machine.clone();
-        self.baseline.displace(&mut displaced)?;
+    fn tune_shift_beside(
+        &self,
+        Displaced { machine, displaced, orbit }: &Displaced,
+    ) -> Result<MatrixXx2<f64>, EffectError> {
         // a drift is no effect of the kicks
         let time = DVector::zeros(self.frames.drives.time.len());
-        let frames = Drives { time, orbit: displaced.orbit()?, ..self.frames.drives.clone() };
+        let frames = Drives { time, orbit: orbit.clone(), ..self.frames.drives.clone() };
         let first_order = machine.readings(&frames)?.2;
         if machine.holding().is_like(&self.believed) && first_order.amax() < FIRST_ORDER {
             return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
         }
-        Ok(tune_shift::by_kicks(&displaced, &frames)? - first_order - &self.frames.tune_shift)
+        Ok(tune_shift::by_kicks(displaced, &frames)? - first_order - &self.frames.tune_shift)
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
@@ -294,14 +313,10 @@ impl Data {
 
     /// What the exact orbits of a machine have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first
     /// order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
-    fn higher_orders(&self, machine: &Machine) -> Result<DMatrix<f64>, EffectError> {
-        // settings do not follow each other in time
-        let machine = &machine.without_memory();
-        let mut displaced = machine.clone();
-        self.baseline.displace(&mut displaced)?;
+    fn higher_orders(&self, Displaced { machine, displaced, orbit }: &Displaced) -> Result<DMatrix<f64>, EffectError> {
         let settings = Settings::of(&self.frames.drives);
-        let drives = Drives { orbit: displaced.orbit()?, ..settings.means(&self.frames.drives) };
-        let tracked = Tracked::of(displaced, self.drives.nominal_kick)?;
+        let drives = Drives { orbit: orbit.clone(), ..settings.means(&self.frames.drives) };
+        let tracked = Tracked::of(displaced.clone(), self.drives.nominal_kick)?;
         let cycle = |kick: Vec<f64>, rf_offset: f64| {
             let strength = vec![0.0; self.ring.quadrupoles.len()];
             tracked.readings(&Cycle { kick, strength, rf_offset, time: 0.0 })

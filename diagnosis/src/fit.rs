@@ -458,7 +458,10 @@ fn machine_at(
 }
 
 /// What a machine predicts.
-fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
+///
+/// # Errors
+/// [`EffectError`].
+pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
     let (readings, tunes, tune_changes) = machine.readings(drives)?;
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }

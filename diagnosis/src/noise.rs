@@ -77,6 +77,7 @@ pub struct Source<'c> {
     pub shapes: &'c [Shape],
 }
 
+/// Unit of a walk.
 const LENGTH: Unit = Unit { symbol: "m", shown: "um", factor: 1e6 };
 /// Fewest differences from which a monitor's noise is learnt: its scale is then known to 16 %.
 const FEWEST: f64 = 20.0;

@@ -158,7 +158,7 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
         _ => false,
     };
     let radial = radial_loop.and_then(held).filter(is_read);
-    let is_believed = |term: &Term| data.campaigns().any(|own| own.believed.effect() == Some(term.kind));
+    let is_believed = |term: &Term| data.campaigns().any(|own| own.believed.kind() == Some(term.kind));
     lasting.flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
 }
 

@@ -2,13 +2,12 @@
 
 use core::ops::RangeInclusive;
 
-use super::tunes;
 use nalgebra::{DMatrix, DVector};
-use twin::{Signature, Tunes};
 
+use super::tunes;
 use crate::data::Data;
 use crate::error::FitError;
-use crate::fit::Fitted;
+use crate::fit::{self, Fitted};
 use crate::hypothesis::{Hypothesis, Term};
 
 /// Some effects of a fit.
@@ -36,9 +35,7 @@ impl<'f> Partial<'f> {
         let data = fitted.data(data);
         let (vars, u) = (fitted.params.len(), fitted.guess(data, &without));
         let (machine, drives) = without.machine(data, &fitted.params, &u.as_slice()[vars..])?;
-        let (readings, Tunes { x, y }, tune_changes) = machine.readings(&drives)?;
-        let signature = Signature { readings, tunes: [x, y], tune_changes };
-        let measured = data.residual(&signature);
+        let measured = data.residual(&fit::predicted(&machine, &drives)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
         let tunes = tunes::ends(&machine, &drives)?;
         Ok(Self { fitted, data, measured, predicted, tunes })

@@ -1,7 +1,7 @@
 //! The ring with the findings marked.
 
 use estimator::MonitorState;
-use twin::Ring;
+use twin::{Parameter, Ring};
 
 use super::lattice::{magnets, positions};
 use super::monitors::word;
@@ -29,48 +29,63 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
         }
     }
     let data = &diagnosis.found.data;
+    spotted.extend(out_of_range(diagnosis));
     spotted.extend(faulty(data));
     let figure = Figure::ring_map(&RingMap { title: title(diagnosis), spotted, everywhere, ..empty(ring) });
-    let what = if diagnosis.findings.is_empty() {
+    let what = if diagnosis.findings.is_empty() && diagnosis.beyond.is_empty() {
         ""
     } else {
-        "filled squares are findings, open circles alternatives to them, "
+        "filled squares are findings and quadrupoles out of their range, open circles alternatives to findings, "
     };
     let unread = unread(ring);
     let unread =
         if unread.is_empty() { "all monitors are read".into() } else { format!("not read: {}", unread.join(", ")) };
     let caption = format!(
-        "The ring; {what}crosses faulty monitors. Names inside the path are labels: a quadrupole, monitor or corrector is named by its label. Of \
+        "The ring; {what}crosses faulty and wandering monitors. Names inside the path are labels: a quadrupole, monitor or corrector is named by its label. Of \
          the monitors, {unread}."
     );
     Section { heading: "Where it is".into(), figures: vec![(caption, figure)], ..Section::default() }
 }
 
 fn title(diagnosis: &Diagnosis) -> String {
-    let ring = &diagnosis.found.data.ring;
-    let faulty = faulty(&diagnosis.found.data).len();
-    let instruments = match faulty {
-        0 => "all monitors in order".to_owned(),
-        1 => "one faulty monitor".to_owned(),
-        _ => format!("{faulty} faulty monitors"),
+    let data = &diagnosis.found.data;
+    let (ring, wandering) = (&data.ring, data.noise.wandering.len());
+    let of = |count: usize, what: &str| match count {
+        0 => None,
+        1 => Some(format!("one {what}")),
+        _ => Some(format!("{count} {what}s")),
     };
-    let findings = match diagnosis.findings.len() {
-        0 => "nothing found".to_owned(),
-        1 => "one finding".to_owned(),
-        many => format!("{many} findings"),
-    };
-    format!("{}, {:.2} m: {findings}, {instruments}", ring.name, ring.circumference)
+    let instruments = [of(faulty(data).len() - wandering, "faulty monitor"), of(wandering, "wandering monitor")];
+    let instruments: Vec<String> = instruments.into_iter().flatten().collect();
+    let instruments = if instruments.is_empty() { "all monitors in order".to_owned() } else { instruments.join(", ") };
+    let outside =
+        of(diagnosis.beyond.len(), "quadrupole").map_or(String::new(), |some| format!(", {some} out of range"));
+    let findings = of(diagnosis.findings.len(), "finding").unwrap_or_else(|| "nothing found".into());
+    format!("{}, {:.2} m: {findings}{outside}, {instruments}", ring.name, ring.circumference)
 }
 
-/// Monitors that are not in state ok, with the word for it.
-fn faulty(data: &Data) -> Vec<Spotted> {
-    let ring = &data.ring;
-    let of = |(b, health): (usize, &estimator::Health)| {
-        let at = ring.monitors[ring.read_monitors[b]].element;
-        let label = format!("{} {}", ring.monitor_names()[b], word(health.state));
-        (health.state != MonitorState::Ok).then(|| Spotted { label, s: ring.elements[at].s, look: Look::Faulty })
+/// Quadrupoles beyond their range.
+fn out_of_range(diagnosis: &Diagnosis) -> Vec<Spotted> {
+    let ring = &diagnosis.found.data.ring;
+    let is_beyond = |parameter: &&Parameter| diagnosis.beyond.iter().any(|one| one.name == parameter.name);
+    let of = |&quadrupole: &usize| {
+        let magnet = &ring.elements[ring.quadrupoles[quadrupole].element];
+        let label = format!("{} out of range", magnet.label);
+        Spotted { label, s: magnet.s + 0.5 * magnet.length, look: Look::Finding }
     };
-    data.health().iter().enumerate().filter_map(of).collect()
+    ring.parameters.iter().filter(is_beyond).flat_map(|parameter| parameter.quadrupoles.iter().map(of)).collect()
+}
+
+/// Monitors that are not in state ok, with the word for it, and those that wander.
+fn faulty(data: &Data) -> Vec<Spotted> {
+    let (ring, names) = (&data.ring, data.ring.monitor_names());
+    let spotted = |b: usize, word: &str| {
+        let at = ring.monitors[ring.read_monitors[b]].element;
+        Spotted { label: format!("{} {word}", names[b]), s: ring.elements[at].s, look: Look::Faulty }
+    };
+    let faulty = data.health().iter().enumerate().filter(|(_, health)| health.state != MonitorState::Ok);
+    let faulty = faulty.map(|(b, health)| spotted(b, word(health.state)));
+    faulty.chain(data.noise.wandering.iter().map(|(b, _)| spotted(*b, "wanders"))).collect()
 }
 
 /// Names of the monitors that are not read.

@@ -6,11 +6,11 @@ use super::partial::Partial;
 use crate::Finding;
 use crate::data::Data;
 use crate::error::FitError;
-use crate::fit::Fitted;
+use crate::fit::{Fitted, predicted};
 use crate::verdict::capitalised;
 use inference::campaign::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
-use twin::{Drives, EffectError, Machine, Tunes};
+use twin::{Drives, EffectError, Machine};
 
 /// Stretches of time.
 const STRETCHES: usize = 8;
@@ -51,14 +51,9 @@ pub fn of_model(data: &Data, fitted: &Fitted, what: &str) -> Result<Vec<(String,
 /// # Errors
 /// [`EffectError`].
 pub fn ends(machine: &Machine, drives: &Drives) -> Result<[RangeInclusive<f64>; 2], EffectError> {
-    let still = Drives { kick: &drives.kick * 0.0, rf_offset: &drives.rf_offset * 0.0, ..drives.clone() };
-    let (_, Tunes { x, y }, changes) = machine.readings(&still)?;
+    let still = predicted(machine, &drives.still())?;
     let (first, last) = (drives.time.imin(), drives.time.imax());
-    let of_plane = |plane: usize| {
-        let tune = [x, y][plane];
-        tune + changes[(first, plane)]..=tune + changes[(last, plane)]
-    };
-    Ok([0, 1].map(of_plane))
+    Ok([0, 1].map(|plane| still.tune(plane, first)..=still.tune(plane, last)))
 }
 
 fn figure(

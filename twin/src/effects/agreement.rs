@@ -163,21 +163,20 @@ fn signatures_hold_about_a_machine_with_effects() {
 /// Largest error of the linear change against the exact one, in frames with kicks and in those with an RF offset, the
 /// largest change, and the error of the tunes.
 fn compare(aligned: &Ring, real: &Ring, effect: &Effect) -> [f64; 4] {
-    let linear = |effects: &[Effect], change: fn(Drives) -> Drives| {
+    let moved = |effects: &[Effect]| {
         let real = machine(real, effects);
-        let drives = change(drives(aligned, orbit(real.ring(), real.hold.delta)));
-        machine(aligned, effects).readings(&drives).unwrap()
+        drives(aligned, orbit(real.ring(), real.hold.delta))
     };
+    let linear = |effects: &[Effect], drives: &Drives| machine(aligned, effects).readings(drives).unwrap();
     let exact = |effects: &[Effect]| tracked(machine(real, effects), &drives(aligned, Vec::new()));
     let one = core::slice::from_ref(effect);
     let change = exact(one) - exact(&[]);
-    let error = &change - (linear(one, |drives| drives).0 - linear(&[], |drives| drives).0);
+    let error = &change - (linear(one, &moved(one)).0 - linear(&[], &moved(&[])).0);
     let still = Tracked::of(machine(real, one), NOMINAL).unwrap();
     let at =
         |time: f64| Cycle { kick: vec![0.0; real.correctors.len()], strength: vec![0.0; 48], rf_offset: 0.0, time };
     let [middle, end] = [0.0, 1.0].map(|time| still.cycle(&at(time)).unwrap().1);
-    let (_, tunes, changes) =
-        linear(one, |drives| Drives { kick: drives.kick * 0.0, rf_offset: drives.rf_offset * 0.0, ..drives });
+    let (_, tunes, changes) = linear(one, &moved(one).still());
     let drift = changes.row(7); // the end of the campaign
     let missed = [middle.x - tunes.x, middle.y - tunes.y, end.x - middle.x - drift[0], end.y - middle.y - drift[1]];
     let tune = missed.map(f64::abs).into_iter().fold(0.0, f64::max);

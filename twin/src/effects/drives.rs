@@ -71,6 +71,13 @@ impl Ring {
 }
 
 impl Drives {
+    /// The same frames without kicks and RF offsets.
+    #[must_use]
+    pub fn still(&self) -> Self {
+        let (kick, rf_offset) = (&self.kick * 0.0, &self.rf_offset * 0.0);
+        Self { kick, rf_offset, time: self.time.clone(), orbit: self.orbit.clone(), ..*self }
+    }
+
     /// Positions x and y at the monitors, rows frames.
     pub(super) fn positions(&self, seen: &Seen, kick: &DMatrix<f64>) -> [DMatrix<f64>; 2] {
         let correctors = kick.ncols();

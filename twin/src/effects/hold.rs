@@ -77,8 +77,8 @@ impl Holding {
         Ok(Self { radial_loop: Some(RadialLoop { pair, of_kicks: 1.0, of_rf_steps: 0.0 }), ..Self::default() })
     }
 
-    /// The effect that it would be if nobody knew of it; none where the momentum is held.
-    pub fn effect(&self) -> Option<EffectKind> {
+    /// Kind of the effect that it would be if nobody knew of it; none where the momentum is held.
+    pub fn kind(&self) -> Option<EffectKind> {
         let frequency = (self.frequency_share != 0.0).then_some(EffectKind::FixedRfFrequency);
         frequency.or(self.radial_loop.map(|_| EffectKind::RadialLoop))
     }
