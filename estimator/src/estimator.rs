@@ -15,6 +15,7 @@ mod screen;
 mod sequence;
 mod steering;
 mod times;
+mod tunes;
 mod whole;
 
 use core::fmt;
@@ -744,20 +745,6 @@ impl<
         self.posterior.narrow();
         if model.setup.walk.params > 0.0 {
             self.posterior.let_loose(&model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
-        }
-    }
-
-    /// Add the tunes that passed.
-    fn condition_tunes(&mut self, model: &Model<'_, G, B, C, F>, screened: &Screened<W>) {
-        let linearised_once = !self.posterior.is_still(&model.setup.walk);
-        for plane in 0..2 {
-            let variance = self.tunes.get(plane).and_then(TuneMeter::variance);
-            if let (Some(Some(innovation)), Some(variance)) = (screened.tune.get(plane), variance) {
-                let (_, slope) = model.surrogate.tune(&self.tangent.linearised, plane, &[0.0; F]);
-                let reading = Reading { channel: K - 2 + plane, innovation: *innovation, variance, slope: &slope };
-                let Posterior { gaussian, solution, .. } = &mut self.posterior;
-                gaussian.condition([reading], &underweighted(solution, linearised_once));
-            }
         }
     }
 

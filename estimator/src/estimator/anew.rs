@@ -165,7 +165,7 @@ impl<
     /// Count a part of the past, or go over to the new linearisation. While the params walk, the past stays counted as it was.
     fn count_past(&mut self, model: &Model<'_, G, B, C, F>) -> Prepared {
         if !self.posterior.is_still(&model.setup.walk) {
-            self.posterior.gaussian.recentre(&self.anew.to);
+            self.recentre(model);
             return self.go_over(model);
         }
         if self.pool_next(model) {

@@ -3,7 +3,7 @@
 use super::{Estimator, Loose, Model, Tangent, about, follow};
 use crate::drive::Drive;
 use crate::following;
-use crate::gaussian::{Gaussian, Independent, Line, Pool, Reading, Repeats};
+use crate::gaussian::{Gaussian, Independent, Line, Pool, Repeats};
 use crate::judged::Screened;
 use crate::linear::dot;
 use crate::mask::Mask;
@@ -195,26 +195,6 @@ impl<
             gaussian.add_scatter(following.chi_square(expected), following.volume(expected));
         }
         self.count_tunes(model);
-    }
-
-    /// Count the tunes of all frames so far, as their mean.
-    fn count_tunes(&mut self, model: &Model<'_, G, B, C, F>) {
-        for plane in 0..2 {
-            let (Some(meter), Work::Past(Pooling { gaussian, .. })) = (self.tunes.get(plane), &mut self.anew.work)
-            else {
-                continue;
-            };
-            if let (Some(variance), (mean, strength, count @ 1..)) = (meter.variance(), meter.mean()) {
-                let squares = meter.scatter();
-                let innovation = self.anew.tangent.tune_innovation(model, plane, mean, &strength);
-                let (_, slope) = model.surrogate.tune(&self.anew.tangent.linearised, plane, &[0.0; F]);
-                let mean =
-                    Reading { channel: K - 2 + plane, innovation, variance: variance / count as f32, slope: &slope };
-                gaussian.condition([mean], &|_| 0.0);
-                gaussian.add_repeats(count, variance);
-                gaussian.add_scatter(squares / f64::from(variance), 0.0);
-            }
-        }
     }
 
     /// A frame of a setting that is counted already is late.

@@ -92,7 +92,8 @@ impl<
         }
     }
 
-    /// Tunes count where the RF is not moved: what the chromaticity makes of them then is not in the model.
+    /// Tunes count where the RF is not moved, since what the chromaticity makes of them then is not in the model, and once they are linear
+    /// in what is not known of the params.
     fn screen_tunes(
         &mut self,
         model: &Model<'_, G, B, C, F>,
@@ -110,6 +111,7 @@ impl<
             let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
             self.past.stale |= meter.judge();
             let innovation = self.tangent.tune_innovation(model, plane, code.value(), &drive.strength);
+            let counts = counts && self.is_straight(model, &self.tangent, plane);
             screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
         }
     }

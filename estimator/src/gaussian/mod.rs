@@ -27,6 +27,7 @@ mod walk;
 use crate::linear::{Real, add, add_rounded, difference, dot, dot_difference};
 use crate::prior::Prior;
 use crate::quarantine::Shift;
+use crate::surrogate::Prediction;
 use crate::triangle::Triangle;
 
 use crate::state::state;
@@ -284,6 +285,18 @@ impl<const B: usize, const N: usize, const T: usize, const U: usize> Gaussian<B,
     pub fn expected(&self, b: usize, h: &[f32], delta: &[f64; N]) -> (f64, f64) {
         let along = self.slope.get(b).map_or(0.0, |slope| dot_difference(h, slope, delta));
         (self.baseline(b) + along, self.covariance.variance(b))
+    }
+
+    /// Count what is predicted of the readings at a drive, and its derivative, to the baselines (`sign` 1) or off them (-1), at each of so
+    /// many times in the cycle. It says nothing of the params.
+    #[inline(never)]
+    pub fn absorb<const M: usize, const F: usize>(&mut self, sign: f64, predicted: &Prediction<M, F, N>, times: usize) {
+        let rows = predicted.jacobian.as_slice().chunks_exact(N.max(1));
+        let each = core::iter::repeat_n(predicted.reading.iter().zip(rows), times).flatten();
+        for ((baseline, slope), (reading, row)) in self.baseline.iter_mut().zip(&mut self.slope).zip(each) {
+            *baseline += sign * f64::from(*reading);
+            slope.iter_mut().zip(row).for_each(|(slope, h)| *slope -= sign * f64::from(*h));
+        }
     }
 }
 
