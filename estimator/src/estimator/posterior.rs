@@ -182,6 +182,26 @@ impl<const K: usize, const N: usize, const T: usize, const U: usize, const W: us
         (self.stepped, self.let_loose) = (true, u16::try_from(step.param).ok());
     }
 
+    /// True if a param has stepped: what was read before is of another ring.
+    pub fn has_stepped(&self) -> bool {
+        self.stepped
+    }
+
+    /// Take the time since the beginning as not passed, if no param has stepped since; returns what is to be passed again [s].
+    pub fn pause(&mut self) -> f32 {
+        if self.stepped { 0.0 } else { core::mem::take(&mut self.walked) as f32 }
+    }
+
+    /// What was learnt does not count: params are as unknown as the prior has them, about the origin, and baselines within `baseline`.
+    #[inline(never)]
+    pub fn doubt(&mut self, baseline: f32, layout: &Layout, prior: impl Fn(usize) -> Prior + Copy) {
+        self.gaussian.centre();
+        self.solution.delta = [0.0; N];
+        self.gaussian.spread_baselines(f64::from(baseline) * f64::from(baseline), Self::BASELINES);
+        self.spread(|i| prior(i).sigma * prior(i).sigma, layout, prior);
+        self.drift.clear();
+    }
+
     /// Add so much variance to each param.
     fn spread(&mut self, variance: impl Fn(usize) -> f32, layout: &Layout, prior: impl Fn(usize) -> Prior) {
         let sigma = core::array::from_fn(|i| libm::sqrt(variance(i).max(LEAST).into()));

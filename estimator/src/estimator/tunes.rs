@@ -46,7 +46,8 @@ impl<
     /// Count the tunes of all frames so far, as their mean.
     pub(super) fn count_tunes(&mut self, model: &Model<'_, G, B, C, F>) {
         for plane in 0..2 {
-            let Some(meter) = self.tunes.get(plane).filter(|_| self.is_straight(model, &self.anew.tangent, plane)) else {
+            let Some(meter) = self.tunes.get(plane).filter(|_| self.is_straight(model, &self.anew.tangent, plane))
+            else {
                 continue;
             };
             if let (Some(variance), (mean, strength, count @ 1..)) = (meter.variance(), meter.mean()) {
@@ -64,6 +65,7 @@ impl<
     }
 
     /// True if a tune is linear in the params as far as they are known, to less than the meter's calibration error.
+    #[inline(never)]
     pub(super) fn is_straight(
         &self,
         model: &Model<'_, G, B, C, F>,

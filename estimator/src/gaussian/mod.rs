@@ -230,6 +230,11 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
         }
     }
 
+    /// Take the origin as the best point, for all that the readings say.
+    pub fn centre(&mut self) {
+        self.vector = [0.0; N];
+    }
+
     /// Move the origin without changing the distribution.
     pub fn recentre(&mut self, origin: &[f32; N]) {
         let step = self.step_to(origin);
@@ -252,8 +257,8 @@ impl<const B: usize, const N: usize, const T: usize, V: Covariance<B>> Gaussian<
 
     /// Some params, relative to the origin.
     fn step_to(&self, params: &[f32; N]) -> [f64; N] {
-        let mut step = params.map(f64::from);
-        step.iter_mut().zip(&self.origin).for_each(|(step, origin)| *step -= f64::from(*origin));
+        let mut step = [0.0; N];
+        difference(params, &self.origin, &mut step);
         step
     }
 }
