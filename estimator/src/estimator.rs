@@ -305,8 +305,8 @@ impl<const B: usize, const C: usize, const F: usize, const W: usize> Blank for L
 const BASELINE: f32 = 0.02;
 
 /// Frames without a setting that are linearised anew with the rest; older ones keep the linearisation that they had when
-/// they left this window. At the start of a stream it holds 16 times 33 readings, enough for 48 params.
-const RECENT: usize = 16;
+/// they left this window. At the start of a stream it holds 15 times 33 readings, enough for 48 params.
+const RECENT: usize = 15;
 
 impl<const B: usize, const C: usize, const F: usize, const W: usize> Loose<B, C, F, W> {
     /// Its readings that are used, each of a variance, as a prediction linearises them.
@@ -494,6 +494,7 @@ impl<
         let before = self.posterior.solution.cost;
         self.posterior.expect();
         self.condition(model, frame, *cell, screened);
+        self.note_kicks(drive);
         self.solve(model);
         *nis = self.count_nis(before, screened);
         self.look_for_steps(model);
@@ -549,11 +550,12 @@ impl<
         }
         self.linearise_design(model)?;
         let (layout, prior) = (model.surrogate.layout(), |i| prior_of::<G, B, C, F, N>(model, i));
+        let walked = !self.posterior.is_still(&model.setup.walk);
         let passed = self.posterior.pause();
         let adopted = self.linearise_anew(model);
         let doubtful = self.posterior.has_stepped() || self.fit_quality(model).is_mismatch();
         self.posterior.pass(&model.setup.walk, passed, &layout, prior);
-        if doubtful {
+        if walked && doubtful {
             self.posterior.doubt(BASELINE, &layout, prior);
         }
         self.nis = (0.0, 0.0);

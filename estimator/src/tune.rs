@@ -27,13 +27,16 @@ pub struct TuneMeter<const F: usize> {
     /// Sum of squared deviations from the mean.
     scatter: f64,
     last: Option<(TuneCode, [f32; F])>,
+    /// The tune is linear in what is not known of the params: it counts.
+    pub is_linear: bool,
 }
 
-state!([const F: usize] TuneMeter<F> { noise, mean, count, strength, scatter, last });
+state!([const F: usize] TuneMeter<F> { noise, mean, count, strength, scatter, last, is_linear });
 
 impl<const F: usize> TuneMeter<F> {
     /// Memory for one.
-    pub const BLANK: Self = Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: 0.0, last: None };
+    pub const BLANK: Self =
+        Self { noise: Noise::BLANK, mean: 0, count: 0, strength: [0; F], scatter: 0.0, last: None, is_linear: false };
 
     /// Restart without readings.
     pub fn clear(&mut self) {

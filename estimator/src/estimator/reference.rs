@@ -25,13 +25,15 @@ pub(super) struct Reference<const C: usize> {
     kick: [f32; C],
     /// Frames of no setting since it was last looked for.
     waited: u16,
+    /// Mean of the kicks that the baselines were read at.
+    read_at: [f32; C],
 }
 
-state!([const C: usize] Reference<C> { number, kick, waited });
+state!([const C: usize] Reference<C> { number, kick, waited, read_at });
 
 impl<const C: usize> Reference<C> {
     /// All correctors at 0 A.
-    pub const ZERO: Self = Self { number: 0, kick: [0.0; C], waited: 0 };
+    pub const ZERO: Self = Self { number: 0, kick: [0.0; C], waited: 0, read_at: [0.0; C] };
 
     /// A frame's kicks, seen from it, and nothing else of its drive.
     fn moved<const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
@@ -121,14 +123,23 @@ impl<
         true
     }
 
-    /// Take the Gaussian to where the surrogate is linearised anew. What has been read at the reference drive is known, and so is how it
-    /// follows the params: the baselines make up for what its kicks' orbit is by the new linearisation, and was by the old one. The second
-    /// order between the two, 0.1 mm for kicks of some amperes and vars that are off by 3 %, would else be taken for news of the vars.
+    /// Count a frame's kicks into those that the baselines were read at, as much as its readings have moved the baselines.
+    pub(super) fn note_kicks(&mut self, drive: &Drive<C, F>) {
+        let share = |b| {
+            self.posterior.gaussian.baseline_variance(self.predicted.first_channel + b) as f32 / self.noise_variance(b)
+        };
+        let share = ((0..B).map(share).sum::<f32>() / B as f32).min(1.0);
+        let each = self.past.reference.read_at.iter_mut().zip(&drive.kick);
+        each.for_each(|(mean, kick)| *mean += share * (kick - *mean));
+    }
+
+    /// Take the Gaussian to where the surrogate is linearised anew, while the params walk and the past cannot be counted anew. A baseline is
+    /// what was read less what the kicks made of it: by the new linearisation, that is another orbit and another derivative of
+    /// it, at the mean of the kicks that it was read at. Their second order would else be taken for news of the params by all frames
+    /// that come: 0.1 mm for kicks of some amperes and vars that are off by 3 %.
     #[inline(never)]
     pub(super) fn recentre(&mut self, model: &Model<'_, G, B, C, F>) {
-        let Reference { kick, waited, .. } = self.past.reference;
-        let last = self.past.recent.back().filter(|_| waited > 0);
-        let drive = Drive { kick: last.map_or(kick, |last| last.drive.kick), ..Drive::NONE };
+        let drive = Drive { kick: self.past.reference.read_at, ..Drive::NONE };
         model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
         self.posterior.gaussian.absorb(1.0, &self.predicted.prediction, Self::TIMES);
         self.posterior.gaussian.recentre(&self.anew.to);

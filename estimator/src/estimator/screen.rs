@@ -105,13 +105,15 @@ impl<
             return;
         }
         for (plane, code) in frame.tune.iter().enumerate() {
+            let is_linear = self.is_linear(model, plane);
             let (Some(code), Some(meter)) = (code, self.tunes.get_mut(plane)) else { continue };
             let predicted = |strength: &[f32; F]| model.surrogate.tune(&self.tangent.linearised, plane, strength).0;
             let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
-            let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple);
+            let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple) && is_linear;
+            // with it, or without it, all tunes so far
+            self.past.stale |= core::mem::replace(&mut meter.is_linear, is_linear) != is_linear;
             self.past.stale |= meter.judge();
             let innovation = self.tangent.tune_innovation(model, plane, code.value(), &drive.strength);
-            let counts = counts && self.is_straight(model, &self.tangent, plane);
             screened.tune.get_mut(plane).into_iter().for_each(|to| *to = counts.then_some(innovation));
         }
     }

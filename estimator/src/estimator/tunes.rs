@@ -1,16 +1,22 @@
 //! The tunes of frames as readings of the params.
 //!
-//! A meter's calibration error is a third of a thousandth, and a tune is not linear in gradients. What its derivative `h` leaves out, with
-//! params `theta_i` off by `sigma_i` each, is of rms `pi/|sin 2 pi Q| sum of (h_i sigma_i)^2`: a gradient `q` changes the tune by
-//! `beta q/(4 pi)`, and the beta of another place by `-beta beta' q cos(2 |phi - phi'| - 2 pi Q)/(2 sin 2 pi Q)` (E. Courant and
-//! H. Snyder, Ann. Phys. 3 (1958) 1), so that `d^2 Q/d theta_i d theta_j = -2 pi h_i h_j cos(..)/sin 2 pi Q`, whose phases are
-//! taken as random. For the Booster that is 1.4e-3 when nothing is known of the vars, five times the calibration error, and 3e-5 after a
-//! campaign. Until it is below the calibration error tunes do not count: two directions of 48 would be known to a tenth of what
-//! they are off by.
+//! A tune is not linear in gradients, and a meter's calibration error is 3e-4. Of params that are off by `sigma_i`, each by itself, the
+//! derivative `h` of the tune leaves out
+//!
+//! `pi/|sin 2 pi Q| sum of (h_i sigma_i)^2` rms:
+//!
+//! a gradient `q` changes the tune by `beta q/(4 pi)`, and the beta of another place by `-beta beta' q cos(2 |phi - phi'| - 2 pi Q)/
+//! (2 sin 2 pi Q)`, so that `d^2 Q/d theta_i d theta_j = -2 pi h_i h_j cos(..)/sin 2 pi Q`, whose phases are taken as random. Exact
+//! tunes confirm it within a tenth (`tests/tune_curvature.rs`): 8e-3 when nothing is known of the Booster's vars, 1e-3 when they are
+//! known to 1 %. After a campaign errors are correlated, and what is left out is a third of what the formula says.
+//!
+//! Until it is below two calibration errors, tunes do not count: two directions of 48 would be known to a thirtieth of what they are off by.
+//!
+//! Source: E. Courant and H. Snyder, Ann. Phys. 3 (1958) 1.
 
 use super::pooling::{Pooling, Work};
 use super::posterior::Posterior;
-use super::{Estimator, Model, Tangent, underweighted};
+use super::{Estimator, Model, underweighted};
 use crate::gaussian::Reading;
 use crate::judged::Screened;
 use crate::surrogate::Surrogate;
@@ -46,10 +52,7 @@ impl<
     /// Count the tunes of all frames so far, as their mean.
     pub(super) fn count_tunes(&mut self, model: &Model<'_, G, B, C, F>) {
         for plane in 0..2 {
-            let Some(meter) = self.tunes.get(plane).filter(|_| self.is_straight(model, &self.anew.tangent, plane))
-            else {
-                continue;
-            };
+            let Some(meter) = self.tunes.get(plane).filter(|meter| meter.is_linear) else { continue };
             if let (Some(variance), (mean, strength, count @ 1..)) = (meter.variance(), meter.mean()) {
                 let squares = meter.scatter();
                 let innovation = self.anew.tangent.tune_innovation(model, plane, mean, &strength);
@@ -64,18 +67,13 @@ impl<
         }
     }
 
-    /// True if a tune is linear in the params as far as they are known, to less than the meter's calibration error.
+    /// True if the tune in a plane is linear in the params as far as they are known.
     #[inline(never)]
-    pub(super) fn is_straight(
-        &self,
-        model: &Model<'_, G, B, C, F>,
-        at: &Tangent<G::Linearised, F>,
-        plane: usize,
-    ) -> bool {
-        let (tune, slope) = model.surrogate.tune(&at.linearised, plane, &[0.0; F]);
+    pub(super) fn is_linear(&self, model: &Model<'_, G, B, C, F>, plane: usize) -> bool {
+        let (tune, slope) = model.surrogate.tune(&self.tangent.linearised, plane, &[0.0; F]);
         let off = |(h, sigma): (&f32, &f32)| h * sigma * h * sigma;
         let squares: f32 = slope.iter().zip(&self.posterior.solution.sigma).map(off).sum();
         let calibration = model.setup.tune_calibration.unwrap_or(0.0);
-        core::f32::consts::PI * squares <= calibration * libm::sinf(core::f32::consts::TAU * tune).abs()
+        core::f32::consts::PI * squares <= 2.0 * calibration * libm::sinf(core::f32::consts::TAU * tune).abs()
     }
 }
