@@ -111,7 +111,7 @@ fn hand_on(outlet: &mut Outlet, works: Receiver<Work>, wishes: &Sender<Wish>) ->
                 unannounced += 1;
                 next = works.try_recv().ok();
                 // the last estimate of several that wait wakes the readers at once, a single one therefore too
-                if next.is_none() || unannounced == TOGETHER {
+                if !matches!(next, Some(Work::Taken(_))) || unannounced == TOGETHER {
                     outlet.announce();
                     unannounced = 0;
                 }

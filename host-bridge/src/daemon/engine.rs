@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::surrogate::Unstable;
-use estimator::{Hold, IngestError, Prepared, StateError, Tables as _};
+use estimator::{FitQuality, Hold, IngestError, Prepared, StateError, Tables as _};
 use inference::stream::{Core, Feedback};
 use training::{LINE, Tables};
 
@@ -18,6 +18,10 @@ use crate::source::queue::{Arrived, Queue};
 
 /// What the posterior expects of readings is worked out as often as this.
 const FITTED: Duration = Duration::from_millis(200);
+
+/// Readings are compared with the model as often as this, by the time of frames [us]: that takes as long as several frames while vars do
+/// not walk.
+const COMPARED_US: u64 = 100_000;
 
 /// While as many frames wait, only one in so many is followed by a slice of preparation, which takes as long as a frame.
 const BEHIND: u32 = 16;
@@ -82,6 +86,8 @@ pub struct Engine {
     /// Number of the last frame, and of all frames.
     last: Option<[u32; 2]>,
     fitted: Option<Instant>,
+    /// How the readings fit the model, and the time of the frame since which it is so [us].
+    compared: Option<(u64, FitQuality)>,
 }
 
 impl Engine {
@@ -99,6 +105,7 @@ impl Engine {
             owes_gains: false,
             last: None,
             fitted: None,
+            compared: None,
         }
     }
 
@@ -135,10 +142,21 @@ impl Engine {
             tell(lost(before, estimate.sequence));
         }
         let fitted = self.fitted_if_due();
-        let (spread, fit) = (self.core.spread(), self.core.fit_quality());
+        let (spread, fit) = (self.core.spread(), self.compare_if_due(estimate.time_us));
         let correction = self.core.correction();
         self.owes_gains = correction.as_ref().is_some_and(|made| made.steered.hold == Some(Hold::Unprepared));
         Some(Taken { frame, estimate, correction, spread, fit, tables: self.model.tables, fitted })
+    }
+
+    fn compare_if_due(&mut self, time_us: u64) -> FitQuality {
+        match self.compared {
+            Some((at, fit)) if time_us.abs_diff(at) < COMPARED_US => fit,
+            _ => {
+                let fit = self.core.fit_quality();
+                self.compared = Some((time_us, fit));
+                fit
+            }
+        }
     }
 
     fn fitted_if_due(&mut self) -> Option<Vec<f32>> {
@@ -210,7 +228,7 @@ impl Engine {
         let (tables, setup) = (self.core.tables.clone(), self.core.setup.clone());
         self.core = Core::with_tables(tables, setup).map_err(|error| error.to_string())?;
         self.steer();
-        (self.last, self.is_prepared) = (None, false);
+        (self.last, self.is_prepared, self.compared) = (None, false, None);
         Ok(Done::Anew("the core is at its prior".into()))
     }
 
@@ -225,7 +243,7 @@ impl Engine {
         let adopted = self.core.adopt(tables);
         adopted.map_err(|Unstable| "with these tables the ring is not stable at the vars at hand".to_owned())?;
         self.model = model_of(&mut self.core).map_err(|error| error.to_string())?;
-        self.is_prepared = false;
+        (self.is_prepared, self.compared) = (false, None);
         Ok(Done::Anew(format!("the tables are now {:08x}", self.model.tables)))
     }
 }

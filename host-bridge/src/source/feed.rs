@@ -35,14 +35,12 @@ trait Stream: Read + Send {
 
 impl Stream for TcpStream {
     fn glance(&self) -> io::Result<()> {
-        self.set_nonblocking(false)?;
         self.set_read_timeout(Some(GLANCE))
     }
 }
 
 impl Stream for UnixStream {
     fn glance(&self) -> io::Result<()> {
-        self.set_nonblocking(false)?;
         self.set_read_timeout(Some(GLANCE))
     }
 }
@@ -75,21 +73,13 @@ impl Door {
             (Role::Connect, address) | (Role::Listen, address @ Address::Serial(..)) => {
                 Ok(Self::Connect(address.clone()))
             }
-            (Role::Listen, Address::Tcp(address)) => {
-                let listener = TcpListener::bind(address)?;
-                listener.set_nonblocking(true)?;
-                Ok(Self::Tcp(listener))
-            }
-            (Role::Listen, Address::Unix(path)) => {
-                let listener = bind(Path::new(path))?;
-                listener.set_nonblocking(true)?;
-                Ok(Self::Unix(listener))
-            }
+            (Role::Listen, Address::Tcp(address)) => TcpListener::bind(address).map(Self::Tcp),
+            (Role::Listen, Address::Unix(path)) => bind(Path::new(path)).map(Self::Unix),
         }
     }
 
-    /// The next connection; none if nobody has come yet.
-    fn next(&self) -> io::Result<Option<Box<dyn Stream>>> {
+    /// The next connection; one that listens waits for it.
+    fn next(&self) -> io::Result<Box<dyn Stream>> {
         let stream: io::Result<Box<dyn Stream>> = match self {
             Self::Connect(Address::Tcp(address)) => connect(address).map(|stream| Box::new(stream) as _),
             Self::Connect(Address::Unix(path)) => UnixStream::connect(path).map(|stream| Box::new(stream) as _),
@@ -98,11 +88,9 @@ impl Door {
             Self::Tcp(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
             Self::Unix(listener) => listener.accept().map(|(stream, _)| Box::new(stream) as _),
         };
-        match stream {
-            Ok(stream) => stream.glance().map(|()| Some(stream)),
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
-            Err(error) => Err(error),
-        }
+        let stream = stream?;
+        stream.glance()?;
+        Ok(stream)
     }
 }
 
@@ -155,7 +143,7 @@ fn start_at(door: Door, source: &Source, most: usize, queue: &Queue, stop: &Stop
         queue: queue.clone(),
         stop: stop.clone(),
     };
-    // not joined: the process does not wait for the system to connect
+    // not joined: the process does not wait until somebody connects
     thread::Builder::new().name("source".into()).spawn(move || reader.run())?;
     Ok(())
 }
@@ -173,17 +161,16 @@ impl Reader {
         let [first, most] = self.source.backoff();
         let (mut wait, mut failure) = (first, String::new());
         while !self.stop.is_requested() {
-            match self.door.next() {
-                Ok(Some(stream)) => {
+            let connected = self.door.next();
+            // the next one comes by itself
+            let is_called = connected.is_ok() && matches!(self.door, Door::Tcp(_) | Door::Unix(_));
+            match connected {
+                Ok(stream) => {
                     tell(format_args!("{}: connected", self.source.address));
                     let had_frames = self.read(stream);
                     // somebody who accepts and hangs up is not asked at once again
                     wait = if had_frames { first } else { wait };
                     failure.clear();
-                }
-                Ok(None) => {
-                    thread::sleep(GLANCE);
-                    continue;
                 }
                 // said once, not at each attempt
                 Err(error) if failure != error.to_string() => {
@@ -192,7 +179,7 @@ impl Reader {
                 }
                 Err(_) => {}
             }
-            if matches!(self.door, Door::Connect(_) | Door::Program(_)) {
+            if !is_called {
                 self.stop.sleep_until(Instant::now() + wait);
                 wait = (2 * wait).min(most.max(first));
             }
