@@ -493,8 +493,9 @@ impl<
         }
         let before = self.posterior.solution.cost;
         self.posterior.expect();
+        let unknown = self.baselines_variance();
         self.condition(model, frame, *cell, screened);
-        self.note_kicks(drive);
+        self.note_kicks(drive, unknown);
         self.solve(model);
         *nis = self.count_nis(before, screened);
         self.look_for_steps(model);

@@ -14,6 +14,9 @@ use crate::wire::Frame;
 
 /// Mean square orbit over the noise's below which kicks count as none: the scatter of read-backs makes 0.004.
 const IDLE: f32 = 0.1;
+/// Largest share of a frame in the mean of the kicks that the baselines were read at. Where baselines walk fast, one frame makes half of them
+/// and moves the params as well: the second order of its own kicks is an error of these, and is not to be put into the baselines.
+const MOST: f64 = 1.0 / 16.0;
 /// Of the recent frames, so many parts of four must belong to a setting about a new reference drive.
 const PARTS: usize = 3;
 
@@ -123,14 +126,18 @@ impl<
         true
     }
 
-    /// Count a frame's kicks into those that the baselines were read at, as much as its readings have moved the baselines.
-    pub(super) fn note_kicks(&mut self, drive: &Drive<C, F>) {
-        let share = |b| {
-            self.posterior.gaussian.baseline_variance(self.predicted.first_channel + b) as f32 / self.noise_variance(b)
-        };
-        let share = ((0..B).map(share).sum::<f32>() / B as f32).min(1.0);
+    /// Count a frame's kicks into those that the baselines were read at, by the share of it in the baselines: that by which it has
+    /// reduced their variance.
+    pub(super) fn note_kicks(&mut self, drive: &Drive<C, F>, before: f64) {
+        let share = if before > 0.0 { (1.0 - self.baselines_variance() / before).min(MOST) } else { 0.0 };
         let each = self.past.reference.read_at.iter_mut().zip(&drive.kick);
-        each.for_each(|(mean, kick)| *mean += share * (kick - *mean));
+        each.for_each(|(mean, kick)| *mean += share as f32 * (kick - *mean));
+    }
+
+    /// Sum of the variances of the baselines at the frame's time in the cycle, params given [m^2].
+    pub(super) fn baselines_variance(&self) -> f64 {
+        let first = self.predicted.first_channel;
+        (first..first + B).map(|channel| self.posterior.gaussian.baseline_variance(channel)).sum()
     }
 
     /// Take the Gaussian to where the surrogate is linearised anew, while the params walk and the past cannot be counted anew. A baseline is
