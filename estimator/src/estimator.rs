@@ -556,11 +556,12 @@ impl<
         let adopted = self.linearise_anew(model);
         let doubtful = self.posterior.has_stepped() || self.fit_quality(model).is_mismatch();
         self.posterior.pass(&model.setup.walk, passed, &layout, prior);
+        adopted?;
         if walked && doubtful {
             self.posterior.doubt(BASELINE, &layout, prior);
         }
         self.nis = (0.0, 0.0);
-        adopted
+        Ok(())
     }
 
     /// Linearise at vars = 1, all steps at once, and keep how orbits follow the gradients there.

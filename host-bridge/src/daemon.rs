@@ -110,7 +110,7 @@ fn hand_on(outlet: &mut Outlet, works: Receiver<Work>, wishes: &Sender<Wish>) ->
                 let taken = outlet.publish(*taken)?;
                 unannounced += 1;
                 next = works.try_recv().ok();
-                // the last estimate of several that wait wakes the readers at once, a single one therefore too
+                // the last estimate of several that wait wakes the readers at once, a single one therefore too, and one before a checkpoint
                 if !matches!(next, Some(Work::Taken(_))) || unannounced == TOGETHER {
                     outlet.announce();
                     unannounced = 0;

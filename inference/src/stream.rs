@@ -186,16 +186,16 @@ impl Core {
     /// Switch to other tables of the same machine. See [`estimator::Estimator::adopt`].
     ///
     /// # Errors
-    /// [`Unstable`] if they have no ring at the vars at hand, or are of another machine; the former tables are then in use again.
+    /// [`Unstable`] if they have no ring at the vars at hand, or are of another machine; nothing has changed then.
     pub fn adopt(&mut self, tables: Tables) -> Result<(), Unstable> {
         if tables.sizes() != self.tables.sizes() {
             return Err(Unstable);
         }
+        let before = self.stream.clone();
         let adopted = self.stream.adopt(&tables);
         match adopted {
             Ok(()) => self.tables = tables,
-            // they have described all frames so far, so they can again
-            Err(Unstable) => self.stream.adopt(&self.tables).unwrap_or_default(),
+            Err(Unstable) => self.stream = before,
         }
         adopted
     }

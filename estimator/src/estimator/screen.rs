@@ -105,8 +105,9 @@ impl<
             return;
         }
         for (plane, code) in frame.tune.iter().enumerate() {
+            let Some(code) = code else { continue };
             let is_linear = self.is_linear(model, plane);
-            let (Some(code), Some(meter)) = (code, self.tunes.get_mut(plane)) else { continue };
+            let Some(meter) = self.tunes.get_mut(plane) else { continue };
             let predicted = |strength: &[f32; F]| model.surrogate.tune(&self.tangent.linearised, plane, strength).0;
             let ripple = |change: &[f32; F]| predicted(change) - predicted(&[0.0; F]);
             let counts = meter.hear(*code, &drive.strength, model.setup.gate, ripple) && is_linear;

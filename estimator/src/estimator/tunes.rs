@@ -7,7 +7,7 @@
 //!
 //! a gradient `q` changes the tune by `beta q/(4 pi)`, and the beta of another place by `-beta beta' q cos(2 |phi - phi'| - 2 pi Q)/
 //! (2 sin 2 pi Q)`, so that `d^2 Q/d theta_i d theta_j = -2 pi h_i h_j cos(..)/sin 2 pi Q`, whose phases are taken as random. Exact
-//! tunes confirm it within a tenth (`tests/tune_curvature.rs`): 8e-3 when nothing is known of the Booster's vars, 1e-3 when they are
+//! tunes confirm it within a quarter (`tests/tune_curvature.rs`): 8e-3 when nothing is known of the Booster's vars, 1e-3 when they are
 //! known to 1 %. After a campaign errors are correlated, and what is left out is a third of what the formula says.
 //!
 //! Until it is below two calibration errors, tunes do not count: two directions of 48 would be known to a thirtieth of what they are off by.

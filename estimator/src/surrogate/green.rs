@@ -438,7 +438,7 @@ impl<
 
     /// Add derivatives with respect to `ln` of each quadrupole's strength to those of its param and of its supply. ([`NONE`] as
     /// an index is beyond any list.) Neighbours mostly share a supply, whose sum stays in a register meanwhile: one in memory would make
-    /// each addition wait for the one before, a fifth of all that a frame takes.
+    /// each addition wait for the one before, a tenth of all that a frame takes.
     #[inline]
     fn spread(&self, slopes: impl Iterator<Item = f32>, by_param: &mut [f32], by_supply: &mut [f32]) {
         let (mut at, mut sum) = (NONE, 0.0);
