@@ -86,19 +86,6 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
         let heard = hear(&mut subscriber, &sent, start, || sender.is_finished());
         sender.join().expect("the sender does not panic").map(|()| heard)
     })?;
-    let mut at = 0;
-    while at < latencies.len() {
-        if latencies[at] > Duration::from_millis(10) {
-            let from = at;
-            let mut most = latencies[at];
-            while at < latencies.len() && latencies[at] > Duration::from_millis(5) {
-                most = most.max(latencies[at]);
-                at += 1;
-            }
-            println!("  {hertz}: {from} to {at}: {most:?}");
-        }
-        at += 1;
-    }
     latencies.sort_unstable();
     let lost = frames.len() - latencies.len();
     let late = latencies.iter().filter(|latency| **latency > LATE).count();
