@@ -2,6 +2,7 @@
 
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
+use std::env;
 use std::io::Write;
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -68,9 +69,12 @@ fn the_command_line_of_iceoryx2_shows_the_services() {
         eprintln!("not tested: `make clients` installs iox2");
         return;
     }
+    // it looks for its commands, iox2-service and others, as a shell does
+    let others = env::var_os("PATH").unwrap_or_default();
+    let path = env::join_paths([root("target/tools/bin")].into_iter().chain(env::split_paths(&others))).unwrap();
     with_daemon("iox2", |place| {
         let run = |arguments: &[&str]| {
-            let output = Command::new(&program).args(arguments).output().unwrap();
+            let output = Command::new(&program).args(arguments).env("PATH", &path).output().unwrap();
             String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
         };
         let listed = run(&["service", "list"]);
