@@ -4,10 +4,10 @@ use estimator::Walk;
 use host_bridge::model_file;
 use inference::stream::{self, Core};
 use inference::{Drive, Recording, simulate, with_priors};
-use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, Normal};
+use system_tests::machine::nees;
 use system_tests::repository;
 use twin::{Cycle, Effect, Machine, Rf, Ring, Tracked};
 
@@ -49,9 +49,8 @@ fn replay(mut core: Core, recording: &Recording, truth: &[f64]) -> CoreResult {
     let mut last = None;
     stream::replay(&mut core, recording, |_, estimate| last = Some(estimate.clone())).unwrap();
     let last = last.unwrap();
-    let error = DVector::from_fn(48, |i, _| f64::from(last.map_params[i]) - truth[i].ln());
-    let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j)));
-    let nees = (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0] / 48.0;
+    let error = core::array::from_fn(|i| f64::from(last.map_params[i]) - truth[i].ln());
+    let nees = nees(&error, |i, j| core.covariance(i, j)) / 48.0;
     let quality = core.fit_quality();
     let vars = last.map_params.iter().map(|theta| f64::from(theta.exp())).collect();
     CoreResult { chi_square: quality.chi_square / quality.degrees_of_freedom, nees, vars }

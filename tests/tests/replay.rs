@@ -4,7 +4,7 @@
 use estimator::Walk;
 use inference::stream::{self, Core, Estimate, Setup};
 use inference::{BatchFit, Campaign, Recording, TuneUse};
-use nalgebra::{DMatrix, DVector};
+use system_tests::machine::nees;
 use system_tests::{repository, truth};
 use twin::Ring;
 
@@ -52,9 +52,8 @@ impl Replayed {
 
     /// Normalised estimation error squared of the params, per param.
     fn nees(&self, truth: &[f64]) -> f64 {
-        let error = DVector::from_fn(48, |i, _| f64::from(self.last.map_params[i]) - truth[i].ln());
-        let covariance = DMatrix::from_fn(48, 48, |i, j| f64::from(self.core.covariance(i, j)));
-        (error.transpose() * covariance.cholesky().unwrap().inverse() * &error)[0] / 48.0
+        let error = core::array::from_fn(|i| f64::from(self.last.map_params[i]) - truth[i].ln());
+        nees(&error, |i, j| self.core.covariance(i, j)) / 48.0
     }
 
     fn state(&self, monitor: &str) -> estimator::Health {
