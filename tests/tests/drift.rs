@@ -43,6 +43,7 @@ fn the_drift_stream_is_followed() {
     let (last, mean) = (followed.iter().rev().find_map(|f| f.nees).unwrap(), mean_nees(&followed));
     assert!((0.6..1.6).contains(&last) && (0.6..1.6).contains(&mean), "NEES/48 {last:.2}, {mean:.2}");
     let sigma = drift::mean_sigma(&stream, &followed);
+    println!("NEES/48 {last:.2} at the end, {mean:.2} on average; mean error bar {:.2} %", 100.0 * sigma);
     assert!(sigma <= 0.0045, "mean sigma {sigma:.5}");
     let found = let_loose(&followed);
     assert!(found.len() == 1 && (1800..1800 + WINDOW).contains(&found[0]), "{found:?}");
