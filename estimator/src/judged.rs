@@ -62,8 +62,8 @@ pub(crate) struct Screened<const W: usize> {
 impl<const W: usize> Screened<W> {
     /// Take note of what the repeats say of a reading.
     pub(crate) fn note(&mut self, b: usize, verdict: Verdict) {
-        self.accepted.put(b, verdict != Verdict::Held);
-        self.rejected.put(b, verdict == Verdict::Held);
+        self.accepted.put(b, verdict.waiting() == 0);
+        self.rejected.put(b, verdict.waiting() > 0);
         self.confirmed.put(b, matches!(verdict, Verdict::Confirms { .. }));
         self.restarted.put(b, verdict == Verdict::Confirms { outvotes: true });
     }

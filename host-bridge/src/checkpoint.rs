@@ -20,7 +20,7 @@ use crate::source::queue::Faults;
 pub use keeper::Keeper;
 
 /// Version of the file's form.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 const CRC_BYTES: usize = 4;
 
@@ -290,9 +290,9 @@ pub(crate) mod tests {
         assert!(said(Model { setup: 9, ..MODEL }).contains("priors, noise, calibration or walk"));
         assert!(said(Model { layout: 9, ..MODEL }).contains("another program"));
         let mut newer = checkpoint(7);
-        newer.head.version = 2;
+        newer.head.version = 3;
         let error = Checkpoint::decode(&newer.encode(), &MODEL).unwrap_err();
-        assert_eq!(error.to_string(), "version 2, this program reads version 1");
+        assert_eq!(error.to_string(), "version 3, this program reads version 2");
     }
 
     #[test]

@@ -94,3 +94,25 @@ fn readings_and_states_are_those_of_the_core() {
         assert!(different.len() <= DIFFERENT, "{}: {different:?}", recording.name);
     }
 }
+
+/// A monitor that jumps twice in a setting, both times to nearly the same place, after it has read the beam there: what it read before
+/// counts, and the jumps do not.
+#[test]
+fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
+    let ring = Ring::booster();
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+    let mut recording = Recording::read(&folder, &ring).unwrap();
+    let b = ring.monitor_names().iter().position(|name| name == "y_C1").unwrap();
+    // four repeats of a setting, in the middle of the campaign
+    let first = (recording.rows.len() / 2..).find(|&i| recording.rows[i - 1].correctors != recording.rows[i].correctors);
+    let first = first.unwrap();
+    for (row, jump) in recording.rows[first + 2..first + 4].iter_mut().zip([-7.0e-3, -7.6e-3]) {
+        *row.reading[b].as_mut().unwrap() += jump;
+    }
+    let (by_core, ..) = by_core(&ring, &recording);
+    let by_host = Campaign::of(&ring, &recording).unwrap().screened.accepted;
+    for accepted in [by_core, by_host] {
+        let used: Vec<bool> = (first..first + 4).map(|i| accepted[(i, b)]).collect();
+        assert_eq!(used, [true, true, false, false]);
+    }
+}

@@ -2,8 +2,9 @@
 
 use super::whole::Whole;
 use super::{Estimator, Model};
-use crate::campaign::{Verdict, is_moved};
+use crate::campaign::{Beside, Verdict, is_moved};
 use crate::drive::Drive;
+use crate::estimate::MonitorState;
 use crate::judged::{Expected, Screened};
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
@@ -135,7 +136,8 @@ impl<
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
         }
-        let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, expected);
+        let beside = Beside { expected, is_ok: monitor.state() == MonitorState::Ok };
+        let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, beside);
         let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
         if let Some(following) = following {
             let variance = f64::from(monitor.variance());
@@ -146,15 +148,15 @@ impl<
         match verdict {
             Verdict::Accepted => {}
             Verdict::Confirms { .. } => monitor.pardon(),
-            Verdict::Held => monitor.reject(),
+            Verdict::Held { .. } => monitor.reject(),
         }
         screened.note(b, verdict);
     }
 
     /// A reading without a setting passes if the model expects it.
     fn screen_loose(&mut self, b: usize, expected: bool, screened: &mut Screened<W>) {
-        let verdict = if expected { Verdict::Accepted } else { Verdict::Held };
-        if let (Verdict::Held, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
+        let verdict = if expected { Verdict::Accepted } else { Verdict::Held { agreeing: 1 } };
+        if let (Verdict::Held { .. }, Some(monitor)) = (verdict, self.monitors.get_mut(b)) {
             monitor.reject();
         }
         screened.note(b, verdict);

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use estimator::{Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
+use estimator::{Beside, Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
 use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
@@ -92,9 +92,9 @@ const MOST: usize = 8;
 struct Repeats {
     /// Frames whose reading counts.
     frames: Vec<usize>,
-    /// The last frame with a reading, and whether that waits for one that confirms it.
+    /// The last frame with a reading, and how many in a row that agree, that one included, wait for one that confirms them.
     last: Option<usize>,
-    waiting: bool,
+    waiting: u8,
 }
 
 /// The screening after some frames.
@@ -279,7 +279,8 @@ impl<'c> Screening<'c> {
         let sigma = self.monitors[b].noise.sigma();
         let agrees = |other: f64| self.gate.agree((here - other) as f32, 0.0, sigma);
         let agrees_with_last = last.is_some_and(|last| agrees(moved(last)));
-        let verdict = repeats.judge(agrees(mean), agrees_with_last, expected);
+        let beside = Beside { expected, is_ok: self.monitors[b].state() == MonitorState::Ok };
+        let verdict = repeats.judge(agrees(mean), agrees_with_last, beside);
         self.note(frame, b, setting, verdict);
     }
 
@@ -287,7 +288,7 @@ impl<'c> Screening<'c> {
         let repeats = &mut self.repeats[setting][b];
         match verdict {
             Verdict::Accepted => {}
-            Verdict::Held => self.monitors[b].reject(),
+            Verdict::Held { .. } => self.monitors[b].reject(),
             Verdict::Confirms { outvotes } => {
                 self.monitors[b].pardon();
                 self.stale = true;
@@ -298,9 +299,9 @@ impl<'c> Screening<'c> {
                 repeats.last.into_iter().for_each(|last| self.accepted[(last, b)] = true);
             }
         }
-        repeats.waiting = verdict == Verdict::Held;
+        repeats.waiting = verdict.waiting();
         repeats.last = Some(frame);
-        if !repeats.waiting {
+        if repeats.waiting == 0 {
             repeats.frames.push(frame);
             self.accepted[(frame, b)] = true;
         }
@@ -420,17 +421,18 @@ impl<'c> Screening<'c> {
 
 impl Repeats {
     /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects it. A
-    /// reading outside the gate waits. Two that agree outvote the model, and whatever came before.
-    fn judge(&self, agrees_with_mean: bool, agrees_with_last: bool, expected: bool) -> Verdict {
+    /// reading outside the gate waits. So many in a row that agree as are needed outvote the model, and whatever came before.
+    fn judge(&self, agrees_with_mean: bool, agrees_with_last: bool, beside: Beside) -> Verdict {
         let any = !self.frames.is_empty();
-        if (any && agrees_with_mean) || (agrees_with_last && !self.waiting) {
+        let agreeing = if agrees_with_last { self.waiting + 1 } else { 1 };
+        if (any && agrees_with_mean) || (agrees_with_last && self.waiting == 0) {
             Verdict::Accepted
-        } else if agrees_with_last {
+        } else if agreeing >= beside.needed(any) {
             Verdict::Confirms { outvotes: any }
-        } else if !any && expected {
+        } else if !any && beside.expected {
             Verdict::Accepted
         } else {
-            Verdict::Held
+            Verdict::Held { agreeing }
         }
     }
 }
