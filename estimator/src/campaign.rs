@@ -310,6 +310,8 @@ pub struct Beside {
     pub expected: bool,
     /// Its monitor is in state ok.
     pub is_ok: bool,
+    /// The noise of its monitor, and so the gate, is that of enough repeats, see [`crate::Noise::is_told`].
+    pub is_told: bool,
 }
 
 impl Beside {
@@ -317,9 +319,10 @@ impl Beside {
     ///
     /// Two jumps of a monitor may agree by chance, three hardly do: of a monitor that jumps by 1 to 9 mm in 2.5 % of its readings, one pair
     /// in a hundred campaigns of three repeats did, with what the setting's good reading said lost to it. So two are enough if the model
-    /// expects them, or if it is only the model that speaks against them and the monitor is sound.
+    /// expects them, or if it is only the model that speaks against them and the monitor is sound; and as long as the noise is only a guess,
+    /// by which repeats of a noisier monitor hardly ever agree.
     pub const fn needed(self, against_others: bool) -> u8 {
-        if self.expected || (self.is_ok && !against_others) { 2 } else { 3 }
+        if self.expected || !self.is_told || (self.is_ok && !against_others) { 2 } else { 3 }
     }
 }
 
@@ -485,7 +488,7 @@ mod tests {
     fn assert_story(is_ok: bool, story: &[(i32, bool, Verdict)]) {
         let mut cell = Cell::<1, 1, 1>::open(REST);
         for &(code, expected, verdict) in story {
-            let judged = cell.judge(0, code, 1.5e-4, Gate::default(), Beside { expected, is_ok });
+            let judged = cell.judge(0, code, 1.5e-4, Gate::default(), Beside { expected, is_ok, is_told: true });
             assert_eq!(judged, verdict, "{code} in {story:?}");
             cell.take(0, code, code, judged, |_, _| ());
         }

@@ -115,9 +115,14 @@ impl Noise {
         self.total = self.histogram.iter().map(|&count| u32::from(count)).sum();
     }
 
+    /// True once there are enough differences to tell.
+    pub const fn is_told(&self) -> bool {
+        self.total >= ENOUGH
+    }
+
     /// Noise estimated from the differences so far [m]; none before there are enough.
     pub fn learnt(&self) -> Option<f32> {
-        if self.total < ENOUGH {
+        if !self.is_told() {
             return None;
         }
         let target = ONE_SIGMA * self.total as f32;

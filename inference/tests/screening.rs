@@ -104,7 +104,8 @@ fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
     let mut recording = Recording::read(&folder, &ring).unwrap();
     let b = ring.monitor_names().iter().position(|name| name == "y_C1").unwrap();
     // four repeats of a setting, in the middle of the campaign
-    let first = (recording.rows.len() / 2..).find(|&i| recording.rows[i - 1].correctors != recording.rows[i].correctors);
+    let first =
+        (recording.rows.len() / 2..).find(|&i| recording.rows[i - 1].correctors != recording.rows[i].correctors);
     let first = first.unwrap();
     for (row, jump) in recording.rows[first + 2..first + 4].iter_mut().zip([-7.0e-3, -7.6e-3]) {
         *row.reading[b].as_mut().unwrap() += jump;

@@ -16,8 +16,17 @@ const SHIFT: f64 = 0.2e-3;
 /// by less than this [m].
 const LEAST_SHIFT: f64 = 1e-7;
 
-/// Rms change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit,
-/// beyond the design dispersion [1]; 0 in a plane in which shifted quadrupoles make no orbit that is read.
+/// Standard deviation of the spurious dispersion for readings that are taken for independent, over its rms: two for the monitors, and
+/// the root of two for the offsets, see [`spurious_dispersion`].
+pub const INDEPENDENT: f64 = 2.0 * core::f64::consts::SQRT_2;
+
+/// Change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit, beyond the design
+/// dispersion, as a standard deviation for readings that are taken for independent [1]: [`INDEPENDENT`] times its rms. 0 in a plane in
+/// which shifted quadrupoles make no orbit that is read.
+///
+/// An offset and its opposite share the change with opposite signs: twice the variance. Monitors share it, too: it is a wave of nearly
+/// the tune's frequency, two numbers a plane. Four times the variance makes up for that: NEES/48 of 80 misaligned Boosters is 0.98 with it and
+/// 1.09 without, and error bars grow by 2 %; without the frames of an RF offset they would grow by 5 %.
 ///
 /// # Errors
 /// [`OrbitError`] if a ring has no closed orbit.
@@ -49,9 +58,7 @@ fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {
             }
         }
     }
-    // An offset and its opposite share the change with opposite signs; the estimate takes them for independent, so each is
-    // given twice the variance.
-    let ratio = |plane: usize| f64::sqrt(2.0 * change[plane] / orbit[plane]);
+    let ratio = |plane: usize| INDEPENDENT * f64::sqrt(change[plane] / orbit[plane]);
     Ok([0, 1].map(|plane| if orbit[plane] > 0.0 { ratio(plane) } else { 0.0 }))
 }
 

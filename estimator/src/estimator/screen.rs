@@ -136,7 +136,8 @@ impl<
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
         }
-        let beside = Beside { expected, is_ok: monitor.state() == MonitorState::Ok };
+        let is_ok = monitor.state() == MonitorState::Ok;
+        let beside = Beside { expected, is_ok, is_told: monitor.noise.is_told() };
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, beside);
         let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
         if let Some(following) = following {

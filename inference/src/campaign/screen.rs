@@ -279,7 +279,9 @@ impl<'c> Screening<'c> {
         let sigma = self.monitors[b].noise.sigma();
         let agrees = |other: f64| self.gate.agree((here - other) as f32, 0.0, sigma);
         let agrees_with_last = last.is_some_and(|last| agrees(moved(last)));
-        let beside = Beside { expected, is_ok: self.monitors[b].state() == MonitorState::Ok };
+        let monitor = &self.monitors[b];
+        let is_ok = monitor.state() == MonitorState::Ok;
+        let beside = Beside { expected, is_ok, is_told: monitor.noise.is_told() };
         let verdict = repeats.judge(agrees(mean), agrees_with_last, beside);
         self.note(frame, b, setting, verdict);
     }

@@ -1,19 +1,22 @@
 //! `make serve-bench`: how fast the daemon is, from a TCP source on loopback to a subscriber of the shared memory: frames lost and late at
 //! 10 kHz, latency at 1 kHz. Numbers of the machine at hand; no test asserts them.
+//!
+//! The latency begins before the writer's call of the system. What of it is the daemon's, the daemon says itself: from the frame that is in
+//! its queue until its readers are woken. How long a reader has waited then, the stamp of the estimate tells.
 
 use core::error::Error;
 use core::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 use std::fs;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::thread;
-use std::time::Instant;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Parser;
-use host_bridge::sink::shared_memory::Subscriber;
+use host_bridge::sink::shared_memory::{Published, Subscriber};
 use inference::{Recording, stream};
 use twin::Ring;
 
@@ -61,7 +64,7 @@ impl Drop for Daemon {
 /// One line of the table.
 fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
-    let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+    let [port, page] = [free_port()?, free_port()?];
     let service = format!("orbitcal/bench/{}/{hertz}", std::process::id());
     let recording = fs::canonicalize(&options.recording)?;
     let buffer_frames = hertz / 10; // 100 ms
@@ -70,7 +73,8 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
         &config,
         format!(
             "[machine]\nrecording = {recording:?}\n[source]\naddress = \"tcp://127.0.0.1:{port}\"\nrole = \"listen\"\n\
-             buffer_frames = {buffer_frames}\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\n"
+             buffer_frames = {buffer_frames}\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\n\
+             [page]\naddress = \"127.0.0.1:{page}\"\n"
         ),
     )?;
     let frames = wires(&recording, hertz, hertz * seconds)?;
@@ -81,24 +85,46 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
     let line = connect(port)?;
     let sent: Vec<AtomicU64> = frames.iter().map(|_| AtomicU64::new(0)).collect();
     let start = Instant::now();
-    let mut latencies = thread::scope(|scope| {
+    let (latencies, since_published) = thread::scope(|scope| {
         let sender = scope.spawn(|| send(line, &frames, &sent, start, hertz));
         let heard = hear(&mut subscriber, &sent, start, || sender.is_finished());
         sender.join().expect("the sender does not panic").map(|()| heard)
     })?;
-    latencies.sort_unstable();
     let lost = frames.len() - latencies.len();
     let late = latencies.iter().filter(|latency| **latency > LATE).count();
-    let at = |share: f64| {
-        let index = (share * latencies.len() as f64) as usize;
-        latencies.get(index.min(latencies.len().saturating_sub(1))).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
-    };
-    let quantiles: Vec<String> = [0.5, 0.99, 0.999, 1.0].iter().map(|share| format!("{:.0}", at(*share))).collect();
+    let quantiles: Vec<String> =
+        [0.5, 0.99, 0.999, 1.0].iter().map(|share| format!("{:.0}", quantile_us(&latencies, *share))).collect();
+    let [in_daemon, of_reader] = [in_daemon_us(page)?, [0.5, 0.99].map(|share| quantile_us(&since_published, share))]
+        .map(|us| us.map(|us| format!("{us:.0}")).join(", "));
     let threads = threads(daemon.0.id(), latencies.len());
     let said = fs::read_to_string(folder.path().join("said"))?;
     let faults: Vec<&str> = said.lines().filter(|line| line.contains("so far")).collect();
     let (count, quantiles, faults) = (frames.len(), quantiles.join(", "), faults.join("; "));
-    Ok(format!("{hertz:>6} {count:>8} {lost:>8} {late:>8}  {quantiles} {faults}\n       {threads}"))
+    Ok(format!(
+        "{hertz:>6} {count:>8} {lost:>8} {late:>8}  {quantiles} {faults}\n       \
+         us, median and 99 %: frame in the daemon's queue to readers woken {in_daemon}; estimate stamped to read {of_reader}\n       {threads}"
+    ))
+}
+
+fn free_port() -> std::io::Result<u16> {
+    Ok(TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+}
+
+/// A quantile of times that are sorted [us].
+fn quantile_us(sorted: &[Duration], share: f64) -> f64 {
+    let index = (share * sorted.len() as f64) as usize;
+    sorted.get(index.min(sorted.len().saturating_sub(1))).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
+}
+
+/// Median and 99 % of the time from a frame in the daemon's queue until its readers are woken, by its page [us].
+fn in_daemon_us(page: u16) -> Result<[f64; 2], Box<dyn Error>> {
+    let mut line = TcpStream::connect(("127.0.0.1", page))?;
+    line.write_all(b"GET /state.json HTTP/1.0\r\n\r\n")?;
+    let mut reply = String::new();
+    line.read_to_string(&mut reply)?;
+    let (_, body) = reply.split_once("\r\n\r\n").ok_or("the page has sent no body")?;
+    let state: serde_json::Value = serde_json::from_str(body)?;
+    Ok(serde_json::from_value(state["latency_us"].clone())?)
 }
 
 /// Time that each thread of the daemon has run for a frame, and waited for a processor [us], by the kernel.
@@ -157,22 +183,26 @@ fn send(
     Ok(())
 }
 
-/// How long each frame took from the socket's writer to here, until the last one or a while after the sender has ended.
+/// How long each frame took from the socket's writer to here, and from the stamp of its estimate, both sorted; until the last one or a while
+/// after the sender has ended.
 fn hear(
     subscriber: &mut Subscriber,
     sent: &[AtomicU64],
     start: Instant,
     has_ended: impl Fn() -> bool,
-) -> Vec<Duration> {
-    let (mut latencies, mut ended) = (Vec::new(), None);
+) -> (Vec<Duration>, Vec<Duration>) {
+    let (mut latencies, mut since_published, mut ended) = (Vec::new(), Vec::new(), None);
     while ended.is_none_or(|ended: Instant| ended.elapsed() < END) && latencies.len() < sent.len() {
         let heard = subscriber.wait(Duration::from_millis(100)).unwrap_or_default();
-        let now = start.elapsed();
-        for record in heard.iter().map(|published| &published.record) {
+        let (now, clock) = (start.elapsed(), SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default());
+        for Published { record, stamp } in &heard {
             let sent = sent.get(record.sequence as usize).map_or(0, |sent| sent.load(Ordering::Acquire));
             latencies.push(now.saturating_sub(Duration::from_nanos(sent)));
+            since_published.push(clock.saturating_sub(Duration::from_nanos(stamp.published_ns)));
         }
         ended = ended.or_else(|| has_ended().then(Instant::now));
     }
-    latencies
+    latencies.sort_unstable();
+    since_published.sort_unstable();
+    (latencies, since_published)
 }
