@@ -6,7 +6,7 @@
 use core::f64::consts::SQRT_2;
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Hold, INDEPENDENT, Machine, Monitor, Optics, OrbitError, Place, Plane, Ring, Tunes};
+use twin::{Hold, Machine, Monitor, Optics, OrbitError, Place, Plane, Ring, Tunes};
 
 use inference::Screened;
 
@@ -27,8 +27,8 @@ pub struct Baseline {
 
 /// Standard deviation of a monitor's offset [m], typical of surveys of such monitors.
 const OFFSET: f64 = 0.7e-3;
-/// Standard deviation of the spurious dispersion over its rms. For vars it is twice that, since monitors share a wave of it
-/// ([`twin::spurious_dispersion`]); what one place does to the orbit is no such wave, and would lose up to a quarter of its evidence.
+/// Standard deviation of the spurious dispersion over its rms, somewhat on the safe side. Vars need more, since monitors share a wave of it
+/// ([`twin::SHARED`]); what one place does to the orbit is no such wave, and would lose up to a quarter of its evidence to that.
 const SPURIOUS: f64 = SQRT_2;
 /// Largest `|cot(pi Q)|`: a machine nearer to the integer resonance keeps no beam.
 const STEEPEST: f64 = 20.0;
@@ -51,7 +51,7 @@ impl Baseline {
         let rms = [rms(&baselines[..split]), rms(&baselines[split..])];
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
-        let spurious = [0, 1].map(|plane| SPURIOUS / INDEPENDENT * per_rms[plane] * rms[plane]);
+        let spurious = [0, 1].map(|plane| SPURIOUS * per_rms[plane] * rms[plane]);
         let Kriged { orbit, sigma, .. } = Kriged::of(ring, &baselines, rms)?;
         Ok((orbit, Self { rms, sensitivity, spurious, sigma, read: baselines }))
     }

@@ -255,25 +255,21 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
         self.last.get(b).and_then(|last| last.code())
     }
 
-    /// Judge a reading, moved to the mean drive, by its repeats; `sigma` is the monitor's noise [m].
-    ///
-    /// A reading passes if it agrees with the mean or the last of its repeats, or, if it is the first, with the model.
-    /// Otherwise it waits for [`Beside::needed`] consecutive readings that agree: they outvote the model and all earlier readings.
+    /// So many readings of a monitor in a row wait for one that confirms them.
+    pub fn waiting(&self, b: usize) -> u8 {
+        self.last.get(b).map_or(0, |last| last.waiting())
+    }
+
+    /// Judge a reading, moved to the mean drive, by its repeats and what is known beside them; `sigma` is the monitor's noise [m].
     pub fn judge(&self, b: usize, moved: i32, sigma: f32, gate: Gate, beside: Beside) -> Verdict {
         let (mean, count) = self.mean(b);
         let reading = moved as f32 * PositionCode::METRES_PER_LSB;
-        let agrees_with_last = self.difference(b, moved).is_some_and(|d| gate.agree(d, 0.0, sigma));
-        let waiting = self.last.get(b).map_or(0, |last| last.waiting());
-        let agreeing = if agrees_with_last { waiting + 1 } else { 1 };
-        if (count > 0 && gate.agree(reading, mean, sigma)) || (agrees_with_last && waiting == 0) {
-            Verdict::Accepted
-        } else if agreeing >= beside.needed(count > 0) {
-            Verdict::Confirms { outvotes: count > 0 }
-        } else if count == 0 && beside.expected {
-            Verdict::Accepted
-        } else {
-            Verdict::Held { agreeing }
-        }
+        beside.judge(ByRepeats {
+            any: count > 0,
+            agrees_with_mean: gate.agree(reading, mean, sigma),
+            agrees_with_last: self.difference(b, moved).is_some_and(|d| gate.agree(d, 0.0, sigma)),
+            waiting: self.waiting(b),
+        })
     }
 
     /// Take a reading in as judged; `scatter` hears of each that is counted how far it is from the mean of those before [m], and
@@ -303,26 +299,60 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     }
 }
 
+/// What its repeats say of a reading.
+#[derive(Debug, Clone, Copy)]
+pub struct ByRepeats {
+    /// There are any that count.
+    pub any: bool,
+    /// It agrees with their mean.
+    pub agrees_with_mean: bool,
+    /// It agrees with the last reading of the setting, whether that counts or waits.
+    pub agrees_with_last: bool,
+    /// So many in a row wait for one that confirms them, and agree with one another.
+    pub waiting: u8,
+}
+
 /// What is known of a reading beside its repeats.
 #[derive(Debug, Clone, Copy)]
 pub struct Beside {
     /// The model, with all its uncertainty, expects it.
     pub expected: bool,
-    /// Its monitor is in state ok.
-    pub is_ok: bool,
-    /// The noise of its monitor, and so the gate, is that of enough repeats, see [`crate::Noise::is_told`].
+    /// It expects nearly all other readings of the frame: what is off is the monitor, and not the machine or the model.
+    pub is_lone: bool,
+    /// The monitor is known to jump.
+    pub jumps: bool,
+    /// The noise of the monitor, and so the gate, is that of enough repeats, see [`crate::Noise::is_told`].
     pub is_told: bool,
 }
 
 impl Beside {
-    /// How many consecutive readings that agree are believed.
+    /// What becomes of a reading. It passes if it agrees with the mean or the last of its repeats, or, if it is the first, with the model.
+    /// Otherwise it waits until [`Beside::needed`] in a row agree: they outvote the model and all earlier readings, and the last two of them
+    /// count.
+    pub const fn judge(self, repeats: ByRepeats) -> Verdict {
+        let ByRepeats { any, agrees_with_mean, agrees_with_last, waiting } = repeats;
+        let agreeing = if agrees_with_last { waiting + 1 } else { 1 };
+        if (any && agrees_with_mean) || (agrees_with_last && waiting == 0) {
+            Verdict::Accepted
+        } else if agreeing >= self.needed(any) {
+            Verdict::Confirms { outvotes: any }
+        } else if !any && self.expected {
+            Verdict::Accepted
+        } else {
+            Verdict::Held { agreeing }
+        }
+    }
+
+    /// How many readings in a row that agree outvote the model, and earlier readings.
     ///
-    /// Two jumps of a monitor may agree by chance, three hardly do: of a monitor that jumps by 1 to 9 mm in 2.5 % of its readings, one pair
-    /// in a hundred campaigns of three repeats did, with what the setting's good reading said lost to it. So two are enough if the model
-    /// expects them, or if it is only the model that speaks against them and the monitor is sound; and as long as the noise is only a guess,
-    /// by which repeats of a noisier monitor hardly ever agree.
-    pub const fn needed(self, against_others: bool) -> u8 {
-        if self.expected || !self.is_told || (self.is_ok && !against_others) { 2 } else { 3 }
+    /// Three, since two jumps of a monitor may agree by chance: of one that jumps by 1 to 9 mm in 2.5 % of its readings, two in a hundred
+    /// campaigns of three repeats have such a pair. Two are enough
+    /// - if the model expects them, or much of the frame is not as it expects: then the monitor is not at fault;
+    /// - if only the model speaks against them, and the monitor is not known to jump;
+    /// - as long as the noise of the monitor is a guess: repeats of a noisier one would hardly ever agree.
+    const fn needed(self, against_others: bool) -> u8 {
+        let is_doubtful = against_others || self.jumps;
+        if !self.expected && self.is_lone && self.is_told && is_doubtful { 3 } else { 2 }
     }
 }
 
@@ -483,12 +513,15 @@ mod tests {
 
     const WAITS: Verdict = Verdict::Held { agreeing: 1 };
     const WAITS_TOO: Verdict = Verdict::Held { agreeing: 2 };
+    /// A monitor in a frame that the model expects but for it, of which nothing bad is known.
+    const SOUND: Beside = Beside { expected: false, is_lone: true, jumps: false, is_told: true };
+    const JUMPS: Beside = Beside { jumps: true, ..SOUND };
 
     /// What readings of 0.15 mm noise become beside the repeats of their setting, the model expecting each of them or not.
-    fn assert_story(is_ok: bool, story: &[(i32, bool, Verdict)]) {
+    fn assert_story(beside: Beside, story: &[(i32, bool, Verdict)]) {
         let mut cell = Cell::<1, 1, 1>::open(REST);
         for &(code, expected, verdict) in story {
-            let judged = cell.judge(0, code, 1.5e-4, Gate::default(), Beside { expected, is_ok, is_told: true });
+            let judged = cell.judge(0, code, 1.5e-4, Gate::default(), Beside { expected, ..beside });
             assert_eq!(judged, verdict, "{code} in {story:?}");
             cell.take(0, code, code, judged, |_, _| ());
         }
@@ -511,7 +544,7 @@ mod tests {
             ],
             // an unconfirmed reading outside the gate gives way to an expected one
             &[(40_000, false, WAITS), (0, true, Accepted), (500, true, Accepted)],
-            // the machine itself has moved: the third reading tells
+            // the monitor's place has changed: the third reading tells
             &[
                 (0, true, Accepted),
                 (500, true, Accepted),
@@ -521,26 +554,34 @@ mod tests {
                 (40_100, false, Accepted),
             ],
         ];
-        stories.into_iter().for_each(|story| assert_story(true, story));
+        stories.into_iter().for_each(|story| assert_story(SOUND, story));
+    }
+
+    /// Where much of the frame is unexpected, the machine has changed, and where the noise is a guess, nobody knows what agrees.
+    #[test]
+    fn two_readings_are_enough_where_the_monitor_is_not_at_fault() {
+        use Verdict::{Accepted, Confirms};
+        for beside in [Beside { is_lone: false, ..JUMPS }, Beside { is_told: false, ..JUMPS }] {
+            let outvotes = Confirms { outvotes: true };
+            assert_story(beside, &[(0, true, Accepted), (40_000, false, WAITS), (40_500, false, outvotes)]);
+            assert_story(beside, &[(40_000, false, WAITS), (40_500, false, Confirms { outvotes: false })]);
+        }
     }
 
     #[test]
     fn two_jumps_that_agree_outvote_no_good_reading() {
-        use Verdict::Accepted;
-        assert_story(
-            true,
-            &[(0, true, Accepted), (-72_000, false, WAITS), (-78_000, false, WAITS_TOO), (300, true, Accepted)],
-        );
+        use Verdict::{Accepted, Confirms};
+        let jumps = [(0, true, Accepted), (-72_000, false, WAITS), (-78_000, false, WAITS_TOO), (300, true, Accepted)];
+        assert_story(SOUND, &jumps);
         // nor what the model expects of a monitor that is known to jump
-        assert_story(
-            false,
-            &[(-72_000, false, WAITS), (-78_000, false, WAITS_TOO), (0, true, Accepted), (300, true, Accepted)],
-        );
-        // two that wait and do not agree count anew
-        assert_story(
-            false,
-            &[(-72_000, false, WAITS), (50_000, false, WAITS), (51_000, false, WAITS_TOO), (0, true, Accepted)],
-        );
+        let first = [(-72_000, false, WAITS), (-78_000, false, WAITS_TOO), (0, true, Accepted), (300, true, Accepted)];
+        assert_story(JUMPS, &first);
+        // three are believed
+        let third = Confirms { outvotes: false };
+        assert_story(JUMPS, &[(-72_000, false, WAITS), (-78_000, false, WAITS_TOO), (-75_000, false, third)]);
+        // those that wait and do not agree count anew
+        let anew = [(-72_000, false, WAITS), (50_000, false, WAITS), (51_000, false, WAITS_TOO), (0, true, Accepted)];
+        assert_story(JUMPS, &anew);
     }
 
     #[test]

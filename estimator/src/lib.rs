@@ -34,7 +34,7 @@ mod tune;
 pub mod wire;
 
 pub use beyond::Beyond;
-pub use campaign::{Beside, Campaign, Cell, Setting, Verdict};
+pub use campaign::{Beside, ByRepeats, Campaign, Cell, Setting, Verdict};
 pub use drive::{Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
 pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Prepared, Setup, Walk};

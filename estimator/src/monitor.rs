@@ -1,8 +1,8 @@
 //! Monitors: noise learnt from repeats, a gate against jumps, and the state of each.
 //!
 //! Noise is learnt from the difference of readings that repeat a setting, not from the model's residuals: those contain
-//! the mismatch that the tool looks for. The gate likewise passes a reading that its repeat confirms, whatever the model
-//! predicts. Batch fits use these same definitions. Where nothing is repeated, residuals are all there is; what all monitors
+//! the mismatch that the tool looks for. The gate likewise passes a reading that its repeats confirm, whatever the model
+//! predicts ([`crate::Beside`]). Batch fits use these same definitions. Where nothing is repeated, residuals are all there is; what all monitors
 //! share of them is the model's ([`Peers`]).
 //!
 //! What is old is forgotten, so that a monitor that turns noisy or recovers is found at any age of the stream.
@@ -261,10 +261,10 @@ impl Monitor {
         self.refused = self.refused.saturating_add(1);
     }
 
-    /// Accept a late reading: a repeat has confirmed it.
-    pub fn pardon(&mut self) {
-        self.rejected = self.rejected.saturating_sub(1);
-        self.refused = self.refused.saturating_sub(1);
+    /// So many of the last rejected readings were right: a repeat has confirmed them.
+    pub fn pardon(&mut self, readings: u8) {
+        self.rejected = self.rejected.saturating_sub(readings.into());
+        self.refused = self.refused.saturating_sub(readings.into());
     }
 
     /// Update the monitor's state; true if its readings so far need re-weighting.
@@ -287,6 +287,11 @@ impl Monitor {
     pub fn variance(&self) -> f32 {
         let variance = self.noise.sigma * self.noise.sigma;
         if self.jumps { JUMPING * variance } else { variance }
+    }
+
+    /// True if it is known to jump, noisy or not.
+    pub const fn jumps(&self) -> bool {
+        self.jumps
     }
 
     /// Its state.

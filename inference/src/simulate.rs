@@ -40,8 +40,7 @@ impl Instruments {
     /// [`OrbitError`] if the ring has no closed orbit.
     pub fn healthy(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let baseline = 2e-3;
-        // for each monitor by itself, as the fit takes it; what is stated gives each of two opposite offsets twice the variance
-        let spurious = spurious_dispersion(ring)?.map(|rms| rms / 2f64.sqrt() * baseline);
+        let spurious = spurious_dispersion(ring)?.map(|rms| rms * baseline);
         Ok(Self { noise: recording.header.noise.clone(), baseline, spurious })
     }
 }

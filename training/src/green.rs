@@ -1,10 +1,12 @@
 //! Green's function tables of a ring, from its twin.
 
+use core::f64::consts::SQRT_2;
+
 use estimator::surrogate::{List, NONE, Table};
 use estimator::{GROUPS, ParcelError, Sizes};
 use nalgebra::DMatrix;
 use twin::{
-    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, Source,
+    ClosedOrbit, EffectError, Hold, Observer, Optics, OrbitError, ParameterPrior, Place, Plane, Ring, SHARED, Source,
     spurious_dispersion,
 };
 
@@ -281,6 +283,8 @@ fn dispersion(
     fill(tables, List::MonitorDispersion, |b| optics.dispersion(&monitors[b]));
     fill(tables, List::NodeDispersion, |q| optics.dispersion(&optics.observe(nodes[q], Plane::X)));
     fill(tables, List::SecondOrder, second);
+    // the core gives each monitor one of its own, and each of two opposite offsets
+    let spurious = spurious.map(|rms| SHARED * SQRT_2 * rms);
     let ring = spurious.into_iter().chain(momentum).map(|v| v as f32);
     tables.list_mut(List::Ring).iter_mut().zip(ring).for_each(|(to, v)| *to = v);
     Ok(())

@@ -44,7 +44,7 @@ pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source};
 pub use ripple::ripple_of_misaligned;
 pub use site::Site;
-pub use spurious::{INDEPENDENT, spurious_dispersion};
+pub use spurious::{SHARED, spurious_dispersion};
 pub use tune::Tunes;
 pub use twiss::Twiss;
 pub use varied::{VariedOptics, VariedRing};

@@ -16,17 +16,13 @@ const SHIFT: f64 = 0.2e-3;
 /// by less than this [m].
 const LEAST_SHIFT: f64 = 1e-7;
 
-/// Standard deviation of the spurious dispersion for readings that are taken for independent, over its rms: two for the monitors, and
-/// the root of two for the offsets, see [`spurious_dispersion`].
-pub const INDEPENDENT: f64 = 2.0 * core::f64::consts::SQRT_2;
+/// Factor on the standard deviation of the spurious dispersion where each monitor is given one of its own: it is a wave of nearly the
+/// tune's frequency, two numbers a plane, which all monitors share. NEES/48 of 80 misaligned Boosters is 0.98 with it and 1.09 without; error
+/// bars grow by 2 %. Without the frames of an RF offset they would grow by 5 %.
+pub const SHARED: f64 = 2.0;
 
-/// Change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit, beyond the design
-/// dispersion, as a standard deviation for readings that are taken for independent [1]: [`INDEPENDENT`] times its rms. 0 in a plane in
-/// which shifted quadrupoles make no orbit that is read.
-///
-/// An offset and its opposite share the change with opposite signs: twice the variance. Monitors share it, too: it is a wave of nearly
-/// the tune's frequency, two numbers a plane. Four times the variance makes up for that: NEES/48 of 80 misaligned Boosters is 0.98 with it and
-/// 1.09 without, and error bars grow by 2 %; without the frames of an RF offset they would grow by 5 %.
+/// Rms change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit,
+/// beyond the design dispersion [1]; 0 in a plane in which shifted quadrupoles make no orbit that is read.
 ///
 /// # Errors
 /// [`OrbitError`] if a ring has no closed orbit.
@@ -58,7 +54,7 @@ fn of_shifts(ring: &Ring, rms: f64) -> Result<[f64; 2], OrbitError> {
             }
         }
     }
-    let ratio = |plane: usize| INDEPENDENT * f64::sqrt(change[plane] / orbit[plane]);
+    let ratio = |plane: usize| f64::sqrt(change[plane] / orbit[plane]);
     Ok([0, 1].map(|plane| if orbit[plane] > 0.0 { ratio(plane) } else { 0.0 }))
 }
 

@@ -4,7 +4,6 @@ use super::whole::Whole;
 use super::{Estimator, Model};
 use crate::campaign::{Beside, Verdict, is_moved};
 use crate::drive::Drive;
-use crate::estimate::MonitorState;
 use crate::judged::{Expected, Screened};
 use crate::monitor::Monitor;
 use crate::surrogate::Surrogate;
@@ -41,13 +40,16 @@ impl<
         let mut screened = Screened::default();
         let within = &expected.within;
         let tells_noise = cell.is_none() && self.tells_noise(frame, expected);
+        let is_lone = self.is_expected_but_for_a_few(frame, expected);
         for b in 0..B {
             let Some(code) = frame.reading.get(b).map(|r| r.steps()) else { continue };
             let valid = frame.valid.has(b);
             let usable = self.monitors.get_mut(b).is_some_and(|m| m.hear(valid.then_some(code)));
             if usable {
                 match cell {
-                    Some(index) => self.screen_repeat(model, b, code, (index, within.has(b)), &mut screened),
+                    Some(index) => {
+                        self.screen_repeat(model, b, code, (index, within.has(b), is_lone), &mut screened);
+                    }
                     None => self.screen_loose(b, whole == Whole::Persists || within.has(b), &mut screened),
                 }
                 if tells_noise {
@@ -126,7 +128,7 @@ impl<
         model: &Model<'_, G, B, C, F>,
         b: usize,
         code: i32,
-        (index, expected): (u16, bool),
+        (index, expected, is_lone): (u16, bool, bool),
         screened: &mut Screened<W>,
     ) {
         let moved = self.moved_to_mean_drive(b, code);
@@ -136,8 +138,8 @@ impl<
         if let Some(difference) = cell.difference(b, moved) {
             monitor.noise.learn(difference);
         }
-        let is_ok = monitor.state() == MonitorState::Ok;
-        let beside = Beside { expected, is_ok, is_told: monitor.noise.is_told() };
+        let beside = Beside { expected, is_lone, jumps: monitor.jumps(), is_told: monitor.noise.is_told() };
+        let waited = cell.waiting(b);
         let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, beside);
         let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
         if let Some(following) = following {
@@ -148,7 +150,7 @@ impl<
         }
         match verdict {
             Verdict::Accepted => {}
-            Verdict::Confirms { .. } => monitor.pardon(),
+            Verdict::Confirms { .. } => monitor.pardon(waited),
             Verdict::Held { .. } => monitor.reject(),
         }
         screened.note(b, verdict);

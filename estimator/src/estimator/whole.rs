@@ -137,7 +137,7 @@ impl<
         self.monitors.iter().enumerate().filter(move |(b, m)| valid.has(*b) && m.state() != MonitorState::Dead)
     }
 
-    fn is_expected_but_for_a_few(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
+    pub(super) fn is_expected_but_for_a_few(&self, frame: &Frame<B, C, F, W>, expected: &Expected<B, W>) -> bool {
         let (mut all, mut surprising) = (0, 0);
         for (b, _) in self.alive(frame) {
             all += 1;

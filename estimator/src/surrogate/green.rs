@@ -51,8 +51,8 @@ pub struct Dispersion<const B: usize, const Q: usize> {
     pub node: [f32; Q],
     /// Design orbit of second order in the relative RF offset, at the monitors [m].
     pub second_order: [f32; B],
-    /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion, in x
-    /// and y [1].
+    /// Change of a misaligned ring's orbit per unit of RF offset and of rms orbit, beyond the design dispersion, in x and y: the standard
+    /// deviation for a reading by itself, the root of 8 times the rms [1].
     pub spurious: [f32; 2],
     /// Design momentum compaction [1].
     pub compaction: f32,

@@ -11,11 +11,11 @@ mod screen;
 mod setting;
 mod times;
 
-use core::f64::consts::FRAC_1_SQRT_2;
+use core::f64::consts::SQRT_2;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{Machine, OrbitError, Ring, ripple_of_misaligned, spurious_dispersion};
+use twin::{Machine, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
 use crate::recording::Recording;
@@ -108,7 +108,8 @@ impl Campaign {
             readings: &readings,
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
-            spurious: of_design,
+            // each of two opposite offsets is given one of its own
+            spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
         };
         let Seen { screened, params, baselines } = screener.run()?;
         let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
@@ -187,8 +188,7 @@ impl Campaign {
     /// these in standard deviations [m].
     pub(crate) fn terms(&self, b: usize) -> DMatrix<f64> {
         let plane = self.plane(b);
-        // `spurious` is stated for offsets of which two opposite ones are taken for independent
-        let spurious = self.spurious[plane] * self.orbit[plane] * FRAC_1_SQRT_2;
+        let spurious = SHARED * self.spurious[plane] * self.orbit[plane];
         let following = self.following(b).transpose();
         let times = self.times.count();
         let mut terms = DMatrix::zeros(times + following.nrows() + 1, self.frames());

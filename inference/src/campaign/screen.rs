@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use estimator::{Beside, Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
+use estimator::{Beside, ByRepeats, Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
 use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
@@ -46,7 +46,7 @@ pub(super) struct Screener<'c> {
     pub noise: &'c [f64],
     /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
     pub sharing: &'c [f64],
-    /// Change of a misaligned ring's orbit per RF offset and rms orbit, in x and y.
+    /// Change of a misaligned ring's orbit per RF offset and rms orbit, in x and y: the standard deviation for a reading by itself.
     pub spurious: [f64; 2],
 }
 
@@ -231,13 +231,16 @@ impl<'c> Screening<'c> {
     /// Take one frame: judge its readings, then learn from those that pass.
     fn take(&mut self, frame: usize) {
         let setting = self.of.settings.of_frame[frame];
+        let reports = |b: usize| !self.of.readings[(frame, b)].is_nan();
+        let expected: Vec<bool> = (0..self.monitors.len()).map(|b| reports(b) && self.is_expected(frame, b)).collect();
+        let is_lone = self.is_expected_but_for_a_few(frame, &expected);
         let mut rejected = Vec::new();
-        for b in 0..self.monitors.len() {
+        for (b, expected) in expected.into_iter().enumerate() {
             let reading = self.of.readings[(frame, b)];
             if self.monitors[b].hear(code(reading)) {
                 match setting {
-                    Some(setting) => self.judge_repeat(frame, b, setting),
-                    None if self.is_expected(frame, b) => self.accepted[(frame, b)] = true,
+                    Some(setting) => self.judge_repeat((frame, b, setting), expected, is_lone),
+                    None if expected => self.accepted[(frame, b)] = true,
                     None => {
                         self.monitors[b].reject();
                         rejected.push(b);
@@ -267,8 +270,7 @@ impl<'c> Screening<'c> {
     }
 
     /// A reading in a setting is judged by its repeats, the first one by the model.
-    fn judge_repeat(&mut self, frame: usize, b: usize, setting: usize) {
-        let expected = self.is_expected(frame, b);
+    fn judge_repeat(&mut self, (frame, b, setting): (usize, usize, usize), expected: bool, is_lone: bool) {
         let repeats = &self.repeats[setting][b];
         let moved = |i: usize| self.of.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
         let (here, last) = (moved(frame), repeats.last);
@@ -276,13 +278,15 @@ impl<'c> Screening<'c> {
             self.monitors[b].noise.learn((here - moved(last)) as f32);
         }
         let mean = repeats.frames.iter().map(|&i| moved(i)).sum::<f64>() / repeats.frames.len() as f64;
-        let sigma = self.monitors[b].noise.sigma();
-        let agrees = |other: f64| self.gate.agree((here - other) as f32, 0.0, sigma);
-        let agrees_with_last = last.is_some_and(|last| agrees(moved(last)));
         let monitor = &self.monitors[b];
-        let is_ok = monitor.state() == MonitorState::Ok;
-        let beside = Beside { expected, is_ok, is_told: monitor.noise.is_told() };
-        let verdict = repeats.judge(agrees(mean), agrees_with_last, beside);
+        let agrees = |other: f64| self.gate.agree((here - other) as f32, 0.0, monitor.noise.sigma());
+        let beside = Beside { expected, is_lone, jumps: monitor.jumps(), is_told: monitor.noise.is_told() };
+        let verdict = beside.judge(ByRepeats {
+            any: !repeats.frames.is_empty(),
+            agrees_with_mean: agrees(mean),
+            agrees_with_last: last.is_some_and(|last| agrees(moved(last))),
+            waiting: repeats.waiting,
+        });
         self.note(frame, b, setting, verdict);
     }
 
@@ -292,7 +296,7 @@ impl<'c> Screening<'c> {
             Verdict::Accepted => {}
             Verdict::Held { .. } => self.monitors[b].reject(),
             Verdict::Confirms { outvotes } => {
-                self.monitors[b].pardon();
+                self.monitors[b].pardon(repeats.waiting);
                 self.stale = true;
                 if outvotes {
                     repeats.frames.drain(..).for_each(|i| self.accepted[(i, b)] = false);
@@ -320,11 +324,19 @@ impl<'c> Screening<'c> {
         self.unexpected += 1;
         let convinced = self.unexpected >= CONVINCED;
         for &b in rejected {
-            self.monitors[b].pardon();
+            self.monitors[b].pardon(1);
             self.accepted[(frame, b)] = true;
         }
         let mut row = self.accepted.row_mut(frame);
         row.iter_mut().for_each(|accepted| *accepted &= convinced);
+    }
+
+    /// True if the model expects nearly all readings of a frame, those of dead monitors left out.
+    fn is_expected_but_for_a_few(&self, frame: usize, expected: &[bool]) -> bool {
+        let is_alive =
+            |b: &usize| !self.of.readings[(frame, *b)].is_nan() && self.monitors[*b].state() != MonitorState::Dead;
+        let alive: Vec<usize> = (0..self.monitors.len()).filter(is_alive).collect();
+        MOST * alive.iter().filter(|b| !expected[**b]).count() <= alive.len()
     }
 
     /// True if the model, with all its uncertainty, expects a reading.
@@ -418,24 +430,6 @@ impl<'c> Screening<'c> {
         let Some(best) = Best::of(self.of, &self.model, &self.normal) else { return false };
         self.best = best;
         true
-    }
-}
-
-impl Repeats {
-    /// A reading passes if it agrees with the mean or the last of its repeats, or, being the first, if the model expects it. A
-    /// reading outside the gate waits. So many in a row that agree as are needed outvote the model, and whatever came before.
-    fn judge(&self, agrees_with_mean: bool, agrees_with_last: bool, beside: Beside) -> Verdict {
-        let any = !self.frames.is_empty();
-        let agreeing = if agrees_with_last { self.waiting + 1 } else { 1 };
-        if (any && agrees_with_mean) || (agrees_with_last && self.waiting == 0) {
-            Verdict::Accepted
-        } else if agreeing >= beside.needed(any) {
-            Verdict::Confirms { outvotes: any }
-        } else if !any && beside.expected {
-            Verdict::Accepted
-        } else {
-            Verdict::Held { agreeing }
-        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! `make serve-bench`: how fast the daemon is, from a TCP source on loopback to a subscriber of the shared memory: frames lost and late at
 //! 10 kHz, latency at 1 kHz. Numbers of the machine at hand; no test asserts them.
 //!
-//! The latency begins before the writer's call of the system. What of it is the daemon's, the daemon says itself: from the frame that is in
-//! its queue until its readers are woken. How long a reader has waited then, the stamp of the estimate tells.
+//! The latency begins before the writer's call of the system. What of it is the daemon's, the daemon says itself, of the last 1,024 frames: from
+//! the frame in its queue until its readers are woken. From the stamp of the estimate until it is read is told by the reader.
 
 use core::error::Error;
 use core::sync::atomic::{AtomicU64, Ordering};
@@ -64,7 +64,7 @@ impl Drop for Daemon {
 /// One line of the table.
 fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
-    let [port, page] = [free_port()?, free_port()?];
+    let [port, page] = free_ports()?;
     let service = format!("orbitcal/bench/{}/{hertz}", std::process::id());
     let recording = fs::canonicalize(&options.recording)?;
     let buffer_frames = hertz / 10; // 100 ms
@@ -106,8 +106,10 @@ fn measure(options: &Options, hertz: u32, seconds: u32) -> Result<String, Box<dy
     ))
 }
 
-fn free_port() -> std::io::Result<u16> {
-    Ok(TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+/// Two ports that nobody listens at.
+fn free_ports() -> std::io::Result<[u16; 2]> {
+    let (one, other) = (TcpListener::bind("127.0.0.1:0")?, TcpListener::bind("127.0.0.1:0")?);
+    Ok([one.local_addr()?.port(), other.local_addr()?.port()])
 }
 
 /// A quantile of times that are sorted [us].
@@ -124,7 +126,8 @@ fn in_daemon_us(page: u16) -> Result<[f64; 2], Box<dyn Error>> {
     line.read_to_string(&mut reply)?;
     let (_, body) = reply.split_once("\r\n\r\n").ok_or("the page has sent no body")?;
     let state: serde_json::Value = serde_json::from_str(body)?;
-    Ok(serde_json::from_value(state["latency_us"].clone())?)
+    // null before the first estimate
+    Ok(serde_json::from_value(state["latency_us"].clone()).unwrap_or([f64::NAN; 2]))
 }
 
 /// Time that each thread of the daemon has run for a frame, and waited for a processor [us], by the kernel.
