@@ -11,7 +11,7 @@ use nalgebra::DVector;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, Normal, StandardNormal};
-use twin::{Hold, Optics, OrbitError, ParameterPrior, Ring, Tunes, spurious_dispersion};
+use twin::{Hold, Optics, OrbitError, ParameterPrior, Ring, SHARED, Tunes, spurious_dispersion};
 
 use crate::campaign::{Drive, rf_orbit};
 use crate::model::ResponseModel;
@@ -29,7 +29,8 @@ pub struct Instruments {
     pub noise: Vec<f64>,
     /// Standard deviation of the monitors' baselines [m].
     pub baseline: f64,
-    /// Standard deviation of the orbit that misaligned quadrupoles add per unit of RF offset, in x and y [m].
+    /// Standard deviation of the orbit that misaligned quadrupoles add per unit of RF offset, in x and y, for each monitor by itself as the
+    /// fit takes it: [`SHARED`] times what it is [m].
     pub spurious: [f64; 2],
 }
 
@@ -40,7 +41,7 @@ impl Instruments {
     /// [`OrbitError`] if the ring has no closed orbit.
     pub fn healthy(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let baseline = 2e-3;
-        let spurious = spurious_dispersion(ring)?.map(|rms| rms * baseline);
+        let spurious = spurious_dispersion(ring)?.map(|rms| SHARED * rms * baseline);
         Ok(Self { noise: recording.header.noise.clone(), baseline, spurious })
     }
 }
