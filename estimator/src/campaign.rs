@@ -350,7 +350,7 @@ impl Beside {
     /// - if the model expects them, or much of the frame is not as it expects: then the monitor is not at fault;
     /// - if only the model speaks against them, and the monitor is not known to jump;
     /// - as long as the noise of the monitor is a guess: repeats of a noisier one would hardly ever agree.
-    const fn needed(self, against_others: bool) -> u8 {
+    pub const fn needed(self, against_others: bool) -> u8 {
         let is_doubtful = against_others || self.jumps;
         if !self.expected && self.is_lone && self.is_told && is_doubtful { 3 } else { 2 }
     }
