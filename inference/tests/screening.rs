@@ -19,6 +19,11 @@ fn folders() -> Vec<PathBuf> {
     all
 }
 
+fn read(ring: &Ring, name: &str) -> Recording {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings").join(name);
+    Recording::read(&folder, ring).unwrap()
+}
+
 /// What the core makes of a recording in the end: readings confirmed late or outvoted are counted as in its last estimate; and which
 /// frames it put aside.
 fn by_core(ring: &Ring, recording: &Recording) -> (DMatrix<bool>, Vec<Health>, Vec<usize>) {
@@ -100,8 +105,7 @@ fn readings_and_states_are_those_of_the_core() {
 #[test]
 fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
     let ring = Ring::booster();
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-    let mut recording = Recording::read(&folder, &ring).unwrap();
+    let mut recording = read(&ring, "paper-vars");
     let b = ring.monitor_names().iter().position(|name| name == "y_C1").unwrap();
     // four repeats of a setting, in the middle of the campaign
     let first =
@@ -123,10 +127,7 @@ fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
 #[test]
 fn a_machine_that_has_changed_is_hardly_any_monitors_fault() {
     let ring = Ring::booster();
-    let [before, mut after] = ["paper-vars", "random-vars"].map(|name| {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings").join(name);
-        Recording::read(&folder, &ring).unwrap()
-    });
+    let [before, mut after] = ["paper-vars", "random-vars"].map(|name| read(&ring, name));
     let last = before.rows.last().unwrap();
     for row in &mut after.rows {
         (row.sequence, row.time) = (row.sequence + last.sequence + 1, row.time + last.time + 4.0);

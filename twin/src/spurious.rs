@@ -17,8 +17,8 @@ const SHIFT: f64 = 0.2e-3;
 const LEAST_SHIFT: f64 = 1e-7;
 
 /// Factor on the standard deviation of the spurious dispersion where each monitor is given one of its own: it is a wave of nearly the
-/// tune's frequency, two numbers a plane, which all monitors share. NEES/48 of 80 misaligned Boosters is 0.98 with it and 1.09 without; error
-/// bars grow by 2 %. Without the frames of an RF offset they would grow by 5 %.
+/// tune's frequency, two numbers a plane, which all monitors share. NEES/48 of 40 misaligned Boosters is 0.93 with it and 1.05 without
+/// (`tests/tests/ripple.rs`); error bars grow by 2 %. Without the frames of an RF offset they would grow by 5 %.
 pub const SHARED: f64 = 2.0;
 
 /// Rms change of a misaligned ring's orbit (x, y) at the read monitors per unit of relative RF offset and of rms orbit,
