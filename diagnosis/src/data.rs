@@ -704,9 +704,9 @@ impl Data {
         DVector::from_fn(pattern.len(), |b, _| values[(0, b)] * self.channels[b].sigma / mixing.own(0, b))
     }
 
-    /// Readings that step with time, whitened: rows pools, columns monitors.
-    pub fn stepping(&self, readings: &DMatrix<f64>, step: &DVectorView<f64>) -> DVector<f64> {
-        self.whiten(|c, pool| if c < self.monitors() { readings[(pool, c)] * step[pool] } else { 0.0 })
+    /// A signature that steps with time, whitened.
+    pub fn stepping(&self, signature: &Signature, step: &DVectorView<f64>) -> DVector<f64> {
+        self.whiten(|c, pool| self.effect_on(signature, c, pool) * step[pool])
     }
 
     /// `E^T S^-1 E` of a monitor's readings for groups of pools, of which `group` names that of each pool, as if the noise were white:

@@ -23,7 +23,9 @@ pub enum Location {
     CorrectorElsewhere(usize),
     /// A place in the ring (a quadrupole's entrance) where the beam is kicked in a plane.
     Ring(usize, Plane),
-    /// A quadrupole that changes in time.
+    /// The same, in time.
+    RingInTime(usize, Plane),
+    /// A quadrupole that changes in time, and as the beam is off its axis kicks it.
     QuadrupoleInTime(usize),
     /// All monitors, in time.
     Time,
@@ -43,7 +45,7 @@ pub enum Location {
 }
 
 /// Number of sorts of location that compete with each other, equally likely a priori.
-pub const SORTS: usize = 12;
+pub const SORTS: usize = 13;
 
 impl Location {
     /// The name of the place: a monitor, a corrector, the label of a quadrupole, or a stretch.
@@ -56,7 +58,9 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
-            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.label(ring.quadrupoles[q].element).to_owned(),
+            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::QuadrupoleInTime(q) => {
+                ring.label(ring.quadrupoles[q].element).to_owned()
+            }
             Self::Time => "time".into(),
             Self::Tunes => "tunes".into(),
             Self::Everywhere => "everywhere".into(),
@@ -78,6 +82,8 @@ impl Location {
             Self::CorrectorElsewhere(_) => format!("corrector {name}, other location"),
             Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
+            Self::RingInTime(_, Plane::X) => format!("kicks near {name} in time, x"),
+            Self::RingInTime(_, Plane::Y) => format!("kicks near {name} in time, y"),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
             Self::Time => "all monitors, in time".into(),
             Self::Tunes => "tunes, in time".into(),
@@ -100,6 +106,8 @@ impl Location {
             Self::CorrectorElsewhere(_) => format!("corrector {name} kicks the beam at another location too"),
             Self::Ring(_, Plane::X) => format!("the beam is kicked horizontally near {name}"),
             Self::Ring(_, Plane::Y) => format!("the beam is kicked vertically near {name}"),
+            Self::RingInTime(_, Plane::X) => format!("a horizontal kick near {name} changes during the campaign"),
+            Self::RingInTime(_, Plane::Y) => format!("a vertical kick near {name} changes during the campaign"),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
             Self::Time => "the orbit changes with time at many monitors".into(),
             Self::Tunes => "the tunes change during the campaign".into(),
@@ -126,7 +134,7 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
-            Self::Ring(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q].element,
+            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q].element,
             Self::FrameToFrame => data.noise.frame_to_frame.as_ref()?.element(ring)?,
             Self::Time | Self::Tunes | Self::Everywhere | Self::FirstFrames { .. } => return None,
         };

@@ -137,7 +137,8 @@ pub struct Fixed {
 
 impl Fixed {
     fn of(data: &Data, alternative: &Alternative) -> Option<Self> {
-        let is_fixed = data.is_joint() && alternative.term()?.kind.is_stray();
+        let kind = alternative.term()?.kind;
+        let is_fixed = data.is_joint() && kind.is_stray() && kind.thin().is_some();
         let (value, sigma) = alternative.amplitude;
         let gradient = Measured { value: value * data.rigidity(), sigma: sigma * data.rigidity() };
         is_fixed.then(|| Self { kinetic_energy: data.kinetic_energy(), gradient })

@@ -717,13 +717,13 @@ pub struct Validate {
     #[arg(long, value_name = "N", default_value_t = 300)]
     pub empty: usize,
     /// Campaigns with one effect of the library
-    #[arg(long, value_name = "N", default_value_t = 252)]
+    #[arg(long, value_name = "N", default_value_t = 250)]
     pub single: usize,
     /// Campaigns with two
     #[arg(long, value_name = "N", default_value_t = 48)]
     pub pair: usize,
     /// Campaigns with an effect that the library does not hold
-    #[arg(long, value_name = "N", default_value_t = 90)]
+    #[arg(long, value_name = "N", default_value_t = 132)]
     pub unknown: usize,
     /// One line a campaign; campaigns already in the file are not run again
     #[arg(long, value_name = "FILE.jsonl", default_value = "target/validate.jsonl")]

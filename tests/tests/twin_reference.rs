@@ -257,8 +257,10 @@ fn by_hand(case: &str) -> (Ring, Hold) {
     match case {
         "nominal" => {}
         "quad_roll" => ring.elements[quadrupole].misalignment.roll = 0.01,
-        "stray_gradient" => ring.elements[slot].kind = Kind::Multipole { k1l: 0.01, k1sl: 0.0, k2l: 0.0 },
-        "stray_skew_gradient" => ring.elements[slot].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.01, k2l: 0.0 },
+        "stray_gradient" => ring.elements[slot].kind = Kind::Multipole { k1l: 0.01, k1sl: 0.0, k2l: 0.0, k3l: 0.0 },
+        "stray_skew_gradient" => {
+            ring.elements[slot].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.01, k2l: 0.0, k3l: 0.0 }
+        }
         "dipole_gradient" => {
             let length = ring.elements[dipole].length;
             let Kind::Bend(bend) = &mut ring.elements[dipole].kind else { unreachable!() };

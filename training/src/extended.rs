@@ -90,7 +90,8 @@ impl Form {
             | EffectKind::BpmTiming
             | EffectKind::QuadDrift
             | EffectKind::SextupoleError
-            | EffectKind::DipoleSextupole => Self::None,
+            | EffectKind::DipoleSextupole
+            | EffectKind::StrayOctupole => Self::None,
         }
     }
 }

@@ -70,8 +70,11 @@ impl Element {
             Kind::Sextupole { k2 } => {
                 integrate(z, depth, slices(0.0, *k2, depth), drift, |z, length| thin(z, 0.0, 0.0, k2 * length));
             }
-            Kind::Multipole { k1l, k1sl, k2l } => thin(z, *k1l, *k1sl, *k2l),
-            Kind::Octupole { k3l } => octupole(z, *k3l),
+            Kind::Multipole { k1l, k1sl, k2l, k3l } => {
+                // both act at the position at which the beam enters, which neither changes
+                thin(z, *k1l, *k1sl, *k2l);
+                octupole(z, *k3l);
+            }
             Kind::Solenoid { ks } => solenoid(z, *ks, depth),
             Kind::Bend(bend) => {
                 bend.enter(z);
@@ -413,8 +416,7 @@ mod tests {
             rolled,
             element(Kind::Solenoid { ks: 0.3 }, 0.7),
             element(Kind::Sextupole { k2: 3.0 }, 0.3),
-            element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0 }, 0.0),
-            element(Kind::Octupole { k3l: 50.0 }, 0.0),
+            element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.0),
             bend(0.0, 0.0),
             bend(0.4, 0.1),
         ];

@@ -458,11 +458,11 @@ mod tests {
     fn a_thin_rolled_gradient_and_a_kick_at_its_entrance_are_exact() {
         let mut ring = Ring::booster();
         let at = ring.element("SLOT_F6").unwrap();
-        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0 };
+        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0, k3l: 0.0 };
         ring.elements[at].misalignment.roll = 0.3;
         let respond = |k1l: f64| {
             let mut ring = ring.clone();
-            ring.elements[at].kind = Kind::Multipole { k1l, k1sl: 0.0, k2l: 0.0 };
+            ring.elements[at].kind = Kind::Multipole { k1l, k1sl: 0.0, k2l: 0.0, k3l: 0.0 };
             let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
             optics.response(&both_planes(&optics), &[optics.kick(at, [1.0, 0.0])])
         };

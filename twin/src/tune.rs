@@ -97,7 +97,7 @@ mod tests {
     fn tunes_of_coupled_modes_follow_their_slopes() {
         let (mut ring, h) = (crate::testing::mixed(), 1e-5);
         let skew = ring.element("SLOT_F6").unwrap();
-        ring.elements[skew].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.05, k2l: 0.0 };
+        ring.elements[skew].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.05, k2l: 0.0, k3l: 0.0 };
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         for q in [2, 30] {
             let tunes = |factor: f64| {
@@ -148,7 +148,7 @@ mod tests {
         let beta = [Plane::X, Plane::Y].map(|plane| optics.beta(at, plane));
         assert!(optics.closest_tune_approach().unwrap() < 1e-9);
         let known = 0.004 * (beta[0] * beta[1]).sqrt() / TAU;
-        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.004, k2l: 0.0 };
+        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.004, k2l: 0.0, k3l: 0.0 };
         let ours = Optics::of(&ring, ON_MOMENTUM).unwrap().closest_tune_approach().unwrap();
         assert!((ours / known - 1.0).abs() < 0.005, "{ours} {known}");
     }
@@ -176,7 +176,7 @@ mod tests {
     fn coupled_modes_keep_their_trace() {
         let mut ring = Ring::booster();
         let at = ring.element("SLOT_F6").unwrap();
-        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.05, k2l: 0.0 };
+        ring.elements[at].kind = Kind::Multipole { k1l: 0.0, k1sl: 0.05, k2l: 0.0, k3l: 0.0 };
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         let tunes = optics.tunes().unwrap();
         // the modes' cosines sum to half the trace of the 4x4 matrix, and eigenvalues lie on the unit circle

@@ -15,7 +15,7 @@ use twin::{
 const TYPES: [&str; 8] = ["marker", "bpm", "corrector", "quadrupole", "sbend", "sextupole", "multipole", "solenoid"];
 const NAMES: [&str; 8] = ["A", "Q_A", "P_A", "ß_Δ 1", "_", "a_", "x_A", ","];
 const NEEDED: [&str; 2] = ["ks", "angle"];
-const OPTIONAL: [&str; 10] = ["k1", "k2", "k1l", "k1sl", "k2l", "e1", "e2", "hgap", "fint", "roll"];
+const OPTIONAL: [&str; 11] = ["k1", "k2", "k1l", "k1sl", "k2l", "k3l", "e1", "e2", "hgap", "fint", "roll"];
 
 /// Mostly what magnets have, sometimes what no magnet has.
 fn number() -> impl Strategy<Value = f64> {

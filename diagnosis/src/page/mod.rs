@@ -214,6 +214,7 @@ mod tests {
             Location::Corrector(2),
             Location::CorrectorElsewhere(2),
             Location::Ring(5, Plane::X),
+            Location::RingInTime(5, Plane::Y),
             Location::QuadrupoleInTime(5),
             Location::Time,
             Location::Tunes,

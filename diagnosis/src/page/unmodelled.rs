@@ -73,6 +73,7 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::GainInTime(b) => vec![left.gain_in_time(b)?],
         Location::Corrector(c) | Location::CorrectorElsewhere(c) => vec![left.of_corrector(c)],
         Location::Ring(q, plane) => vec![left.kicks(q, plane)?],
+        Location::RingInTime(q, plane) => vec![left.kick_in_time(q, plane)?],
         Location::QuadrupoleInTime(_) | Location::Tunes => tunes::of_model(&found.data, &found.best, &left.what)?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
@@ -194,12 +195,7 @@ impl Left<'_> {
 
     /// The kick at a quadrupole that each setting's residuals would give.
     fn kicks(&self, q: usize, plane: Plane) -> Result<(String, Figure), FitError> {
-        let (data, fitted) = (self.partial.data, self.partial.fitted);
-        let (machine, _) = fitted.machine(data)?;
-        let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
-        let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
-        let source = optics.kick(data.ring.quadrupoles[q].element, direction);
-        let response = optics.response(&optics.read_monitors(), &[source]);
+        let (data, response) = (self.partial.data, self.response_to(q, plane)?);
         let driven = data.driven_correctors();
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
@@ -207,7 +203,7 @@ impl Left<'_> {
                 let Some((c, _)) = one.kick.filter(|(_, sign)| *sign == wanted) else { continue };
                 let Some(at) = driven.iter().position(|&of| of == c) else { continue };
                 // um per urad
-                means[at].add(one.value, response[(one.monitor, 0)] / one.noise);
+                means[at].add(one.value, response[one.monitor] / one.noise);
             }
             means
         };
@@ -222,6 +218,28 @@ impl Left<'_> {
              kicks in proportion to the orbit that each corrector makes."
         );
         Ok((caption, Figure::lines(&axes.named(&names).compared(Reference::Level(0.0)), &series)))
+    }
+
+    /// The kick at a quadrupole that the residuals of each stretch of time would give.
+    fn kick_in_time(&self, q: usize, plane: Plane) -> Result<(String, Figure), FitError> {
+        let response = self.response_to(q, plane)?;
+        let mut means = [Mean::default(); STRETCHES];
+        for one in &self.residuals {
+            means[stretch(one.time)].add(one.value, response[one.monitor] / one.noise);
+        }
+        let label = self.partial.data.ring.label(self.partial.data.ring.quadrupoles[q].element);
+        let axis = format!("kick near {label} [µrad]");
+        Ok(self.over_time(&means, &axis, "The kick that describes the residuals of all monitors best, the vars held,"))
+    }
+
+    /// Response of the read monitors to a kick at a quadrupole [m/rad].
+    fn response_to(&self, q: usize, plane: Plane) -> Result<DVector<f64>, FitError> {
+        let (data, fitted) = (self.partial.data, self.partial.fitted);
+        let (machine, _) = fitted.machine(data)?;
+        let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
+        let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
+        let source = optics.kick(data.ring.quadrupoles[q].element, direction);
+        Ok(optics.response(&optics.read_monitors(), &[source]).column(0).into_owned())
     }
 
     /// Mean residuals of all monitors in stretches of time.

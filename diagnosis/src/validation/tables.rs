@@ -7,7 +7,7 @@ use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF};
 
 use super::mixes::{Calibration, Reliability};
-use super::{Class, Outcome};
+use super::{Class, Outcome, UnmodelledKind};
 use crate::Verdict;
 use crate::score::{Fate, Grade};
 
@@ -56,7 +56,9 @@ pub struct Tables {
     pub by_gain: Vec<([f64; 2], Fates)>,
     /// Campaigns with a false identification, of all but those with unmodelled physics.
     pub wrong: Share,
-    /// Campaigns with physics outside the library, by oracle gain.
+    /// Campaigns with physics outside the library, of kinds that the diagnosis was not made for, by oracle gain.
+    pub frozen: Vec<([f64; 2], Unknown)>,
+    /// The same of kinds that it has met before.
     pub unknown: Vec<([f64; 2], Unknown)>,
     /// Single effects named right, by kind and size (weak, medium, strong thirds of the logarithm).
     pub power: BTreeMap<String, [Share; 3]>,
@@ -142,9 +144,6 @@ impl Tables {
             let effects = library().flat_map(|outcome| &outcome.fates);
             effects.filter(move |(gain, _)| (from..to).contains(gain)).map(|(_, fate)| fate)
         };
-        let within = |[from, to]: [f64; 2]| move |o: &&Outcome| (from..to).contains(&o.oracle_gain);
-        let named = |outcome: &Outcome| outcome.verdict == Verdict::Identified;
-        let undecided = |outcome: &Outcome| outcome.grade == Grade::Open;
         let right = || outcomes.iter().filter(|o| o.grade == Grade::Right && o.class != Class::Empty);
         let pulls: Vec<f64> = outcomes.iter().flat_map(|o| o.pulls.iter().copied()).collect();
         let inside = |limit: f64| Share::new(pulls.iter().filter(|p| p.abs() < limit).count(), pulls.len());
@@ -152,23 +151,11 @@ impl Tables {
         let seconds: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
         Self {
             empty_consistent: Share::of(class(Class::Empty), |o| o.verdict == Verdict::Consistent),
-            empty_identified: Share::of(class(Class::Empty), named),
+            empty_identified: Share::of(class(Class::Empty), is_named),
             by_gain: GAINS.map(|bin| (bin, Fates::of(with_gain(bin)))).into(),
             wrong: Share::of(outcomes.iter().filter(|o| o.class != Class::Unknown), |o| o.grade == Grade::Wrong),
-            unknown: GAINS
-                .map(|bin| {
-                    let of = || class(Class::Unknown).filter(within(bin));
-                    let undecided = Share::of(of(), undecided);
-                    (
-                        bin,
-                        Unknown {
-                            undecided,
-                            near: Share::of(of(), |o| o.near),
-                            named: of().filter(|o| named(o)).count(),
-                        },
-                    )
-                })
-                .into(),
+            frozen: unknown(outcomes, true),
+            unknown: unknown(outcomes, false),
             power: power(class(Class::Single)),
             confused: outcomes.iter().filter(|o| o.grade == Grade::Wrong).map(confusion).collect(),
             calibration: Calibration::all(outcomes),
@@ -209,15 +196,7 @@ impl Tables {
             writeln!(text, "| {} | {counts} | {} |", range(bin), found.text())?;
         }
         writeln!(text, "\nCampaigns with a false identification: {}.", self.wrong.text())?;
-        writeln!(text, "\nPhysics outside the library:\n")?;
-        writeln!(
-            text,
-            "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else |"
-        )?;
-        writeln!(text, "|---|---|---|---|")?;
-        for (bin, Unknown { undecided, near, named }) in &self.unknown {
-            writeln!(text, "| {} | {} | {} | {named} |", range(bin), undecided.text(), near.text())?;
-        }
+        self.write_unknown(text)?;
         writeln!(text, "\nA place is right within the mean distance of two quadrupoles.")?;
         writeln!(
             text,
@@ -252,6 +231,25 @@ impl Tables {
         )
     }
 
+    fn write_unknown(&self, text: &mut String) -> core::fmt::Result {
+        let groups = [
+            ("of kinds that the diagnosis was not made for", &self.frozen),
+            ("of kinds that it has met before", &self.unknown),
+        ];
+        for (group, rows) in groups {
+            writeln!(text, "\nPhysics outside the library, {group}:\n")?;
+            writeln!(
+                text,
+                "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else |"
+            )?;
+            writeln!(text, "|---|---|---|---|")?;
+            for (bin, Unknown { undecided, near, named }) in rows {
+                writeln!(text, "| {} | {} | {} | {named} |", range(bin), undecided.text(), near.text())?;
+            }
+        }
+        Ok(())
+    }
+
     fn write_calibration(&self, text: &mut String) -> core::fmt::Result {
         writeln!(
             text,
@@ -277,6 +275,26 @@ impl Tables {
         let brier: Vec<String> = self.calibration.iter().map(|one| format!("{:.3}", one.brier)).collect();
         writeln!(text, "\nOutside the limits: {outside} of {bins}. Brier scores {}.\n", brier.join(", "))
     }
+}
+
+fn is_named(outcome: &Outcome) -> bool {
+    outcome.verdict == Verdict::Identified
+}
+
+/// What became of physics outside the library, of kinds that are frozen or not, by oracle gain.
+fn unknown(outcomes: &[Outcome], is_frozen: bool) -> Vec<([f64; 2], Unknown)> {
+    let kind = |outcome: &Outcome| outcome.truth.first().and_then(|made| UnmodelledKind::named(&made.kind));
+    let is_one = |outcome: &&Outcome| {
+        outcome.class == Class::Unknown && kind(outcome).is_some_and(|kind| kind.is_frozen() == is_frozen)
+    };
+    let of = |bin: [f64; 2]| {
+        let within = move |outcome: &&Outcome| (bin[0]..bin[1]).contains(&outcome.oracle_gain);
+        let all: Vec<&Outcome> = outcomes.iter().filter(is_one).filter(within).collect();
+        let share = |is: fn(&Outcome) -> bool| Share::of(all.iter().copied(), is);
+        let undecided = share(|outcome| outcome.grade == Grade::Open);
+        (bin, Unknown { undecided, near: share(|outcome| outcome.near), named: share(is_named).of })
+    };
+    GAINS.map(of).into()
 }
 
 /// Named right, by kind and third of the logarithm of the size.

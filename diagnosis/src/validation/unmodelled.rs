@@ -1,21 +1,29 @@
 //! Physics that the library of effects does not hold, for campaigns whose right verdict is "unexplained".
 //!
-//! Sizes are drawn evenly in their logarithm, from well below the noise to far above it.
+//! Sizes are drawn evenly in their logarithm, from well below the noise to far above it. `t` is the time within the campaign, from -1 to 1.
 //!
 //! | word | what happens, `a` the size | unit |
 //! |---|---|---|
 //! | `quad_jump` | one quadrupole is stronger by the share `a` from some moment on | 1 |
-//! | `bpm_warm_up` | a monitor's gain is off by `a exp(-(t + 1)/0.5)`, t from -1 to 1 | 1 |
+//! | `bpm_warm_up` | a monitor's gain is off by `a exp(-(t + 1)/0.5)` | 1 |
 //! | `bpm_saturation` | a monitor reads `x/(1 + (a x)^8)^(1/8)`: linear for small x, and limited to `1/a` | 1/m |
-//! | `octupole` | a thin octupole of K3L `a` stands in a free straight | 1/m3 |
 //! | `orbit_drift` | the kick of an unlogged corrector varies slowly by ±`a` | rad |
 //! | `bpm_wander` | a monitor's offset varies slowly by ±`a` | m |
+//! | `dead_band` | a monitor shows its last value until the position differs from that by more than `a` | m |
+//! | `cable_pickup` | a monitor reads the current in the correctors' cable tray: `+ a (sum of all kicks)/0.2 mrad` | m |
+//! | `bus_sag` | the load on the correctors' common bus shifts one corrector: its kick `+ a (sum of all abs(kick))/0.2 mrad` | rad |
+//! | `alternate_cycle` | a corrector gives a kick `a` too much in every second machine cycle, which follows another user's | rad |
+//! | `thermostat` | `ln` of a quadrupole's gradient follows its cooling water: `+ a sin(2 pi (5 t/2 + phase))` | 1 |
+//! | `solenoid` | a drift is filled by a solenoid that turns the beam by `a`: `ks = 2 a/length` | rad |
+//!
+//! The last six are by somebody who had seen neither the library nor the diagnosis, and nothing was changed after it had met them: they say how a
+//! diagnosis fares that has not been made for what it meets.
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
-use twin::{Cycle, Kind, Ring, Site};
+use twin::{Cycle, Element, Kind, Ring, Site};
 
 use inference::simulate::Beyond;
 
@@ -28,12 +36,22 @@ pub enum UnmodelledKind {
     WarmUp,
     /// A monitor saturates.
     Saturation,
-    /// An octupole.
-    Octupole,
     /// The orbit drifts.
     OrbitDrift,
     /// A monitor's offset drifts.
     BpmWander,
+    /// A monitor is read out anew only when its value has changed enough.
+    DeadBand,
+    /// A monitor's cable picks up the current of all correctors.
+    CablePickup,
+    /// A corrector's supply gives way under the load of all correctors, whatever their sign.
+    BusSag,
+    /// A corrector keeps a remanent field in every second machine cycle.
+    AlternateCycle,
+    /// A quadrupole's gradient swings with its cooling water, five times in the campaign.
+    Thermostat,
+    /// A solenoid, uncompensated, in a free drift.
+    Solenoid,
 }
 
 /// One of them: where, and how large.
@@ -47,14 +65,43 @@ pub struct Unmodelled {
     pub size: f64,
     /// Index of the place: read monitor, corrector, quadrupole or element.
     index: usize,
-    /// Time of a jump, or phase of a slow variation, -0.5 to 0.5.
+    /// Time of a jump, or phase of a variation, -0.5 to 0.5.
     when: f64,
 }
 
+/// What a corrector kicks at its nominal setting [rad].
+const FULL_KICK: f64 = 2e-4;
+/// Length from which on a drift takes a solenoid [m]: its focusing, of the order of a^2/length, is then weak.
+const ROOM: f64 = 0.5;
+
 impl UnmodelledKind {
     /// Every kind.
-    pub const ALL: [Self; 6] =
-        [Self::QuadJump, Self::WarmUp, Self::Saturation, Self::Octupole, Self::OrbitDrift, Self::BpmWander];
+    pub const ALL: [Self; 11] = [
+        Self::QuadJump,
+        Self::WarmUp,
+        Self::Saturation,
+        Self::OrbitDrift,
+        Self::BpmWander,
+        Self::DeadBand,
+        Self::CablePickup,
+        Self::BusSag,
+        Self::AlternateCycle,
+        Self::Thermostat,
+        Self::Solenoid,
+    ];
+
+    /// True for those that the diagnosis was not made for.
+    pub fn is_frozen(self) -> bool {
+        match self {
+            Self::QuadJump | Self::WarmUp | Self::Saturation | Self::OrbitDrift | Self::BpmWander => false,
+            Self::DeadBand
+            | Self::CablePickup
+            | Self::BusSag
+            | Self::AlternateCycle
+            | Self::Thermostat
+            | Self::Solenoid => true,
+        }
+    }
 
     /// The word for it.
     pub fn word(self) -> &'static str {
@@ -62,10 +109,20 @@ impl UnmodelledKind {
             Self::QuadJump => "quad_jump",
             Self::WarmUp => "bpm_warm_up",
             Self::Saturation => "bpm_saturation",
-            Self::Octupole => "octupole",
             Self::OrbitDrift => "orbit_drift",
             Self::BpmWander => "bpm_wander",
+            Self::DeadBand => "dead_band",
+            Self::CablePickup => "cable_pickup",
+            Self::BusSag => "bus_sag",
+            Self::AlternateCycle => "alternate_cycle",
+            Self::Thermostat => "thermostat",
+            Self::Solenoid => "solenoid",
         }
+    }
+
+    /// The kind of a word.
+    pub fn named(word: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.word() == word)
     }
 
     /// Sizes from weak to strong.
@@ -74,23 +131,29 @@ impl UnmodelledKind {
             Self::QuadJump => [2e-3, 2e-2],
             Self::WarmUp => [0.02, 0.3],
             Self::Saturation => [1.0 / 6e-3, 1.0 / 1.5e-3],
-            Self::Octupole => [50.0, 1000.0],
             Self::OrbitDrift => [3e-6, 1e-4],
             Self::BpmWander => [1e-4, 2e-3],
+            Self::DeadBand => [1e-4, 1e-2],
+            Self::CablePickup => [2e-5, 3e-3],
+            Self::BusSag | Self::AlternateCycle => [5e-7, 1e-4],
+            Self::Thermostat => [5e-4, 0.025],
+            Self::Solenoid => [5e-4, 0.05],
         }
     }
 
     /// Where it may act in a campaign.
     fn sites(self, ring: &Ring) -> Vec<Site> {
         match self {
-            Self::WarmUp | Self::Saturation | Self::BpmWander => {
+            Self::WarmUp | Self::Saturation | Self::BpmWander | Self::DeadBand | Self::CablePickup => {
                 ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect()
             }
-            Self::QuadJump => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
-            Self::OrbitDrift => (0..ring.correctors.len()).map(Site::Corrector).collect(),
-            Self::Octupole => {
-                let straights = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Marker);
-                straights.map(Site::Element).collect()
+            Self::QuadJump | Self::Thermostat => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
+            Self::OrbitDrift | Self::BusSag | Self::AlternateCycle => {
+                (0..ring.correctors.len()).map(Site::Corrector).collect()
+            }
+            Self::Solenoid => {
+                let has_room = |element: &Element| element.kind == Kind::Drift && element.length > ROOM;
+                (0..ring.elements.len()).filter(|&at| has_room(&ring.elements[at])).map(Site::Element).collect()
             }
         }
     }
@@ -127,34 +190,49 @@ impl Unmodelled {
 
 impl Beyond for Unmodelled {
     fn alter_ring(&self, ring: &mut Ring) {
-        if self.kind == UnmodelledKind::Octupole {
-            ring.elements[self.index].kind = Kind::Octupole { k3l: self.size };
+        if self.kind == UnmodelledKind::Solenoid {
+            let drift = &mut ring.elements[self.index];
+            drift.kind = Kind::Solenoid { ks: 2.0 * self.size / drift.length };
         }
     }
 
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
-        let late = |cycle: &&mut Cycle| cycle.time >= self.when;
-        match self.kind {
-            UnmodelledKind::QuadJump => {
-                cycles.iter_mut().filter(late).for_each(|c| c.strength[self.index] += self.size.ln_1p());
+        for (count, cycle) in cycles.iter_mut().enumerate() {
+            match self.kind {
+                UnmodelledKind::QuadJump if cycle.time >= self.when => cycle.strength[self.index] += self.size.ln_1p(),
+                UnmodelledKind::Thermostat => {
+                    let phase = core::f64::consts::TAU * (2.5 * cycle.time + self.when);
+                    cycle.strength[self.index] += self.size * phase.sin();
+                }
+                UnmodelledKind::OrbitDrift => cycle.kick[self.index] += self.size * self.slow_variation(cycle.time),
+                UnmodelledKind::BusSag => {
+                    let load: f64 = cycle.kick.iter().map(|kick| kick.abs()).sum();
+                    cycle.kick[self.index] += self.size * load / FULL_KICK;
+                }
+                UnmodelledKind::AlternateCycle if count % 2 == 1 => cycle.kick[self.index] += self.size,
+                _ => {}
             }
-            UnmodelledKind::OrbitDrift => {
-                cycles.iter_mut().for_each(|c| c.kick[self.index] += self.size * self.slow_variation(c.time));
-            }
-            _ => {}
         }
     }
 
     fn alter_readings(&self, cycles: &[Cycle], readings: &mut DMatrix<f64>) {
-        let read = |time: f64, x: f64| match self.kind {
-            UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(time + 1.0) / 0.5).exp()),
+        let mut shown = f64::INFINITY;
+        let mut read = |cycle: &Cycle, x: f64| match self.kind {
+            UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(cycle.time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
-            UnmodelledKind::BpmWander => x + self.size * self.slow_variation(time),
+            UnmodelledKind::BpmWander => x + self.size * self.slow_variation(cycle.time),
+            UnmodelledKind::CablePickup => x + self.size * cycle.kick.iter().sum::<f64>() / FULL_KICK,
+            UnmodelledKind::DeadBand => {
+                if (x - shown).abs() > self.size.abs() {
+                    shown = x;
+                }
+                shown
+            }
             _ => x,
         };
-        if self.index < readings.ncols() {
+        if matches!(self.site, Site::Monitor(_)) {
             for (cycle, reading) in cycles.iter().zip(&mut readings.column_mut(self.index)) {
-                *reading = read(cycle.time, *reading);
+                *reading = read(cycle, *reading);
             }
         }
     }

@@ -44,8 +44,7 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Corrector { .. } => corrector(lattice, at),
         Kind::Quadrupole { k1 } => body("Quadrupole", "StrMPoleSymplectic4Pass", &[0.0, *k1], element.length),
         Kind::Sextupole { k2 } => body("Sextupole", "StrMPoleSymplectic4Pass", &[0.0, 0.0, k2 / 2.0], element.length),
-        Kind::Multipole { k1l, k1sl, k2l } => thin(&[0.0, *k1sl, 0.0], &[0.0, *k1l, k2l / 2.0]),
-        Kind::Octupole { k3l } => thin(&[0.0; 4], &[0.0, 0.0, 0.0, k3l / 6.0]),
+        Kind::Multipole { k1l, k1sl, k2l, k3l } => thin(&[0.0, *k1sl, 0.0, 0.0], &[0.0, *k1l, k2l / 2.0, k3l / 6.0]),
         Kind::Solenoid { ks } => json!({"Class": "Element", "PassMethod": "SolenoidLinearPass", "K": ks}),
         Kind::Bend(bend) => {
             let field = [0.0, bend.k1, bend.k2 / 2.0];

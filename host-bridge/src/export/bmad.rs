@@ -78,12 +78,8 @@ fn definition(lattice: &Lattice, at: usize, element: &Element) -> String {
             "solenoid"
         }
         // b_n + i a_n is the integrated field over n!
-        Kind::Multipole { k1l, k1sl, k2l } => {
-            attributes.other("b1", *k1l).other("a1", *k1sl).other("b2", k2l / 2.0);
-            "ab_multipole"
-        }
-        Kind::Octupole { k3l } => {
-            attributes.other("b3", k3l / 6.0);
+        Kind::Multipole { k1l, k1sl, k2l, k3l } => {
+            attributes.other("b1", *k1l).other("a1", *k1sl).other("b2", k2l / 2.0).other("b3", k3l / 6.0);
             "ab_multipole"
         }
         Kind::Bend(bend) => {

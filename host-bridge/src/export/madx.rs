@@ -56,12 +56,8 @@ fn definition(lattice: &Lattice, at: usize, element: &Element) -> String {
             attributes.length(element).number("ks", *ks);
             "solenoid"
         }
-        Kind::Multipole { k1l, k1sl, k2l } => {
-            attributes.list("knl", &[0.0, *k1l, *k2l]).list("ksl", &[0.0, *k1sl]);
-            "multipole"
-        }
-        Kind::Octupole { k3l } => {
-            attributes.list("knl", &[0.0, 0.0, 0.0, *k3l]);
+        Kind::Multipole { k1l, k1sl, k2l, k3l } => {
+            attributes.list("knl", &[0.0, *k1l, *k2l, *k3l]).list("ksl", &[0.0, *k1sl]);
             "multipole"
         }
         Kind::Bend(bend) => {

@@ -39,8 +39,9 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Corrector { .. } => ("Kicker", magnet(json!({"Kn0L": 0.0, "Ks0L": 0.0}))),
         Kind::Quadrupole { k1 } => ("Quadrupole", magnet(json!({"Kn1": k1}))),
         Kind::Sextupole { k2 } => ("Sextupole", magnet(json!({"Kn2": k2}))),
-        Kind::Multipole { k1l, k1sl, k2l } => ("Multipole", magnet(json!({"Kn1L": k1l, "Ks1L": k1sl, "Kn2L": k2l}))),
-        Kind::Octupole { k3l } => ("Multipole", magnet(json!({"Kn3L": k3l}))),
+        Kind::Multipole { k1l, k1sl, k2l, k3l } => {
+            ("Multipole", magnet(json!({"Kn1L": k1l, "Ks1L": k1sl, "Kn2L": k2l, "Kn3L": k3l})))
+        }
         Kind::Solenoid { ks } => ("Solenoid", json!({"SolenoidP": {"Ksol": ks}})),
         Kind::Bend(bend) => {
             let field = if bend.k2 == 0.0 { json!({"Kn1": bend.k1}) } else { json!({"Kn1": bend.k1, "Kn2": bend.k2}) };

@@ -41,8 +41,7 @@ fn element(element: &Element) -> Value {
         Kind::Quadrupole { k1 } => json!({"__class__": "Quadrupole", "length": element.length, "k1": k1}),
         Kind::Sextupole { k2 } => json!({"__class__": "Sextupole", "length": element.length, "k2": k2}),
         Kind::Solenoid { ks } => json!({"__class__": "UniformSolenoid", "length": element.length, "ks": ks}),
-        Kind::Multipole { k1l, k1sl, k2l } => multipole(&[0.0, *k1l, *k2l], &[0.0, *k1sl, 0.0]),
-        Kind::Octupole { k3l } => multipole(&[0.0, 0.0, 0.0, *k3l], &[0.0; 4]),
+        Kind::Multipole { k1l, k1sl, k2l, k3l } => multipole(&[0.0, *k1l, *k2l, *k3l], &[0.0, *k1sl, 0.0, 0.0]),
         Kind::Bend(bend) => {
             let mut value = json!({
             "__class__": "Bend", "length": element.length, "angle": bend.curvature * element.length, "k1": bend.k1,

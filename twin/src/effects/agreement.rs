@@ -151,10 +151,12 @@ fn signatures_hold_about_a_machine_with_effects() {
     // off momentum: what the ring holds is exact there, gradients feed down
     let held = |kind: EffectKind| matches!(kind.class(), Class::Hold(_));
     assert(&about("momentum_offset=0.002"), &held, 5e-5);
-    // where not the momentum is held, but for the curvature of a sextupole, which is taken at constant momentum
+    // where not the momentum is held, but for the curvature of a field, which is taken at constant momentum
     // what is held beside it is held already: of a full loop nothing is left
     let holds = |kind: EffectKind| matches!(kind, EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
-    let is_curved = |kind| matches!(kind, EffectKind::SextupoleError | EffectKind::DipoleSextupole);
+    let is_curved = |kind: EffectKind| {
+        matches!(kind, EffectKind::SextupoleError | EffectKind::DipoleSextupole | EffectKind::StrayOctupole)
+    };
     let linear = |kind: EffectKind| !kind.is_switch() && !holds(kind) && !is_curved(kind);
     assert(&about("radial_loop@x_D8,x_E6"), &linear, 2e-4);
     assert(&about("fixed_rf_frequency"), &linear, 2e-4);
@@ -229,7 +231,7 @@ fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
 }
 
 #[test]
-fn what_crosses_sextupole_fields_moves_the_tunes() {
+fn what_crosses_curved_fields_moves_the_tunes() {
     let ring = Ring::booster();
     let drives = Drives { rf_offset: DVector::zeros(8), ..drives(&ring, orbit(&ring, 0.0)) };
     let exact = |effects: &[Effect]| {
@@ -244,7 +246,12 @@ fn what_crosses_sextupole_fields_moves_the_tunes() {
         MatrixXx2::from_fn(6, |i, plane| [tunes[i].x, tunes[i].y][plane])
     };
     // where a loop is on, the dispersion crosses them too; it moves the tunes of a ring without them as well
-    for (held, text) in [("", "sextupole_error@SX_F4=2"), ("radial_loop@x_D8,x_E6", "dipole_sextupole=0.1")] {
+    let cases = [
+        ("", "sextupole_error@SX_F4=2"),
+        ("radial_loop@x_D8,x_E6", "dipole_sextupole=0.1"),
+        ("stray_gradient@SLOT_F6=0.01", "stray_octupole@SLOT_F6=100"),
+    ];
+    for (held, text) in cases {
         let about: Vec<Effect> = held.split_whitespace().map(|text| Effect::parse(text, &ring).unwrap()).collect();
         let with = [about.as_slice(), &[Effect::parse(text, &ring).unwrap()]].concat();
         let change = exact(&with) - exact(&about);

@@ -1,7 +1,7 @@
-//! Fields that the model does not have: gradients, edges, rolled quadrupoles, sextupoles.
+//! Fields that the model does not have: gradients, edges, rolled quadrupoles, sextupoles, octupoles.
 //!
-//! The exact form is the changed element, and so is the form per frame, but that a sextupole's field depends on the orbit
-//! that passes it: to a small deviation it is a gradient and a skew gradient ([`Machine::on_orbit`]), to larger ones curved ([`Crossed`]).
+//! The exact form is the changed element, and so is the form per frame, but that the field of a sextupole or an octupole depends on the
+//! orbit that passes it: to a small deviation it is a gradient and a skew gradient ([`Machine::on_orbit`]), to larger ones curved ([`Crossed`]).
 //! The derivative is one formula for all gradients, `dR = -a (W + step) Q (W + step) c` of [`crate::response`].
 
 use nalgebra::{DMatrix, MatrixXx2, RowVector2};
@@ -31,6 +31,8 @@ pub enum FieldEffect {
     Sextupole,
     /// A sextupole in the body of every dipole, K2L of each [1/m^2].
     DipoleSextupole,
+    /// An octupole in a free straight, K3L [1/m^3].
+    StrayOctupole,
 }
 
 /// A thin gradient at one place.
@@ -58,14 +60,14 @@ impl FieldEffect {
         match self {
             Self::StrayGradient | Self::DipoleGradient => Some(Thin::Normal),
             Self::StraySkewGradient | Self::QuadRoll => Some(Thin::Skew),
-            Self::DipoleEdge | Self::Sextupole | Self::DipoleSextupole => None,
+            Self::DipoleEdge | Self::Sextupole | Self::DipoleSextupole | Self::StrayOctupole => None,
         }
     }
 
     /// True for a field that does not grow with the magnets.
     pub fn is_stray(self) -> bool {
         match self {
-            Self::StrayGradient | Self::StraySkewGradient => true,
+            Self::StrayGradient | Self::StraySkewGradient | Self::StrayOctupole => true,
             Self::QuadRoll | Self::DipoleGradient | Self::DipoleEdge | Self::Sextupole | Self::DipoleSextupole => false,
         }
     }
@@ -76,8 +78,9 @@ impl FieldEffect {
             (Self::QuadRoll, Site::Quadrupole(at)) => {
                 ring.elements[ring.quadrupoles[at].element].misalignment.roll += amplitude;
             }
-            (Self::StrayGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, amplitude, 0.0)?,
-            (Self::StraySkewGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, 0.0, amplitude)?,
+            (Self::StrayGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, [amplitude, 0.0, 0.0])?,
+            (Self::StraySkewGradient, Site::Element(at)) => stray(&mut ring.elements[at].kind, [0.0, amplitude, 0.0])?,
+            (Self::StrayOctupole, Site::Element(at)) => stray(&mut ring.elements[at].kind, [0.0, 0.0, amplitude])?,
             (Self::DipoleGradient, Site::Element(at)) => {
                 let per_length = amplitude / ring.elements[at].length;
                 bend(&mut ring.elements[at])?.k1 += per_length;
@@ -113,6 +116,7 @@ impl Mechanism for FieldEffect {
             Self::DipoleEdge => "dipole_edge",
             Self::Sextupole => "sextupole_error",
             Self::DipoleSextupole => "dipole_sextupole",
+            Self::StrayOctupole => "stray_octupole",
         }
     }
 
@@ -120,7 +124,7 @@ impl Mechanism for FieldEffect {
     /// K1L is 0.28/m, skew and in a dipole half of that; edges differ by a tenth of the angle over which a rectangular magnet
     /// would; a chromaticity sextupole at full current has some 1/m2. Eddy currents in a chamber of conductivity s and thickness t between poles a
     /// distance 2 h apart make, by Ampere's law, `B'' = mu0 s t (dB/dt)/h`: 2 mm of Inconel (8e5 S/m), 5 T/s and 4 cm make 0.25 T/m2, over 2.4 m at 6 Tm
-    /// K2L = 0.1/m2.
+    /// K2L = 0.1/m2. An octupole of 0.3 m with 0.2 T at its poles 8 cm away has 100/m3 at 6 Tm.
     fn prior_scale(&self) -> Option<f64> {
         match self {
             Self::QuadRoll => Some(0.015),
@@ -129,6 +133,7 @@ impl Mechanism for FieldEffect {
             Self::DipoleEdge => Some(0.05),
             Self::Sextupole => Some(2.0),
             Self::DipoleSextupole => Some(0.1),
+            Self::StrayOctupole => Some(100.0),
         }
     }
 
@@ -137,6 +142,7 @@ impl Mechanism for FieldEffect {
             Self::QuadRoll | Self::DipoleEdge => Unit::ANGLE,
             Self::StrayGradient | Self::StraySkewGradient | Self::DipoleGradient => Unit::PER_METRE,
             Self::Sextupole | Self::DipoleSextupole => Unit::PER_SQUARE_METRE,
+            Self::StrayOctupole => Unit::PER_CUBIC_METRE,
         }
     }
 
@@ -147,7 +153,9 @@ impl Mechanism for FieldEffect {
         };
         match self {
             Self::QuadRoll => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
-            Self::StrayGradient | Self::StraySkewGradient => elements(|kind| matches!(kind, Kind::Marker)).collect(),
+            Self::StrayGradient | Self::StraySkewGradient | Self::StrayOctupole => {
+                elements(|kind| matches!(kind, Kind::Marker)).collect()
+            }
             Self::DipoleGradient => elements(is_bend).collect(),
             Self::DipoleEdge => elements(is_bend).chain([Site::Ring]).collect(),
             Self::Sextupole => elements(is_sextupole).collect(),
@@ -158,7 +166,7 @@ impl Mechanism for FieldEffect {
     fn expected(&self) -> &'static str {
         match self {
             Self::QuadRoll => "a quadrupole",
-            Self::StrayGradient | Self::StraySkewGradient => "a free straight",
+            Self::StrayGradient | Self::StraySkewGradient | Self::StrayOctupole => "a free straight",
             Self::DipoleGradient | Self::DipoleEdge => "a dipole",
             Self::Sextupole => "a sextupole",
             Self::DipoleSextupole => "no place",
@@ -168,7 +176,7 @@ impl Mechanism for FieldEffect {
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         match self {
             Self::QuadRoll => ring.quadrupole(name).ok().map(Site::Quadrupole),
-            Self::StrayGradient | Self::StraySkewGradient => {
+            Self::StrayGradient | Self::StraySkewGradient | Self::StrayOctupole => {
                 Site::element(ring, name, |kind| matches!(kind, Kind::Marker | Kind::Multipole { .. }))
                     .map(Site::Element)
             }
@@ -186,8 +194,11 @@ impl Mechanism for FieldEffect {
         let put = self.put(&mut machine.ring, site, amplitude);
         put.ok_or_else(|| self.misplaced(&machine.ring, site.name(&machine.ring)))?;
         match (self, site) {
-            (Self::Sextupole, Site::Element(at)) => machine.sextupoles.push((at, amplitude)),
-            (Self::DipoleSextupole, _) => machine.sextupoles.extend(dipoles(&machine.ring).map(|at| (at, amplitude))),
+            (Self::Sextupole, Site::Element(at)) => machine.curved.push(Curved::sextupole(at, amplitude)),
+            (Self::DipoleSextupole, _) => {
+                machine.curved.extend(dipoles(&machine.ring).map(|at| Curved::sextupole(at, amplitude)));
+            }
+            (Self::StrayOctupole, Site::Element(at)) => machine.curved.push(Curved::octupole(at, amplitude)),
             _ => {}
         }
         Ok(())
@@ -210,13 +221,14 @@ impl Mechanism for FieldEffect {
             (Self::DipoleEdge, Site::Ring) => Ok(edges(about, 0..ring.elements.len())),
             (Self::Sextupole, Site::Element(at)) => Ok(sextupole(about, at)),
             (Self::DipoleSextupole, Site::Ring) => Ok(in_dipoles(about)),
+            (Self::StrayOctupole, Site::Element(at)) => Ok(octupole(about, at)),
             _ => Err(self.misplaced(ring, site.name(ring))),
         }
     }
 
     fn orbit(&self, _ring: &Ring, site: Site) -> Vec<(usize, Plane)> {
         match (self, site) {
-            (Self::Sextupole, Site::Element(at)) => vec![(at, Plane::X), (at, Plane::Y)],
+            (Self::Sextupole | Self::StrayOctupole, Site::Element(at)) => vec![(at, Plane::X), (at, Plane::Y)],
             _ => Vec::new(),
         }
     }
@@ -234,6 +246,7 @@ impl Mechanism for FieldEffect {
             (Self::DipoleEdge, _) => format!("dipole {name} has edge angles of {} mrad", amplitude.signed(1e3)),
             (Self::DipoleSextupole, _) => format!("all dipoles have a field K2L = {} /m2", amplitude.signed(1.0)),
             (Self::Sextupole, _) => format!("sextupole {name} has a field K2L = {} /m2", amplitude.signed(1.0)),
+            (Self::StrayOctupole, _) => format!("there is an octupole K3L = {} /m3 at {name}", amplitude.signed(1.0)),
         }
     }
 }
@@ -263,14 +276,15 @@ fn turn_edges(bend: &mut Bend, angle: f64) {
     bend.e2 += angle;
 }
 
-/// Add to the thin multipole that a free straight then is.
-fn stray(kind: &mut Kind, normal: f64, skew: f64) -> Option<()> {
+/// Add K1L, K1sL and K3L to the thin multipole that a free straight then is.
+fn stray(kind: &mut Kind, [normal, skew, octupole]: [f64; 3]) -> Option<()> {
     if *kind == Kind::Marker {
-        *kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0 };
+        *kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0, k3l: 0.0 };
     }
-    let Kind::Multipole { k1l, k1sl, .. } = kind else { return None };
+    let Kind::Multipole { k1l, k1sl, k3l, .. } = kind else { return None };
     *k1l += normal;
     *k1sl += skew;
+    *k3l += octupole;
     Some(())
 }
 
@@ -306,25 +320,50 @@ fn sextupole(about: &Signatures, at: usize) -> Signature {
     let mut signature = about.of_gradient(&about.optics.gradient(at), x * per_length);
     // a skew gradient moves no tune to first order
     signature.readings += about.of_gradient(&about.optics.skew_gradient(at), y * per_length).readings;
-    let crossed = Crossed::of(&about.optics, &about.held, &[(at, 1.0)], about.drives, &about.kick);
-    crossed.add_to(&mut signature, ring);
+    let fields = [Curved::sextupole(at, 1.0)];
+    Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick).add_to(&mut signature, ring);
     signature
 }
 
-/// The same of all dipoles: gradients of their feed-down, and the rest of the kick of what crosses them, per unit of the K2L of each.
+/// The same of an octupole, per unit of K3L.
+fn octupole(about: &Signatures, at: usize) -> Signature {
+    let [x, y] = about.drives.orbit[at];
+    let mut signature = about.of_gradient(&about.optics.thin_gradient(at.into()), 0.5 * (x * x - y * y));
+    signature.readings += about.of_gradient(&about.optics.thin_skew_gradient(at.into()), x * y).readings;
+    let fields = [Curved::octupole(at, 1.0)];
+    let crossed = Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick);
+    crossed.add_to(&mut signature, &about.machine.ring);
+    signature
+}
+
+/// That of a sextupole, of all dipoles: gradients of their feed-down, and the rest of the kick of what crosses them, per unit of the K2L of each.
 fn in_dipoles(about: &Signatures) -> Signature {
     let ring = &about.machine.ring;
     let of = |at: usize| (about.optics.gradient(at), across(&about.drives.orbit, at)[0] / ring.elements[at].length);
     let mut signature = about.of_gradients(dipoles(ring).map(of));
-    let fields: Vec<(usize, f64)> = dipoles(ring).map(|at| (at, 1.0)).collect();
-    let crossed = Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick);
-    crossed.add_to(&mut signature, ring);
+    let fields: Vec<Curved> = dipoles(ring).map(|at| Curved::sextupole(at, 1.0)).collect();
+    Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick).add_to(&mut signature, ring);
     signature
 }
 
-/// Change of both tunes by x in a sextupole field (element, K2L), a gradient `K2L x` [1/m].
-fn tune_slope(optics: &Optics, &(element, k2l): &(usize, f64)) -> [f64; 2] {
-    optics.tune_slope(&optics.gradient_middle(element)).map(|slope| slope * k2l)
+/// A field beyond the ring's that is no gradient.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Curved {
+    element: usize,
+    /// Sextupole [1/m^2].
+    k2l: f64,
+    /// Octupole [1/m^3].
+    k3l: f64,
+}
+
+impl Curved {
+    fn sextupole(element: usize, k2l: f64) -> Self {
+        Self { element, k2l, k3l: 0.0 }
+    }
+
+    fn octupole(element: usize, k3l: f64) -> Self {
+        Self { element, k2l: 0.0, k3l }
+    }
 }
 
 /// The orbit (x, y) across an element, mean of both ends [m].
@@ -336,11 +375,11 @@ fn across(orbit: &[[f64; 2]], at: usize) -> [f64; 2] {
 impl Machine {
     /// The same machine as small deviations from its orbit without kicks (x, y) see it: each stray sextupole is a gradient `k2 x`
     /// and a skew gradient `k2 y`, which together are a rolled quadrupole; in a dipole it is the gradient, and the skew one belongs to what
-    /// crosses it. Its dipole part is in the orbit already.
+    /// crosses it. An octupole is a gradient `K3L (x^2 - y^2)/2` and a skew gradient `K3L x y`. Their dipole parts are in the orbit already.
     #[must_use]
     pub fn on_orbit(&self, orbit: &[[f64; 2]]) -> Self {
         let mut machine = self.clone();
-        for &(at, _) in &self.sextupoles {
+        for &Curved { element: at, .. } in &self.curved {
             let ([x, y], element) = (orbit[at], &mut machine.ring.elements[at]);
             match &mut element.kind {
                 Kind::Sextupole { k2 } => {
@@ -351,6 +390,11 @@ impl Machine {
                     bend.k1 += bend.k2 * across(orbit, at)[0];
                     bend.k2 = 0.0;
                 }
+                Kind::Multipole { k1l, k1sl, k3l, .. } => {
+                    *k1l += 0.5 * *k3l * (x * x - y * y);
+                    *k1sl += *k3l * x * y;
+                    *k3l = 0.0;
+                }
                 _ => {}
             }
         }
@@ -358,20 +402,22 @@ impl Machine {
     }
 }
 
-/// Rounds of the orbit in the sextupoles and the kicks that it gets there, at most. Each leaves a share `G K2L dx` of the error, 0.1 for
+/// Rounds of the orbit in these fields and the kicks that it gets there, at most. Each leaves a share `G K2L dx` of the error, 0.1 for
 /// 5 /m2 crossed 3 mm off the orbit.
 const ROUNDS: usize = 8;
 /// Change of the kicks in a round below which they have settled [rad]: some 0.1 nm at a monitor.
 const SETTLED: f64 = 1e-11;
 
-/// What crosses the stray sextupoles of a machine beside the orbit without kicks: `dx' = -K2L (dx^2 - dy^2)/2 + S dy`,
-/// `dy' = K2L dx dy + S dx`, with (dx, dy) the orbit in the middle of each, and `S = K2L y` of a dipole on the orbit y without kicks, which is
-/// in the ring of other elements. It holds what the correctors and the RF offset make, and what these kicks make in turn.
+/// What crosses the stray sextupoles and octupoles of a machine beside the orbit (x, y) without kicks. With (dx, dy) the orbit in the middle of
+/// each, `a = K2L + K3L x` and `b = K3L y`,
+///
+/// `dx' = -a (dx^2 - dy^2)/2 + b dx dy - K3L (dx^3 - 3 dx dy^2)/6 + S dy`,
+/// `dy' = a dx dy + b (dx^2 - dy^2)/2 - K3L (dy^3 - 3 dx^2 dy)/6 + S dx`,
+///
+/// the fields' expansion about that orbit less its gradients, which are in the ring; but for the skew gradient `S = K2L y` of a dipole. It holds what the
+/// correctors and the RF offset make, and what these kicks make in turn.
 pub(super) struct Crossed {
-    /// K2L [1/m^2] and S [1/m] of each.
-    strengths: Vec<[f64; 2]>,
-    /// Change of both tunes by x in the middle of each [1/m].
-    tune_slopes: Vec<[f64; 2]>,
+    fields: Vec<About>,
     /// Orbit that correctors and RF offset make in their middles: rows frames, columns x and y of each [m].
     orbit: DMatrix<f64>,
     /// Orbit there by kicks there [m/rad].
@@ -380,21 +426,59 @@ pub(super) struct Crossed {
     monitors: [DMatrix<f64>; 2],
 }
 
+/// One field about the orbit that passes it.
+struct About {
+    /// Normal and skew sextupole, `a` and `b` [1/m^2].
+    sextupole: [f64; 2],
+    /// K3L [1/m^3].
+    octupole: f64,
+    /// S [1/m].
+    skew: f64,
+    /// Change of both tunes by a gradient there [m].
+    tune_slope: [f64; 2],
+}
+
+impl About {
+    fn of(optics: &Optics, &Curved { element, k2l, k3l }: &Curved, orbit: &[[f64; 2]]) -> Self {
+        let is_of_a_dipole = is_bend(&optics.ring.elements[element].kind);
+        let [x, y] = orbit[element];
+        Self {
+            sextupole: [k2l + k3l * x, k3l * y],
+            octupole: k3l,
+            skew: if is_of_a_dipole { k2l * across(orbit, element)[1] } else { 0.0 },
+            tune_slope: optics.tune_slope(&optics.gradient_middle(element)),
+        }
+    }
+
+    /// Kick of an orbit [rad].
+    fn kick(&self, x: f64, y: f64) -> [f64; 2] {
+        let ([a, b], cubic) = (self.sextupole, self.octupole / 6.0);
+        let (half, product) = (0.5 * (x * x - y * y), x * y);
+        [
+            self.skew * y - a * half + b * product - cubic * x * (x * x - 3.0 * y * y),
+            self.skew * x + a * product + b * half - cubic * y * (y * y - 3.0 * x * x),
+        ]
+    }
+
+    /// Gradient on an orbit, less that without kicks [1/m].
+    fn gradient(&self, x: f64, y: f64) -> f64 {
+        let [a, b] = self.sextupole;
+        a * x - b * y + 0.5 * self.octupole * (x * x - y * y)
+    }
+}
+
 impl Crossed {
-    /// Of sextupole fields (element, K2L) on a ring that holds something; `kick`: rows frames, columns correctors [rad].
-    pub fn of(optics: &Optics, held: &Held, fields: &[(usize, f64)], drives: &Drives, kick: &DMatrix<f64>) -> Self {
-        let elements = &optics.ring.elements;
-        let skew = |at: usize| if is_bend(&elements[at].kind) { across(&drives.orbit, at)[1] } else { 0.0 };
+    /// Of some fields in a ring that holds something; `kick`: rows frames, columns correctors [rad].
+    pub fn of(optics: &Optics, held: &Held, fields: &[Curved], drives: &Drives, kick: &DMatrix<f64>) -> Self {
         let (mut observers, mut sources) = (Vec::new(), Vec::new());
-        for &(element, _) in fields {
-            observers.extend(optics.observe_middle(element));
-            sources.extend(optics.kick_middle(element));
+        for field in fields {
+            observers.extend(optics.observe_middle(field.element));
+            sources.extend(optics.kick_middle(field.element));
         }
         let mut orbit = kick * held.response(optics, &observers, &optics.correctors()).transpose();
         orbit.ger(1.0, &drives.rf_offset, &held.rf_response(optics, &observers), 1.0);
         Self {
-            tune_slopes: fields.iter().map(|field| tune_slope(optics, field)).collect(),
-            strengths: fields.iter().map(|&(at, k2l)| [k2l, k2l * skew(at)]).collect(),
+            fields: fields.iter().map(|field| About::of(optics, field, &drives.orbit)).collect(),
             orbit,
             back: held.response(optics, &observers, &sources),
             monitors: [Plane::X, Plane::Y].map(|plane| held.response(optics, &optics.monitor_places(plane), &sources)),
@@ -404,8 +488,9 @@ impl Crossed {
     /// What the orbit of each frame does to the tunes by its feed-down, rows frames.
     pub fn tune_changes(&self) -> MatrixXx2<f64> {
         let mut changes = MatrixXx2::zeros(self.orbit.nrows());
-        for (i, slope) in self.tune_slopes.iter().enumerate() {
-            changes += self.orbit.column(2 * i) * RowVector2::from(*slope);
+        for (i, field) in self.fields.iter().enumerate() {
+            let gradient = self.orbit.column(2 * i).zip_map(&self.orbit.column(2 * i + 1), |x, y| field.gradient(x, y));
+            changes += gradient * RowVector2::from(field.tune_slope);
         }
         changes
     }
@@ -419,10 +504,11 @@ impl Crossed {
     /// Kicks of an orbit, same shape [rad].
     fn kicks(&self, orbit: &DMatrix<f64>) -> DMatrix<f64> {
         let mut kicks = DMatrix::zeros(orbit.nrows(), orbit.ncols());
-        for (i, [k2l, skew]) in self.strengths.iter().enumerate() {
-            let (x, y) = (orbit.column(2 * i), orbit.column(2 * i + 1));
-            kicks.set_column(2 * i, &x.zip_map(&y, |x, y| skew * y - 0.5 * k2l * (x * x - y * y)));
-            kicks.set_column(2 * i + 1, &x.zip_map(&y, |x, y| skew * x + k2l * x * y));
+        for (i, field) in self.fields.iter().enumerate() {
+            for frame in 0..orbit.nrows() {
+                let [x, y] = field.kick(orbit[(frame, 2 * i)], orbit[(frame, 2 * i + 1)]);
+                (kicks[(frame, 2 * i)], kicks[(frame, 2 * i + 1)]) = (x, y);
+            }
         }
         kicks
     }

@@ -3,10 +3,10 @@
 //! With `k` the kicks that a frame really had (gains, polarities and even parts applied), `f` its RF offset, `t` its time from
 //! -1 to 1 and `R` the response of the ring with all its effects,
 //!
-//! `position = R k - (D/eta) f + t a (dR/dln k1) k + t^2 a^2 (d^2R/d(ln k1)^2) k/2 + quadratic terms of sextupole fields`,
+//! `position = R k - (D/eta) f + t a (dR/dln k1) k + t^2 a^2 (d^2R/d(ln k1)^2) k/2 + kicks of sextupole and octupole fields`,
 //!
 //! and the monitors' errors (gain, roll, cubic term, exchanged names) are applied last. Everything is the change
-//! against the orbit without kicks, whose own reading is unknown and constant. A sextupole field and a cubic term depend on
+//! against the orbit without kicks, whose own reading is unknown and constant. Sextupole and octupole fields and a cubic term depend on
 //! that orbit: it is part of [`Drives`].
 
 use nalgebra::{DMatrix, MatrixXx2, RowVector2};
@@ -37,9 +37,9 @@ impl Machine {
             add(&mut positions, change);
             tune_changes += &drives.time * RowVector2::from(of_tunes);
         }
-        if !self.sextupoles.is_empty() {
+        if !self.curved.is_empty() {
             let held = self.held_of(&ring, &optics)?;
-            let crossed = Crossed::of(&optics, &held, &self.sextupoles, drives, &kick);
+            let crossed = Crossed::of(&optics, &held, &self.curved, drives, &kick);
             add(&mut positions, crossed.curved());
             tune_changes += crossed.tune_changes();
         }

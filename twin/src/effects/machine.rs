@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::corrector::Kick;
+use super::field::Curved;
 use super::hold::{Held, Holding};
 use super::mechanism::Mechanism;
 use super::monitor::Reading;
@@ -24,8 +25,8 @@ pub struct Machine {
     pub(super) monitors: Vec<Reading>,
     /// Effects of correctors, in the order given.
     pub(super) correctors: Vec<Kick>,
-    /// Sextupole fields beyond the ring's: element, K2L [1/m^2].
-    pub(super) sextupoles: Vec<(usize, f64)>,
+    /// Fields beyond the ring's that are no gradients.
+    pub(super) curved: Vec<Curved>,
     /// Relative change of all quadrupoles from mid-campaign to its end.
     pub(super) drift: f64,
 }
@@ -56,7 +57,7 @@ impl Machine {
             hold: hold.into(),
             monitors: Vec::new(),
             correctors: Vec::new(),
-            sextupoles: Vec::new(),
+            curved: Vec::new(),
             drift: 0.0,
         };
         effects.iter().try_for_each(|effect| machine.add(effect.kind.mechanism(), effect.site, effect.amplitude))?;

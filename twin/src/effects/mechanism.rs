@@ -83,6 +83,8 @@ impl Unit {
     pub const PER_METRE: Self = Self { symbol: "1/m", shown: "/m", factor: 1.0 };
     /// An integrated sextupole field [1/m^2].
     pub const PER_SQUARE_METRE: Self = Self { symbol: "1/m2", shown: "/m2", factor: 1.0 };
+    /// An integrated octupole field [1/m^3].
+    pub const PER_CUBIC_METRE: Self = Self { symbol: "1/m3", shown: "/m3", factor: 1.0 };
     /// A cubic term [1/mm^2].
     pub const PER_SQUARE_MILLIMETRE: Self = Self { symbol: "1/mm2", shown: "/mm2", factor: 1.0 };
 

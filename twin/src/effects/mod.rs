@@ -106,6 +106,8 @@ kinds! {
     SextupoleError => Field(FieldEffect::Sextupole),
     /// A sextupole in all dipoles, K2L of each [1/m^2], as eddy currents in their vacuum chambers make; a response shows it on a displaced orbit.
     DipoleSextupole => Field(FieldEffect::DipoleSextupole),
+    /// An octupole where the model has none, K3L [1/m^3]; a response shows it on a displaced orbit.
+    StrayOctupole => Field(FieldEffect::StrayOctupole),
     /// The beam is off momentum.
     MomentumOffset => Hold(HoldEffect::Momentum),
     /// The RF frequency is held instead of the momentum, as a fraction.
@@ -400,6 +402,7 @@ mod tests {
             ["corrector_swap@H_E4,H_E6", "corrector_swap@H_E6,H_E4"],
             ["corrector_gain@H_A4", "corrector_gain@H_DCH_A4"],
             ["stray_gradient@F6", "stray_gradient@SLOT_F6"],
+            ["stray_octupole@F6", "stray_octupole@SLOT_F6"],
             ["dipole_gradient@C4", "dipole_gradient@B_C4"],
             ["sextupole_error@A1", "sextupole_error@SX_A1"],
             ["sextupole_error@SX_A2", "sextupole_error@SXH_A2"],
@@ -437,6 +440,7 @@ mod tests {
             let elsewhere = [
                 EffectKind::StrayGradient,
                 EffectKind::StraySkewGradient,
+                EffectKind::StrayOctupole,
                 EffectKind::DipoleGradient,
                 EffectKind::SextupoleError,
             ];
@@ -466,6 +470,7 @@ mod tests {
             ("dipole_edge@B_C4=0.01", 0.001, "dipole B_C4 has edge angles of +10.0 ± 1.0 mrad"),
             ("sextupole_error@SX_A1=1.5", 0.2, "sextupole SX_A1 has a field K2L = +1.50 ± 0.20 /m2"),
             ("dipole_sextupole=0.1", 0.01, "all dipoles have a field K2L = +0.100 ± 0.010 /m2"),
+            ("stray_octupole@SLOT_F6=-150", 20.0, "there is an octupole K3L = -150 ± 20 /m3 at SLOT_F6"),
             ("momentum_offset=-2e-3", 1e-4, "the beam is off momentum by -2.00 ± 0.10 per mille"),
             ("fixed_rf_frequency", 0.02, "the RF frequency was held instead of the momentum, by +100.0 ± 2.0 %"),
             (

@@ -89,10 +89,7 @@ pub enum Kind {
         k1sl: f64,
         /// Integrated sextupole [1/m^2].
         k2l: f64,
-    },
-    /// Thin octupole, `x' -= K3L (x^3 - 3 x y^2)/6`, `y' -= K3L (y^3 - 3 x^2 y)/6`; no machine file has one yet.
-    Octupole {
-        /// Integrated third derivative of the field over the rigidity [1/m^3].
+        /// Integrated octupole [1/m^3], `x' -= K3L (x^3 - 3 x y^2)/6`, `y' -= K3L (y^3 - 3 x^2 y)/6`.
         k3l: f64,
     },
     /// Solenoid of field over rigidity `ks` [1/m].

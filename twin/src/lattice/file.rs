@@ -78,6 +78,7 @@ struct Entry {
     k1l: Option<f64>,
     k1sl: Option<f64>,
     k2l: Option<f64>,
+    k3l: Option<f64>,
     ks: Option<f64>,
     angle: Option<f64>,
     e1: Option<f64>,
@@ -286,6 +287,7 @@ impl Entry {
                 k1l: or_zero("a finite k1l", self.k1l)?,
                 k1sl: or_zero("a finite k1sl", self.k1sl)?,
                 k2l: or_zero("a finite k2l", self.k2l)?,
+                k3l: or_zero("a finite k3l", self.k3l)?,
             },
             "solenoid" => Kind::Solenoid { ks: self.finite("a finite ks", self.ks)? },
             "sbend" => Kind::Bend(Bend {
