@@ -85,6 +85,8 @@ pub struct Data {
     shared: Vec<DMatrix<f64>>,
     /// Relative change of all gradients, from mid-campaign to the end, with which the baselines drift.
     drift: f64,
+    /// True if the readings are linearised about a machine with effects: a fit without one of these then has readings of its own.
+    pub(super) is_about_effects: bool,
 }
 
 /// A recording, frame by frame.
@@ -235,6 +237,7 @@ impl Data {
             mixing: Mixing::default(),
             believed,
             drift: 0.0,
+            is_about_effects: false,
             drives: pools.drives(&drives),
             pools,
             frames: Frames {

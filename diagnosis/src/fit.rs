@@ -6,7 +6,7 @@
 //!
 //! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::evidence`]). The normalisation of
 //! the data is included, since hypotheses with drifting baselines change their covariance. The ordinary imperfections, many and
-//! small, are taken to first order about the start of the fit.
+//! small, are taken to first order about the start of the fit, but for those that change the focusing.
 
 use core::ops::{Mul, Sub};
 
@@ -47,8 +47,8 @@ pub struct Fitted {
     pub free: Factor,
     /// `J^T r - u`, zero for the vars that are held.
     pub slope: DVector<f64>,
-    /// The data whitened for this hypothesis, where it says that the baselines drift.
-    drifting: Option<Box<Data>>,
+    /// The data as this fit has them, where they are its own: whitened for baselines that drift, or linearised about its machine.
+    own: Option<Box<Data>>,
 }
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
@@ -65,12 +65,12 @@ struct Problem<'d> {
     data: &'d Data,
     hypothesis: &'d Hypothesis,
     unknowns: Vec<Unknown>,
-    /// The ordinary imperfections at the start, the last unknowns of the fit.
+    /// The ordinary imperfections of first order at the start, the last unknowns of the fit.
     start: DVector<f64>,
     ordinary: Ordinary,
 }
 
-/// The ordinary imperfections to first order about a machine.
+/// Ordinary imperfections to first order about a machine.
 struct Ordinary {
     /// Derivative `Z` of the whitened predictions with respect to each.
     slopes: DMatrix<f64>,
@@ -102,7 +102,7 @@ impl Fitted {
         if let Some(given) = hypothesis.given.iter().find(|effect| effect.kind.moves_baselines()) {
             let drifting = data.drifting(given.amplitude.abs());
             let fitted = Self::minimise(&drifting, hypothesis, guess, rival)?;
-            return Ok(Self { drifting: Some(Box::new(drifting)), ..fitted });
+            return Ok(Self { own: Some(Box::new(drifting)), ..fitted });
         }
         let fitted = Self::minimise(data, hypothesis, guess, rival)?;
         let Some(term) = hypothesis.terms.iter().position(|term| term.kind.moves_baselines()) else {
@@ -111,7 +111,7 @@ impl Fitted {
         // the drift of the baselines is as large as that of the quadrupoles
         let drifting = data.drifting(fitted.amplitude(data, term).0.abs());
         let fitted = Self::minimise(&drifting, hypothesis, &fitted.u, rival)?;
-        Ok(Self { drifting: Some(Box::new(drifting)), ..fitted })
+        Ok(Self { own: Some(Box::new(drifting)), ..fitted })
     }
 
     /// The hypothesis at the prior's mean, linearised and not fitted.
@@ -127,9 +127,15 @@ impl Fitted {
         Self::at(&problem, Point { u, residual, cost }, factor, slopes)
     }
 
-    /// The data as this fit whitens them.
+    /// The data as this fit has them.
     pub fn data<'d>(&'d self, data: &'d Data) -> &'d Data {
-        self.drifting.as_deref().unwrap_or(data)
+        self.own.as_deref().unwrap_or(data)
+    }
+
+    /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
+    #[must_use]
+    pub(super) fn to(self, data: &Data) -> Self {
+        Self { own: self.own.or_else(|| Some(Box::new(data.clone()))), ..self }
     }
 
     fn minimise(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f64) -> Result<Self, FitError> {
@@ -170,7 +176,7 @@ impl Fitted {
             free,
             slope,
             u,
-            drifting: None,
+            own: None,
         })
     }
 
@@ -359,22 +365,22 @@ impl Fitted {
 }
 
 impl<'d> Problem<'d> {
-    /// About the ordinary imperfections of a start.
+    /// About those of a start.
     fn new(data: &'d Data, hypothesis: &'d Hypothesis, start: &DVector<f64>) -> Result<Self, EffectError> {
         let unknowns = hypothesis.unknowns(data);
-        let others = unknowns.iter().filter(|unknown| !unknown.is_ordinary()).count();
+        let others = unknowns.iter().filter(|unknown| !unknown.is_of_first_order()).count();
         let first = data.units.len() + others;
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
         let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
         Ok(Self { data, hypothesis, start: start.rows_range(first..).into_owned(), unknowns, ordinary })
     }
 
-    /// Number of unknowns that are no ordinary imperfections, the first.
+    /// Number of the other unknowns, the first.
     fn others(&self) -> usize {
         self.data.units.len() + self.unknowns.len() - self.start.len()
     }
 
-    /// The same point with the ordinary imperfections at their start: the machine about which they are of first order.
+    /// The same point with those of first order at their start: the machine about which they are.
     fn held(&self, u: &DVector<f64>) -> DVector<f64> {
         let mut held = u.clone();
         held.rows_range_mut(self.others()..).copy_from(&self.start);
@@ -399,10 +405,15 @@ impl<'d> Problem<'d> {
         let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
             let (machine, drives) = machine_at(data, self.hypothesis, campaign, &held)?;
             let machine = machine.on_orbit(&drives.orbit);
-            let of_vars = Signatures::of(&machine, &drives)?.of_vars().into_iter().zip(&data.units.sigma);
-            own.signatures::<EffectError>(vars, of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma))))
+            let signatures = Signatures::of(&machine, &drives)?;
+            let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
+            let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
+            let of_others = self.unknowns[..self.others() - vars].iter();
+            let of_others = of_others.map(|unknown| of_ordinary(data, campaign, &signatures, unknown));
+            own.signatures::<EffectError>(self.others(), of_vars.chain(of_others))
         })?;
-        for i in vars..self.others() {
+        let is_of_a_term = |i: &usize| !matches!(self.unknowns[i - vars], Unknown::Ordinary(..));
+        for i in (vars..self.others()).filter(is_of_a_term) {
             let at = |step: f64| {
                 let mut u = u.clone();
                 u[i] += step;
@@ -425,13 +436,7 @@ impl Ordinary {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
             let signatures = Signatures::of(&machine, &drives)?;
-            let of = |unknown: &Unknown| match unknown {
-                Unknown::Ordinary(member, width) if member.is_in(campaign) => {
-                    let scale = |kind| data.scale(campaign, kind);
-                    Ok(Some(together(&signatures, member, scale)? * *width))
-                }
-                _ => Ok(None),
-            };
+            let of = |unknown: &Unknown| of_ordinary(data, campaign, &signatures, unknown);
             own.signatures::<EffectError>(unknowns.len(), unknowns.iter().map(of))
         })?;
         let gram = gram(&slopes);
@@ -464,6 +469,21 @@ fn machine_at(
 pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
     let (readings, tunes, tune_changes) = machine.readings(drives)?;
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
+}
+
+/// The signature of an ordinary imperfection in a recording, per width; none of another unknown, or where it does not act.
+fn of_ordinary(
+    data: &Data,
+    campaign: usize,
+    signatures: &Signatures,
+    unknown: &Unknown,
+) -> Result<Option<Signature>, EffectError> {
+    match unknown {
+        Unknown::Ordinary(member, width) if member.is_in(campaign) => {
+            Ok(Some(together(signatures, member, |kind| data.scale(campaign, kind))? * *width))
+        }
+        _ => Ok(None),
+    }
 }
 
 /// The sum of the signatures of effects that share an amplitude, each by the scale of its kind.

@@ -26,6 +26,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
+use super::linearise::about_itself;
 use super::scan::SignatureScore;
 use super::settings::Settings;
 
@@ -293,7 +294,7 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
 /// # Errors
 /// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    from_near_or_far(data, fitted, Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() })
+    lessened(data, fitted, Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() })
 }
 
 /// The same fit without one of its terms.
@@ -301,7 +302,13 @@ pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
 /// # Errors
 /// [`FitError`].
 pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    from_near_or_far(data, fitted, fitted.hypothesis.without(term))
+    lessened(data, fitted, fitted.hypothesis.without(term))
+}
+
+/// The fit of a hypothesis with fewer effects.
+fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
+    let less = from_near_or_far(data, fitted, other)?;
+    Ok(if data.is_about_effects { about_itself(data, less) } else { less })
 }
 
 /// The fit of another hypothesis: vars that are stable with an effect may be unstable without it, and so may ordinary imperfections that grow

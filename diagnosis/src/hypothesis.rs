@@ -3,7 +3,7 @@
 use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
-use super::ordinary::Family;
+use super::ordinary::{Family, is_absorbed};
 
 /// One effect that a hypothesis holds, its amplitude unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -64,9 +64,10 @@ pub enum Identity<'u> {
 }
 
 impl Unknown {
-    /// True for an ordinary imperfection.
-    pub fn is_ordinary(&self) -> bool {
-        matches!(self, Self::Ordinary(..))
+    /// True for an ordinary imperfection that is small in every respect: of others the vars absorb most, which only works out where both are
+    /// taken about the same machine.
+    pub fn is_of_first_order(&self) -> bool {
+        matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
     }
 
     /// Its prior standard deviation.

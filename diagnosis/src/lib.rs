@@ -33,6 +33,7 @@ mod jitter;
 pub mod joint;
 mod laplace;
 pub mod limits;
+mod linearise;
 pub mod location;
 mod memory;
 mod modes;

@@ -59,7 +59,14 @@ const SETTLED: f64 = 0.01;
 /// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles; a common
 /// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
 /// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
+///
+/// Those that change the optics come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
 const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
+    ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
+    ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
+    ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
+    ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
+    ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
     ("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
     ("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
     ("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
@@ -70,12 +77,19 @@ const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
     ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
     ("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
     ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, 0.001),
-    ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
-    ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
-    ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
-    ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
-    ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
 ];
+
+/// True for a kind of imperfection that vars absorb: a change of focusing.
+pub fn is_absorbed(kind: EffectKind) -> bool {
+    matches!(
+        kind,
+        EffectKind::DipoleGradient
+            | EffectKind::DipoleEdge
+            | EffectKind::DipoleSextupole
+            | EffectKind::MomentumOffset
+            | EffectKind::StrayGradient
+    )
+}
 
 impl Family {
     /// All of them, as wide as their tolerances.

@@ -22,6 +22,7 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::half_normal::HalfNormal;
 use super::hypothesis::{Hypothesis, Term, Unknown};
+use super::linearise::{self, CURVED, about_itself};
 use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
 use super::scan::{Candidate, scan};
@@ -52,9 +53,8 @@ const WALKS: usize = 12;
 const WANDERERS: usize = 4;
 /// `ln` odds of 95 %, by which another change of one monitor has to be more likely than its walk, which is no physics.
 const DOUBT: f64 = 2.94;
-/// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
+/// Most steps of the widths of what is ordinary, or of a poor first fit.
 const PASSES: usize = 4;
-const CURVED: f64 = 4.0;
 
 /// The result of the search.
 #[derive(Debug, Clone)]
@@ -169,8 +169,8 @@ impl Search {
         let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
-        let fitted = fit_linearised(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
-        let null = fitted.map_or_else(|| fit_linearised(&mut data, &Hypothesis::default(), &start), Ok)?;
+        let fitted = linearise::fit(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
+        let null = fitted.map_or_else(|| linearise::fit(&mut data, &Hypothesis::default(), &start), Ok)?;
         let null = settled(&data, null);
         let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
@@ -181,11 +181,11 @@ impl Search {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
         let (mut best, mut competitions) = self.settle(&data, leader, &found.next)?;
-        // the effects change the orbits' higher orders, so that the readings are linearised about the new machine; the fit without
-        // effects is then linearised about a wrong machine, an error small against an effect of this size
+        // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
-            best = fit_linearised(&mut data, &best.hypothesis, &best.u)?;
-            null = without_effects_again(&data, &null)?;
+            best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
+            null = null.to(&found.data);
+            data.is_about_effects = true;
             competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
         } else {
             data = found.data.clone();
@@ -243,6 +243,9 @@ impl Search {
                     && round < ROUNDS
                     && self.held.get() < COMPETITIONS
                 {
+                    // which was fitted to readings that are linearised about the machine without it
+                    let other =
+                        if data.is_about_effects { Fitted::of(data, &other.hypothesis, &other.u)? } else { other };
                     (best, changed) = (other, true);
                 }
                 competitions.push(competition);
@@ -256,9 +259,12 @@ impl Search {
 
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
-        let rest = relearnt(data, super::heldout::reduced(data, fitted, term)?);
+        let reduced = super::heldout::reduced(data, fitted, term)?;
+        let about = reduced.data(data).clone();
+        let rest = relearnt(&about, reduced);
+        let rest = if data.is_about_effects { rest.to(&about) } else { rest };
         let present = Alternative::exact(data, &rest, fitted.clone(), term);
-        self.competition(data, &rest, Some(present))
+        self.competition(rest.data(data), &rest, Some(present))
     }
 
     /// The competition for one more effect beside those of a fit.
@@ -286,7 +292,8 @@ impl Search {
                 true => refit(data, fitted, candidate, least),
                 false => Alternative::of(candidate),
             };
-            let better = known.filter(|known| known.log_gain > alternative.log_gain).cloned();
+            // it has been fitted to readings that are linearised about it
+            let better = known.filter(|known| data.is_about_effects || known.log_gain > alternative.log_gain).cloned();
             let alternative = better.unwrap_or(alternative);
             // the costs of drifting baselines are of other numbers
             if let Some(fitted) = alternative.fitted.as_ref().filter(|_| !candidate.term.kind.moves_baselines()) {
@@ -350,12 +357,6 @@ fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
     }
     let best = fits.into_iter().filter(|fitted| fitted.is_stable(data)).min_by(|a, b| a.cost.total_cmp(&b.cost));
     Ok(best.filter(|best| best.cost < first.cost).unwrap_or(first))
-}
-
-/// The fit without effects anew, the data being linearised about another machine: what is ordinary may then leave no beam, and is left out.
-fn without_effects_again(data: &Data, null: &Fitted) -> Result<Fitted, FitError> {
-    let again = Fitted::of(data, &null.hypothesis, &null.u).ok().filter(|fitted| fitted.is_stable(data));
-    again.map_or_else(|| Fitted::of(data, &Hypothesis::default(), &DVector::zeros(null.params.len())), Ok)
 }
 
 /// A fit whose ordinary widths no longer grow in evidence: what is left to gain would be given to the first effect that is tried.
@@ -428,24 +429,6 @@ fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
     Ok((of_walk > (of_leader - doubt).max(0.0)).then(|| wander.with(data, walk)))
 }
 
-/// Fit, and linearise the readings about the fitted machine, until they no longer change.
-fn fit_linearised(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
-    let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    if !fitted.is_gross() && data.trim_each(&fitted.residual) {
-        fitted = Fitted::of(data, hypothesis, &fitted.u)?;
-    }
-    for _ in 0..PASSES {
-        // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = data.linearise_each(&fitted.machines(data)?) else { break };
-        let Ok(again) = Fitted::of(data, hypothesis, &fitted.u) else { break };
-        fitted = again;
-        if moved < CURVED {
-            break;
-        }
-    }
-    Ok(fitted)
-}
-
 /// The exact fit with a candidate, abandoned where its cost stays far above the least of its rivals.
 fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alternative {
     let hypothesis = fitted.hypothesis.with(candidate.term);
@@ -470,7 +453,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
 }
 
 /// Refit the best of some weighted candidates, and those that stand out of their family, with the ordinary widths that the recording shows
-/// beside each.
+/// beside each; what changes the ring, and is more likely than nothing, to readings that are linearised about it.
 fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], outstanding: &[Term]) {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
     let is_near = |(one, weight): &&mut (Alternative, f64)| {
@@ -482,7 +465,12 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
         let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {
             continue;
         };
-        let again = Alternative::exact(data, without, relearnt(data, fitted), term);
+        let mut again = relearnt(data, fitted);
+        let kind = again.hypothesis.terms[term].kind;
+        if best > 0.0 && !kind.is_of_a_monitor() && !kind.is_of_a_corrector() {
+            again = about_itself(data, again);
+        }
+        let again = Alternative::exact(data, without, again, term);
         *weight += again.log_gain - alternative.log_gain;
         *alternative = again;
     }
