@@ -20,22 +20,20 @@ use core::ops::Range;
 use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, DVectorView, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
-    Cycle, Drives, EffectError, Hold, Holding, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
-    Tracked,
+    Drives, EffectError, Hold, Holding, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
 };
 
 use super::baseline::Baseline;
 use super::channel::Channel;
 use super::error::FitError;
 use super::evidence::Units;
+use super::exact::Exact;
 use super::frame_to_frame::Shape;
 use super::joint::following;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
-use super::settings::Settings;
-use super::tune_shift;
 use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
@@ -122,6 +120,14 @@ impl Displaced {
         let orbit = displaced.orbit()?;
         Ok(Self { machine, displaced, orbit })
     }
+
+    /// What the exact orbits have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first order in kicks and RF
+    /// offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
+    fn higher_orders(&self, exact: &Exact) -> Result<DMatrix<f64>, EffectError> {
+        let means = Drives { orbit: self.orbit.clone(), ..exact.means.clone() };
+        let higher = &exact.readings - self.machine.readings(&means)?.0;
+        Ok(higher.select_rows(&exact.settings.of_frame))
+    }
 }
 
 /// Why a recording cannot be diagnosed.
@@ -206,7 +212,7 @@ impl Data {
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
         let design = Machine::new(at_supplies, believed, &[])?;
         let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
-        let shift = tune_shift::by_kicks(&design.without_memory(), &drives)?;
+        let shift = Exact::of(&design.without_memory(), &drives)?.tune_shift();
         let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
             if of_momentum(i, plane) { campaign.tunes[(i, plane)] - shift[(i, plane)] } else { f64::NAN }
         });
@@ -266,14 +272,15 @@ impl Data {
         let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
         let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&self.drives)?.0);
         let displaced = Displaced::of(machine, &self.baseline)?;
-        let off_first_order = within + self.higher_orders(&displaced)?;
+        let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
+        let off_first_order = within + displaced.higher_orders(&exact)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
         let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);
         let mut of_monitors = readings.columns_mut(0, monitors);
         of_monitors -= off_first_order;
         let mut of_tunes = readings.columns_mut(monitors, 2);
-        of_tunes -= self.tune_shift_beside(&displaced)?;
+        of_tunes -= self.tune_shift_beside(&displaced, &exact)?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();
@@ -284,7 +291,8 @@ impl Data {
     /// the chromaticity; and beyond first order where it has strong sextupole fields. Rows frames.
     fn tune_shift_beside(
         &self,
-        Displaced { machine, displaced, orbit }: &Displaced,
+        Displaced { machine, orbit, .. }: &Displaced,
+        exact: &Exact,
     ) -> Result<MatrixXx2<f64>, EffectError> {
         // a drift is no effect of the kicks
         let time = DVector::zeros(self.frames.drives.time.len());
@@ -293,7 +301,7 @@ impl Data {
         if machine.holding().is_like(&self.believed) && first_order.amax() < FIRST_ORDER {
             return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
         }
-        Ok(tune_shift::by_kicks(displaced, &frames)? - first_order - &self.frames.tune_shift)
+        Ok(exact.tune_shift() - first_order - &self.frames.tune_shift)
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
@@ -312,25 +320,6 @@ impl Data {
             self.prepare();
         }
         !dropped.is_empty()
-    }
-
-    /// What the exact orbits of a machine have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first
-    /// order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
-    fn higher_orders(&self, Displaced { machine, displaced, orbit }: &Displaced) -> Result<DMatrix<f64>, EffectError> {
-        let settings = Settings::of(&self.frames.drives);
-        let drives = Drives { orbit: orbit.clone(), ..settings.means(&self.frames.drives) };
-        let tracked = Tracked::of(displaced.clone(), self.drives.nominal_kick)?;
-        let cycle = |kick: Vec<f64>, rf_offset: f64| {
-            let strength = vec![0.0; self.ring.quadrupoles.len()];
-            tracked.readings(&Cycle { kick, strength, rf_offset, time: 0.0 })
-        };
-        let plain = cycle(vec![0.0; drives.kick.ncols()], 0.0)?;
-        let mut higher = -machine.readings(&drives)?.0;
-        for (i, mut row) in higher.row_iter_mut().enumerate() {
-            let exact = cycle(drives.kick.row(i).iter().copied().collect(), drives.rf_offset[i])?;
-            row.iter_mut().zip(exact.iter().zip(&plain)).for_each(|(to, (exact, plain))| *to += exact - plain);
-        }
-        Ok(higher.select_rows(&settings.of_frame))
     }
 
     /// The same recording with a known signal taken out of its readings and tunes, rows frames.

@@ -3,8 +3,9 @@
 //! About a point, `cost(x + s) = cost(x) - 2 g s + s A s`; the step is the minimum of that within the bounds, halved as long as it
 //! leads uphill or to a point that has no cost (an unstable ring). A trial may fail; the best point so far never does.
 //!
-//! Source: J. Nocedal and S. Wright, Numerical Optimization (2006), ch. 10.3; projected Gauss-Seidel sweeps, R. Cottle, J.-S. Pang and
-//! R. Stone, The Linear Complementarity Problem (1992), ch. 5.
+//! Source: J. Nocedal and S. Wright, Numerical Optimization (2006), ch. 10.3; a bounded step by the sets that are held, M. Hintermuller, K. Ito and
+//! K. Kunisch, SIAM J. Optim. 13 (2003) 865, and by projected Gauss-Seidel sweeps, R. Cottle, J.-S. Pang and R. Stone, The Linear
+//! Complementarity Problem (1992), ch. 5.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -99,6 +100,8 @@ pub enum OptimiseError<E> {
 
 /// Relative growth of a cost that counts as rounding.
 const ROUNDING: f64 = 1e-9;
+/// Sets that are tried for a bounded step: the next is mostly the last.
+const SETS: usize = 20;
 /// Sweeps of a bounded step at most, and the move in standard deviations at which they have settled.
 const SWEEPS: usize = 1000;
 const SWEPT: f64 = 1e-6;
@@ -164,8 +167,7 @@ fn descend<O: Objective>(
 }
 
 impl Quadratic {
-    /// The best step within the bounds: the full one if it stays there, else by projected Gauss-Seidel sweeps; none if the matrix is not
-    /// positive.
+    /// The best step within the bounds; none if the matrix is not positive.
     pub fn step(&self, x: &DVector<f64>, bounds: &[[f64; 2]]) -> Option<DVector<f64>> {
         self.factor().map(|factor| self.within(&factor.solve(&self.slope), x, bounds))
     }
@@ -175,22 +177,28 @@ impl Quadratic {
         Factor::of(self.matrix.clone())
     }
 
-    /// The best step within the bounds, given that without.
+    /// The best step within the bounds, given that without: by the set of those that are held at a bound, or where the sets come round again by sweeps.
     pub fn within(&self, full: &DVector<f64>, x: &DVector<f64>, bounds: &[[f64; 2]]) -> DVector<f64> {
-        let clamp = |i: usize, step: f64| {
-            let at = x[i] + step;
-            let [lower, upper] = bounds[i];
-            if at < lower {
-                lower - x[i]
-            } else if at > upper {
-                upper - x[i]
-            } else {
-                step
-            }
-        };
+        let range = |i: usize| bounds[i].map(|bound| bound - x[i]);
+        let clamp = |i: usize, step: f64| step.clamp(range(i)[0], range(i)[1]);
         let mut step = full.map_with_location(|i, _, step| clamp(i, step));
         if step == *full {
             return step;
+        }
+        let mut held: Vec<usize> = (0..step.len()).filter(|&i| step[i] != full[i]).collect();
+        for _ in 0..SETS {
+            let Some(best) = self.holding(&held, &step) else { break };
+            let pull = &self.slope - &self.matrix * &best;
+            // what is held stays as long as it is pulled against its bound
+            let stays = |i: usize| if best[i] <= range(i)[0] { pull[i] < 0.0 } else { pull[i] > 0.0 };
+            let is_held =
+                |i: usize| if held.binary_search(&i).is_ok() { stays(i) } else { clamp(i, best[i]) != best[i] };
+            let next: Vec<usize> = (0..best.len()).filter(|&i| is_held(i)).collect();
+            step = best.map_with_location(|i, _, step| clamp(i, step));
+            if next == held {
+                return step;
+            }
+            held = next;
         }
         for _ in 0..SWEEPS {
             let mut moved = 0.0_f64;
@@ -206,6 +214,17 @@ impl Quadratic {
             }
         }
         step
+    }
+
+    /// The best step with some of its parts as they are.
+    fn holding(&self, held: &[usize], step: &DVector<f64>) -> Option<DVector<f64>> {
+        let free: Vec<usize> = (0..step.len()).filter(|i| held.binary_search(i).is_err()).collect();
+        let mut best = DVector::zeros(step.len());
+        held.iter().for_each(|&i| best[i] = step[i]);
+        let pull = (&self.slope - &self.matrix * &best).select_rows(&free);
+        let factor = Factor::of(self.matrix.select_rows(&free).select_columns(&free))?;
+        free.iter().zip(&factor.solve(&pull)).for_each(|(&i, own)| best[i] = *own);
+        Some(best)
     }
 }
 
@@ -260,5 +279,31 @@ mod tests {
         let found = from([-0.5, -1.0], [FREE, [-1.0, 0.0]]).unwrap();
         let (x, y) = (found.x[0], found.x[1]);
         assert!(y == 0.0 && (200.0 * x.powi(3) - (1.0 - x)).abs() < 1e-6, "{x} {y}");
+    }
+
+    /// At the best step nothing that is free is pulled, and what is held is pulled against its bound.
+    #[test]
+    fn a_bounded_step_is_the_best_of_its_quadratic() {
+        let wave = |i: usize, j: usize| (1.0 + (3 * i + 7 * j) as f64).sin();
+        for n in [2, 7, 48, 130] {
+            let root = DMatrix::from_fn(n, n, wave);
+            let matrix = &root * root.transpose() / n as f64 + DMatrix::identity(n, n) * 0.05;
+            let quadratic = Quadratic { matrix, slope: DVector::from_fn(n, |i, _| 3.0 * wave(i, i + 1)) };
+            let (x, bounds) = (DVector::from_fn(n, |i, _| 0.5 * wave(i, 2)), vec![[-1.0, 1.0]; n]);
+            let step = quadratic.step(&x, &bounds).unwrap();
+            let pull = &quadratic.slope - &quadratic.matrix * &step;
+            for i in 0..n {
+                // x and step add up to a bound but for rounding
+                let (lower, upper) = (step[i] <= -1.0 - x[i], step[i] >= 1.0 - x[i]);
+                let is_right = if lower {
+                    pull[i] < 0.0
+                } else if upper {
+                    pull[i] > 0.0
+                } else {
+                    pull[i].abs() < 1e-9
+                };
+                assert!((x[i] + step[i]).abs() < 1.0 + 1e-12 && is_right, "{i} of {n} is pulled by {}", pull[i]);
+            }
+        }
     }
 }
