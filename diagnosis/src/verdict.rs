@@ -364,8 +364,16 @@ pub fn sentence(
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
+    // what is not as the recording or the machine file says is no physics that is missing, and yet found
+    let mut facts = contradicted(data, contradictions);
+    facts.extend(beyond.iter().map(Beyond::to_string));
     let text = match verdict {
-        Verdict::Consistent => format!("nothing was found at the noise level; {}", power(found)),
+        Verdict::Consistent => {
+            let found_besides =
+                if facts.is_empty() { String::new() } else { format!("{}; besides, ", facts.join("; ")) };
+            facts.clear();
+            format!("{found_besides}nothing was found at the noise level; {}", power(found))
+        }
         Verdict::Identified => {
             let gain: Vec<String> = findings
                 .iter()
@@ -384,18 +392,22 @@ pub fn sentence(
             format!("{named}{last}")
         }
     };
-    let remarks = remarks(data, found, contradictions, beyond);
-    capitalised(&core::iter::once(text).chain(remarks).collect::<Vec<_>>().join("; "))
+    capitalised(&core::iter::once(text).chain(facts).chain(remarks(data, found)).collect::<Vec<_>>().join("; "))
 }
 
-/// What is said besides: of read-backs, vars out of range, ordinary imperfections, noise, frames and monitors.
-fn remarks(data: &Data, found: &Found, contradictions: &[Contradiction], beyond: &[Beyond]) -> Vec<String> {
-    let within = |recording: &str, said: String| match data.is_joint() {
-        true => format!("in {recording} {said}"),
-        false => said,
-    };
-    let mut remarks: Vec<String> = contradictions.iter().map(|one| within(&one.recording, one.to_string())).collect();
-    remarks.extend(beyond.iter().map(Beyond::to_string));
+/// What is said of one of several recordings.
+fn within(data: &Data, recording: &str, said: String) -> String {
+    if data.is_joint() { format!("in {recording} {said}") } else { said }
+}
+
+/// Read-backs that are not the settings.
+fn contradicted(data: &Data, contradictions: &[Contradiction]) -> Vec<String> {
+    contradictions.iter().map(|one| within(data, &one.recording, one.to_string())).collect()
+}
+
+/// What is said besides: of ordinary imperfections, noise, frames and monitors.
+fn remarks(data: &Data, found: &Found) -> Vec<String> {
+    let mut remarks = Vec::new();
     let large: Vec<String> =
         ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
     if !large.is_empty() {
@@ -403,9 +415,9 @@ fn remarks(data: &Data, found: &Found, contradictions: &[Contradiction], beyond:
     }
     remarks.extend(data.noise.remark());
     for own in data.campaigns() {
-        remarks.extend(wandering(own).into_iter().map(|said| within(&own.name, said)));
+        remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
     }
-    remarks.extend(Aside::all(data).iter().map(|one| within(&one.recording, one.to_string())));
+    remarks.extend(Aside::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)

@@ -296,11 +296,11 @@ mod tests {
                 // x and step add up to a bound but for rounding
                 let (lower, upper) = (step[i] <= -1.0 - x[i], step[i] >= 1.0 - x[i]);
                 let is_right = if lower {
-                    pull[i] < 0.0
+                    pull[i] < SWEPT
                 } else if upper {
-                    pull[i] > 0.0
+                    pull[i] > -SWEPT
                 } else {
-                    pull[i].abs() < 1e-9
+                    pull[i].abs() < SWEPT
                 };
                 assert!((x[i] + step[i]).abs() < 1.0 + 1e-12 && is_right, "{i} of {n} is pulled by {}", pull[i]);
             }
