@@ -132,6 +132,11 @@ impl Fitted {
         self.own.as_deref().unwrap_or(data)
     }
 
+    /// True if it has data of its own.
+    pub(super) fn has_own(&self) -> bool {
+        self.own.is_some()
+    }
+
     /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
     #[must_use]
     pub(super) fn to(self, data: &Data) -> Self {
@@ -308,7 +313,9 @@ impl Fitted {
         let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Ordinary(member, width) => together(&signatures, member, |_| 1.0)? * *width,
+                Unknown::Ordinary(..) => {
+                    of_ordinary(data, 0, &signatures, unknown)?.unwrap_or_else(|| slopes[0].clone() * 0.0)
+                }
                 _ => {
                     let at = |step: f64| {
                         let mut u = self.u.clone();
@@ -365,10 +372,11 @@ impl Fitted {
 }
 
 impl<'d> Problem<'d> {
-    /// About those of a start.
+    /// With the imperfections of first order linearised about a start.
     fn new(data: &'d Data, hypothesis: &'d Hypothesis, start: &DVector<f64>) -> Result<Self, EffectError> {
         let unknowns = hypothesis.unknowns(data);
         let others = unknowns.iter().filter(|unknown| !unknown.is_of_first_order()).count();
+        debug_assert!(unknowns[others..].iter().all(Unknown::is_of_first_order), "they are the last");
         let first = data.units.len() + others;
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
         let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
@@ -515,7 +523,7 @@ impl Objective for Problem<'_> {
         Ok((residual.norm_squared() + u.norm_squared(), residual))
     }
 
-    /// With `A` the derivatives of the others and `Z` those of the ordinary imperfections: `1 + (A Z)^T (A Z)` and `(A Z)^T r - u`.
+    /// With `A` the derivatives of the others and `Z` those of the imperfections of first order: `1 + (A Z)^T (A Z)` and `(A Z)^T r - u`.
     fn linearise(&self, u: &DVector<f64>, residual: &DVector<f64>) -> Result<(Quadratic, DMatrix<f64>), EffectError> {
         let (slopes, k) = (self.jacobian(u)?, self.others());
         let back = slopes.transpose();

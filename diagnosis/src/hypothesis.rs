@@ -64,8 +64,8 @@ pub enum Identity<'u> {
 }
 
 impl Unknown {
-    /// True for an ordinary imperfection that is small in every respect: of others the vars absorb most, which only works out where both are
-    /// taken about the same machine.
+    /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
+    /// evaluated for the same machine.
     pub fn is_of_first_order(&self) -> bool {
         matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
     }

@@ -2,7 +2,7 @@
 //!
 //! A fit knows orbits to first order in the kicks; what exact orbits have besides is taken off the readings, for the machine of some fit. Where an
 //! effect changes that machine much, the fit without the effect needs readings of its own: on those of the other machine it would be worse than it
-//! is, by up to 15 nat for a momentum of 5 per mille that is not there, and the effect seem to be needed.
+//! is, by 16 nat for a momentum of 5 per mille that was not there, and the effect seems to be needed.
 
 use nalgebra::DVector;
 

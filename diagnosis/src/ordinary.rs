@@ -60,7 +60,7 @@ const SETTLED: f64 = 0.01;
 /// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
 /// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
 ///
-/// Those that change the optics come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
+/// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
 const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
     ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
     ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
@@ -361,8 +361,8 @@ mod tests {
         assert_eq!(of("edge angle of all dipoles")[0].terms.len(), 1);
     }
 
-    /// The exact machine of the first fit, which starts at none, is 4.1 standard deviations of all readings together (root of the sum of
-    /// squares) from its first order; that of the next, which starts at the first, less than 1.
+    /// The exact machine of the first fit, which starts at none, is 0.7 standard deviations of all readings together (root of the sum of
+    /// squares) from its first order; that of the next, which starts at the first, 0.005.
     #[test]
     fn ordinary_imperfections_are_of_first_order() {
         let (ring, recording) = template();
@@ -373,6 +373,6 @@ mod tests {
         let off = |fitted: &Fitted| (fitted.residual_of(&data).unwrap() - &fitted.residual).norm();
         let (first, second) = (off(&first), off(&second));
         println!("{first} {second}");
-        assert!(first < 5.0 && second < 1.0, "{first} {second}");
+        assert!(first < 1.0 && second < 0.02, "{first} {second}");
     }
 }

@@ -164,6 +164,7 @@ impl Search {
     /// The fit of the vars and of what is ordinary. What makes a fit poor is not: ordinary imperfections, small by their nature, are then left out
     /// until the effects are in the model that explain it.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
+        data.is_about_effects = false;
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
         let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
@@ -184,8 +185,8 @@ impl Search {
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
-            null = null.to(&found.data);
             data.is_about_effects = true;
+            null = null_beside(&data, null, &found.data);
             competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
         } else {
             data = found.data.clone();
@@ -238,14 +239,13 @@ impl Search {
                 let known = won.filter(|_| round == 0 && i == last && !changed);
                 let competition = known.map_or_else(|| self.without(data, &best, i), |won| Ok(won.clone()))?;
                 // the leader may be the same effects, better fitted from another start
-                if let Some(other) = competition.leader()
-                    && self.log_posterior(&other) > self.log_posterior(&best) + BETTER
-                    && round < ROUNDS
+                if round < ROUNDS
                     && self.held.get() < COMPETITIONS
+                    && let Some(other) = competition.leader()
+                    && self.is_better(&other, &best)
+                    && let Some(other) = fitted_to(data, other)
+                    && self.is_better(&other, &best)
                 {
-                    // which was fitted to readings that are linearised about the machine without it
-                    let other =
-                        if data.is_about_effects { Fitted::of(data, &other.hypothesis, &other.u)? } else { other };
                     (best, changed) = (other, true);
                 }
                 competitions.push(competition);
@@ -257,13 +257,20 @@ impl Search {
         Ok((best, competitions))
     }
 
+    /// True for the more likely of two fits with as many effects.
+    fn is_better(&self, one: &Fitted, other: &Fitted) -> bool {
+        self.log_posterior(one) > self.log_posterior(other) + BETTER
+    }
+
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
         let reduced = super::heldout::reduced(data, fitted, term)?;
         let about = reduced.data(data).clone();
-        let rest = relearnt(&about, reduced);
-        let rest = if data.is_about_effects { rest.to(&about) } else { rest };
-        let present = Alternative::exact(data, &rest, fitted.clone(), term);
+        let (mut rest, mut present) = (relearnt(&about, reduced), fitted.clone());
+        if data.is_about_effects {
+            (rest, present) = (rest.to(&about), present.to(data));
+        }
+        let present = Alternative::exact(data, &rest, present, term);
         self.competition(rest.data(data), &rest, Some(present))
     }
 
@@ -337,7 +344,7 @@ impl Search {
 }
 
 /// The first fit of a hypothesis with all that is ordinary. Where it is poor the ordinary imperfections may be so large that about none of them
-/// they are not of first order, such as a gradient in all dipoles that moves the tunes: it is then begun anew where it ended, or where the
+/// they are not of first order, or lead to another minimum: it is then begun anew where it ended, or where the
 /// vars alone come to rest, which absorb most of that.
 fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
     let start = DVector::zeros(data.units.len());
@@ -357,6 +364,24 @@ fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
     }
     let best = fits.into_iter().filter(|fitted| fitted.is_stable(data)).min_by(|a, b| a.cost.total_cmp(&b.cost));
     Ok(best.filter(|best| best.cost < first.cost).unwrap_or(first))
+}
+
+/// The fit without effects beside readings that are linearised about a machine with some: to readings of its own. Where further ones were dropped from
+/// those, it is fitted to as many.
+fn null_beside(data: &Data, null: Fitted, before: &Data) -> Fitted {
+    if data.whole_size() == null.data(before).whole_size() {
+        return null.to(before);
+    }
+    let again = Fitted::of(data, &null.hypothesis, &null.u).ok().filter(|fitted| fitted.is_stable(data));
+    again.map_or_else(|| null.to(before), |again| about_itself(data, again))
+}
+
+/// A fit to the readings at hand, where they are linearised about a machine with effects that it may not have.
+fn fitted_to(data: &Data, fitted: Fitted) -> Option<Fitted> {
+    if !data.is_about_effects {
+        return Some(fitted);
+    }
+    Fitted::of(data, &fitted.hypothesis, &fitted.u).ok().map(|fitted| about_itself(data, fitted))
 }
 
 /// A fit whose ordinary widths no longer grow in evidence: what is left to gain would be given to the first effect that is tried.
@@ -418,7 +443,8 @@ fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
     let Some(Alternative { cause: Cause::Unmodelled(leading), probability, .. }) = leader else { return Ok(None) };
     let Some(wander) = Wander::of(data, leading) else { return Ok(None) };
     let log_likelihood = |value: f64| {
-        let fitted = Fitted::of(&wander.with(data, Measured { value, sigma: 0.0 }), &best.hypothesis, &best.u);
+        let wandering = wander.with(best.data(data), Measured { value, sigma: 0.0 });
+        let fitted = Fitted::of(&wandering, &best.hypothesis, &best.u);
         fitted.map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
     };
     let posterior = HalfNormal::of(log_likelihood, data.campaign(leading.campaign).noise.ordinary_walk, WALKS);
@@ -453,7 +479,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
 }
 
 /// Refit the best of some weighted candidates, and those that stand out of their family, with the ordinary widths that the recording shows
-/// beside each; what changes the ring, and is more likely than nothing, to readings that are linearised about it.
+/// beside each; what changes the ring, where the best is more likely than nothing, to readings that are linearised about it.
 fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], outstanding: &[Term]) {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
     let is_near = |(one, weight): &&mut (Alternative, f64)| {
@@ -465,11 +491,13 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
         let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {
             continue;
         };
-        let mut again = relearnt(data, fitted);
+        let (about, has_own) = (fitted.data(data).clone(), fitted.has_own());
+        let mut again = relearnt(&about, fitted);
         let kind = again.hypothesis.terms[term].kind;
         if best > 0.0 && !kind.is_of_a_monitor() && !kind.is_of_a_corrector() {
-            again = about_itself(data, again);
+            again = about_itself(&about, again);
         }
+        let again = if has_own { again.to(&about) } else { again };
         let again = Alternative::exact(data, without, again, term);
         *weight += again.log_gain - alternative.log_gain;
         *alternative = again;

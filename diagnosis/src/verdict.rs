@@ -364,7 +364,7 @@ pub fn sentence(
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
-    // what is not as the recording or the machine file says is no physics that is missing, and yet found
+    // contradicted read-backs and vars out of range are no missing physics, and a consistent recording's sentence begins with them
     let mut facts = contradicted(data, contradictions);
     facts.extend(beyond.iter().map(Beyond::to_string));
     let text = match verdict {

@@ -100,7 +100,7 @@ pub enum OptimiseError<E> {
 
 /// Relative growth of a cost that counts as rounding.
 const ROUNDING: f64 = 1e-9;
-/// Sets that are tried for a bounded step: the next is mostly the last.
+/// Sets that are tried for a bounded step; mostly one or two are needed.
 const SETS: usize = 20;
 /// Sweeps of a bounded step at most, and the move in standard deviations at which they have settled.
 const SWEEPS: usize = 1000;
@@ -177,7 +177,7 @@ impl Quadratic {
         Factor::of(self.matrix.clone())
     }
 
-    /// The best step within the bounds, given that without: by the set of those that are held at a bound, or where the sets come round again by sweeps.
+    /// The best step within the bounds, given that without: by the set of those that are held at a bound, or by sweeps where no set settles in as many trials.
     pub fn within(&self, full: &DVector<f64>, x: &DVector<f64>, bounds: &[[f64; 2]]) -> DVector<f64> {
         let range = |i: usize| bounds[i].map(|bound| bound - x[i]);
         let clamp = |i: usize, step: f64| step.clamp(range(i)[0], range(i)[1]);
@@ -190,7 +190,10 @@ impl Quadratic {
             let Some(best) = self.holding(&held, &step) else { break };
             let pull = &self.slope - &self.matrix * &best;
             // what is held stays as long as it is pulled against its bound
-            let stays = |i: usize| if best[i] <= range(i)[0] { pull[i] < 0.0 } else { pull[i] > 0.0 };
+            let stays = |i: usize| {
+                let [lower, upper] = range(i);
+                lower == upper || if best[i] <= lower { pull[i] < 0.0 } else { pull[i] > 0.0 }
+            };
             let is_held =
                 |i: usize| if held.binary_search(&i).is_ok() { stays(i) } else { clamp(i, best[i]) != best[i] };
             let next: Vec<usize> = (0..best.len()).filter(|&i| is_held(i)).collect();

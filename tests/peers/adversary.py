@@ -476,7 +476,7 @@ def apply(state, e):
 # ------------------------------------------------------------------------------------------- effects of nobody's table
 
 INVENTED = {
-    "octupole": "thin octupole in a free straight, K3L [1/m3]",
+    "stray_octupole": "thin octupole in a free straight, K3L [1/m3]",
     "skew_sextupole": "thin skew sextupole in a free straight, K2sL [1/m2]",
     "sextupole_family": "all sextupoles of one plane are on (at: SH or SV), K2L [1/m2]",
     "quad_sextupole": "sextupole component in one quadrupole, K2L [1/m2]",
@@ -508,7 +508,7 @@ def invented(state, e):
     kind, at_, a = e["kind"], e.get("at"), e.get("amplitude")
     ring, n = state.ring, state.plan.frames
     frame = np.arange(n)
-    if kind == "octupole":
+    if kind == "stray_octupole":
         ring.slot_normal[slot(at_), 3] += a
     elif kind == "skew_sextupole":
         ring.slot_skew[slot(at_), 2] += a
@@ -960,7 +960,7 @@ def table_effect(kind, places, low=0.5, high=2.5):
 
 
 INVENTED_SIZES = {                            # weak, strong
-    "octupole": (150.0, 1500.0), "skew_sextupole": (0.7, 4.0), "sextupole_family": (0.05, 0.2), "quad_sextupole": (1.0, 5.0),
+    "stray_octupole": (150.0, 1500.0), "skew_sextupole": (0.7, 4.0), "sextupole_family": (0.05, 0.2), "quad_sextupole": (1.0, 5.0),
     "solenoid": (0.006, 0.03), "cavity_focusing": (0.004, 0.02), "stale_monitor": (0.05, 0.5), "monitor_crosstalk": (0.05, 0.25),
     "kick_switch": (6e-6, 4e-5), "pulsed_leak": (4e-6, 2e-5), "corrector_lag": (0.1, 0.4), "corrector_crosstalk": (0.03, 0.15),
     "corrector_swap": (None, None), "crate_drift": (0.06, 0.3), "family_ripple": (5e-4, 2e-3), "intensity_gain": (0.05, 0.3),
@@ -972,7 +972,7 @@ def invented_effect(kind, places, strength):
     """One invented effect, ``strength`` from 0 (weak) to 1 (strong) on a logarithmic scale."""
     rng = places.rng
     e = {"kind": kind}
-    if kind in ("octupole", "skew_sextupole", "solenoid", "cavity_focusing", "kick_switch", "pulsed_leak", "skew_switch"):
+    if kind in ("stray_octupole", "skew_sextupole", "solenoid", "cavity_focusing", "kick_switch", "pulsed_leak", "skew_switch"):
         e["at"] = "SLOT_A3" if kind == "cavity_focusing" else places.slot()
     elif kind == "sextupole_family":
         e["at"] = places.pick(["SH", "SV"])

@@ -333,6 +333,7 @@ def cases(orbitcal, folder):
     yield Case(orbitcal, folder, "booster-findings", None, strengths, [
         ("quad_roll", "D8", 0.012), ("stray_gradient", "SLOT_F6", 0.01), ("stray_skew_gradient", "SLOT_C3", -0.008),
         ("dipole_gradient", "B_C4", 0.009), ("dipole_edge", "B_E2", 0.05), ("sextupole_error", "SX_A1", 2.0),
+        ("stray_octupole", "SLOT_D6", 100.0),
         ("corrector_gain", "H_A4", 0.06), ("corrector_roll", "V_D3", 0.05), ("corrector_polarity", "H_B2", 1.0),
         ("bpm_gain", "x_E4", -0.08), ("bpm_roll", "y_C5", 0.04),
     ])

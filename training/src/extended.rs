@@ -23,7 +23,7 @@ pub struct Extended {
     /// Effects that they carry.
     pub carried: Vec<Effect>,
     /// Effects that no response shows, or that depend on the orbit without kicks: `bpm_cubic`, `corrector_even`, `corrector_hysteresis`,
-    /// `corrector_settling`, `bpm_timing`, `quad_drift`, `sextupole_error` and `dipole_sextupole`.
+    /// `corrector_settling`, `bpm_timing`, `quad_drift`, `sextupole_error`, `dipole_sextupole` and `stray_octupole`.
     pub left_out: Vec<Effect>,
     /// Rms remainder over monitors and correctors at the vars given [m/rad]; more terms would reduce it.
     pub missing: f64,

@@ -74,7 +74,12 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::Corrector(c) | Location::CorrectorElsewhere(c) => vec![left.of_corrector(c)],
         Location::Ring(q, plane) => vec![left.kicks(q, plane)?],
         Location::RingInTime(q, plane) => vec![left.kick_in_time(q, plane)?],
-        Location::QuadrupoleInTime(_) | Location::Tunes => tunes::of_model(&found.data, &found.best, &left.what)?,
+        Location::QuadrupoleInTime(q) => {
+            let mut figures = tunes::of_model(&found.data, &found.best, &left.what)?;
+            figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);
+            figures
+        }
+        Location::Tunes => tunes::of_model(&found.data, &found.best, &left.what)?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
         Location::Everywhere | Location::FirstFrames { .. } | Location::FrameToFrame => Vec::new(),
@@ -228,7 +233,7 @@ impl Left<'_> {
             means[stretch(one.time)].add(one.value, response[one.monitor] / one.noise);
         }
         let label = self.partial.data.ring.label(self.partial.data.ring.quadrupoles[q].element);
-        let axis = format!("kick near {label} [µrad]");
+        let axis = format!("{} kick near {label} [µrad]", if plane == Plane::X { "horizontal" } else { "vertical" });
         Ok(self.over_time(&means, &axis, "The kick that describes the residuals of all monitors best, the vars held,"))
     }
 

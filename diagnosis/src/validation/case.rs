@@ -71,7 +71,8 @@ impl Case {
             Class::Single => vec![effect(index)],
             Class::Pair => vec![effect(index), effect(7 * index + 3)],
         };
-        let kind = UnmodelledKind::ALL[index % UnmodelledKind::ALL.len()];
+        let unknown = UnmodelledKind::in_ring(ring);
+        let kind = unknown[index % unknown.len()];
         let unmodelled = if class == Class::Unknown { vec![Unmodelled::of(kind, ring, stream())] } else { Vec::new() };
         Self { index, class, vars, effects, unmodelled, seed: stream() }
     }

@@ -9,15 +9,14 @@
 //! | `bpm_saturation` | a monitor reads `x/(1 + (a x)^8)^(1/8)`: linear for small x, and limited to `1/a` | 1/m |
 //! | `orbit_drift` | the kick of an unlogged corrector varies slowly by ±`a` | rad |
 //! | `bpm_wander` | a monitor's offset varies slowly by ±`a` | m |
-//! | `dead_band` | a monitor shows its last value until the position differs from that by more than `a` | m |
+//! | `dead_band` | a monitor shows its last position until that differs by more than `a`; its noise comes on top | m |
 //! | `cable_pickup` | a monitor reads the current in the correctors' cable tray: `+ a (sum of all kicks)/0.2 mrad` | m |
 //! | `bus_sag` | the load on the correctors' common bus shifts one corrector: its kick `+ a (sum of all abs(kick))/0.2 mrad` | rad |
 //! | `alternate_cycle` | a corrector gives a kick `a` too much in every second machine cycle, which follows another user's | rad |
 //! | `thermostat` | `ln` of a quadrupole's gradient follows its cooling water: `+ a sin(2 pi (5 t/2 + phase))` | 1 |
 //! | `solenoid` | a drift is filled by a solenoid that turns the beam by `a`: `ks = 2 a/length` | rad |
 //!
-//! The last six are by somebody who had seen neither the library nor the diagnosis, and nothing was changed after it had met them: they say how a
-//! diagnosis fares that has not been made for what it meets.
+//! The last six are by somebody who had seen neither the library nor the diagnosis: they say what becomes of physics that the diagnosis was not made for.
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -44,7 +43,7 @@ pub enum UnmodelledKind {
     DeadBand,
     /// A monitor's cable picks up the current of all correctors.
     CablePickup,
-    /// A corrector's supply gives way under the load of all correctors, whatever their sign.
+    /// A corrector's supply changes with the load of all correctors, whatever their sign.
     BusSag,
     /// A corrector keeps a remanent field in every second machine cycle.
     AlternateCycle,
@@ -75,6 +74,11 @@ const FULL_KICK: f64 = 2e-4;
 const ROOM: f64 = 0.5;
 
 impl UnmodelledKind {
+    /// Those that have places in a ring.
+    pub fn in_ring(ring: &Ring) -> Vec<Self> {
+        Self::ALL.into_iter().filter(|kind| !kind.sites(ring).is_empty()).collect()
+    }
+
     /// Every kind.
     pub const ALL: [Self; 11] = [
         Self::QuadJump,

@@ -10,9 +10,9 @@ use std::sync::Mutex;
 use diagnosis::data::{Data, DataError};
 use diagnosis::scan::candidates;
 use diagnosis::validation::tables::Tables;
-use diagnosis::validation::{self, Case, Class, Outcome};
+use diagnosis::validation::{self, Case, Class, Outcome, UnmodelledKind};
 use inference::{Campaign, Recording};
-use twin::Ring;
+use twin::{EffectKind, Ring};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Validate;
@@ -26,7 +26,9 @@ pub fn run(options: &Validate) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.page.as_deref()])?;
     let ring = machine(options.common.machine.as_deref())?;
     let template = recording(&options.template, &ring)?;
-    let key = format!("{} {}", template.name, options.seed);
+    // which cases there are depends on the kinds
+    let kinds = (EffectKind::ALL.len(), UnmodelledKind::ALL.len());
+    let key = format!("{} {} {} {}", template.name, options.seed, kinds.0, kinds.1);
     let known = known(&options.outcomes, &key)?;
     let cases = cases(options, &ring, &template)?;
     let to_do: Vec<&Case> = cases.iter().filter(|case| !known.contains_key(&case.index)).collect();

@@ -124,7 +124,7 @@ impl Mechanism for FieldEffect {
     /// K1L is 0.28/m, skew and in a dipole half of that; edges differ by a tenth of the angle over which a rectangular magnet
     /// would; a chromaticity sextupole at full current has some 1/m2. Eddy currents in a chamber of conductivity s and thickness t between poles a
     /// distance 2 h apart make, by Ampere's law, `B'' = mu0 s t (dB/dt)/h`: 2 mm of Inconel (8e5 S/m), 5 T/s and 4 cm make 0.25 T/m2, over 2.4 m at 6 Tm
-    /// K2L = 0.1/m2. An octupole of 0.3 m with 0.2 T at its poles 8 cm away has 100/m3 at 6 Tm.
+    /// K2L = 0.1/m2. An octupole of 0.3 m with 0.17 T at its poles 8 cm away has 100/m3 at 6 Tm.
     fn prior_scale(&self) -> Option<f64> {
         match self {
             Self::QuadRoll => Some(0.015),
@@ -329,6 +329,7 @@ fn sextupole(about: &Signatures, at: usize) -> Signature {
 fn octupole(about: &Signatures, at: usize) -> Signature {
     let [x, y] = about.drives.orbit[at];
     let mut signature = about.of_gradient(&about.optics.thin_gradient(at.into()), 0.5 * (x * x - y * y));
+    // a skew gradient moves no tune to first order
     signature.readings += about.of_gradient(&about.optics.thin_skew_gradient(at.into()), x * y).readings;
     let fields = [Curved::octupole(at, 1.0)];
     let crossed = Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick);
@@ -379,7 +380,7 @@ impl Machine {
     #[must_use]
     pub fn on_orbit(&self, orbit: &[[f64; 2]]) -> Self {
         let mut machine = self.clone();
-        for &Curved { element: at, .. } in &self.curved {
+        for &Curved { element: at, k3l: own, .. } in &self.curved {
             let ([x, y], element) = (orbit[at], &mut machine.ring.elements[at]);
             match &mut element.kind {
                 Kind::Sextupole { k2 } => {
@@ -391,9 +392,9 @@ impl Machine {
                     bend.k2 = 0.0;
                 }
                 Kind::Multipole { k1l, k1sl, k3l, .. } => {
-                    *k1l += 0.5 * *k3l * (x * x - y * y);
-                    *k1sl += *k3l * x * y;
-                    *k3l = 0.0;
+                    *k1l += 0.5 * own * (x * x - y * y);
+                    *k1sl += own * x * y;
+                    *k3l -= own;
                 }
                 _ => {}
             }
@@ -417,7 +418,7 @@ const SETTLED: f64 = 1e-11;
 /// the fields' expansion about that orbit less its gradients, which are in the ring; but for the skew gradient `S = K2L y` of a dipole. It holds what the
 /// correctors and the RF offset make, and what these kicks make in turn.
 pub(super) struct Crossed {
-    fields: Vec<About>,
+    fields: Vec<FieldOnOrbit>,
     /// Orbit that correctors and RF offset make in their middles: rows frames, columns x and y of each [m].
     orbit: DMatrix<f64>,
     /// Orbit there by kicks there [m/rad].
@@ -427,7 +428,7 @@ pub(super) struct Crossed {
 }
 
 /// One field about the orbit that passes it.
-struct About {
+struct FieldOnOrbit {
     /// Normal and skew sextupole, `a` and `b` [1/m^2].
     sextupole: [f64; 2],
     /// K3L [1/m^3].
@@ -438,7 +439,7 @@ struct About {
     tune_slope: [f64; 2],
 }
 
-impl About {
+impl FieldOnOrbit {
     fn of(optics: &Optics, &Curved { element, k2l, k3l }: &Curved, orbit: &[[f64; 2]]) -> Self {
         let is_of_a_dipole = is_bend(&optics.ring.elements[element].kind);
         let [x, y] = orbit[element];
@@ -478,7 +479,7 @@ impl Crossed {
         let mut orbit = kick * held.response(optics, &observers, &optics.correctors()).transpose();
         orbit.ger(1.0, &drives.rf_offset, &held.rf_response(optics, &observers), 1.0);
         Self {
-            fields: fields.iter().map(|field| About::of(optics, field, &drives.orbit)).collect(),
+            fields: fields.iter().map(|field| FieldOnOrbit::of(optics, field, &drives.orbit)).collect(),
             orbit,
             back: held.response(optics, &observers, &sources),
             monitors: [Plane::X, Plane::Y].map(|plane| held.response(optics, &optics.monitor_places(plane), &sources)),
