@@ -1,7 +1,7 @@
 //! An unmodelled discrepancy: a part of the data that no effect of the library describes, and its most likely location.
 //!
 //! Each place is tried with free amplitudes: one of standard deviation `omega` for every setting (or stretch of time) at a monitor, a
-//! corrector or a place in the ring that kicks the beam; a quadrupole that changes in time has three, of its gradient and, as the beam is off its axis,
+//! corrector or a place in the ring that kicks the beam; a quadrupole that changes in time has those of its gradient and, if the beam is off its axis,
 //! of kicks in both planes. With `Z` the whitened pattern of those amplitudes,
 //! `P` the projection that removes what the fit's unknowns can absorb, `g = Z^T P r` and `G = Z^T P Z`:
 //!
@@ -21,7 +21,7 @@ use core::ops::Range;
 
 use estimator::MonitorState;
 use inference::Factor;
-use nalgebra::{DMatrix, DVector, DVectorView};
+use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
 use twin::{Plane, Signature, Signatures};
 
 use super::data::Data;
@@ -64,6 +64,8 @@ const ASKED: f64 = 3.0;
 const STRETCHES: usize = 8;
 /// Least norm that a column of norm 1 has at right angles to those before it.
 const DEPENDENT: f64 = 1e-8;
+/// Share of a Gram matrix' mean diagonal by which rounding may move its eigenvalues.
+const SLACK: f64 = 1e-9;
 /// Highest power of the position that a monitor's reading may contain.
 const POWERS: usize = 5;
 
@@ -175,8 +177,12 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     for (q, signature) in of_quadrupoles.iter().enumerate() {
         let gradient = data.stepped(signature, &stretches, &active);
         let own_kicks: Vec<_> = patterns.iter().filter(|(of, ..)| *of == q).map(|(.., pattern)| pattern).collect();
-        let sums = in_time.of_quadrupole(data, &own, &active, &gradient, &own_kicks);
-        found.push(linearised.judge(Location::QuadrupoleInTime(q), &sums, of_quadrupoles.len()));
+        // the beam may be on its axis or off
+        let of = |kicks: &[&DVector<f64>]| {
+            let sums = in_time.of_quadrupole(data, &own, &active, &gradient, kicks);
+            linearised.judge(Location::QuadrupoleInTime(q), &sums, of_quadrupoles.len())
+        };
+        found.push(of(&[]).or(of(&own_kicks)));
     }
     let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
     found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
@@ -202,7 +208,9 @@ impl<'f> Linearised<'f> {
 
     fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
         let (pull, gram) = self.project(sums);
-        let logs = SIZES.map(|size| marginal(&pull, &gram, size));
+        // nothing gains more than all that the fit leaves
+        let possible = |log: f64| if log <= 0.5 * self.fitted.cost { log } else { f64::NEG_INFINITY };
+        let logs = marginals(&pull, &gram).map(possible);
         self.conclude(Discrepancy::of(at, logs, sites), &[sums])
     }
 
@@ -289,6 +297,33 @@ impl Discrepancy {
         let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
         Self { at, campaign: 0, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
     }
+
+    /// One of two forms of it, equally likely beforehand: the evidence is their mean, all else that of the better one.
+    fn or(self, other: Self) -> Self {
+        let (better, worse) = if other.log_bayes > self.log_bayes { (other, self) } else { (self, other) };
+        let share = (worse.log_bayes - better.log_bayes).exp();
+        Self { log_bayes: better.log_bayes + (0.5 * (1.0 + share)).ln(), ..better }
+    }
+}
+
+/// [`marginal`] of every size. Where monitors have nearly all of their noise in common, sums that are taken monitor by monitor may make a Gram matrix with
+/// negative eigenvalues: these directions are left out.
+fn marginals(pull: &DVector<f64>, gram: &DMatrix<f64>) -> [f64; SIZES.len()] {
+    let mut grown = gram.clone();
+    let slack = SLACK * gram.trace() / gram.ncols().max(1) as f64;
+    (0..grown.ncols()).for_each(|i| grown[(i, i)] += slack);
+    if slack <= 0.0 || Factor::of(grown).is_some() {
+        return SIZES.map(|size| marginal(pull, gram, size));
+    }
+    let SymmetricEigen { eigenvectors, eigenvalues } = gram.clone().symmetric_eigen();
+    let along = eigenvectors.tr_mul(pull);
+    SIZES.map(|size| {
+        let variance = size * size;
+        let of = |(pull, power): (&f64, &f64)| {
+            variance * pull * pull / (1.0 + variance * power) - (variance * power).ln_1p()
+        };
+        0.5 * along.iter().zip(&eigenvalues).filter(|(_, power)| **power > slack).map(of).sum::<f64>()
+    })
 }
 
 /// `ln` Bayes factor of free amplitudes of one standard deviation, given their projected pull and Gram matrix.
