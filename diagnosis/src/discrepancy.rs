@@ -70,6 +70,7 @@ const SLACK: f64 = 1e-9;
 const POWERS: usize = 5;
 
 /// Sums of whitened numbers over settings or stretches of time, one group for each amplitude.
+#[derive(Clone)]
 struct Sums {
     /// `E^T S^-1 E`.
     gram: DMatrix<f64>,
@@ -177,12 +178,10 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     for (q, signature) in of_quadrupoles.iter().enumerate() {
         let gradient = data.stepped(signature, &stretches, &active);
         let own_kicks: Vec<_> = patterns.iter().filter(|(of, ..)| *of == q).map(|(.., pattern)| pattern).collect();
-        // the beam may be on its axis or off
-        let of = |kicks: &[&DVector<f64>]| {
-            let sums = in_time.of_quadrupole(data, &own, &active, &gradient, kicks);
-            linearised.judge(Location::QuadrupoleInTime(q), &sums, of_quadrupoles.len())
-        };
-        found.push(of(&[]).or(of(&own_kicks)));
+        let on_axis = Sums::whole(&gradient, &own);
+        let off_axis = in_time.with_kicks(data, &on_axis, &active, &gradient, &own_kicks);
+        let judge = |sums: &Sums| linearised.judge(Location::QuadrupoleInTime(q), sums, of_quadrupoles.len());
+        found.push(judge(&on_axis).or(judge(&off_axis)));
     }
     let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
     found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
@@ -208,10 +207,7 @@ impl<'f> Linearised<'f> {
 
     fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
         let (pull, gram) = self.project(sums);
-        // nothing gains more than all that the fit leaves
-        let possible = |log: f64| if log <= 0.5 * self.fitted.cost { log } else { f64::NEG_INFINITY };
-        let logs = marginals(&pull, &gram).map(possible);
-        self.conclude(Discrepancy::of(at, logs, sites), &[sums])
+        self.conclude(at, marginals(&pull, &gram), sites, &[sums])
     }
 
     /// The same of one amplitude for each monitor and each of some settings. As many as there are readings, they are taken monitor by
@@ -233,7 +229,7 @@ impl<'f> Linearised<'f> {
         let sides: Vec<DMatrix<f64>> =
             each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &self.slope))).collect();
         let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
-        self.conclude(Discrepancy::of(at, logs, sites), &each.iter().collect::<Vec<_>>())
+        self.conclude(at, logs, sites, &each.iter().collect::<Vec<_>>())
     }
 
     /// `ln` Bayes factor of one size; `sides` are `(C, g)` of each monitor.
@@ -258,11 +254,14 @@ impl<'f> Linearised<'f> {
         for sums in each {
             logs.iter_mut().zip(SIZES).for_each(|(log, size)| *log += marginal(&sums.pull, &sums.gram, size));
         }
-        self.conclude(Discrepancy::of(at, logs, 1), each)
+        self.conclude(at, logs, 1, each)
     }
 
-    /// Add the adapted unknowns of the fit.
-    fn conclude(&self, found: Discrepancy, each: &[&Sums]) -> Discrepancy {
+    /// Of the `ln` Bayes factor of every size, with the adapted unknowns of the fit.
+    fn conclude(&self, at: Location, logs: [f64; SIZES.len()], sites: usize, each: &[&Sums]) -> Discrepancy {
+        // nothing gains more than all that the fit leaves
+        let possible = |log: f64| if log <= 0.5 * self.fitted.cost { log } else { f64::NEG_INFINITY };
+        let found = Discrepancy::of(at, logs.map(possible), sites);
         let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
         Discrepancy { adapted, ..found }
     }
@@ -476,20 +475,18 @@ impl InTime {
         Self { sums, steps: monitors.map(|b| data.whiten_columns(b, stretches)).collect() }
     }
 
-    /// A gradient that steps, and kicks at its place: on an orbit off its axis a quadrupole kicks. `gradient`: whitened, one step a column; `kicks`: what
-    /// a kick in each plane does to the monitors.
-    fn of_quadrupole(
+    /// A gradient that steps, and kicks at its place: off its axis a quadrupole kicks. `gradient`: whitened, one step a column, and `of_gradient` its
+    /// sums; `kicks`: what a kick in each plane does to the monitors.
+    fn with_kicks(
         &self,
         data: &Data,
-        own: &Seen,
+        of_gradient: &Sums,
         monitors: &[usize],
         gradient: &DMatrix<f64>,
         kicks: &[&DVector<f64>],
     ) -> Sums {
-        let back = gradient.transpose();
-        let of_gradient = Sums { gram: &back * gradient, cross: &back * &own.jacobian, pull: back * &own.residual };
         let of_kicks = kicks.iter().map(|pattern| weighted(data, &self.sums, monitors, pattern));
-        let mut all = Sums::stacked(&core::iter::once(of_gradient).chain(of_kicks).collect::<Vec<_>>());
+        let mut all = Sums::stacked(&core::iter::once(of_gradient.clone()).chain(of_kicks).collect::<Vec<_>>());
         let (n, gradient) = (gradient.ncols(), data.taken_back(gradient));
         let mut set = |row: usize, column: usize, both: DMatrix<f64>| {
             all.gram.view_mut((column * n, row * n), (n, n)).copy_from(&both.transpose());
@@ -517,6 +514,12 @@ impl Sums {
     fn none(numbers: usize, unknowns: usize) -> Self {
         let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
         Self { gram, cross, pull: DVector::zeros(numbers) }
+    }
+
+    /// Of whitened patterns of all readings, one a column.
+    fn whole(columns: &DMatrix<f64>, own: &Seen) -> Self {
+        let back = columns.transpose();
+        Self { gram: &back * columns, cross: &back * &own.jacobian, pull: back * &own.residual }
     }
 
     /// Of several monitors, each with its own amplitudes.
@@ -640,10 +643,7 @@ mod tests {
             let all = Signature { readings, tunes: [0.0; 2], tune_changes: MatrixXx2::zeros(data.pools.count) };
             indicator.column_iter().map(|c| data.stepping(&all, &c)).collect::<Vec<_>>()
         };
-        let of_columns = |columns: Vec<DVector<f64>>| {
-            let back = DMatrix::from_columns(&columns).transpose();
-            Sums { gram: &back * back.transpose(), cross: &back * &own.jacobian, pull: back * &own.residual }
-        };
+        let of_columns = |columns: Vec<DVector<f64>>| Sums::whole(&DMatrix::from_columns(&columns), &own);
         let whole = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| of_columns(columns_of(pattern, indicator));
         let evidence = |sums: &Sums| linearised.judge(Location::Time, sums, 1).log_bayes;
         let (monitors, mut largest) = (data.active_monitors(), 0.0_f64);
@@ -672,7 +672,8 @@ mod tests {
         for (q, signature) in signatures.of_quadrupoles().iter().enumerate().step_by(8) {
             let gradient = data.stepped(signature, &stretches, &monitors);
             let kicks: Vec<_> = kicked.iter().filter(|(of, ..)| *of == q).map(|(.., pattern)| read(pattern)).collect();
-            let near = in_time.of_quadrupole(&data, &own, &monitors, &gradient, &kicks.iter().collect::<Vec<_>>());
+            let (on_axis, kicked) = (Sums::whole(&gradient, &own), kicks.iter().collect::<Vec<_>>());
+            let near = in_time.with_kicks(&data, &on_axis, &monitors, &gradient, &kicked);
             let of_gradient = gradient.column_iter().map(|column| column.into_owned());
             let of_kicks = kicks.iter().flat_map(|pattern| columns_of(pattern, &stretches));
             let exact = of_columns(of_gradient.chain(of_kicks).collect());

@@ -2,7 +2,7 @@
 //!
 //! A fit knows orbits to first order in the kicks; what exact orbits have besides is taken off the readings, for the machine of some fit. Where an
 //! effect changes that machine much, the fit without the effect needs readings of its own: on those of the other machine it would be worse than it
-//! is, by 16 nat for a momentum of 5 per mille that was not there, and the effect seems to be needed.
+//! is, and an effect that is not there, such as a momentum of 5 per mille, seem to be needed.
 
 use nalgebra::DVector;
 
@@ -34,23 +34,22 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
 }
 
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
-pub(super) fn about_itself(data: &Data, fitted: Fitted) -> Fitted {
-    let mut own = data.clone();
+pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
+    let mut own = fitted.data(data).clone();
     let linearise = |own: &mut Data, fitted: &Fitted| own.linearise_each(&fitted.machines(own)?);
-    let mut best = fitted;
     for pass in 0..PASSES {
-        if best.is_gross() {
-            return best;
+        if fitted.is_gross() {
+            break;
         }
-        let Ok(moved) = linearise(&mut own, &best) else { return best };
+        let Ok(moved) = linearise(&mut own, &fitted) else { break };
         if pass == 0 && moved < CURVED {
-            return best;
+            break;
         }
-        let Ok(again) = Fitted::of(&own, &best.hypothesis, &best.u) else { return best };
-        best = again.to(&own);
+        let Ok(again) = Fitted::of(&own, &fitted.hypothesis, &fitted.u) else { break };
+        fitted = again.to(&own);
         if moved < CURVED {
             break;
         }
     }
-    best
+    fitted
 }

@@ -264,12 +264,9 @@ impl Search {
 
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
-        let reduced = super::heldout::reduced(data, fitted, term)?;
-        let about = reduced.data(data).clone();
-        let (mut rest, mut present) = (relearnt(&about, reduced), fitted.clone());
-        if data.is_about_effects {
-            (rest, present) = (rest.to(&about), present.to(data));
-        }
+        let rest = relearnt(data, super::heldout::reduced(data, fitted, term)?);
+        // the others are fitted to the readings of the rest
+        let present = if data.is_about_effects { fitted.clone().to(data) } else { fitted.clone() };
         let present = Alternative::exact(data, &rest, present, term);
         self.competition(rest.data(data), &rest, Some(present))
     }
@@ -491,13 +488,11 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
         let Some((fitted, term)) = alternative.fitted.clone().and_then(|f| place(&f).map(|at| (f, at))) else {
             continue;
         };
-        let (about, has_own) = (fitted.data(data).clone(), fitted.has_own());
-        let mut again = relearnt(&about, fitted);
+        let mut again = relearnt(data, fitted);
         let kind = again.hypothesis.terms[term].kind;
         if best > 0.0 && !kind.is_of_a_monitor() && !kind.is_of_a_corrector() {
-            again = about_itself(&about, again);
+            again = about_itself(data, again);
         }
-        let again = if has_own { again.to(&about) } else { again };
         let again = Alternative::exact(data, without, again, term);
         *weight += again.log_gain - alternative.log_gain;
         *alternative = again;
@@ -506,11 +501,13 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
 
 /// The same fit with the ordinary widths that the recording then shows, if it is the better and keeps a beam: as wide as that, imperfections
 /// that are of first order in the fit may leave none. A poor one stays as it is; one that was poor before
-/// gets the ordinary imperfections that it lacks.
+/// gets the ordinary imperfections that it lacks. One that has readings of its own keeps them.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_gross() {
         return fitted;
     }
+    let own = fitted.has_own().then(|| fitted.data(data).clone());
+    let data = own.as_ref().unwrap_or(data);
     let again = |ordinary: Vec<Family>, from: &Fitted| {
         let hypothesis = Hypothesis { ordinary, ..from.hypothesis.clone() };
         Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis))
@@ -519,5 +516,6 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let begun = if lacks_all { again(Family::all(), &fitted) } else { Ok(fitted.clone()) };
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
-    learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted)
+    let best = learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
+    if own.is_some() { best.to(data) } else { best }
 }

@@ -364,16 +364,8 @@ pub fn sentence(
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
-    // contradicted read-backs and vars out of range are no missing physics, and a consistent recording's sentence begins with them
-    let mut facts = contradicted(data, contradictions);
-    facts.extend(beyond.iter().map(Beyond::to_string));
     let text = match verdict {
-        Verdict::Consistent => {
-            let found_besides =
-                if facts.is_empty() { String::new() } else { format!("{}; besides, ", facts.join("; ")) };
-            facts.clear();
-            format!("{found_besides}nothing was found at the noise level; {}", power(found))
-        }
+        Verdict::Consistent => format!("nothing was found at the noise level; {}", power(found)),
         Verdict::Identified => {
             let gain: Vec<String> = findings
                 .iter()
@@ -392,17 +384,21 @@ pub fn sentence(
             format!("{named}{last}")
         }
     };
-    capitalised(&core::iter::once(text).chain(facts).chain(remarks(data, found)).collect::<Vec<_>>().join("; "))
+    let contradicted = contradictions.iter().map(|one| within(data, &one.recording, one.to_string()));
+    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(Beyond::to_string)).collect();
+    // these are no missing physics, and a consistent recording's sentence begins with them
+    if verdict == Verdict::Consistent && !said.is_empty() {
+        said.push(format!("besides, {text}"));
+    } else {
+        said.insert(0, text);
+    }
+    said.extend(remarks(data, found));
+    capitalised(&said.join("; "))
 }
 
 /// What is said of one of several recordings.
 fn within(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
-}
-
-/// Read-backs that are not the settings.
-fn contradicted(data: &Data, contradictions: &[Contradiction]) -> Vec<String> {
-    contradictions.iter().map(|one| within(data, &one.recording, one.to_string())).collect()
 }
 
 /// What is said besides: of ordinary imperfections, noise, frames and monitors.

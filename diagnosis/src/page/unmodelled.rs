@@ -75,11 +75,11 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::Ring(q, plane) => vec![left.kicks(q, plane)?],
         Location::RingInTime(q, plane) => vec![left.kick_in_time(q, plane)?],
         Location::QuadrupoleInTime(q) => {
-            let mut figures = tunes::of_model(&found.data, &found.best, &left.what)?;
+            let mut figures = tunes::of_model(&found.data, &found.best, &left.title())?;
             figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);
             figures
         }
-        Location::Tunes => tunes::of_model(&found.data, &found.best, &left.what)?,
+        Location::Tunes => tunes::of_model(&found.data, &found.best, &left.title())?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
         Location::Everywhere | Location::FirstFrames { .. } | Location::FrameToFrame => Vec::new(),

@@ -99,16 +99,15 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     let truth = simulate::Truth { vars: &case.vars, effects: &case.effects, beyond: &beyond };
     let plain = simulate::Truth { effects: &[], beyond: &[], ..truth };
     let simulated = |truth| simulate::campaign(template, ring, &truth, &hardware, case.seed);
-    let Ok(recording) = simulated(truth) else { return Ok(None) };
     // what is not in the library is told by its signal
-    let without = if case.unmodelled.is_empty() { Ok(recording.clone()) } else { simulated(plain) };
-    let Ok(without) = without else { return Ok(None) };
+    let without = case.unmodelled.first().map(|_| simulated(plain)).transpose();
+    let (Ok(recording), Ok(without)) = (simulated(truth), without) else { return Ok(None) };
     let started = Instant::now();
     let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
     let key = case.key(ring);
     let names = ring.var_names();
-    let (oracle_gain, own) = oracle(ring, case, &recording, &without)?;
+    let (oracle_gain, own) = oracle(ring, case, &recording, without.as_ref())?;
     Ok(Some(Outcome {
         index: case.index,
         class: case.class,
@@ -204,7 +203,12 @@ fn is_near(ring: &Ring, diagnosis: &Diagnosis, one: &Unmodelled) -> bool {
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
 /// others; for physics that the library does not hold, when its signal is subtracted.
-fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) -> Result<(f64, Vec<f64>), DataError> {
+fn oracle(
+    ring: &Ring,
+    case: &Case,
+    recording: &Recording,
+    without: Option<&Recording>,
+) -> Result<(f64, Vec<f64>), DataError> {
     if case.class == Class::Empty {
         return Ok((0.0, Vec::new()));
     }
@@ -215,7 +219,7 @@ fn oracle(ring: &Ring, case: &Case, recording: &Recording, without: &Recording) 
         Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
     };
     let nothing = best(&data, &[])?;
-    if !case.unmodelled.is_empty() {
+    if let Some(without) = without {
         let cleaned = data.less(&signal(recording, without), &tunes(recording, without));
         let gain = best(&cleaned, &[])? - nothing;
         return Ok((gain, vec![gain]));

@@ -320,8 +320,7 @@ fn sextupole(about: &Signatures, at: usize) -> Signature {
     let mut signature = about.of_gradient(&about.optics.gradient(at), x * per_length);
     // a skew gradient moves no tune to first order
     signature.readings += about.of_gradient(&about.optics.skew_gradient(at), y * per_length).readings;
-    let fields = [Curved::sextupole(at, 1.0)];
-    Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick).add_to(&mut signature, ring);
+    add_crossed(&mut signature, about, &[Curved::sextupole(at, 1.0)]);
     signature
 }
 
@@ -331,9 +330,7 @@ fn octupole(about: &Signatures, at: usize) -> Signature {
     let mut signature = about.of_gradient(&about.optics.thin_gradient(at.into()), 0.5 * (x * x - y * y));
     // a skew gradient moves no tune to first order
     signature.readings += about.of_gradient(&about.optics.thin_skew_gradient(at.into()), x * y).readings;
-    let fields = [Curved::octupole(at, 1.0)];
-    let crossed = Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick);
-    crossed.add_to(&mut signature, &about.machine.ring);
+    add_crossed(&mut signature, about, &[Curved::octupole(at, 1.0)]);
     signature
 }
 
@@ -343,8 +340,15 @@ fn in_dipoles(about: &Signatures) -> Signature {
     let of = |at: usize| (about.optics.gradient(at), across(&about.drives.orbit, at)[0] / ring.elements[at].length);
     let mut signature = about.of_gradients(dipoles(ring).map(of));
     let fields: Vec<Curved> = dipoles(ring).map(|at| Curved::sextupole(at, 1.0)).collect();
-    Crossed::of(&about.optics, &about.held, &fields, about.drives, &about.kick).add_to(&mut signature, ring);
+    add_crossed(&mut signature, about, &fields);
     signature
+}
+
+/// Add the kicks of the orbit that crosses some fields, without what these do to the orbit in turn, and its changes of the tunes.
+fn add_crossed(signature: &mut Signature, about: &Signatures, fields: &[Curved]) {
+    let crossed = Crossed::of(&about.optics, &about.held, fields, about.drives, &about.kick);
+    signature.readings += about.machine.ring.own_planes(&crossed.seen(&crossed.kicks(&crossed.orbit)));
+    signature.tune_changes += crossed.tune_changes();
 }
 
 /// A field beyond the ring's that is no gradient.
@@ -494,12 +498,6 @@ impl Crossed {
             changes += gradient * RowVector2::from(field.tune_slope);
         }
         changes
-    }
-
-    /// Add the kicks of the orbit, without what these do to the orbit in turn, and its changes of the tunes.
-    fn add_to(&self, signature: &mut Signature, ring: &Ring) {
-        signature.readings += ring.own_planes(&self.seen(&self.kicks(&self.orbit)));
-        signature.tune_changes += self.tune_changes();
     }
 
     /// Kicks of an orbit, same shape [rad].
