@@ -27,7 +27,7 @@ use twin::{Plane, Signature, Signatures};
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::location::Location;
+use super::location::{Linear, Location};
 use super::settings::Settings;
 
 /// Free amplitudes at one place, and their evidence.
@@ -173,6 +173,20 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         found.push(linearised.judge(Location::Ring(*quadrupole, *plane), &of_settings, sites));
         let of_stretches = weighted(data, steps, &active, pattern);
         found.push(linearised.judge(Location::RingInTime(*quadrupole, *plane), &of_stretches, sites));
+    }
+    let always = DMatrix::from_element(data.readings.nrows(), 1, 1.0);
+    for (q, quadrupole) in data.ring.quadrupoles.iter().enumerate() {
+        let forms: Vec<[usize; 2]> = Linear::FocusesAndCouples.forms().collect();
+        let of_form = |&form: &[usize; 2]| {
+            let signature = signatures.of_thin_linear(quadrupole.element.into(), form);
+            data.stepped(&signature, &always, &active).column(0).into_owned()
+        };
+        let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(of_form).collect::<Vec<_>>()), &own);
+        for does in Linear::ALL {
+            let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i])).collect();
+            let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
+            found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
+        }
     }
     let of_quadrupoles = signatures.of_quadrupoles();
     for (q, signature) in of_quadrupoles.iter().enumerate() {
@@ -437,10 +451,9 @@ impl Data {
 
     /// A signature that sets in at each edge of time, scaled to an rms of 1 at the readings, whitened: one a column. Only some monitors count; the tunes always do.
     fn stepped(&self, signature: &Signature, stretches: &DMatrix<f64>, monitors: &[usize]) -> DMatrix<f64> {
-        let rms = (signature.readings.norm_squared() / signature.readings.len() as f64).sqrt();
         let mut some = Signature { readings: signature.readings.clone() * 0.0, ..signature.clone() };
         monitors.iter().for_each(|&b| some.readings.set_column(b, &signature.readings.column(b)));
-        let some = some * rms.recip();
+        let some = some * signature.rms().recip();
         let columns: Vec<DVector<f64>> = stretches.column_iter().map(|step| self.stepping(&some, &step)).collect();
         DMatrix::from_columns(&columns)
     }

@@ -294,10 +294,7 @@ impl Fitted {
     }
 
     fn predicted_at(&self, data: &Data, campaign: usize, u: &DVector<f64>) -> Result<Signature, EffectError> {
-        let vars = self.params.len();
-        let unknown = &u.as_slice()[vars..];
-        let (machine, drives) = self.hypothesis.machine_in(data, campaign, &data.units.params(u), unknown)?;
-        predicted(&machine, &drives)
+        predicted_by(data, &self.hypothesis, campaign, u)
     }
 
     /// Derivative of the predictions of the first recording with respect to every u.
@@ -313,8 +310,9 @@ impl Fitted {
         let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
-                Unknown::Ordinary(..) => {
-                    of_ordinary(data, 0, &signatures, unknown)?.unwrap_or_else(|| slopes[0].clone() * 0.0)
+                Unknown::Ordinary(..) | Unknown::Form(..) => {
+                    let own = of_linear(data, 0, &signatures, &self.hypothesis, unknown)?;
+                    own.unwrap_or_else(|| slopes[0].clone() * 0.0)
                 }
                 _ => {
                     let at = |step: f64| {
@@ -379,7 +377,7 @@ impl<'d> Problem<'d> {
         debug_assert!(unknowns[others..].iter().all(Unknown::is_of_first_order), "they are the last");
         let first = data.units.len() + others;
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
-        let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
+        let ordinary = Ordinary::about(data, hypothesis, &unknowns[others..], machine)?;
         Ok(Self { data, hypothesis, start: start.rows_range(first..).into_owned(), unknowns, ordinary })
     }
 
@@ -400,8 +398,7 @@ impl<'d> Problem<'d> {
         let held = self.held(u);
         let moved = u.rows_range(self.others()..) - &self.start;
         let left = self.data.stacked(|campaign, own| {
-            let (machine, drives) = machine_at(self.data, self.hypothesis, campaign, &held)?;
-            Ok::<_, EffectError>(own.residual(&predicted(&machine, &drives)?))
+            Ok::<_, EffectError>(own.residual(&predicted_by(self.data, self.hypothesis, campaign, &held)?))
         })?;
         Ok(left - &self.ordinary.slopes * moved)
     }
@@ -417,11 +414,11 @@ impl<'d> Problem<'d> {
             let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
             let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
             let of_others = self.unknowns[..self.others() - vars].iter();
-            let of_others = of_others.map(|unknown| of_ordinary(data, campaign, &signatures, unknown));
+            let of_others = of_others.map(|unknown| of_linear(data, campaign, &signatures, self.hypothesis, unknown));
             own.signatures::<EffectError>(self.others(), of_vars.chain(of_others))
         })?;
-        let is_of_a_term = |i: &usize| !matches!(self.unknowns[i - vars], Unknown::Ordinary(..));
-        for i in (vars..self.others()).filter(is_of_a_term) {
+        let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
+        for i in (vars..self.others()).filter(is_exact) {
             let at = |step: f64| {
                 let mut u = u.clone();
                 u[i] += step;
@@ -437,6 +434,7 @@ impl<'d> Problem<'d> {
 impl Ordinary {
     fn about(
         data: &Data,
+        hypothesis: &Hypothesis,
         unknowns: &[Unknown],
         machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
     ) -> Result<Self, EffectError> {
@@ -444,7 +442,7 @@ impl Ordinary {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
             let signatures = Signatures::of(&machine, &drives)?;
-            let of = |unknown: &Unknown| of_ordinary(data, campaign, &signatures, unknown);
+            let of = |unknown: &Unknown| of_linear(data, campaign, &signatures, hypothesis, unknown);
             own.signatures::<EffectError>(unknowns.len(), unknowns.iter().map(of))
         })?;
         let gram = gram(&slopes);
@@ -470,6 +468,32 @@ fn machine_at(
     hypothesis.machine_in(data, campaign, &data.units.params(u), &u.as_slice()[data.units.len()..])
 }
 
+/// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element.
+///
+/// # Errors
+/// [`EffectError`].
+pub(super) fn predicted_by(
+    data: &Data,
+    hypothesis: &Hypothesis,
+    campaign: usize,
+    u: &DVector<f64>,
+) -> Result<Signature, EffectError> {
+    let (machine, drives) = machine_at(data, hypothesis, campaign, u)?;
+    let mut all = predicted(&machine, &drives)?;
+    if hypothesis.element.is_some() {
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, &drives)?;
+        for (unknown, u) in hypothesis.unknowns(data).iter().zip(u.iter().skip(data.units.len())) {
+            if matches!(unknown, Unknown::Form(..))
+                && let Some(form) = of_linear(data, campaign, &signatures, hypothesis, unknown)?
+            {
+                all += form * *u;
+            }
+        }
+    }
+    Ok(all)
+}
+
 /// What a machine predicts.
 ///
 /// # Errors
@@ -479,16 +503,22 @@ pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature,
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }
 
-/// The signature of an ordinary imperfection in a recording, per width; none of another unknown, or where it does not act.
-fn of_ordinary(
+/// The signature of an ordinary imperfection, or of a form of the unknown element, in a recording, per width; none of another unknown, or where it does
+/// not act.
+fn of_linear(
     data: &Data,
     campaign: usize,
     signatures: &Signatures,
+    hypothesis: &Hypothesis,
     unknown: &Unknown,
 ) -> Result<Option<Signature>, EffectError> {
-    match unknown {
-        Unknown::Ordinary(member, width) if member.is_in(campaign) => {
+    match (unknown, &hypothesis.element) {
+        (Unknown::Ordinary(member, width), _) if member.is_in(campaign) => {
             Ok(Some(together(signatures, member, |kind| data.scale(campaign, kind))? * *width))
+        }
+        (Unknown::Form(i, sigma), Some(element)) => {
+            let at = data.ring.quadrupoles[element.quadrupole].element.into();
+            Ok(Some(signatures.of_thin_linear(at, element.form(*i)) * *sigma))
         }
         _ => Ok(None),
     }

@@ -289,12 +289,12 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     Ok(gain)
 }
 
-/// The same fit without its effects, what is ordinary being of the same size.
+/// The same fit without its effects and its unknown element, what is ordinary being of the same size.
 ///
 /// # Errors
 /// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    lessened(data, fitted, Hypothesis { terms: Vec::new(), ..fitted.hypothesis.clone() })
+    lessened(data, fitted, fitted.hypothesis.without_terms(|_| true).without_element())
 }
 
 /// The same fit without one of its terms.
@@ -306,7 +306,7 @@ pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitE
 }
 
 /// The fit of a hypothesis with fewer effects.
-fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
+pub(super) fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
     let less = from_near_or_far(data, fitted, other)?;
     Ok(if data.is_about_effects { about_itself(data, less) } else { less })
 }

@@ -1,8 +1,9 @@
 //! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Signatures, Site};
 
 use super::data::Data;
+use super::location::Linear;
 use super::ordinary::{Family, is_absorbed};
 
 /// One effect that a hypothesis holds, its amplitude unknown.
@@ -19,10 +20,23 @@ pub struct Term {
 pub struct Hypothesis {
     /// Effects that count as findings.
     pub terms: Vec<Term>,
+    /// Something that the library does not hold.
+    pub element: Option<Element>,
     /// Ordinary imperfections.
     pub ordinary: Vec<Family>,
     /// Effects of known amplitude.
     pub given: Vec<Effect>,
+}
+
+/// A thin linear element that the library does not hold, at the entrance of a quadrupole; to first order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Element {
+    /// Index of the quadrupole.
+    pub quadrupole: usize,
+    /// What it does.
+    pub does: Linear,
+    /// Prior standard deviation of the strength of each of its forms, in their order.
+    pub sigma: Vec<f64>,
 }
 
 /// One unknown besides the vars, with its prior standard deviation.
@@ -32,6 +46,8 @@ pub enum Unknown {
     Amplitude(usize, f64),
     /// The orbit of a recording at an element, in x or y [m].
     Orbit(usize, usize, Plane, f64),
+    /// The strength of a form of the unknown element, by its index.
+    Form(usize, f64),
     /// One ordinary imperfection.
     Ordinary(Member, f64),
 }
@@ -59,8 +75,34 @@ pub enum Identity<'u> {
     Amplitude(Term),
     /// The orbit of a recording at an element.
     Orbit(usize, usize, Plane),
+    /// A form of an unknown element near a quadrupole.
+    Form(usize, [usize; 2]),
     /// An ordinary imperfection.
     Ordinary(&'u Member),
+}
+
+impl Element {
+    /// One whose forms each change the readings by `size` (rms).
+    pub fn of(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
+        let at = ring.quadrupoles[quadrupole].element.into();
+        let sigma = |form| size / signatures.of_thin_linear(at, form).rms();
+        Self { quadrupole, does, sigma: does.forms().map(sigma).collect() }
+    }
+
+    /// One of its forms.
+    pub fn form(&self, index: usize) -> [usize; 2] {
+        self.does.forms().nth(index).expect("it has so many")
+    }
+
+    /// True if it is what a linear field of the library would be: one nearer than two quadrupoles are to each other, on average.
+    pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
+        let at = ring.elements[ring.quadrupoles[self.quadrupole].element].s;
+        let is_near = |s: f64| {
+            let along = (s - at).rem_euclid(ring.circumference);
+            along.min(ring.circumference - along) < ring.circumference / ring.quadrupoles.len() as f64
+        };
+        term.kind.thin().is_some() && term.position(ring).is_some_and(is_near)
+    }
 }
 
 impl Unknown {
@@ -73,7 +115,9 @@ impl Unknown {
     /// Its prior standard deviation.
     pub fn sigma(&self) -> f64 {
         match self {
-            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Ordinary(_, sigma) => *sigma,
+            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(_, sigma) | Self::Ordinary(_, sigma) => {
+                *sigma
+            }
         }
     }
 
@@ -82,6 +126,10 @@ impl Unknown {
         match self {
             Self::Amplitude(i, _) => Identity::Amplitude(hypothesis.terms[*i]),
             Self::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
+            Self::Form(i, _) => {
+                let element = hypothesis.element.as_ref().expect("it has forms");
+                Identity::Form(element.quadrupole, element.form(*i))
+            }
             Self::Ordinary(member, _) => Identity::Ordinary(member),
         }
     }
@@ -161,10 +209,29 @@ impl Hypothesis {
             family.members(data).into_iter().map(move |member| Unknown::Ordinary(member, width))
         };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
-        terms.chain(self.ordinary.iter().flat_map(of_family)).collect()
+        let sigma = self.element.iter().flat_map(|element| element.sigma.iter().enumerate());
+        let forms = sigma.map(|(i, sigma)| Unknown::Form(i, *sigma));
+        terms.chain(forms).chain(self.ordinary.iter().flat_map(of_family)).collect()
     }
 
-    /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations.
+    /// Without some.
+    pub fn without_terms(&self, is_one: impl Fn(&Term) -> bool) -> Self {
+        let mut less = self.clone();
+        less.terms.retain(|term| !is_one(term));
+        less
+    }
+
+    /// Without the unknown element.
+    pub fn without_element(&self) -> Self {
+        Self { element: None, ..self.clone() }
+    }
+
+    /// True if one more effect would be what it has already.
+    pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
+        self.terms.contains(term) || self.element.as_ref().is_some_and(|element| element.holds(term, ring))
+    }
+
+    /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations, without the unknown element.
     ///
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
@@ -197,7 +264,7 @@ impl Hypothesis {
                 Unknown::Ordinary(member, sigma) if member.is_in(campaign) => {
                     effects.extend(member.terms.iter().map(|term| scaled(term, u * sigma)));
                 }
-                Unknown::Orbit(..) | Unknown::Ordinary(..) => {}
+                Unknown::Orbit(..) | Unknown::Form(..) | Unknown::Ordinary(..) => {}
             }
         }
         let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));

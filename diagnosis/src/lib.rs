@@ -154,16 +154,16 @@ impl Diagnosis {
         let data = &found.data;
         progress("held-out frames");
         let blocks = heldout::by_pool(data);
-        let bare = if found.competitions.is_empty() { found.null.clone() } else { heldout::bare(data, &found.best)? };
+        let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
         let before = Score::of(data, &bare, &blocks)?;
-        let after = if found.competitions.is_empty() { before.clone() } else { Score::of(data, &found.best, &blocks)? };
+        let after = if found.has_more() { Score::of(data, &found.best, &blocks)? } else { before.clone() };
         let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
         let of_means = Verdict::of(&found, &tests);
         let verdict = of_means.beside(&transients).with_noise(data);
-        let findings = verdict::findings(data, &found, &transients, &tests, of_means)?;
+        let of_element = verdict::test_of_element(data, &found, &after, &blocks)?;
+        let findings = verdict::findings(data, &found, &transients, &tests, of_element, of_means)?;
         progress("held-out correctors");
-        let whole =
-            !found.competitions.is_empty() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
+        let whole = found.has_more() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let blocks = heldout::by_corrector(data);
         let correctors = if whole && !blocks.is_empty() {
             let scored = |fitted| Score::of(data, fitted, &blocks).ok();
@@ -239,7 +239,7 @@ impl Diagnosis {
 
     /// Gain of held-out log predictive density by all effects, and its standard error.
     pub fn gain(&self) -> (f64, f64) {
-        if self.found.competitions.is_empty() { (0.0, 0.0) } else { self.after.gain_over(&self.before) }
+        if self.found.has_more() { self.after.gain_over(&self.before) } else { (0.0, 0.0) }
     }
 }
 

@@ -25,6 +25,8 @@ pub enum Location {
     Ring(usize, Plane),
     /// The same, in time.
     RingInTime(usize, Plane),
+    /// A place in the ring (a quadrupole's entrance) with a linear element that is unknown.
+    Linear(usize, Linear),
     /// A quadrupole that changes in time, and as the beam is off its axis kicks it.
     QuadrupoleInTime(usize),
     /// All monitors, in time.
@@ -44,8 +46,48 @@ pub enum Location {
     FrameToFrame,
 }
 
+/// What an unknown linear element does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Linear {
+    /// It focuses or defocuses, in one plane or both.
+    Focuses,
+    /// It couples the planes, by a field or by a rotation.
+    Couples,
+    /// Both.
+    FocusesAndCouples,
+}
+
+impl Linear {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Focuses, Self::Couples, Self::FocusesAndCouples];
+
+    /// The terms `z_i z_j` of its Hamiltonian, z = (x, x', y, y').
+    pub fn forms(self) -> impl Iterator<Item = [usize; 2]> {
+        let all = (0..4).flat_map(|i| (i..4).map(move |j| [i, j]));
+        all.filter(move |form| self.has(*form))
+    }
+
+    /// True if one of them is this.
+    pub fn has(self, [i, j]: [usize; 2]) -> bool {
+        let couples = (i < 2) != (j < 2);
+        match self {
+            Self::Focuses => !couples,
+            Self::Couples => couples,
+            Self::FocusesAndCouples => true,
+        }
+    }
+
+    fn phrase(self) -> &'static str {
+        match self {
+            Self::Focuses => "focuses the beam",
+            Self::Couples => "couples the planes",
+            Self::FocusesAndCouples => "focuses the beam and couples the planes",
+        }
+    }
+}
+
 /// Number of sorts of location that compete with each other, equally likely a priori.
-pub const SORTS: usize = 13;
+pub const SORTS: usize = 14;
 
 impl Location {
     /// The name of the place: a monitor, a corrector, the label of a quadrupole, or a stretch.
@@ -58,7 +100,7 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
-            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::QuadrupoleInTime(q) => {
+            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::Linear(q, _) | Self::QuadrupoleInTime(q) => {
                 ring.label(ring.quadrupoles[q].element).to_owned()
             }
             Self::Time => "time".into(),
@@ -84,6 +126,7 @@ impl Location {
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::RingInTime(_, Plane::X) => format!("kicks near {name} in time, x"),
             Self::RingInTime(_, Plane::Y) => format!("kicks near {name} in time, y"),
+            Self::Linear(_, does) => format!("an unknown element near {name} that {}", does.phrase()),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
             Self::Time => "all monitors, in time".into(),
             Self::Tunes => "tunes, in time".into(),
@@ -108,6 +151,7 @@ impl Location {
             Self::Ring(_, Plane::Y) => format!("the beam is kicked vertically near {name}"),
             Self::RingInTime(_, Plane::X) => format!("a horizontal kick near {name} changes during the campaign"),
             Self::RingInTime(_, Plane::Y) => format!("a vertical kick near {name} changes during the campaign"),
+            Self::Linear(_, does) => format!("an unknown element near {name} {}", does.phrase()),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
             Self::Time => "the orbit changes with time at many monitors".into(),
             Self::Tunes => "the tunes change during the campaign".into(),
@@ -134,7 +178,9 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
-            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::QuadrupoleInTime(q) => ring.quadrupoles[q].element,
+            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::Linear(q, _) | Self::QuadrupoleInTime(q) => {
+                ring.quadrupoles[q].element
+            }
             Self::FrameToFrame => data.noise.frame_to_frame.as_ref()?.element(ring)?,
             Self::Time | Self::Tunes | Self::Everywhere | Self::FirstFrames { .. } => return None,
         };

@@ -13,15 +13,16 @@ use core::cell::Cell;
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::{EffectKind, Measured};
+use twin::{EffectKind, Measured, Ring, Signatures};
 
-use super::alternatives::{Alternative, Cause, Competition};
+use super::alternatives::{Alternative, Cause, Competition, SUSPICIOUS};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::error::FitError;
 use super::fit::Fitted;
 use super::half_normal::HalfNormal;
-use super::hypothesis::{Hypothesis, Term, Unknown};
+use super::heldout::lessened;
+use super::hypothesis::{Element, Hypothesis, Term, Unknown};
 use super::linearise::{self, CURVED, about_itself};
 use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
@@ -76,6 +77,26 @@ impl Found {
     pub fn nothing(&self) -> f64 {
         self.competitions.iter().fold(self.next.nothing, |least, competition| least.min(competition.nothing))
     }
+
+    /// True if the best fit has anything that the one without effects has not.
+    pub fn has_more(&self) -> bool {
+        !self.competitions.is_empty() || self.best.hypothesis.element.is_some()
+    }
+
+    /// An unknown linear element, where what is left is physics that the library does not hold, and such an element its most likely form.
+    fn unknown_element(&self) -> Result<Option<Element>, FitError> {
+        let leader = self.next.alternatives.iter().find(|one| !one.is_of_library());
+        let Some(Cause::Unmodelled(one)) = leader.map(|one| &one.cause) else { return Ok(None) };
+        let Location::Linear(quadrupole, does) = one.at else { return Ok(None) };
+        if self.next.unknown() < SUSPICIOUS {
+            return Ok(None);
+        }
+        let without = &self.next.without;
+        let (machine, drives) = without.machine_in(without.data(&self.data), one.campaign)?;
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, &drives).map_err(FitError::from)?;
+        Ok(Some(Element::of(&signatures, &self.data.ring, quadrupole, does, one.size)))
+    }
 }
 
 /// Prior odds of one more beside some effects.
@@ -127,7 +148,12 @@ impl Search {
     /// # Errors
     /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
-        let mut found = self.with_noise(self.without_effects(data)?)?;
+        let found = self.grown(self.with_noise(self.without_effects(data)?)?)?;
+        self.beside_element(found)
+    }
+
+    /// One effect after the other, as long as one more is likely to be needed.
+    fn grown(&self, mut found: Found) -> Result<Found, FitError> {
         // one effect can make another unnecessary, so that there may be more steps than effects
         for _ in 0..2 * MOST {
             let is_over = found.competitions.len() >= MOST || self.held.get() >= COMPETITIONS;
@@ -149,6 +175,51 @@ impl Search {
             found = self.with_noise(further)?;
         }
         Ok(found)
+    }
+
+    /// The search beside an unknown linear element, where that is what the library lacks: with the element in the model, what else there is shows. The
+    /// linear fields of the library beside it that were found are taken for parts of it: two independent causes at one place are rare, and what an element
+    /// does beyond first order makes parts of it seem to be needed. The element stays where it is still the most likely of what the other
+    /// effects leave.
+    fn beside_element(&self, found: Found) -> Result<Found, FitError> {
+        let Some(element) = found.unknown_element()? else { return Ok(found) };
+        let whole = self.without_parts(&found, &element)?;
+        let Some(element) = whole.unknown_element()? else { return Ok(found) };
+        let Found { data, null, best, .. } = whole;
+        let hypothesis = Hypothesis { element: Some(element), ..best.hypothesis.clone() };
+        let with = relearnt(&data, Fitted::of(best.data(&data), &hypothesis, &best.guess(&data, &hypothesis))?);
+        let (best, competitions) = self.settle(&data, with, None)?;
+        let next = self.one_more(&data, &best)?;
+        let beside = self.grown(Found { data, null, best, competitions, next })?;
+        if beside.best.hypothesis.element.is_none() {
+            return Ok(beside);
+        }
+        let without = lessened(&beside.data, &beside.best, beside.best.hypothesis.without_element())?;
+        let next = self.one_more(&beside.data, &relearnt(&beside.data, without))?;
+        let beside = Found { next, ..beside };
+        Ok(if beside.unknown_element()?.is_some() { beside } else { found })
+    }
+
+    /// The same without the effects that are parts of an unknown element.
+    fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
+        let Found { null, best, .. } = found;
+        let ring = &found.data.ring;
+        let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
+        let mut data = found.data.clone();
+        if hypothesis.terms.len() == best.hypothesis.terms.len() {
+            return Ok(found.clone());
+        }
+        if hypothesis.terms.is_empty() {
+            return self.without_effects(data);
+        }
+        let best = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
+        let best = relearnt(&data, best);
+        data.is_about_effects = true;
+        let null = null_beside(&data, null.clone(), &found.data);
+        let others = 0..hypothesis.terms.len();
+        let competitions = others.map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
+        let next = self.one_more(&data, &best)?;
+        Ok(Found { data, null, best, competitions, next })
     }
 
     /// The same, begun anew with monitors that wander as long as that is the most likely of what is left: what was found without knowing of them has to
@@ -181,7 +252,7 @@ impl Search {
     fn further(&self, found: &Found, leader: Fitted) -> Result<Found, FitError> {
         let mut data = found.data.clone();
         let mut null = found.null.clone();
-        let (mut best, mut competitions) = self.settle(&data, leader, &found.next)?;
+        let (mut best, mut competitions) = self.settle(&data, leader, Some(&found.next))?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
@@ -208,14 +279,20 @@ impl Search {
     }
 
     /// Let each effect compete with all candidates, given the others, until the best one stands in each place; effects that are then
-    /// not needed are removed. The last effect of the fit has just won its competition.
-    fn settle(&self, data: &Data, fitted: Fitted, won: &Competition) -> Result<(Fitted, Vec<Competition>), FitError> {
-        let (mut best, mut competitions) = self.compete(data, fitted, Some(won))?;
+    /// not needed are removed. The last effect of the fit may just have won its competition.
+    fn settle(
+        &self,
+        data: &Data,
+        fitted: Fitted,
+        won: Option<&Competition>,
+    ) -> Result<(Fitted, Vec<Competition>), FitError> {
+        let least = if fitted.hypothesis.element.is_some() { 0 } else { 1 };
+        let (mut best, mut competitions) = self.compete(data, fitted, won)?;
         while let Some(idle) = competitions
             .iter()
             .filter(|competition| !competition.is_suspicious())
             .max_by(|a, b| a.nothing.total_cmp(&b.nothing))
-            && competitions.len() > 1
+            && competitions.len() > least
         {
             (best, competitions) = self.compete(data, idle.without.clone(), None)?;
         }
@@ -230,8 +307,8 @@ impl Search {
         won: Option<&Competition>,
     ) -> Result<(Fitted, Vec<Competition>), FitError> {
         let mut best = fitted;
-        let last = best.hypothesis.terms.len() - 1;
         let mut competitions = Vec::new();
+        let Some(last) = best.hypothesis.terms.len().checked_sub(1) else { return Ok((best, competitions)) };
         for round in 0.. {
             let mut changed = false;
             competitions.clear();
@@ -288,7 +365,7 @@ impl Search {
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
         let mut least = f64::INFINITY;
         for (i, candidate) in scanned.iter().enumerate() {
-            if fitted.hypothesis.terms.contains(&candidate.term) {
+            if fitted.hypothesis.holds(&candidate.term, &data.ring) {
                 continue;
             }
             let known = present.as_ref().filter(|present| present.term() == Some(&candidate.term));
@@ -318,19 +395,20 @@ impl Search {
     /// The candidates for an exact fit. Where the fit is poor its vars are strongly biased, and so is a scan about them: the leaders of a
     /// scan at the prior's mean are then added.
     fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, FitError> {
-        let mut leaders = self.first(scanned, &fitted.hypothesis);
+        let ring = &data.ring;
+        let mut leaders = self.first(ring, scanned, &fitted.hypothesis);
         if fitted.is_gross() {
             let at_mean = Fitted::unfitted(data, &fitted.hypothesis).and_then(|start| scan(data, &start, &self.terms));
-            leaders.extend(at_mean.map_or_else(|_| Vec::new(), |scanned| self.first(&scanned, &fitted.hypothesis)));
+            leaders
+                .extend(at_mean.map_or_else(|_| Vec::new(), |scanned| self.first(ring, &scanned, &fitted.hypothesis)));
         }
         Ok(leaders)
     }
 
     /// The candidates near the best of a scan.
-    fn first(&self, scanned: &[Candidate], hypothesis: &Hypothesis) -> Vec<usize> {
+    fn first(&self, ring: &Ring, scanned: &[Candidate], hypothesis: &Hypothesis) -> Vec<usize> {
         let weight = |i: usize| scanned[i].log_bayes + self.log_prior[i];
-        let mut order: Vec<usize> =
-            (0..scanned.len()).filter(|&i| !hypothesis.terms.contains(&scanned[i].term)).collect();
+        let mut order: Vec<usize> = (0..scanned.len()).filter(|&i| !hypothesis.holds(&scanned[i].term, ring)).collect();
         order.sort_by(|&one, &other| weight(other).total_cmp(&weight(one)));
         let Some(&best) = order.first() else { return order };
         let behind = BEHIND.max(BEHIND_SHARE * scanned[best].log_bayes);
@@ -518,4 +596,58 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
     let best = learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
     if own.is_some() { best.to(data) } else { best }
+}
+
+#[cfg(test)]
+mod tests {
+    use twin::{Effect, Kind};
+
+    use super::*;
+    use crate::{Diagnosis, Verdict};
+    use inference::simulate::{self, Beyond, Hardware};
+
+    /// A solenoid that turns the beam by 40 mrad in the longest drift of the last superperiod.
+    struct Solenoid {
+        drift: usize,
+    }
+
+    impl Solenoid {
+        fn of(ring: &Ring) -> Self {
+            let drifts = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Drift);
+            let drift = drifts.max_by(|&a, &b| ring.elements[a].length.total_cmp(&ring.elements[b].length)).unwrap();
+            Self { drift }
+        }
+    }
+
+    impl Beyond for Solenoid {
+        fn alter_ring(&self, ring: &mut Ring) {
+            let drift = &mut ring.elements[self.drift];
+            drift.kind = Kind::Solenoid { ks: 2.0 * 0.04 / drift.length };
+        }
+    }
+
+    /// A strong one looks like a skew gradient and rolls of the quadrupoles on both sides: these are not named. Nor does it hide what else there is.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn an_element_that_the_library_lacks_is_one_unknown_thing() {
+        let (ring, template) = crate::testing::template();
+        let (solenoid, hardware) = (Solenoid::of(&ring), Hardware::shipped(&ring, &template));
+        let beyond: &[&dyn Beyond] = &[&solenoid];
+        let gain = Effect::parse("bpm_gain@x_E6=0.2", &ring).unwrap();
+        for effects in [vec![], vec![gain]] {
+            let vars = simulate::vars(&ring, true, 21).unwrap();
+            let truth = simulate::Truth { vars: &vars, effects: &effects, beyond };
+            let recording = simulate::campaign(&template, &ring, &truth, &hardware, 21).unwrap();
+            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+            assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
+            let named: Vec<EffectKind> = found.findings.iter().filter_map(|one| Some(one.term()?.kind)).collect();
+            let true_kinds: Vec<EffectKind> = effects.iter().map(|effect| effect.kind).collect();
+            assert_eq!(named, true_kinds, "{}", found.sentence);
+            let last = found.findings.last().unwrap();
+            assert!(last.is_validated(), "{}", found.sentence);
+            assert!(last.phrase.contains("couples the planes"), "{}", found.sentence);
+            let away = (last.s.unwrap() - ring.elements[solenoid.drift].s).abs();
+            assert!(away < ring.circumference / 24.0, "{away} m: two quadrupoles");
+        }
+    }
 }

@@ -11,7 +11,7 @@ use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
-use super::heldout::{Block, Score, VALIDATED, gain_of_choice, reduced};
+use super::heldout::{Block, Score, VALIDATED, gain_of_choice, lessened, reduced};
 use super::hypothesis::Term;
 use super::imperfection::Imperfection;
 use super::limits::Limits;
@@ -295,7 +295,8 @@ pub fn tests(
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let without = &reduced(data, &found.best, i)?;
-        let rival = if found.competitions.len() == 1 { before } else { &Score::of(data, without, blocks)? };
+        let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
+        let rival = if is_all { before } else { &Score::of(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_gross() {
             return Ok(Tested { gain, of_choice: None, chance: None });
@@ -304,6 +305,24 @@ pub fn tests(
         Ok(Tested { gain, of_choice: Some(gain_of_choice(&choice)?), chance: Some(chance::of_search(&choice)?) })
     };
     (0..found.competitions.len()).map(test).collect()
+}
+
+/// Test of the unknown element in the model, all effects against all but this; none where there is no such element.
+///
+/// # Errors
+/// [`FitError`].
+pub fn test_of_element(
+    data: &Data,
+    found: &Found,
+    after: &Score,
+    blocks: &[Block],
+) -> Result<Option<Tested>, FitError> {
+    if found.best.hypothesis.element.is_none() {
+        return Ok(None);
+    }
+    let without = lessened(data, &found.best, found.best.hypothesis.without_element())?;
+    let gain = after.gain_over(&Score::of(data, &without, blocks)?);
+    Ok(Some(Tested { gain, of_choice: None, chance: None }))
 }
 
 /// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of
@@ -316,6 +335,7 @@ pub fn findings(
     found: &Found,
     transients: &[Transient],
     tests: &[Tested],
+    of_element: Option<Tested>,
     of_means: Verdict,
 ) -> Result<Vec<Finding>, FitError> {
     let (named, unmodelled): (Vec<Finding>, Vec<Finding>) =
@@ -344,7 +364,7 @@ pub fn findings(
         _ => None,
     };
     if let Some(first) = open {
-        all.push(Finding::of_competition(data, &found.next, first)?);
+        all.push(Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? });
     }
     all.extend(unmodelled);
     for (index, campaign) in data.campaigns().enumerate() {
@@ -439,10 +459,14 @@ fn wandering(own: &Data) -> Vec<String> {
 
 /// What is missing and not in the library.
 fn undescribed(finding: &Finding) -> String {
-    match finding.probability >= DECISIVE {
+    let what = match finding.probability >= DECISIVE {
         true => format!("{}, which no effect of the library describes", finding.phrase),
         false => format!("something that no effect of the library describes: {}", likely(finding)),
-    }
+    };
+    let gain = finding.tested.map(|Tested { gain: (gain, error), .. }| {
+        format!("; with it in the model held-out frames gain {gain:.0} ± {error:.0} nat")
+    });
+    what + &gain.unwrap_or_default()
 }
 
 /// A cause, with its probability and the alternatives where it is less than certain.

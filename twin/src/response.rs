@@ -105,6 +105,9 @@ fn skew(back: &Matrix6<f64>, map: &Matrix6<f64>) -> Matrix6<f64> {
     -(back.column(PX) * map.row(Y) + back.column(PY) * map.row(X))
 }
 
+/// Transverse coordinates x, x', y and y'.
+const PHASE: [usize; 4] = [X, PX, Y, PY];
+
 /// Nodes and weights of four-point Gauss-Legendre quadrature on 0..1; exact to better than 1e-10 for the phase advance
 /// of any quadrupole of less than 0.8 rad (test `thick_gradients_are_exact`).
 const NODES: [(f64, f64); 4] = [
@@ -239,6 +242,21 @@ impl<'r> Optics<'r> {
     pub fn thin_skew_gradient(&self, place: Place) -> Gradient {
         let map = self.transfer_into(place);
         Gradient { place, kernel: skew(&inverse(&map), &map) }
+    }
+
+    /// Derivative with respect to the strength of a thin linear element of Hamiltonian `strength z_i z_j` at one place, z = (x, x', y, y'):
+    /// `z_i` changes by `strength z_j` times what its conjugate does to it.
+    pub fn thin_linear(&self, place: Place, [i, j]: [usize; 2]) -> Gradient {
+        let map = self.transfer_into(place);
+        let back = inverse(&map);
+        // x changes by dH/dx', x' by -dH/dx; taken away
+        let part = |of: usize, by: usize| match of {
+            0 => back.column(PX) * map.row(PHASE[by]),
+            1 => -back.column(X) * map.row(PHASE[by]),
+            2 => back.column(PY) * map.row(PHASE[by]),
+            _ => -back.column(Y) * map.row(PHASE[by]),
+        };
+        Gradient { place, kernel: part(i, j) + part(j, i) }
     }
 
     /// `integral of T^-1 E T ds` over an element, `T^-1 E T` of a place given by `field`.
@@ -431,6 +449,38 @@ mod tests {
 
     fn both_planes(optics: &Optics) -> Vec<Observer> {
         [optics.monitor_places(Plane::X), optics.monitor_places(Plane::Y)].concat()
+    }
+
+    /// A gradient is the Hamiltonian `k (x^2 - y^2)/2`; a solenoid turns the beam by an angle a wherever that is said in its drift, `a (x' y - x y')`.
+    #[test]
+    fn thin_linear_elements_are_gradients_and_rotations() {
+        let ring = Ring::booster();
+        let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+        let jacobian = |gradients: &[Gradient]| {
+            optics.response_jacobian(&both_planes(&optics), &optics.correctors(), gradients).into_iter().sum()
+        };
+        let at = Place::from(ring.quadrupoles[10].element);
+        let (x, y) = (optics.thin_linear(at, [0, 0]).times(0.5), optics.thin_linear(at, [2, 2]).times(-0.5));
+        let gradient: DMatrix<f64> = jacobian(&[x, y]);
+        let known: DMatrix<f64> = jacobian(&[optics.thin_gradient(at)]);
+        assert!((gradient - &known).amax() < 1e-12 * known.amax(), "rounding");
+        let is_drift = |element: &Element| element.kind == Kind::Drift && element.length > 0.5;
+        let drift = ring.elements.iter().position(is_drift).unwrap();
+        let length = ring.elements[drift].length;
+        let with = |angle: f64| {
+            let mut ring = ring.clone();
+            ring.elements[drift].kind = Kind::Solenoid { ks: 2.0 * angle / length };
+            let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+            optics.response(&both_planes(&optics), &optics.correctors())
+        };
+        let exact = (with(1e-4) - with(-1e-4)) / 2e-4;
+        for depth in [0.1, 0.9].map(|share| share * length) {
+            let at = Place { element: drift, depth };
+            let turned = [optics.thin_linear(at, [1, 2]), optics.thin_linear(at, [0, 3]).times(-1.0)];
+            let turned: DMatrix<f64> = jacobian(&turned);
+            // second order of 0.1 mrad, and rounding
+            assert!((turned - &exact).amax() < 1e-6 * exact.amax());
+        }
     }
 
     /// A rolled quadrupole is one of `k1 cos 2a` with a skew gradient of `-k1 sin 2a`; against differences of the exact twin.

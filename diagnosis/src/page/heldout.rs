@@ -17,7 +17,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             tables.push(scores("All frames of one corrector left out at a time.", before, after));
             ""
         }
-        None if diagnosis.found.competitions.is_empty() => "",
+        None if !diagnosis.found.has_more() => "",
         None => {
             " Whole correctors were not held out: an effect of one corrector does not appear in the frames of the others."
         }

@@ -40,7 +40,7 @@ pub fn page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, FitErr
     let found = &diagnosis.found;
     let data = &found.data;
     let mut residuals = vec![Residuals::of("before", data, &found.null)];
-    if !found.competitions.is_empty() {
+    if found.has_more() {
         residuals.push(Residuals::of("after", data, &found.best));
     }
     let mut sections: Vec<Section> = vec![
@@ -107,7 +107,7 @@ mod tests {
 
     use super::*;
     use crate::discrepancy::Discrepancy;
-    use crate::location::Location;
+    use crate::location::{Linear, Location};
     use crate::testing::template;
     use inference::simulate::{Hardware, Truth, campaign};
     use twin::Plane;
@@ -215,6 +215,7 @@ mod tests {
             Location::CorrectorElsewhere(2),
             Location::Ring(5, Plane::X),
             Location::RingInTime(5, Plane::Y),
+            Location::Linear(5, Linear::Couples),
             Location::QuadrupoleInTime(5),
             Location::Time,
             Location::Tunes,

@@ -66,6 +66,8 @@ impl Fit {
         let moves = |unknown: &Unknown| match unknown {
             Unknown::Amplitude(i, _) => moves_optics(fitted.hypothesis.terms[*i].kind),
             Unknown::Ordinary(member, _) => member.terms.first().is_some_and(|term| moves_optics(term.kind)),
+            // of first order, it is not in the machine
+            Unknown::Form(..) => false,
             // on which sextupoles focus
             Unknown::Orbit(..) => true,
         };

@@ -30,12 +30,18 @@ impl<'f> Partial<'f> {
     /// # Errors
     /// [`FitError`] where the machine without the effects keeps no beam.
     pub fn of(data: &'f Data, fitted: &'f Fitted, is_of: impl Fn(&Term) -> bool) -> Result<Self, FitError> {
-        let kept = fitted.hypothesis.terms.iter().copied().filter(|term| !is_of(term)).collect();
-        let without = Hypothesis { terms: kept, ..fitted.hypothesis.clone() };
+        Self::beyond(data, fitted, &fitted.hypothesis.without_terms(is_of))
+    }
+
+    /// What a fit has beyond a hypothesis.
+    ///
+    /// # Errors
+    /// [`FitError`] where the machine without that keeps no beam.
+    pub fn beyond(data: &'f Data, fitted: &'f Fitted, less: &Hypothesis) -> Result<Self, FitError> {
         let data = fitted.data(data);
-        let (vars, u) = (fitted.params.len(), fitted.guess(data, &without));
-        let (machine, drives) = without.machine(data, &fitted.params, &u.as_slice()[vars..])?;
-        let measured = data.residual(&fit::predicted(&machine, &drives)?);
+        let (vars, u) = (fitted.params.len(), fitted.guess(data, less));
+        let (machine, drives) = less.machine(data, &fitted.params, &u.as_slice()[vars..])?;
+        let measured = data.residual(&fit::predicted_by(data, less, 0, &u)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
         let tunes = tunes::ends(&machine, &drives)?;
         Ok(Self { fitted, data, measured, predicted, tunes })

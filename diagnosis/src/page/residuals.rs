@@ -123,9 +123,9 @@ const MOST: f64 = 12.0;
 /// [`FitError`].
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let found = &diagnosis.found;
-    let some = !found.competitions.is_empty();
+    let bare = found.best.hypothesis.without_terms(|_| true).without_element();
     // a machine that keeps no beam without the effects has no map before
-    let before = some.then(|| Partial::of(&found.data, &found.best, |_| true)).and_then(Result::ok);
+    let before = found.has_more().then(|| Partial::beyond(&found.data, &found.best, &bare)).and_then(Result::ok);
     let model = Partial::of(&found.data, &found.best, |_| false)?;
     let data = model.data;
     let (monitors, correctors) = (data.active_monitors(), data.driven_correctors());

@@ -63,8 +63,8 @@ struct Left<'d> {
 /// [`FitError`].
 pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, Figure)>, FitError> {
     let found = &diagnosis.found;
-    let partial = Partial::of(&found.data, &found.best, |_| false)?;
-    let residuals = Residual::all(partial.data, &partial.left());
+    let partial = Partial::beyond(&found.data, &found.best, &found.best.hypothesis.without_element())?;
+    let residuals = Residual::all(partial.data, &partial.measured);
     let left = Left { diagnosis, what: one.at.phrase(&found.data), residuals, partial };
     Ok(match one.at {
         Location::Monitor(b) | Location::MonitorElsewhere(b) => vec![left.of_monitor(b)],
@@ -74,6 +74,7 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::Corrector(c) | Location::CorrectorElsewhere(c) => vec![left.of_corrector(c)],
         Location::Ring(q, plane) => vec![left.kicks(q, plane)?],
         Location::RingInTime(q, plane) => vec![left.kick_in_time(q, plane)?],
+        Location::Linear(q, _) => vec![left.kicks(q, Plane::X)?, left.kicks(q, Plane::Y)?],
         Location::QuadrupoleInTime(q) => {
             let mut figures = tunes::of_model(&found.data, &found.best, &left.title())?;
             figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);

@@ -79,6 +79,11 @@ impl core::ops::Mul<f64> for Signature {
 }
 
 impl Signature {
+    /// Rms over all readings [m].
+    pub fn rms(&self) -> f64 {
+        (self.readings.norm_squared() / self.readings.len() as f64).sqrt()
+    }
+
     /// Readings and, as two more columns, the tunes of every frame.
     pub fn by_frame(self) -> DMatrix<f64> {
         let monitors = self.readings.ncols();
@@ -159,6 +164,12 @@ impl<'m> Signatures<'m> {
     /// Derivative with respect to a gradient [1/m] at any place of the ring.
     pub fn of_thin(&self, place: Place, kind: Thin) -> Signature {
         self.as_read(field::thin(self, place, kind))
+    }
+
+    /// Derivative with respect to the strength of a thin linear element of Hamiltonian `strength z_i z_j` at a place, z = (x, x', y, y'). Whatever
+    /// focuses, couples or turns the beam between two instruments is, to first order, a sum of ten such.
+    pub fn of_thin_linear(&self, place: Place, form: [usize; 2]) -> Signature {
+        self.as_read(self.of_gradient(&self.optics.thin_linear(place, form), 1.0))
     }
 
     /// What kicks and RF offset do to the orbit at a read monitor: its position and slope in the monitor's plane,
