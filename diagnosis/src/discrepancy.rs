@@ -2,7 +2,7 @@
 //!
 //! Each place is tried with free amplitudes: one of standard deviation `omega` for every setting (or stretch of time) at a monitor, a
 //! corrector or a place in the ring that kicks the beam; a quadrupole that changes in time has those of its gradient and, if the beam is off its axis,
-//! of kicks in both planes. With `Z` the whitened pattern of those amplitudes,
+//! of kicks in both planes; an unknown linear element those of the terms of its Hamiltonian, as a solenoid or a wiggler would have them. With `Z` the whitened pattern of those amplitudes,
 //! `P` the projection that removes what the fit's unknowns can absorb, `g = Z^T P r` and `G = Z^T P Z`:
 //!
 //! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,

@@ -256,6 +256,11 @@ impl Search {
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
+            if best.hypothesis.ordinary.is_empty() {
+                // about another machine what is ordinary may have left no beam
+                let learnt = relearnt(&data, best);
+                best = linearise::fit(&mut data, &learnt.hypothesis, &learnt.u)?;
+            }
             data.is_about_effects = true;
             null = null_beside(&data, null, &found.data);
             competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;

@@ -153,6 +153,28 @@ fn what_is_no_recording_is_refused() {
     }
 }
 
+/// What could be scored is told, and then what could not.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn one_recording_that_cannot_be_read_does_not_lose_the_others() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, is_whole) in [("broken", false), ("sound", true)] {
+        let to = folder.path().join(name);
+        fs::create_dir(&to).unwrap();
+        for file in ["header.toml", "frames.csv", "truth.json"] {
+            fs::copy(format!("../recordings/concealed/open-00/{file}"), to.join(file)).unwrap();
+        }
+        if !is_whole {
+            fs::write(to.join("frames.csv"), "seq\n").unwrap();
+        }
+    }
+    let run = orbitcal(&["challenge", folder.path().to_str().unwrap()]);
+    let (said, error) = (String::from_utf8_lossy(&run.stdout), String::from_utf8_lossy(&run.stderr));
+    assert_eq!(run.status.code(), Some(2), "{error}");
+    assert!(said.contains("1 right") && said.contains("sound: found nothing"), "{said}");
+    assert!(error.lines().count() == 1 && error.contains("broken"), "{error}");
+}
+
 /// Two halves of a campaign, each with correctors of its own, are two campaigns of one machine.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]

@@ -122,6 +122,25 @@ pub fn figure(finding: &Finding, partial: &Partial) -> (String, Figure) {
     (caption, Figure::lines(&axes, &[points, line]))
 }
 
+/// The figure of an unknown element, of which `partial` is the fit without it: what it leaves against what the fitted element does.
+pub fn of_element(what: &str, partial: &Partial) -> (String, Figure) {
+    let settings = of_settings(partial, 1.0);
+    let largest = settings.iter().map(|point| point.x().abs()).fold(0.0, f64::max);
+    let groups = grouped(&settings, largest);
+    let (x, y): (Vec<f64>, Vec<f64>) = groups.iter().map(|point| (point.x(), point.y())).unzip();
+    let bars = groups.iter().map(|point| (point.y() - point.sigma(), point.y() + point.sigma())).collect();
+    let measured = Series::points("measured ± 1 σ: the mean of many settings", x.clone(), y).within(bars);
+    let (from, to) = x.iter().fold((0.0_f64, 0.0_f64), |(from, to), &x| (from.min(x), to.max(x)));
+    let line = Series::line("fitted: slope 1", vec![from, to], vec![from, to]);
+    let (slope, error) = regression(&settings);
+    let title = format!("{}: slope {slope:.2} ± {error:.2} where 1 is expected", capitalised(what));
+    let axes =
+        Axes::new(&title, "change of the reading by the fitted element [µm]", "measured less model without it [µm]");
+    let caption = "Readings less the prediction of the model without the element, everything else as fitted, against what it does to them. Its strengths \
+                   are fitted to the same readings and held small by their prior, so that the slope is somewhat above 1.";
+    (caption.into(), Figure::lines(&axes, &[measured, line]))
+}
+
 /// The figure of what passes within settings: first frames against the frames before the change.
 pub fn of_first_frames(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
     // in um, the signature per percent of the share

@@ -6,7 +6,7 @@ use twin::{Hold, Optics, Plane};
 use super::lattice::{STRIP, strip};
 use super::partial::Partial;
 use super::residuals::Residual;
-use super::tunes;
+use super::{slope, tunes};
 use crate::Diagnosis;
 use crate::discrepancy::Discrepancy;
 use crate::error::FitError;
@@ -74,7 +74,11 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::Corrector(c) | Location::CorrectorElsewhere(c) => vec![left.of_corrector(c)],
         Location::Ring(q, plane) => vec![left.kicks(q, plane)?],
         Location::RingInTime(q, plane) => vec![left.kick_in_time(q, plane)?],
-        Location::Linear(q, _) => vec![left.kicks(q, Plane::X)?, left.kicks(q, Plane::Y)?],
+        Location::Linear(q, _) => {
+            let mut figures = Vec::from_iter(left.of_element());
+            figures.extend([left.kicks(q, Plane::X)?, left.kicks(q, Plane::Y)?]);
+            figures
+        }
         Location::QuadrupoleInTime(q) => {
             let mut figures = tunes::of_model(&found.data, &found.best, &left.title())?;
             figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);
@@ -88,6 +92,12 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
 }
 
 impl Left<'_> {
+    /// What the unknown element of the model does.
+    fn of_element(&self) -> Option<(String, Figure)> {
+        let element = self.partial.fitted.hypothesis.element.as_ref();
+        element.map(|_| slope::of_element(&self.what, &self.partial))
+    }
+
     fn name(&self, b: usize) -> String {
         self.partial.data.ring.monitor_names()[b].clone()
     }
@@ -218,7 +228,8 @@ impl Left<'_> {
         });
         let names: Vec<String> = driven.iter().map(|&c| data.ring.corrector_names()[c].clone()).collect();
         let label = data.ring.label(data.ring.quadrupoles[q].element);
-        let axes = Axes::new(&self.title(), "corrector that is powered", &format!("kick near {label} [µrad]"));
+        let axis = format!("{} kick near {label} [µrad]", direction(plane));
+        let axes = Axes::new(&self.title(), "corrector that is powered", &axis);
         let caption = format!(
             "The kick at {label} that describes the residuals of each setting best, the vars held, with its error from the noise. A gradient there \
              kicks in proportion to the orbit that each corrector makes."
@@ -234,7 +245,7 @@ impl Left<'_> {
             means[stretch(one.time)].add(one.value, response[one.monitor] / one.noise);
         }
         let label = self.partial.data.ring.label(self.partial.data.ring.quadrupoles[q].element);
-        let axis = format!("{} kick near {label} [µrad]", if plane == Plane::X { "horizontal" } else { "vertical" });
+        let axis = format!("{} kick near {label} [µrad]", direction(plane));
         Ok(self.over_time(&means, &axis, "The kick that describes the residuals of all monitors best, the vars held,"))
     }
 
@@ -277,6 +288,10 @@ impl Left<'_> {
     fn title(&self) -> String {
         capitalised(&self.what)
     }
+}
+
+fn direction(plane: Plane) -> &'static str {
+    if plane == Plane::X { "horizontal" } else { "vertical" }
 }
 
 fn stretch(time: f64) -> usize {

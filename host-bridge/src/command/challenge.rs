@@ -54,18 +54,30 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
     let ring = machine(options.common.machine.as_deref())?;
     let folders = folders(&options.folder)?;
     let bar = progress(folders.len(), "recordings", options.common.quiet);
-    let mut recordings = Vec::new();
+    let (mut recordings, mut refused) = (Vec::new(), Vec::new());
     for folder in &folders {
-        let recording = recording(folder, &ring)?;
-        let started = Instant::now();
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| {})?;
-        let seconds = started.elapsed().as_secs_f64();
-        let truth = Truth::read(folder, &ring).map_err(|error| CommandError::Input(error.to_string()))?;
-        recordings.push(Scored::of(&ring, &recording.name, &diagnosis, &truth, seconds));
+        match scored(&ring, folder) {
+            Ok(one) => recordings.push(one),
+            // the others are not lost with it
+            Err(error) => refused.push(format!("{}: {error}", folder.display())),
+        }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    deliver(&options.common, &ChallengeResult::of(recordings))
+    if !recordings.is_empty() {
+        deliver(&options.common, &ChallengeResult::of(recordings))?;
+    }
+    if refused.is_empty() { Ok(()) } else { Err(CommandError::Input(refused.join("; "))) }
+}
+
+/// One recording.
+fn scored(ring: &Ring, folder: &Path) -> Result<Scored, CommandError> {
+    let recording = recording(folder, ring)?;
+    let truth = Truth::read(folder, ring).map_err(|error| CommandError::Input(error.to_string()))?;
+    let started = Instant::now();
+    let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Scored::of(ring, &recording.name, &diagnosis, &truth, seconds))
 }
 
 /// Folders below (or the folder itself) that hold a recording and its key, sorted.

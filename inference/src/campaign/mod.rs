@@ -111,8 +111,7 @@ impl Campaign {
             // each of two opposite offsets is given one of its own
             spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
         };
-        let Seen { screened, params, baselines } = screener.run()?;
-        let linearised = Linearised::of(&held, &params, &supplies, &drives)?;
+        let Seen { screened, params, linearised, baselines } = screener.run()?;
         let orbit = rms_by_plane(&ring, &baselines);
         let found = ring.with_strengths(&ring.strengths(params.as_slice(), &supplies));
         let ripple = ripple_of_misaligned(&found)?;

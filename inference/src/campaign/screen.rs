@@ -62,8 +62,10 @@ pub(super) struct Groups {
 /// What remains when all frames have been taken.
 pub(super) struct Seen {
     pub screened: Screened,
-    /// The best params.
+    /// The best params, of a stable ring.
     pub params: DVector<f64>,
+    /// The ring linearised at them.
+    pub linearised: Linearised,
     /// Baselines [B] [m], for each time in the cycle.
     pub baselines: Vec<Option<f64>>,
 }
@@ -167,9 +169,18 @@ impl Screener<'_> {
         }
         screening.drop_stuck();
         let Screening { accepted, monitors, model, best, normal, .. } = screening;
-        let baselines = normal.baselines(&best.step);
         let health = monitors.iter().map(Monitor::health).collect();
-        Ok(Seen { screened: Screened { accepted, health }, params: model.params + best.step, baselines })
+        let screened = Screened { accepted, health };
+        // the last step has not been tried: next to a resonance it may lead to no stable ring
+        let shares = (0..HALVINGS).map(|halvings| 0.5_f64.powi(halvings)).chain([0.0]);
+        let mut tried = shares.map(|share| {
+            let step = &best.step * share;
+            let (params, baselines) = (&model.params + &step, normal.baselines(&step));
+            let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
+            Ok(Seen { screened: screened.clone(), params, linearised, baselines })
+        });
+        let first = tried.next().expect("there are shares");
+        first.or_else(|error| tried.find_map(Result::ok).ok_or(error))
     }
 
     /// Number of baselines: one for each monitor and time in the cycle.
