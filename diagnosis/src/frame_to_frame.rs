@@ -145,7 +145,7 @@ impl Found {
     /// The most likely pattern, beside or in the place of known ones, of which each has those before it; `noise`: of each monitor whose differences
     /// there are [m]. A pattern has to be needed beside all that are known too: it might only be the cheaper description of a crate.
     pub fn of(near: &Differences, known: &[Known], shapes: &[Shape], noise: &[Option<f64>]) -> Option<Self> {
-        let seen = Seen::of(&near.0);
+        let seen = Seen::of(&near.all);
         let shapes: Vec<Shape> = shapes.iter().filter_map(|shape| shape.over(noise)).collect();
         let (mut nothing, mut beside_all) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
         let mut best: Option<Self> = None;
@@ -504,7 +504,7 @@ mod tests {
             let known = [Known { modes: none.clone(), cost: 0.0 }, Known { modes: beside(&none, &jitter), cost }];
             let noise = vec![Some(case.noise.noise); monitors];
             logs.push(
-                Found::of(&Differences(all), &known, &case.shapes, &noise)
+                Found::of(&Differences::of(all), &known, &case.shapes, &noise)
                     .map_or(f64::NEG_INFINITY, |one| one.log_bayes),
             );
         }

@@ -8,14 +8,28 @@
 //!
 //! Source: K. V. Mardia, J. T. Kent and J. M. Bibby, Multivariate Analysis (1979), ch. 9, the factor model of known pattern.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector};
 use twin::Measured;
 
 use super::half_normal::HalfNormal;
 use super::laplace::Peak;
 
-/// Whitened differences, rows frames, columns monitors; not a number where there is none.
-pub struct Differences(pub DMatrix<f64>);
+/// Whitened differences.
+pub struct Differences {
+    /// Rows frames, columns monitors; not a number where there is none.
+    pub all: DMatrix<f64>,
+    alike: Vec<Alike>,
+}
+
+/// Frames in which the same monitors have a difference.
+struct Alike {
+    monitors: Vec<usize>,
+    frames: f64,
+    /// Sum of `z z^T`.
+    products: DMatrix<f64>,
+}
 
 /// Monitors that share a crate.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,11 +54,44 @@ const FACTOR: f64 = 1.6;
 /// Points at which the range of what is not needed is integrated.
 const RANGE: usize = 24;
 
+impl Alike {
+    /// `ln` density of the frames over that of independent differences: with `S = diag(own) + G G^T`, `V = diag(own)^-1 G` and `N = 1 + G^T V`,
+    /// `ln det S = sum of ln own + ln det N` and `S^-1 = diag(own)^-1 - V N^-1 V^T`.
+    fn log_likelihood(&self, modes: &DMatrix<f64>) -> f64 {
+        let modes = modes.select_rows(&self.monitors);
+        let own =
+            DVector::from_iterator(modes.nrows(), modes.row_iter().map(|row| (1.0 - row.norm_squared()).max(OWN)));
+        let mut over = modes.clone();
+        over.column_iter_mut().for_each(|mut column| column.component_div_assign(&own));
+        let normal = DMatrix::identity(modes.ncols(), modes.ncols()) + modes.tr_mul(&over);
+        let Some(factor) = normal.cholesky() else { return f64::NEG_INFINITY };
+        let log_det = 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
+        let squares = self.products.diagonal();
+        let alone: f64 =
+            own.iter().zip(&squares).map(|(own, square)| square * (1.0 / own - 1.0) + self.frames * own.ln()).sum();
+        let together = factor.solve(&(over.tr_mul(&self.products) * over)).trace();
+        -0.5 * (alone - together + self.frames * log_det)
+    }
+}
+
 impl Differences {
+    /// Of a matrix, rows frames, columns monitors, not a number where there is none.
+    pub fn of(all: DMatrix<f64>) -> Self {
+        let mut alike: BTreeMap<Vec<usize>, Vec<usize>> = BTreeMap::new();
+        for (frame, row) in all.row_iter().enumerate() {
+            let seen = (0..row.len()).filter(|&b| !row[b].is_nan()).collect();
+            alike.entry(seen).or_default().push(frame);
+        }
+        let of = |(monitors, frames): (Vec<usize>, Vec<usize>)| {
+            let some = all.select_rows(&frames).select_columns(&monitors);
+            Alike { products: some.tr_mul(&some), monitors, frames: frames.len() as f64 }
+        };
+        Self { alike: alike.into_iter().map(of).collect(), all }
+    }
+
     /// `ln` likelihood of common modes, one a column [monitors][modes], over that of none.
     pub fn log_likelihood(&self, modes: &DMatrix<f64>) -> f64 {
-        let own: Vec<f64> = modes.row_iter().map(|row| (1.0 - row.norm_squared()).max(OWN)).collect();
-        self.0.row_iter().map(|frame| of_frame(frame.iter().copied(), &own, modes)).sum()
+        self.alike.iter().map(|frames| frames.log_likelihood(modes)).sum()
     }
 
     /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior, beside known modes.
@@ -57,7 +104,7 @@ impl Differences {
     /// With the error of a sample of the frames: readings are in units of their rms in these, that of the mode included. `power`: 1/2 of an
     /// rms, 1 of a variance.
     fn sampled(&self, found: Measured, power: f64) -> Measured {
-        let frames = self.0.row_iter().filter(|frame| frame.iter().any(|z| !z.is_nan())).count();
+        let frames = self.all.row_iter().filter(|frame| frame.iter().any(|z| !z.is_nan())).count();
         let sample = found.value * power * (2.0 / frames.max(1) as f64).sqrt();
         Measured { sigma: found.sigma.hypot(sample), ..found }
     }
@@ -88,12 +135,12 @@ impl Differences {
 
     /// Mean products of pairs of monitors in units of their errors without correlation, the part of known modes taken out.
     pub fn correlation(&self, known: &DMatrix<f64>) -> DMatrix<f64> {
-        let monitors = self.0.ncols();
+        let monitors = self.all.ncols();
         let common = known * known.transpose();
         let mut sums = DMatrix::zeros(monitors, monitors);
         for b in 0..monitors {
             for other in 0..b {
-                let pairs = self.0.column(b).component_mul(&self.0.column(other));
+                let pairs = self.all.column(b).component_mul(&self.all.column(other));
                 let known = pairs.iter().filter(|product| !product.is_nan());
                 let (sum, count) = known.fold((0.0, 0.0), |(sum, count), product| (sum + product, count + 1.0));
                 let off = if count > 0.0 { (sum - count * common[(b, other)]) / f64::sqrt(count) } else { 0.0 };
@@ -119,25 +166,6 @@ fn learnt(log_likelihood: impl Fn(f64) -> f64, width: f64, correction: f64) -> M
         return Measured { value, sigma: value * peak.sigma(0) };
     }
     Measured { value: 0.0, sigma: HalfNormal::of(log_likelihood, width, RANGE).range(correction) }
-}
-
-/// `ln` density of one frame over that of independent differences: with `S = diag(own) + G G^T`,
-/// `ln det S = sum of ln own + ln det(1 + G^T G/own)`.
-fn of_frame(differences: impl Iterator<Item = f64>, own: &[f64], modes: &DMatrix<f64>) -> f64 {
-    let k = modes.ncols();
-    let (mut normal, mut pull) = (DMatrix::identity(k, k), DVector::zeros(k));
-    let mut log = 0.0;
-    for (b, z) in differences.enumerate().filter(|(_, z)| !z.is_nan()) {
-        log -= 0.5 * (z * z * (1.0 / own[b] - 1.0) + own[b].ln());
-        for i in 0..k {
-            let share = modes[(b, i)] / own[b];
-            pull[i] += share * z;
-            (0..k).for_each(|j| normal[(i, j)] += share * modes[(b, j)]);
-        }
-    }
-    let Some(factor) = normal.cholesky() else { return f64::NEG_INFINITY };
-    let log_det: f64 = factor.l_dirty().diagonal().iter().map(|d: &f64| d.ln()).sum();
-    log + 0.5 * pull.dot(&factor.solve(&pull)) - log_det
 }
 
 /// Groups of neighbours that may share a crate, in some orders.
@@ -170,4 +198,33 @@ fn strength(correlation: &DMatrix<f64>, group: &[usize]) -> f64 {
     let pairs = (0..group.len()).flat_map(|i| (0..i).map(move |j| (group[i], group[j])));
     let all: Vec<f64> = pairs.map(|(b, other)| correlation[(b, other)]).collect();
     all.iter().sum::<f64>() / (all.len() as f64).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Of frames with and without some monitors, as the normal density of each with its covariance.
+    #[test]
+    fn the_likelihood_is_that_of_every_frame() {
+        let wave = |i: usize, b: usize| (0.7 + (5 * i + 3 * b) as f64).sin();
+        let is_missing = |i: usize, b: usize| (i + 2 * b) % 7 == 0;
+        let all = DMatrix::from_fn(12, 6, |i, b| if is_missing(i, b) { f64::NAN } else { 1.5 * wave(i, b) });
+        let modes = DMatrix::from_fn(6, 2, |b, k| 0.5 * wave(k, b));
+        let density = |z: &DVector<f64>, covariance: DMatrix<f64>| {
+            let factor = covariance.cholesky().unwrap();
+            -0.5 * (z.dot(&factor.solve(z)) + 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>())
+        };
+        let of_frame = |i: usize| {
+            let seen: Vec<usize> = (0..6).filter(|&b| !is_missing(i, b)).collect();
+            let z = DVector::from_iterator(seen.len(), seen.iter().map(|&b| all[(i, b)]));
+            let modes = modes.select_rows(&seen);
+            let mut covariance = &modes * modes.transpose();
+            covariance.fill_diagonal(1.0);
+            density(&z, covariance) - density(&z, DMatrix::identity(seen.len(), seen.len()))
+        };
+        let known: f64 = (0..12).map(of_frame).sum();
+        let found = Differences::of(all.clone()).log_likelihood(&modes);
+        assert!((found - known).abs() < 1e-12 * known.abs(), "{found} {known}");
+    }
 }

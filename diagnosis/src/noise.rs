@@ -203,10 +203,10 @@ impl Noise {
             one.sigma = one.repeats.weigh(slow.memory(one.sigma)).sigma().unwrap_or(one.sigma);
         }
         let of = |repeats: fn(&Learner) -> &Repeats| {
-            Differences(differences(&learners, repeats, &slow, (campaign.frames(), campaign.monitors())))
+            Differences::of(differences(&learners, repeats, &slow, (campaign.frames(), campaign.monitors())))
         };
         let (differences, near) = (of(|one| &one.repeats), of(|one| &one.near));
-        let kurtosis = kurtosis(&differences.0);
+        let kurtosis = kurtosis(&differences.all);
         // per momentum, in units of the noise of whole readings
         let mut pattern = DVector::zeros(campaign.monitors());
         learners.iter().for_each(|one| pattern[one.b] = source.dispersion[one.b] / one.sigma);

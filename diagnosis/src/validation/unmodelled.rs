@@ -15,8 +15,18 @@
 //! | `alternate_cycle` | a corrector gives a kick `a` too much in every second machine cycle, which follows another user's | rad |
 //! | `thermostat` | `ln` of a quadrupole's gradient follows its cooling water: `+ a sin(2 pi (5 t/2 + phase))` | 1 |
 //! | `solenoid` | a drift is filled by a solenoid that turns the beam by `a`: `ks = 2 a/length` | rad |
+//! | `crate_sag` | while another corrector of its crate of eight is on, of either sign, this one kicks `+ a sum of abs(kick)/0.2 mrad` | rad |
+//! | `coil_heat` | a corrector's coil warms: kick times `1 - a T`, `T <- (T + (kick/0.2 mrad)^2)/2` after each cycle | 1 |
+//! | `neighbour_pulse` | every seventh cycle another machine's stray field kicks by `a`, then `a/3`, then `a/9` | rad |
+//! | `loop_gradient` | the correctors' common return runs through a trim winding: `ln` of a quadrupole's gradient `+ a (sum of all kicks)/0.2 mrad` | 1 |
+//! | `flickering_turn` | a short comes and goes: a quadrupole is weaker by the share `a` for about 4 cycles in 20 | 1 |
+//! | `bucked_solenoids` | two opposite solenoids fill a drift: no rotation is left, but focusing `a = ks^2 length/4` in both planes | 1/m |
+//! | `stuck_bit` | the bit of weight `a` of a monitor's converter stays at 0 | m |
+//! | `range_switch` | a monitor's gain is `1 + a` from 1.3 rms outwards, until it is back at 0.7 rms | 1 |
+//! | `loss_offset` | large orbits lose beam, which moves a monitor's zero: `+ a w/mean(w)`, w the squared orbit at all monitors, at most `4 a` | m |
 //!
-//! The last six are by somebody who had seen neither the library nor the diagnosis: they say what becomes of physics that the diagnosis was not made for.
+//! The last nine are by somebody who had seen neither the library nor the diagnosis, written before the code that first met them: they say what
+//! becomes of physics that the diagnosis was not made for. So were the six before these, which have been looked at since.
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -51,6 +61,24 @@ pub enum UnmodelledKind {
     Thermostat,
     /// A solenoid, uncompensated, in a free drift.
     Solenoid,
+    /// A corrector's supply changes with the load of its crate.
+    CrateSag,
+    /// A corrector's coil warms by its own current.
+    CoilHeat,
+    /// Another machine's field kicks the beam at a corrector every seventh cycle.
+    NeighbourPulse,
+    /// The current of all correctors runs through a quadrupole's winding.
+    LoopGradient,
+    /// A turn of a quadrupole is shorted now and then.
+    FlickeringTurn,
+    /// A solenoid and its opposite in a free drift.
+    BuckedSolenoids,
+    /// A bit of a monitor's converter is stuck.
+    StuckBit,
+    /// A monitor switches its range, with a memory.
+    RangeSwitch,
+    /// Lost beam moves a monitor's zero.
+    LossOffset,
 }
 
 /// One of them: where, and how large.
@@ -70,8 +98,11 @@ pub struct Unmodelled {
 
 /// What a corrector kicks at its nominal setting [rad].
 const FULL_KICK: f64 = 2e-4;
-/// Length from which on a drift takes a solenoid [m]: its focusing, of the order of a^2/length, is then weak.
+/// Length from which on a drift takes a solenoid [m]: its focusing, of the order of a^2/length, is then weak; and of one that takes two.
 const ROOM: f64 = 0.5;
+const ROOM_FOR_TWO: f64 = 0.3;
+/// Correctors of a crate.
+const CRATE: usize = 8;
 
 impl UnmodelledKind {
     /// Those that have places in a ring.
@@ -80,7 +111,7 @@ impl UnmodelledKind {
     }
 
     /// Every kind.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 20] = [
         Self::QuadJump,
         Self::WarmUp,
         Self::Saturation,
@@ -92,19 +123,35 @@ impl UnmodelledKind {
         Self::AlternateCycle,
         Self::Thermostat,
         Self::Solenoid,
+        Self::CrateSag,
+        Self::CoilHeat,
+        Self::NeighbourPulse,
+        Self::LoopGradient,
+        Self::FlickeringTurn,
+        Self::BuckedSolenoids,
+        Self::StuckBit,
+        Self::RangeSwitch,
+        Self::LossOffset,
     ];
 
     /// True for those that the diagnosis was not made for.
     pub fn is_frozen(self) -> bool {
         match self {
             Self::QuadJump | Self::WarmUp | Self::Saturation | Self::OrbitDrift | Self::BpmWander => false,
-            Self::DeadBand
-            | Self::CablePickup
-            | Self::BusSag
-            | Self::AlternateCycle
-            | Self::Thermostat
-            | Self::Solenoid => true,
+            Self::DeadBand | Self::CablePickup | Self::BusSag => false,
+            Self::AlternateCycle | Self::Thermostat | Self::Solenoid => false,
+            Self::CrateSag | Self::CoilHeat | Self::NeighbourPulse => true,
+            Self::LoopGradient | Self::FlickeringTurn | Self::BuckedSolenoids => true,
+            Self::StuckBit | Self::RangeSwitch | Self::LossOffset => true,
         }
+    }
+
+    /// True for those whose size has no sign.
+    fn is_positive(self) -> bool {
+        matches!(
+            self,
+            Self::Saturation | Self::CoilHeat | Self::FlickeringTurn | Self::BuckedSolenoids | Self::StuckBit
+        )
     }
 
     /// The word for it.
@@ -121,6 +168,15 @@ impl UnmodelledKind {
             Self::AlternateCycle => "alternate_cycle",
             Self::Thermostat => "thermostat",
             Self::Solenoid => "solenoid",
+            Self::CrateSag => "crate_sag",
+            Self::CoilHeat => "coil_heat",
+            Self::NeighbourPulse => "neighbour_pulse",
+            Self::LoopGradient => "loop_gradient",
+            Self::FlickeringTurn => "flickering_turn",
+            Self::BuckedSolenoids => "bucked_solenoids",
+            Self::StuckBit => "stuck_bit",
+            Self::RangeSwitch => "range_switch",
+            Self::LossOffset => "loss_offset",
         }
     }
 
@@ -142,23 +198,40 @@ impl UnmodelledKind {
             Self::BusSag | Self::AlternateCycle => [5e-7, 1e-4],
             Self::Thermostat => [5e-4, 0.025],
             Self::Solenoid => [5e-4, 0.05],
+            Self::CrateSag => [3e-7, 1.5e-5],
+            Self::CoilHeat => [0.01, 0.4],
+            Self::NeighbourPulse => [5e-7, 2.5e-5],
+            Self::LoopGradient => [2e-4, 1e-2],
+            Self::FlickeringTurn => [4e-4, 2e-2],
+            Self::BuckedSolenoids => [1e-4, 5e-3],
+            Self::StuckBit => [2e-5, 1e-3],
+            Self::RangeSwitch => [6e-3, 0.3],
+            Self::LossOffset => [4e-6, 2e-4],
         }
     }
 
     /// Where it may act in a campaign.
     fn sites(self, ring: &Ring) -> Vec<Site> {
         match self {
-            Self::WarmUp | Self::Saturation | Self::BpmWander | Self::DeadBand | Self::CablePickup => {
-                ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect()
+            Self::WarmUp
+            | Self::Saturation
+            | Self::BpmWander
+            | Self::DeadBand
+            | Self::CablePickup
+            | Self::StuckBit
+            | Self::RangeSwitch
+            | Self::LossOffset => ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect(),
+            Self::QuadJump | Self::Thermostat | Self::LoopGradient | Self::FlickeringTurn => {
+                (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect()
             }
-            Self::QuadJump | Self::Thermostat => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
-            Self::OrbitDrift | Self::BusSag | Self::AlternateCycle => {
-                (0..ring.correctors.len()).map(Site::Corrector).collect()
-            }
-            Self::Solenoid => {
-                let has_room = |element: &Element| element.kind == Kind::Drift && element.length > ROOM;
-                (0..ring.elements.len()).filter(|&at| has_room(&ring.elements[at])).map(Site::Element).collect()
-            }
+            Self::OrbitDrift
+            | Self::BusSag
+            | Self::AlternateCycle
+            | Self::CrateSag
+            | Self::CoilHeat
+            | Self::NeighbourPulse => (0..ring.correctors.len()).map(Site::Corrector).collect(),
+            Self::Solenoid => drifts(ring, ROOM),
+            Self::BuckedSolenoids => drifts(ring, ROOM_FOR_TWO),
         }
     }
 }
@@ -173,7 +246,7 @@ impl Unmodelled {
         let sites = kind.sites(ring);
         let site = *sites.choose(&mut random).expect("a ring has places of every kind");
         let [weak, strong] = kind.sizes().map(f64::ln);
-        let sign = if kind != UnmodelledKind::Saturation && random.random_bool(0.5) { -1.0 } else { 1.0 };
+        let sign = if !kind.is_positive() && random.random_bool(0.5) { -1.0 } else { 1.0 };
         let size = sign * random.random_range(weak..=strong).exp();
         Self { kind, site, size, index: index(ring, site), when: random.random_range(-0.5..=0.5) }
     }
@@ -194,14 +267,26 @@ impl Unmodelled {
 
 impl Beyond for Unmodelled {
     fn alter_ring(&self, ring: &mut Ring) {
-        if self.kind == UnmodelledKind::Solenoid {
-            let drift = &mut ring.elements[self.index];
-            drift.kind = Kind::Solenoid { ks: 2.0 * self.size / drift.length };
+        let Site::Element(at) = self.site else { return };
+        let drift = &mut ring.elements[at];
+        match self.kind {
+            UnmodelledKind::Solenoid => drift.kind = Kind::Solenoid { ks: 2.0 * self.size / drift.length },
+            UnmodelledKind::BuckedSolenoids => {
+                let ks = 2.0 * (self.size / drift.length).sqrt();
+                drift.length *= 0.5;
+                drift.kind = Kind::Solenoid { ks };
+                let second = Element { kind: Kind::Solenoid { ks: -ks }, s: drift.s + drift.length, ..drift.clone() };
+                insert(ring, at + 1, second);
+            }
+            _ => {}
         }
     }
 
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
+        let (mut warmth, mut short) = (0.0, Flicker::of(self.when));
         for (count, cycle) in cycles.iter_mut().enumerate() {
+            // as if the first cycle were one of several
+            let since = |period: usize| (count + ((self.when + 0.5) * period as f64) as usize) % period;
             match self.kind {
                 UnmodelledKind::QuadJump if cycle.time >= self.when => cycle.strength[self.index] += self.size.ln_1p(),
                 UnmodelledKind::Thermostat => {
@@ -214,14 +299,38 @@ impl Beyond for Unmodelled {
                     cycle.kick[self.index] += self.size * load / FULL_KICK;
                 }
                 UnmodelledKind::AlternateCycle if count % 2 == 1 => cycle.kick[self.index] += self.size,
+                UnmodelledKind::CrateSag => {
+                    let is_beside = |c: usize| c != self.index && c / CRATE == self.index / CRATE;
+                    let others = cycle.kick.iter().enumerate().filter(|(c, _)| is_beside(*c));
+                    let load: f64 = others.map(|(_, kick)| kick.abs()).sum();
+                    cycle.kick[self.index] += self.size * load / FULL_KICK;
+                }
+                UnmodelledKind::CoilHeat => {
+                    let kick = &mut cycle.kick[self.index];
+                    let power = (*kick / FULL_KICK).powi(2);
+                    *kick *= 1.0 - self.size * warmth;
+                    warmth = 0.5 * (warmth + power);
+                }
+                UnmodelledKind::NeighbourPulse if since(7) < 3 => {
+                    cycle.kick[self.index] += self.size / 3.0_f64.powi(since(7) as i32);
+                }
+                UnmodelledKind::LoopGradient => {
+                    cycle.strength[self.index] += self.size * cycle.kick.iter().sum::<f64>() / FULL_KICK;
+                }
+                UnmodelledKind::FlickeringTurn if short.next() => cycle.strength[self.index] -= self.size,
                 _ => {}
             }
         }
     }
 
     fn alter_readings(&self, cycles: &[Cycle], readings: &mut DMatrix<f64>) {
-        let mut shown = f64::INFINITY;
-        let mut read = |cycle: &Cycle, x: f64| match self.kind {
+        let lost = lost(readings);
+        if !matches!(self.site, Site::Monitor(_)) {
+            return;
+        }
+        let (centre, rms) = (readings.column(self.index).mean(), readings.column(self.index).variance().sqrt());
+        let (mut shown, mut is_coarse) = (f64::INFINITY, false);
+        let mut read = |cycle: &Cycle, x: f64, lost: f64| match self.kind {
             UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(cycle.time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
             UnmodelledKind::BpmWander => x + self.size * self.slow_variation(cycle.time),
@@ -232,14 +341,62 @@ impl Beyond for Unmodelled {
                 }
                 shown
             }
+            UnmodelledKind::StuckBit => {
+                let is_set = (x / self.size + 2.0 * self.when).floor().rem_euclid(2.0) > 0.5;
+                if is_set { x - self.size } else { x }
+            }
+            UnmodelledKind::RangeSwitch => {
+                is_coarse = (x - centre).abs() > if is_coarse { 0.7 * rms } else { 1.3 * rms };
+                if is_coarse { x + self.size * (x - centre) } else { x }
+            }
+            UnmodelledKind::LossOffset => x + self.size * lost.min(4.0),
             _ => x,
         };
-        if matches!(self.site, Site::Monitor(_)) {
-            for (cycle, reading) in cycles.iter().zip(&mut readings.column_mut(self.index)) {
-                *reading = read(cycle, *reading);
-            }
+        for ((cycle, reading), lost) in cycles.iter().zip(&mut readings.column_mut(self.index)).zip(lost) {
+            *reading = read(cycle, *reading, lost);
         }
     }
+}
+
+/// A short that closes with a chance of 1 in 16 and opens with 1 in 4.
+struct Flicker {
+    state: u64,
+    is_closed: bool,
+}
+
+impl Flicker {
+    fn of(seed: f64) -> Self {
+        Self { state: seed.to_bits(), is_closed: false }
+    }
+
+    fn next(&mut self) -> bool {
+        self.state = self.state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.is_closed ^= self.state >> 60 < if self.is_closed { 4 } else { 1 };
+        self.is_closed
+    }
+}
+
+/// Squared orbit at all monitors in each cycle, about the mean orbit, over its mean.
+fn lost(readings: &DMatrix<f64>) -> Vec<f64> {
+    let means = readings.row_mean();
+    let squares: Vec<f64> = readings.row_iter().map(|row| (row - &means).norm_squared()).collect();
+    let usual = squares.iter().sum::<f64>() / squares.len() as f64;
+    squares.into_iter().map(|square| square / usual.max(f64::MIN_POSITIVE)).collect()
+}
+
+/// The drifts that are longer than some length [m].
+fn drifts(ring: &Ring, room: f64) -> Vec<Site> {
+    let has_room = |element: &Element| element.kind == Kind::Drift && element.length > room;
+    (0..ring.elements.len()).filter(|&at| has_room(&ring.elements[at])).map(Site::Element).collect()
+}
+
+/// Put an element into a ring.
+fn insert(ring: &mut Ring, at: usize, element: Element) {
+    ring.elements.insert(at, element);
+    let quadrupoles = ring.quadrupoles.iter_mut().map(|one| &mut one.element);
+    let monitors = ring.monitors.iter_mut().map(|one| &mut one.element);
+    let correctors = ring.correctors.iter_mut().map(|one| &mut one.element);
+    quadrupoles.chain(monitors).chain(correctors).filter(|own| **own >= at).for_each(|own| *own += 1);
 }
 
 /// Index of the place among the read monitors, correctors, quadrupoles or elements.
