@@ -27,6 +27,7 @@ use twin::{Plane, Signature, Signatures};
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
+use super::hypothesis::Element;
 use super::location::{Linear, Location};
 use super::settings::Settings;
 
@@ -175,16 +176,13 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         found.push(linearised.judge(Location::RingInTime(*quadrupole, *plane), &of_stretches, sites));
     }
     let always = DMatrix::from_element(data.readings.nrows(), 1, 1.0);
-    for (q, quadrupole) in data.ring.quadrupoles.iter().enumerate() {
-        let forms: Vec<[usize; 2]> = Linear::FocusesAndCouples.forms().collect();
-        let of_form = |&form: &[usize; 2]| {
-            let signature = signatures.of_thin_linear(quadrupole.element.into(), form);
-            data.stepped(&signature, &always, &active).column(0).into_owned()
-        };
-        let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(of_form).collect::<Vec<_>>()), &own);
+    let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
+    for q in 0..data.ring.quadrupoles.len() {
+        let forms = Element::signatures(&signatures, &data.ring, q);
+        let column = |(_, one): &([usize; 2], Signature)| data.stepped(one, &always, &active).column(0).into_owned();
+        let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(column).collect::<Vec<_>>()), &own);
         for does in Linear::ALL {
-            let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i])).collect();
-            let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
+            let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
             found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
         }
     }

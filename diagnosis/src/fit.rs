@@ -261,6 +261,14 @@ impl Fitted {
         (0..data.count()).map(|campaign| Ok(self.machine_in(data, campaign)?.0)).collect()
     }
 
+    /// Change of the tunes by the unknown element, which is not in the machine; 0 without one.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
+        Ok(of_element(self.data(data), &self.hypothesis, 0, &self.u)?.map_or([0.0; 2], |own| own.tunes))
+    }
+
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
     pub fn is_stable(&self, data: &Data) -> bool {
         let keeps = |campaign: usize| {
@@ -311,7 +319,7 @@ impl Fitted {
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
                 Unknown::Ordinary(..) | Unknown::Form(..) => {
-                    let own = of_linear(data, 0, &signatures, &self.hypothesis, unknown)?;
+                    let own = of_linear(data, 0, &signatures, unknown)?;
                     own.unwrap_or_else(|| slopes[0].clone() * 0.0)
                 }
                 _ => {
@@ -377,7 +385,7 @@ impl<'d> Problem<'d> {
         debug_assert!(unknowns[others..].iter().all(Unknown::is_of_first_order), "they are the last");
         let first = data.units.len() + others;
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
-        let ordinary = Ordinary::about(data, hypothesis, &unknowns[others..], machine)?;
+        let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
         Ok(Self { data, hypothesis, start: start.rows_range(first..).into_owned(), unknowns, ordinary })
     }
 
@@ -414,7 +422,7 @@ impl<'d> Problem<'d> {
             let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
             let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
             let of_others = self.unknowns[..self.others() - vars].iter();
-            let of_others = of_others.map(|unknown| of_linear(data, campaign, &signatures, self.hypothesis, unknown));
+            let of_others = of_others.map(|unknown| of_linear(data, campaign, &signatures, unknown));
             own.signatures::<EffectError>(self.others(), of_vars.chain(of_others))
         })?;
         let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
@@ -434,7 +442,6 @@ impl<'d> Problem<'d> {
 impl Ordinary {
     fn about(
         data: &Data,
-        hypothesis: &Hypothesis,
         unknowns: &[Unknown],
         machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
     ) -> Result<Self, EffectError> {
@@ -442,7 +449,7 @@ impl Ordinary {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
             let signatures = Signatures::of(&machine, &drives)?;
-            let of = |unknown: &Unknown| of_linear(data, campaign, &signatures, hypothesis, unknown);
+            let of = |unknown: &Unknown| of_linear(data, campaign, &signatures, unknown);
             own.signatures::<EffectError>(unknowns.len(), unknowns.iter().map(of))
         })?;
         let gram = gram(&slopes);
@@ -468,7 +475,8 @@ fn machine_at(
     hypothesis.machine_in(data, campaign, &data.units.params(u), &u.as_slice()[data.units.len()..])
 }
 
-/// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element.
+/// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element. How the vars change what the element does is
+/// left out of the fit's derivatives, though not of its residuals: beside a solenoid of 40 mrad a fit that is begun again where it ended differs by 0.75 nat.
 ///
 /// # Errors
 /// [`EffectError`].
@@ -480,18 +488,41 @@ pub(super) fn predicted_by(
 ) -> Result<Signature, EffectError> {
     let (machine, drives) = machine_at(data, hypothesis, campaign, u)?;
     let mut all = predicted(&machine, &drives)?;
-    if hypothesis.element.is_some() {
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, &drives)?;
-        for (unknown, u) in hypothesis.unknowns(data).iter().zip(u.iter().skip(data.units.len())) {
-            if matches!(unknown, Unknown::Form(..))
-                && let Some(form) = of_linear(data, campaign, &signatures, hypothesis, unknown)?
-            {
-                all += form * *u;
-            }
-        }
+    if let Some(own) = of_element(data, hypothesis, campaign, u)? {
+        all += own;
     }
     Ok(all)
+}
+
+/// What the unknown element of a hypothesis does, if it has one.
+///
+/// # Errors
+/// [`EffectError`].
+pub(super) fn of_element(
+    data: &Data,
+    hypothesis: &Hypothesis,
+    campaign: usize,
+    u: &DVector<f64>,
+) -> Result<Option<Signature>, EffectError> {
+    if hypothesis.element.is_none() {
+        return Ok(None);
+    }
+    let (machine, drives) = machine_at(data, hypothesis, campaign, u)?;
+    let machine = machine.on_orbit(&drives.orbit);
+    let signatures = Signatures::of(&machine, &drives)?;
+    let unknowns = hypothesis.unknowns(data);
+    let forms = unknowns.iter().zip(u.iter().skip(data.units.len()));
+    let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));
+    let mut sum: Option<Signature> = None;
+    for (unknown, u) in forms {
+        let Some(form) = of_linear(data, campaign, &signatures, unknown)? else { continue };
+        let form = form * *u;
+        match &mut sum {
+            None => sum = Some(form),
+            Some(sum) => *sum += form,
+        }
+    }
+    Ok(sum)
 }
 
 /// What a machine predicts.
@@ -503,22 +534,23 @@ pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature,
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }
 
-/// The signature of an ordinary imperfection, or of a form of the unknown element, in a recording, per width; none of another unknown, or where it does
+/// The signature of an ordinary imperfection, or of a form of an unknown element, in a recording, per width; none of another unknown, or where it does
 /// not act.
 fn of_linear(
     data: &Data,
     campaign: usize,
     signatures: &Signatures,
-    hypothesis: &Hypothesis,
     unknown: &Unknown,
 ) -> Result<Option<Signature>, EffectError> {
-    match (unknown, &hypothesis.element) {
-        (Unknown::Ordinary(member, width), _) if member.is_in(campaign) => {
+    match unknown {
+        Unknown::Ordinary(member, width) if member.is_in(campaign) => {
             Ok(Some(together(signatures, member, |kind| data.scale(campaign, kind))? * *width))
         }
-        (Unknown::Form(i, sigma), Some(element)) => {
-            let at = data.ring.quadrupoles[element.quadrupole].element.into();
-            Ok(Some(signatures.of_thin_linear(at, element.form(*i)) * *sigma))
+        Unknown::Form(quadrupole, form, sigma) => {
+            let at = data.ring.quadrupoles[*quadrupole].element.into();
+            // as a field that is no magnet of the ring
+            let scale = data.scale(campaign, EffectKind::StrayGradient);
+            Ok(Some(signatures.of_thin_linear(at, *form) * (*sigma * scale)))
         }
         _ => Ok(None),
     }

@@ -516,7 +516,7 @@ mod tests {
     }
 
     #[test]
-    fn unordinary_sizes_begin_at_four_widths() {
+    fn unordinary_sizes_begin_at_nearly_four_widths() {
         assert!(beyond_ordinary(3.75) < correction_of_sort() && beyond_ordinary(3.85) > correction_of_sort());
         // a period that chance gives once in a hundred recordings is no evidence, of one in a million it is
         assert!(

@@ -1,6 +1,6 @@
 //! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Signatures, Site};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Signature, Signatures, Site};
 
 use super::data::Data;
 use super::location::Linear;
@@ -28,15 +28,16 @@ pub struct Hypothesis {
     pub given: Vec<Effect>,
 }
 
-/// A thin linear element that the library does not hold, at the entrance of a quadrupole; to first order.
+/// A thin linear element that the library does not hold, at the entrance of a quadrupole; to first order. In recordings at several energies it is a field
+/// that does not grow with the magnets.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Element {
     /// Index of the quadrupole.
     pub quadrupole: usize,
     /// What it does.
     pub does: Linear,
-    /// Prior standard deviation of the strength of each of its forms, in their order.
-    pub sigma: Vec<f64>,
+    /// Its forms `z_i z_j`, z = (x, x', y, y'), with the prior standard deviation of the strength of each.
+    pub forms: Vec<([usize; 2], f64)>,
 }
 
 /// One unknown besides the vars, with its prior standard deviation.
@@ -46,8 +47,8 @@ pub enum Unknown {
     Amplitude(usize, f64),
     /// The orbit of a recording at an element, in x or y [m].
     Orbit(usize, usize, Plane, f64),
-    /// The strength of a form of the unknown element, by its index.
-    Form(usize, f64),
+    /// The strength of a form of an unknown element near a quadrupole.
+    Form(usize, [usize; 2], f64),
     /// One ordinary imperfection.
     Ordinary(Member, f64),
 }
@@ -82,28 +83,39 @@ pub enum Identity<'u> {
 }
 
 impl Element {
-    /// One whose forms each change the readings by `size` (rms).
+    /// One whose forms each change the readings by `size` (rms); those that change them by much less than others do, such as those of a plane in which
+    /// nothing was kicked, are left out.
     pub fn of(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
+        let all = Self::signatures(signatures, ring, quadrupole);
+        let some = all.into_iter().filter(|(form, _)| does.has(*form));
+        Self { quadrupole, does, forms: some.map(|(form, signature)| (form, size / signature.rms())).collect() }
+    }
+
+    /// The forms at a quadrupole that a recording shows, with their signatures.
+    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<([usize; 2], Signature)> {
         let at = ring.quadrupoles[quadrupole].element.into();
-        let sigma = |form| size / signatures.of_thin_linear(at, form).rms();
-        Self { quadrupole, does, sigma: does.forms().map(sigma).collect() }
+        let all = Linear::FocusesAndCouples.forms().map(|form| (form, signatures.of_thin_linear(at, form)));
+        let mut all: Vec<_> = all.collect();
+        let largest = all.iter().map(|(_, signature)| signature.rms()).fold(0.0, f64::max);
+        all.retain(|(_, signature)| signature.rms() > SHOWN * largest);
+        all
     }
 
-    /// One of its forms.
-    pub fn form(&self, index: usize) -> [usize; 2] {
-        self.does.forms().nth(index).expect("it has so many")
+    /// True for the same thing at the same place, whatever its size.
+    pub fn is_like(&self, other: &Self) -> bool {
+        self.quadrupole == other.quadrupole && self.does == other.does
     }
 
-    /// True if it is what a linear field of the library would be: one nearer than two quadrupoles are to each other, on average.
+    /// True for a thin linear field of the library that is nearer to it than two quadrupoles are to each other, on average.
     pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
         let at = ring.elements[ring.quadrupoles[self.quadrupole].element].s;
-        let is_near = |s: f64| {
-            let along = (s - at).rem_euclid(ring.circumference);
-            along.min(ring.circumference - along) < ring.circumference / ring.quadrupoles.len() as f64
-        };
-        term.kind.thin().is_some() && term.position(ring).is_some_and(is_near)
+        let spacing = ring.circumference / ring.quadrupoles.len() as f64;
+        term.kind.thin().is_some() && term.position(ring).is_some_and(|s| ring.distance(s, at) < spacing)
     }
 }
+
+/// Share of the largest change of the readings by a form below which another one is not seen.
+const SHOWN: f64 = 1e-3;
 
 impl Unknown {
     /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
@@ -115,7 +127,7 @@ impl Unknown {
     /// Its prior standard deviation.
     pub fn sigma(&self) -> f64 {
         match self {
-            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(_, sigma) | Self::Ordinary(_, sigma) => {
+            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(.., sigma) | Self::Ordinary(_, sigma) => {
                 *sigma
             }
         }
@@ -126,10 +138,7 @@ impl Unknown {
         match self {
             Self::Amplitude(i, _) => Identity::Amplitude(hypothesis.terms[*i]),
             Self::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
-            Self::Form(i, _) => {
-                let element = hypothesis.element.as_ref().expect("it has forms");
-                Identity::Form(element.quadrupole, element.form(*i))
-            }
+            Self::Form(quadrupole, form, _) => Identity::Form(*quadrupole, *form),
             Self::Ordinary(member, _) => Identity::Ordinary(member),
         }
     }
@@ -209,8 +218,11 @@ impl Hypothesis {
             family.members(data).into_iter().map(move |member| Unknown::Ordinary(member, width))
         };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
-        let sigma = self.element.iter().flat_map(|element| element.sigma.iter().enumerate());
-        let forms = sigma.map(|(i, sigma)| Unknown::Form(i, *sigma));
+        let of_element = |element: &Element| {
+            let quadrupole = element.quadrupole;
+            element.forms.clone().into_iter().map(move |(form, sigma)| Unknown::Form(quadrupole, form, sigma))
+        };
+        let forms = self.element.iter().flat_map(of_element);
         terms.chain(forms).chain(self.ordinary.iter().flat_map(of_family)).collect()
     }
 
@@ -224,6 +236,11 @@ impl Hypothesis {
     /// Without the unknown element.
     pub fn without_element(&self) -> Self {
         Self { element: None, ..self.clone() }
+    }
+
+    /// Number of its effects, the unknown element as one.
+    pub fn count(&self) -> usize {
+        self.terms.len() + usize::from(self.element.is_some())
     }
 
     /// True if one more effect would be what it has already.

@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn the_likelihood_is_that_of_every_frame() {
         let wave = |i: usize, b: usize| (0.7 + (5 * i + 3 * b) as f64).sin();
-        let is_missing = |i: usize, b: usize| (i + 2 * b) % 7 == 0;
+        let is_missing = |i: usize, b: usize| (i + 2 * b).is_multiple_of(7);
         let all = DMatrix::from_fn(12, 6, |i, b| if is_missing(i, b) { f64::NAN } else { 1.5 * wave(i, b) });
         let modes = DMatrix::from_fn(6, 2, |b, k| 0.5 * wave(k, b));
         let density = |z: &DVector<f64>, covariance: DMatrix<f64>| {

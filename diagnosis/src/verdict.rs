@@ -112,7 +112,7 @@ pub struct Tested {
     /// Gain of held-out log predictive density with the amplitude fitted to the rest, and its standard error.
     pub gain: (f64, f64),
     /// The same where kind and place are chosen by the rest too; none beside a fit that is poor without the effect, about which nothing is of
-    /// first order.
+    /// first order, and of an unknown element, whose place and form all readings have chosen.
     pub of_choice: Option<f64>,
     /// Probability of as good a candidate were nothing there.
     pub chance: Option<f64>,

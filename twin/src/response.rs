@@ -244,8 +244,9 @@ impl<'r> Optics<'r> {
         Gradient { place, kernel: skew(&inverse(&map), &map) }
     }
 
-    /// Derivative with respect to the strength of a thin linear element of Hamiltonian `strength z_i z_j` at one place, z = (x, x', y, y'):
-    /// `z_i` changes by `strength z_j` times what its conjugate does to it.
+    /// Derivative with respect to the strength of a thin linear element of Hamiltonian `strength z_i z_j` at one place, z = (x, x', y, y'): a position
+    /// changes by the derivative of that with respect to its slope, a slope by minus the one with respect to its position. The unit of the strength is
+    /// 1/m of two positions, 1 of a position and a slope, m of two slopes.
     pub fn thin_linear(&self, place: Place, [i, j]: [usize; 2]) -> Gradient {
         let map = self.transfer_into(place);
         let back = inverse(&map);
@@ -453,7 +454,7 @@ mod tests {
 
     /// A gradient is the Hamiltonian `k (x^2 - y^2)/2`; a solenoid turns the beam by an angle a wherever that is said in its drift, `a (x' y - x y')`.
     #[test]
-    fn thin_linear_elements_are_gradients_and_rotations() {
+    fn thin_linear_elements_are_gradients_rotations_and_drifts() {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
         let jacobian = |gradients: &[Gradient]| {
@@ -465,8 +466,21 @@ mod tests {
         let known: DMatrix<f64> = jacobian(&[optics.thin_gradient(at)]);
         assert!((gradient - &known).amax() < 1e-12 * known.amax(), "rounding");
         let is_drift = |element: &Element| element.kind == Kind::Drift && element.length > 0.5;
+        let skew: DMatrix<f64> = jacobian(&[optics.thin_linear(at, [0, 2]).times(-1.0)]);
+        let known: DMatrix<f64> = jacobian(&[optics.thin_skew_gradient(at)]);
+        assert!((skew - &known).amax() < 1e-12 * known.amax(), "rounding");
         let drift = ring.elements.iter().position(is_drift).unwrap();
         let length = ring.elements[drift].length;
+        let longer = |by: f64| {
+            let mut ring = ring.clone();
+            ring.elements[drift].length += by;
+            let optics = Optics::of(&ring, ON_MOMENTUM).unwrap();
+            optics.response(&both_planes(&optics), &optics.correctors())
+        };
+        let exact = (longer(1e-4) - longer(-1e-4)) / 2e-4;
+        let here = Place { element: drift, depth: 0.5 * length };
+        let drifted: DMatrix<f64> = jacobian(&[[1, 1], [3, 3]].map(|form| optics.thin_linear(here, form).times(0.5)));
+        assert!((drifted - &exact).amax() < 1e-6 * exact.amax(), "second order of 0.1 mm, and rounding");
         let with = |angle: f64| {
             let mut ring = ring.clone();
             ring.elements[drift].kind = Kind::Solenoid { ks: 2.0 * angle / length };

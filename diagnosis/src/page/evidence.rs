@@ -18,7 +18,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let terms: Vec<_> = found.next.scanned.iter().map(|candidate| candidate.term).collect();
     let scanned = match found.competitions.len() {
         0 => found.next.scanned.clone(),
-        1 => found.competitions[0].scanned.clone(),
+        1 if found.best.hypothesis.element.is_none() => found.competitions[0].scanned.clone(),
         _ => scan(null.data(data), null, &terms)?,
     };
     let count = scanned.len();

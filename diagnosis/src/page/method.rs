@@ -16,7 +16,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
     let found = &diagnosis.found;
     let [before, after] = [found.null.chi2_per_dof(&found.data)?, found.best.chi2_per_dof(&found.data)?];
     let minutes = recording.rows.last().map_or(0.0, |last| (last.time - recording.rows[0].time) / 60.0);
-    let effects = if !found.has_more() { String::new() } else { format!(", {after:.3} with the effects found") };
+    let effects = if found.has_more() { format!(", {after:.3} with what was found") } else { String::new() };
     let text = format!(
         "Recording {}: {} frames in {minutes:.0} minutes, recorded with {}. Noise of a reading by its header {:.0} µm. Chi-square per degree of \
          freedom {before:.3} without any effect{effects}.",

@@ -142,13 +142,17 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         ),
         &[fit.series("x", &fit.dispersion[0], 1e3), fit.series("y", &fit.dispersion[1], 1e3)],
     );
+    let without = if found.best.hypothesis.element.is_some() {
+        " The unknown element is known to first order in its strengths only, and is not in it."
+    } else {
+        ""
+    };
     Ok(Section {
         heading: "Optics of the fitted machine".into(),
-        text: vec![
-            "The machine of the fit, with the effects found, against the design. Error bands are one standard deviation: of the strengths, of the effects and of what is \
-             ordinary together."
-                .into(),
-        ],
+        text: vec![format!(
+            "The machine of the fit, with the effects found, against the design.{without} Error bands are one standard deviation: of the strengths, of the effects \
+             and of what is ordinary together."
+        )],
         figures: vec![
             (format!("Relative change of the beta functions of the projected planes. {STRIP}"), beat),
             (format!("Change of the dispersion; in y the design has none. {STRIP}"), dispersion),

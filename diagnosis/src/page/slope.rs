@@ -133,7 +133,7 @@ pub fn of_element(what: &str, partial: &Partial) -> (String, Figure) {
     let (from, to) = x.iter().fold((0.0_f64, 0.0_f64), |(from, to), &x| (from.min(x), to.max(x)));
     let line = Series::line("fitted: slope 1", vec![from, to], vec![from, to]);
     let (slope, error) = regression(&settings);
-    let title = format!("{}: slope {slope:.2} ± {error:.2} where 1 is expected", capitalised(what));
+    let title = format!("{}: slope {slope:.2} ± {error:.2}", capitalised(what));
     let axes =
         Axes::new(&title, "change of the reading by the fitted element [µm]", "measured less model without it [µm]");
     let caption = "Readings less the prediction of the model without the element, everything else as fitted, against what it does to them. Its strengths \

@@ -193,12 +193,8 @@ fn covered(ring: &Ring, diagnosis: &Diagnosis, key: &Truth) -> Vec<bool> {
 /// Whether a finding is nearer to a place than two quadrupoles are to each other, on average.
 fn is_near(ring: &Ring, diagnosis: &Diagnosis, one: &Unmodelled) -> bool {
     let at = one.site.elements(ring).first().map_or(f64::NAN, |&element| ring.elements[element].s);
-    let away = |s: f64| {
-        let along = (s - at).rem_euclid(ring.circumference);
-        along.min(ring.circumference - along)
-    };
     let spacing = ring.circumference / ring.quadrupoles.len() as f64;
-    diagnosis.findings.iter().filter_map(|finding| finding.s).any(|s| away(s) < spacing)
+    diagnosis.findings.iter().filter_map(|finding| finding.s).any(|s| ring.distance(s, at) < spacing)
 }
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the

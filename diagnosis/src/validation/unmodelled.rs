@@ -285,6 +285,7 @@ impl Beyond for Unmodelled {
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
         let (mut warmth, mut short) = (0.0, Flicker::of(self.when));
         for (count, cycle) in cycles.iter_mut().enumerate() {
+            let is_closed = short.next();
             // as if the first cycle were one of several
             let since = |period: usize| (count + ((self.when + 0.5) * period as f64) as usize) % period;
             match self.kind {
@@ -317,17 +318,17 @@ impl Beyond for Unmodelled {
                 UnmodelledKind::LoopGradient => {
                     cycle.strength[self.index] += self.size * cycle.kick.iter().sum::<f64>() / FULL_KICK;
                 }
-                UnmodelledKind::FlickeringTurn if short.next() => cycle.strength[self.index] -= self.size,
+                UnmodelledKind::FlickeringTurn if is_closed => cycle.strength[self.index] += (-self.size).ln_1p(),
                 _ => {}
             }
         }
     }
 
     fn alter_readings(&self, cycles: &[Cycle], readings: &mut DMatrix<f64>) {
-        let lost = lost(readings);
         if !matches!(self.site, Site::Monitor(_)) {
             return;
         }
+        let lost = lost(readings);
         let (centre, rms) = (readings.column(self.index).mean(), readings.column(self.index).variance().sqrt());
         let (mut shown, mut is_coarse) = (f64::INFINITY, false);
         let mut read = |cycle: &Cycle, x: f64, lost: f64| match self.kind {
@@ -416,6 +417,7 @@ mod tests {
     use crate::testing::{ideal, readings, template};
     use inference::recording::Recording;
     use inference::simulate::{Truth, campaign};
+    use twin::{Hold, Optics, Place};
 
     /// Readings with the unknown less those without, rows frames.
     fn change(unknown: &Unmodelled, ring: &Ring, recording: &Recording) -> DMatrix<f64> {
@@ -448,6 +450,38 @@ mod tests {
                 assert!(moved >= least && (moved <= 1) == of_a_monitor, "{unknown:?}: {moved} monitors");
             }
         }
+    }
+
+    /// Two opposite solenoids focus as a thin lens does in both planes, and couple nothing; what is behind them keeps its element.
+    #[test]
+    fn bucked_solenoids_are_a_lens_in_both_planes() {
+        let ring = Ring::booster();
+        let hold = Hold::Momentum { delta: 0.0 };
+        let response = |ring: &Ring| {
+            let optics = Optics::of(ring, hold).unwrap();
+            optics.response(&optics.read_monitors(), &optics.correctors())
+        };
+        let site = drifts(&ring, ROOM_FOR_TWO)[0];
+        let Site::Element(at) = site else { unreachable!("drifts are elements") };
+        let one = Unmodelled { kind: UnmodelledKind::BuckedSolenoids, site, size: 1e-4, index: at, when: 0.0 };
+        let mut with = ring.clone();
+        one.alter_ring(&mut with);
+        let names = |ring: &Ring| {
+            let of = |element: usize| ring.elements[element].name.clone();
+            let quadrupoles = ring.quadrupoles.iter().map(|one| of(one.element));
+            let monitors = ring.monitors.iter().map(|one| of(one.element));
+            let correctors = ring.correctors.iter().map(|one| of(one.element));
+            quadrupoles.chain(monitors).chain(correctors).collect::<Vec<_>>()
+        };
+        assert_eq!(names(&with), names(&ring));
+        let optics = Optics::of(&ring, hold).unwrap();
+        let middle = Place { element: at, depth: 0.5 * ring.elements[at].length };
+        let lens = [[0, 0], [2, 2]].map(|form| optics.thin_linear(middle, form).times(0.5 * one.size));
+        let thin: DMatrix<f64> =
+            optics.response_jacobian(&optics.read_monitors(), &optics.correctors(), &lens).into_iter().sum();
+        let off = (response(&with) - response(&ring) - &thin).amax() / thin.amax();
+        // a thick lens, and second order
+        assert!(off < 0.05, "{off}");
     }
 
     #[test]

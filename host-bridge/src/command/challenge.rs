@@ -17,6 +17,8 @@ use crate::output::{self, fill, table};
 #[derive(Debug, Serialize)]
 struct ChallengeResult {
     recordings: Vec<Scored>,
+    /// Those that could not be diagnosed, and why.
+    refused: Vec<String>,
     /// Number of recordings by grade.
     right: usize,
     partial: usize,
@@ -59,15 +61,22 @@ pub fn run(options: &Challenge) -> Result<(), CommandError> {
         match scored(&ring, folder) {
             Ok(one) => recordings.push(one),
             // the others are not lost with it
-            Err(error) => refused.push(format!("{}: {error}", folder.display())),
+            Err(error) => refused.push(error),
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
+    let whys: Vec<String> = refused.iter().map(ToString::to_string).collect();
+    let all = whys.join("; ");
     if !recordings.is_empty() {
-        deliver(&options.common, &ChallengeResult::of(recordings))?;
+        deliver(&options.common, &ChallengeResult::of(recordings, whys))?;
     }
-    if refused.is_empty() { Ok(()) } else { Err(CommandError::Input(refused.join("; "))) }
+    // of the sort of the first
+    match refused.first() {
+        None => Ok(()),
+        Some(CommandError::Input(_)) => Err(CommandError::Input(all)),
+        Some(CommandError::Other(_)) => Err(CommandError::Other(all)),
+    }
 }
 
 /// One recording.
@@ -137,7 +146,7 @@ impl Scored {
 }
 
 impl ChallengeResult {
-    fn of(recordings: Vec<Scored>) -> Self {
+    fn of(recordings: Vec<Scored>, refused: Vec<String>) -> Self {
         let count = |grade| recordings.iter().filter(|scored| scored.grade == grade).count();
         let pulls: Vec<f64> = recordings
             .iter()
@@ -154,6 +163,7 @@ impl ChallengeResult {
             amplitude_chi2: pulls.iter().map(|p| p * p).sum(),
             amplitudes: pulls.len(),
             recordings,
+            refused,
         }
     }
 }

@@ -270,6 +270,9 @@ fn write_model(diagnosis: &Diagnosis, path: &Path) -> Result<(), CommandError> {
     // with the supplies that the recording has
     let ring = &diagnosis.found.data.ring;
     let failed = |why: String| CommandError::Other(format!("{}: not written: {why}", path.display()));
+    if diagnosis.found.best.hypothesis.element.is_some() {
+        return Err(failed("the core's tables cannot hold an unknown element".into()));
+    }
     let effects = diagnosis.effects();
     if effects.is_empty() {
         return Err(failed("nothing was identified beyond the ring as designed".into()));
@@ -445,10 +448,12 @@ impl FindingResult {
 
 /// Tunes of the machine that was found, what is ordinary included, at the recording's mean supply currents; none if it is unstable.
 fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
-    let (machine, drives) = diagnosis.found.best.machine(&diagnosis.found.data).ok()?;
+    let (best, data) = (&diagnosis.found.best, &diagnosis.found.data);
+    let (machine, drives) = best.machine(data).ok()?;
     // on its orbit, where sextupoles focus
     let tunes = machine.on_orbit(&drives.orbit).optics().and_then(|optics| optics.tunes()).ok()?;
-    Some(Tunes { x: tunes.x, y: tunes.y })
+    let [x, y] = best.tunes_of_element(data).ok()?;
+    Some(Tunes { x: tunes.x + x, y: tunes.y + y })
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

@@ -52,6 +52,12 @@ pub struct Ring {
 }
 
 impl Ring {
+    /// Distance of two places along the ring, the shorter way round [m].
+    pub fn distance(&self, s: f64, other: f64) -> f64 {
+        let along = (s - other).rem_euclid(self.circumference);
+        along.min(self.circumference - along)
+    }
+
     /// Index of the element of this exact name.
     ///
     /// # Errors
