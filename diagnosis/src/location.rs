@@ -77,6 +77,14 @@ impl Linear {
         }
     }
 
+    fn short(self) -> &'static str {
+        match self {
+            Self::Focuses => "focusing",
+            Self::Couples => "coupling",
+            Self::FocusesAndCouples => "both",
+        }
+    }
+
     fn phrase(self) -> &'static str {
         match self {
             Self::Focuses => "focuses the beam",
@@ -126,7 +134,7 @@ impl Location {
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::RingInTime(_, Plane::X) => format!("kicks near {name} in time, x"),
             Self::RingInTime(_, Plane::Y) => format!("kicks near {name} in time, y"),
-            Self::Linear(_, does) => format!("unknown element near {name} that {}", does.phrase()),
+            Self::Linear(_, does) => format!("unknown element near {name}, {}", does.short()),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
             Self::Time => "all monitors, in time".into(),
             Self::Tunes => "tunes, in time".into(),
