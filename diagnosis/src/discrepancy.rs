@@ -25,10 +25,10 @@ use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
 use twin::{Plane, Signature, Signatures};
 
 use super::data::Data;
+use super::element::{Element, Linear};
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Element;
-use super::location::{Linear, Location};
+use super::location::Location;
 use super::settings::Settings;
 
 /// Free amplitudes at one place, and their evidence.

@@ -1,9 +1,9 @@
 //! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Signature, Signatures, Site};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
-use super::location::Linear;
+use super::element::Element;
 use super::ordinary::{Family, is_absorbed};
 
 /// One effect that a hypothesis holds, its amplitude unknown.
@@ -26,18 +26,6 @@ pub struct Hypothesis {
     pub ordinary: Vec<Family>,
     /// Effects of known amplitude.
     pub given: Vec<Effect>,
-}
-
-/// A thin linear element that the library does not hold, at the entrance of a quadrupole; to first order. In recordings at several energies it is a field
-/// that does not grow with the magnets.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Element {
-    /// Index of the quadrupole.
-    pub quadrupole: usize,
-    /// What it does.
-    pub does: Linear,
-    /// Its forms `z_i z_j`, z = (x, x', y, y'), with the prior standard deviation of the strength of each.
-    pub forms: Vec<([usize; 2], f64)>,
 }
 
 /// One unknown besides the vars, with its prior standard deviation.
@@ -81,41 +69,6 @@ pub enum Identity<'u> {
     /// An ordinary imperfection.
     Ordinary(&'u Member),
 }
-
-impl Element {
-    /// One whose forms each change the readings by `size` (rms); those that change them by much less than others do, such as those of a plane in which
-    /// nothing was kicked, are left out.
-    pub fn of(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
-        let all = Self::signatures(signatures, ring, quadrupole);
-        let some = all.into_iter().filter(|(form, _)| does.has(*form));
-        Self { quadrupole, does, forms: some.map(|(form, signature)| (form, size / signature.rms())).collect() }
-    }
-
-    /// The forms at a quadrupole that a recording shows, with their signatures.
-    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<([usize; 2], Signature)> {
-        let at = ring.quadrupoles[quadrupole].element.into();
-        let all = Linear::FocusesAndCouples.forms().map(|form| (form, signatures.of_thin_linear(at, form)));
-        let mut all: Vec<_> = all.collect();
-        let largest = all.iter().map(|(_, signature)| signature.rms()).fold(0.0, f64::max);
-        all.retain(|(_, signature)| signature.rms() > SHOWN * largest);
-        all
-    }
-
-    /// True for the same thing at the same place, whatever its size.
-    pub fn is_like(&self, other: &Self) -> bool {
-        self.quadrupole == other.quadrupole && self.does == other.does
-    }
-
-    /// True for a thin linear field of the library that is nearer to it than two quadrupoles are to each other, on average.
-    pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
-        let at = ring.elements[ring.quadrupoles[self.quadrupole].element].s;
-        let spacing = ring.circumference / ring.quadrupoles.len() as f64;
-        term.kind.thin().is_some() && term.position(ring).is_some_and(|s| ring.distance(s, at) < spacing)
-    }
-}
-
-/// Share of the largest change of the readings by a form below which another one is not seen.
-const SHOWN: f64 = 1e-3;
 
 impl Unknown {
     /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are

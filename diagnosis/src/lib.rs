@@ -19,6 +19,7 @@ mod channel;
 pub mod choice;
 pub mod data;
 pub mod discrepancy;
+pub mod element;
 pub mod error;
 pub mod evidence;
 mod exact;

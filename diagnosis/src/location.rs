@@ -3,6 +3,7 @@
 use twin::Plane;
 
 use super::data::Data;
+use super::element::Linear;
 
 /// Location of an unmodelled discrepancy.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,54 +45,6 @@ pub enum Location {
     },
     /// A pattern that all monitors share, from frame to frame: of the noise, so that it competes with none of the others.
     FrameToFrame,
-}
-
-/// What an unknown linear element does.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Linear {
-    /// It focuses or defocuses, in one plane or both.
-    Focuses,
-    /// It couples the planes, by a field or by a rotation.
-    Couples,
-    /// Both.
-    FocusesAndCouples,
-}
-
-impl Linear {
-    /// All of them.
-    pub const ALL: [Self; 3] = [Self::Focuses, Self::Couples, Self::FocusesAndCouples];
-
-    /// The terms `z_i z_j` of its Hamiltonian, z = (x, x', y, y').
-    pub fn forms(self) -> impl Iterator<Item = [usize; 2]> {
-        let all = (0..4).flat_map(|i| (i..4).map(move |j| [i, j]));
-        all.filter(move |form| self.has(*form))
-    }
-
-    /// True if one of them is this.
-    pub fn has(self, [i, j]: [usize; 2]) -> bool {
-        let couples = (i < 2) != (j < 2);
-        match self {
-            Self::Focuses => !couples,
-            Self::Couples => couples,
-            Self::FocusesAndCouples => true,
-        }
-    }
-
-    fn short(self) -> &'static str {
-        match self {
-            Self::Focuses => "focusing",
-            Self::Couples => "coupling",
-            Self::FocusesAndCouples => "both",
-        }
-    }
-
-    fn phrase(self) -> &'static str {
-        match self {
-            Self::Focuses => "focuses the beam",
-            Self::Couples => "couples the planes",
-            Self::FocusesAndCouples => "focuses the beam and couples the planes",
-        }
-    }
 }
 
 /// Number of sorts of location that compete with each other, equally likely a priori.

@@ -7,22 +7,25 @@
 //!
 //! Forward: the best candidate is added as long as one more effect is clearly more likely than none. Backward: each effect is removed
 //! in turn and competes with all candidates, given the others; one that is not needed is dropped. Where an unmodelled discrepancy is
-//! the most likely, one more effect is still tried: two strong effects may show only together.
+//! the most likely, one more effect is still tried: two strong effects may show only together. Where it is an unknown element in the end, the search goes on
+//! with that in the model (`search/beside.rs`).
+
+mod beside;
 
 use core::cell::Cell;
 use std::collections::BTreeMap;
 
 use nalgebra::DVector;
-use twin::{EffectKind, Measured, Ring, Signatures};
+use twin::{EffectKind, Measured, Ring};
 
-use super::alternatives::{Alternative, Cause, Competition, SUSPICIOUS};
+use super::alternatives::{Alternative, Cause, Competition};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::error::FitError;
 use super::fit::Fitted;
 use super::half_normal::HalfNormal;
-use super::heldout::{lessened, reduced};
-use super::hypothesis::{Element, Hypothesis, Term, Unknown};
+use super::heldout::reduced;
+use super::hypothesis::{Hypothesis, Term, Unknown};
 use super::linearise::{self, CURVED, about_itself};
 use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
@@ -49,8 +52,6 @@ const BEHIND_SHARE: f64 = 0.3;
 /// `ln` Bayes factor below which first order suffices.
 const WORTH: f64 = 3.0;
 
-/// Places of an unknown element that are tried in the model, where the next search finds it elsewhere.
-const PLACES: usize = 3;
 /// Walks that are tried, and monitors of a recording that may wander by themselves: with more it is something that they share.
 const WALKS: usize = 12;
 const WANDERERS: usize = 4;
@@ -83,19 +84,6 @@ impl Found {
     /// True if the best fit has anything that the one without effects has not.
     pub fn has_more(&self) -> bool {
         !self.competitions.is_empty() || self.best.hypothesis.element.is_some()
-    }
-
-    /// An unknown linear element, where what is left is physics that the library does not hold, and such an element its most likely form.
-    fn unknown_element(&self) -> Result<Option<Element>, FitError> {
-        let leader = self.next.alternatives.iter().find(|one| !one.is_of_library());
-        let leader = leader.filter(|_| self.next.unknown() > SUSPICIOUS);
-        let Some(Cause::Unmodelled(one)) = leader.map(|one| &one.cause) else { return Ok(None) };
-        let Location::Linear(quadrupole, does) = one.at else { return Ok(None) };
-        let without = &self.next.without;
-        let (machine, drives) = without.machine_in(without.data(&self.data), one.campaign)?;
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, &drives).map_err(FitError::from)?;
-        Ok(Some(Element::of(&signatures, &self.data.ring, quadrupole, does, one.size)))
     }
 }
 
@@ -177,71 +165,6 @@ impl Search {
             found = self.with_noise(further)?;
         }
         Ok(found)
-    }
-
-    /// The search beside an unknown linear element, where that is what the library lacks: with the element in the model, what else there is shows. The
-    /// linear fields of the library beside it that were found are taken for parts of it: two independent causes at one place are rare, and what an element
-    /// does beyond first order makes parts of it seem to be needed. None where, beside what was then found, it is no longer the most likely of what is
-    /// left: the first search is as good.
-    fn beside_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
-        let Some(element) = found.unknown_element()? else { return Ok(None) };
-        self.held.set(0);
-        let whole = self.without_parts(found, &element)?;
-        let Some(mut element) = whole.unknown_element()? else { return Ok(None) };
-        for _ in 0..PLACES {
-            let Some(beside) = self.beside(&whole, element.clone())? else { return Ok(None) };
-            if beside.best.hypothesis.element.is_none() {
-                // a monitor wanders, and all was begun anew
-                return Ok(Some(self.beside_element(&beside)?.unwrap_or(beside)));
-            }
-            let data = &beside.data;
-            let rest = relearnt(data, lessened(data, &beside.best, beside.best.hypothesis.without_element())?);
-            let next = self.one_more(rest.data(data), &rest)?;
-            let beside = Found { next, ..beside };
-            match beside.unknown_element()? {
-                Some(leading) if leading.is_like(&element) => return Ok(Some(beside)),
-                Some(leading) => element = leading,
-                None => return Ok(None),
-            }
-        }
-        // its place is not decided, so that none is in the model
-        Ok(Some(whole))
-    }
-
-    /// With an unknown element in the model, and what else shows beside it; none where the machine keeps no beam.
-    fn beside(&self, whole: &Found, element: Element) -> Result<Option<Found>, FitError> {
-        let Found { data, null, best, .. } = whole;
-        let less = best.hypothesis.without_terms(|term| element.holds(term, &data.ring));
-        let hypothesis = Hypothesis { element: Some(element), ..less };
-        let with = relearnt(data, Fitted::of(data, &hypothesis, &best.guess(data, &hypothesis))?);
-        if !with.is_stable(data) {
-            return Ok(None);
-        }
-        let (best, competitions) = self.settle(data, with, None)?;
-        let next = self.one_more(data, &best)?;
-        Ok(Some(self.grown(Found { data: data.clone(), null: null.clone(), best, competitions, next })?))
-    }
-
-    /// The same without the effects that are parts of an unknown element.
-    fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
-        let Found { null, best, .. } = found;
-        let ring = &found.data.ring;
-        let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
-        let mut data = found.data.clone();
-        if hypothesis.terms.len() == best.hypothesis.terms.len() {
-            return Ok(found.clone());
-        }
-        if hypothesis.terms.is_empty() {
-            return self.without_effects(data);
-        }
-        let best = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
-        let best = relearnt(&data, best);
-        data.is_about_effects = true;
-        let null = null_beside(&data, null.clone(), &found.data);
-        let others = 0..hypothesis.terms.len();
-        let competitions = others.map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
-        let next = self.one_more(&data, &best)?;
-        Ok(Found { data, null, best, competitions, next })
     }
 
     /// The same, begun anew with monitors that wander as long as that is the most likely of what is left: what was found without knowing of them has to
@@ -636,67 +559,4 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
     let best = learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
     if own.is_some() { best.to(data) } else { best }
-}
-
-#[cfg(test)]
-mod tests {
-    use twin::{Effect, Kind};
-
-    use super::*;
-    use crate::{Diagnosis, Verdict};
-    use inference::simulate::{self, Beyond, Hardware};
-
-    /// A solenoid that turns the beam by 40 mrad in the longest drift of the last superperiod.
-    struct Solenoid {
-        drift: usize,
-    }
-
-    impl Solenoid {
-        fn of(ring: &Ring) -> Self {
-            let drifts = (0..ring.elements.len()).filter(|&at| ring.elements[at].kind == Kind::Drift);
-            let drift = drifts.max_by(|&a, &b| ring.elements[a].length.total_cmp(&ring.elements[b].length)).unwrap();
-            Self { drift }
-        }
-    }
-
-    impl Beyond for Solenoid {
-        fn alter_ring(&self, ring: &mut Ring) {
-            let drift = &mut ring.elements[self.drift];
-            drift.kind = Kind::Solenoid { ks: 2.0 * 0.04 / drift.length };
-        }
-    }
-
-    /// A strong one looks like a skew gradient and rolls of the quadrupoles on both sides: these are not named. Nor does it hide what else there is.
-    #[test]
-    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn an_element_that_the_library_lacks_is_one_unknown_thing() {
-        let (ring, template) = crate::testing::template();
-        let (solenoid, hardware) = (Solenoid::of(&ring), Hardware::shipped(&ring, &template));
-        let beyond: &[&dyn Beyond] = &[&solenoid];
-        let gain = Effect::parse("bpm_gain@x_E6=0.2", &ring).unwrap();
-        for effects in [vec![], vec![gain]] {
-            let vars = simulate::vars(&ring, true, 21).unwrap();
-            let truth = simulate::Truth { vars: &vars, effects: &effects, beyond };
-            let recording = simulate::campaign(&template, &ring, &truth, &hardware, 21).unwrap();
-            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
-            assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
-            let named: Vec<EffectKind> = found.findings.iter().filter_map(|one| Some(one.term()?.kind)).collect();
-            let true_kinds: Vec<EffectKind> = effects.iter().map(|effect| effect.kind).collect();
-            assert_eq!(named, true_kinds, "{}", found.sentence);
-            let last = found.findings.last().unwrap();
-            assert!(last.is_validated(), "{}", found.sentence);
-            assert!(last.phrase.contains("couples the planes"), "{}", found.sentence);
-            let away = ring.distance(last.s.unwrap(), ring.elements[solenoid.drift].s);
-            assert!(away < ring.circumference / 24.0, "{away} m: twice the mean distance of two quadrupoles");
-            let (data, best) = (&found.found.data, &found.found.best);
-            // what the vars do to its signature is left out of the derivatives: 0.75 nat where it is 40 mrad
-            let again = Fitted::of(data, &best.hypothesis, &best.u).unwrap();
-            let moved = again.log_evidence - best.log_evidence;
-            println!("{moved} nat");
-            assert!(moved.abs() < 2.0, "{moved} nat");
-            let page = crate::page::page(&found, &recording).unwrap();
-            let figures = page.sections.iter().flat_map(|section| &section.figures);
-            assert!(figures.filter(|(_, figure)| figure.svg.contains("couples the planes: slope")).count() == 1);
-        }
-    }
 }

@@ -107,7 +107,8 @@ mod tests {
 
     use super::*;
     use crate::discrepancy::Discrepancy;
-    use crate::location::{Linear, Location};
+    use crate::element::Linear;
+    use crate::location::Location;
     use crate::testing::template;
     use inference::simulate::{Hardware, Truth, campaign};
     use twin::Plane;
