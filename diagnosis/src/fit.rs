@@ -266,7 +266,9 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
-        Ok(of_element(self.data(data), &self.hypothesis, 0, &self.u)?.map_or([0.0; 2], |own| own.tunes))
+        let (machine, drives) = self.machine(data)?;
+        let own = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
+        Ok(own.map_or([0.0; 2], |own| own.tunes))
     }
 
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
@@ -488,13 +490,13 @@ pub(super) fn predicted_by(
 ) -> Result<Signature, EffectError> {
     let (machine, drives) = machine_at(data, hypothesis, campaign, u)?;
     let mut all = predicted(&machine, &drives)?;
-    if let Some(own) = of_element(data, hypothesis, campaign, u)? {
+    if let Some(own) = of_element(data, hypothesis, campaign, (&machine, &drives), u)? {
         all += own;
     }
     Ok(all)
 }
 
-/// What the unknown element of a hypothesis does, if it has one.
+/// What the unknown element of a hypothesis does in its machine, if it has one.
 ///
 /// # Errors
 /// [`EffectError`].
@@ -502,14 +504,14 @@ pub(super) fn of_element(
     data: &Data,
     hypothesis: &Hypothesis,
     campaign: usize,
+    (machine, drives): (&Machine, &Drives),
     u: &DVector<f64>,
 ) -> Result<Option<Signature>, EffectError> {
     if hypothesis.element.is_none() {
         return Ok(None);
     }
-    let (machine, drives) = machine_at(data, hypothesis, campaign, u)?;
     let machine = machine.on_orbit(&drives.orbit);
-    let signatures = Signatures::of(&machine, &drives)?;
+    let signatures = Signatures::of(&machine, drives)?;
     let unknowns = hypothesis.unknowns(data);
     let forms = unknowns.iter().zip(u.iter().skip(data.units.len()));
     let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));

@@ -161,7 +161,7 @@ impl Diagnosis {
         let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
         let of_means = Verdict::of(&found, &tests);
         let verdict = of_means.beside(&transients).with_noise(data);
-        let of_element = verdict::test_of_element(data, &found, &after, &blocks)?;
+        let of_element = verdict::test_of_element(data, &found, &before, &after, &blocks)?;
         let findings = verdict::findings(data, &found, &transients, &tests, of_element, of_means)?;
         progress("held-out correctors");
         let whole = found.has_more() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());

@@ -196,20 +196,25 @@ impl Search {
     /// One more effect.
     fn further(&self, found: &Found, leader: Fitted) -> Result<Found, FitError> {
         let mut data = found.data.clone();
-        let mut null = found.null.clone();
-        let (mut best, mut competitions) = self.settle(&data, leader, Some(&found.next))?;
+        let (mut best, competitions) = self.settle(&data, leader, Some(&found.next))?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
             if best.hypothesis.ordinary.is_empty() {
                 best = with_ordinary(&mut data, best);
             }
-            data.is_about_effects = true;
-            null = null_beside(&data, null, &found.data);
-            competitions = (0..competitions.len()).map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
-        } else {
-            data = found.data.clone();
+            return self.about_effects(found, data, best);
         }
+        let next = self.one_more(&found.data, &best)?;
+        Ok(Found { data: found.data.clone(), null: found.null.clone(), best, competitions, next })
+    }
+
+    /// With readings that are linearised about the machine of a fit with effects, and that fit.
+    fn about_effects(&self, found: &Found, mut data: Data, best: Fitted) -> Result<Found, FitError> {
+        data.is_about_effects = true;
+        let null = null_beside(&data, found.null.clone(), &found.data);
+        let each = 0..best.hypothesis.terms.len();
+        let competitions = each.map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
         let next = self.one_more(&data, &best)?;
         Ok(Found { data, null, best, competitions, next })
     }

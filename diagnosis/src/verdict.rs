@@ -314,15 +314,16 @@ pub fn tests(
 pub fn test_of_element(
     data: &Data,
     found: &Found,
+    before: &Score,
     after: &Score,
     blocks: &[Block],
 ) -> Result<Option<Tested>, FitError> {
     if found.best.hypothesis.element.is_none() {
         return Ok(None);
     }
-    let without = lessened(data, &found.best, found.best.hypothesis.without_element())?;
-    let gain = after.gain_over(&Score::of(data, &without, blocks)?);
-    Ok(Some(Tested { gain, of_choice: None, chance: None }))
+    let without = || lessened(data, &found.best, found.best.hypothesis.without_element());
+    let rival = if found.competitions.is_empty() { before } else { &Score::of(data, &without()?, blocks)? };
+    Ok(Some(Tested { gain: after.gain_over(rival), of_choice: None, chance: None }))
 }
 
 /// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of

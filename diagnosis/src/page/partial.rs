@@ -43,7 +43,7 @@ impl<'f> Partial<'f> {
         let (machine, drives) = less.machine(data, &fitted.params, &u.as_slice()[vars..])?;
         let measured = data.residual(&fit::predicted_by(data, less, 0, &u)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
-        let of_element = fit::of_element(data, less, 0, &u)?.map_or([0.0; 2], |own| own.tunes);
+        let of_element = fit::of_element(data, less, 0, (&machine, &drives), &u)?.map_or([0.0; 2], |own| own.tunes);
         let ends = tunes::ends(&machine, &drives)?;
         let tunes = [0, 1].map(|plane| {
             let (ends, moved) = (&ends[plane], of_element[plane]);

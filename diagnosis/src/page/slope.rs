@@ -125,12 +125,7 @@ pub fn figure(finding: &Finding, partial: &Partial) -> (String, Figure) {
 /// The figure of an unknown element, of which `partial` is the fit without it: what it leaves against what the fitted element does.
 pub fn of_element(what: &str, partial: &Partial) -> (String, Figure) {
     let settings = of_settings(partial, 1.0);
-    let largest = settings.iter().map(|point| point.x().abs()).fold(0.0, f64::max);
-    let groups = grouped(&settings, largest);
-    let (x, y): (Vec<f64>, Vec<f64>) = groups.iter().map(|point| (point.x(), point.y())).unzip();
-    let bars = groups.iter().map(|point| (point.y() - point.sigma(), point.y() + point.sigma())).collect();
-    let measured = Series::points("measured ± 1 σ: the mean of many settings", x.clone(), y).within(bars);
-    let (from, to) = x.iter().fold((0.0_f64, 0.0_f64), |(from, to), &x| (from.min(x), to.max(x)));
+    let (measured, [from, to]) = means(&settings, "measured ± 1 σ: the mean of many settings");
     let line = Series::line("fitted: slope 1", vec![from, to], vec![from, to]);
     let (slope, error) = regression(&settings);
     let title = format!("{}: slope {slope:.2} ± {error:.2}", capitalised(what));
@@ -149,16 +144,11 @@ pub fn of_first_frames(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
         Point { signature: 1e4 * one.predicted * weight, residual: 1e6 * one.measured * weight, weight }
     };
     let points: Vec<Point> = shown.iter().map(point).collect();
-    let largest = points.iter().map(|point| point.x().abs()).fold(0.0, f64::max);
-    let groups = grouped(&points, largest);
-    let (x, y): (Vec<f64>, Vec<f64>) = groups.iter().map(|point| (point.x(), point.y())).unzip();
-    let bars = groups.iter().map(|point| (point.y() - point.sigma(), point.y() + point.sigma())).collect();
-    let measured = Series::points("measured ± 1 σ: the mean of many readings", x.clone(), y).within(bars);
+    let (measured, [from, to]) = means(&points, "measured ± 1 σ: the mean of many readings");
     let (slope, sigma) = match finding.term() {
         Some(_) => (100.0 * finding.amplitude.0, 100.0 * finding.amplitude.1),
         None => regression(&points),
     };
-    let (from, to) = x.iter().fold((0.0_f64, 0.0_f64), |(from, to), &x| (from.min(x), to.max(x)));
     let ends = vec![from, 0.0, to];
     let band = ends.iter().map(|x| (slope * x - sigma * x.abs(), slope * x + sigma * x.abs())).collect();
     let line = Series::line(
@@ -173,6 +163,20 @@ pub fn of_first_frames(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
     let caption = "The first reading after a change less the mean of the later readings of the same setting, against the difference that one \
                    percent of the cause should make, by the orbits as measured; the slope is its size.";
     (caption.into(), Figure::lines(&axes, &[measured, line]))
+}
+
+/// Means of points over equal steps of the signature, with their error bars, and the range of it that they and 0 span.
+fn means(points: &[Point], label: &str) -> (Series, [f64; 2]) {
+    let largest = points.iter().map(|point| point.x().abs()).fold(0.0, f64::max);
+    let groups = grouped(points, largest);
+    let (x, y): (Vec<f64>, Vec<f64>) = groups.iter().map(|point| (point.x(), point.y())).unzip();
+    let bars = groups.iter().map(|point| (point.y() - point.sigma(), point.y() + point.sigma())).collect();
+    (Series::points(label, x.clone(), y).within(bars), range(&x))
+}
+
+/// From the least to the largest of some numbers and 0.
+fn range(x: &[f64]) -> [f64; 2] {
+    x.iter().fold([0.0, 0.0], |[from, to]: [f64; 2], &x| [from.min(x), to.max(x)])
 }
 
 /// Name of a finding.
@@ -195,7 +199,7 @@ fn significance(finding: &Finding) -> f64 {
 
 /// The line through the origin, with its error band.
 fn line(x: &[f64], slope: f64, sigma: f64, finding: &Finding, is_switch: bool) -> Series {
-    let (from, to) = x.iter().fold((0.0_f64, 0.0_f64), |(from, to), &x| (from.min(x), to.max(x)));
+    let [from, to] = range(x);
     let x = vec![from, 0.0, to];
     let y: Vec<f64> = x.iter().map(|x| slope * x).collect();
     if is_switch {

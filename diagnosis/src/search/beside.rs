@@ -6,7 +6,7 @@
 
 use twin::Signatures;
 
-use super::{Found, Search, null_beside, relearnt};
+use super::{Found, Search, relearnt};
 use crate::alternatives::{Cause, SUSPICIOUS};
 use crate::element::Element;
 use crate::error::FitError;
@@ -78,8 +78,7 @@ impl Search {
 
     /// The same without the effects that are parts of an unknown element.
     fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
-        let Found { null, best, .. } = found;
-        let ring = &found.data.ring;
+        let (best, ring) = (&found.best, &found.data.ring);
         let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
         let mut data = found.data.clone();
         if hypothesis.terms.len() == best.hypothesis.terms.len() {
@@ -88,14 +87,9 @@ impl Search {
         if hypothesis.terms.is_empty() {
             return self.without_effects(data);
         }
-        let best = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
-        let best = relearnt(&data, best);
-        data.is_about_effects = true;
-        let null = null_beside(&data, null.clone(), &found.data);
-        let others = 0..hypothesis.terms.len();
-        let competitions = others.map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
-        let next = self.one_more(&data, &best)?;
-        Ok(Found { data, null, best, competitions, next })
+        let less = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
+        let less = relearnt(&data, less);
+        self.about_effects(found, data, less)
     }
 }
 
