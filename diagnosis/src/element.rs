@@ -46,12 +46,12 @@ impl Linear {
         }
     }
 
-    /// In a word or two.
+    /// In a few words.
     pub(super) fn short(self) -> &'static str {
         match self {
             Self::Focuses => "focusing",
             Self::Couples => "coupling",
-            Self::FocusesAndCouples => "doing both",
+            Self::FocusesAndCouples => "focusing and coupling",
         }
     }
 
