@@ -8,7 +8,7 @@ use core::f64::consts::SQRT_2;
 use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Machine, Monitor, Optics, OrbitError, Place, Plane, Ring, Tunes};
 
-use inference::Screened;
+use inference::{Factor, Screened};
 
 /// The orbit without kicks: its size, its changes and its uncertainty.
 #[derive(Debug, Clone)]
@@ -21,6 +21,8 @@ pub struct Baseline {
     pub spurious: [f64; 2],
     /// Standard deviation of the orbit at each element (x, y) [m].
     pub sigma: Vec<[f64; 2]>,
+    /// Share of each monitor's own mean reading in the estimated orbit at its place [1].
+    share: Vec<f64>,
     /// Mean reading of each monitor less the response to the kicks [m]; none for a monitor without readings.
     read: Vec<Option<f64>>,
 }
@@ -32,6 +34,11 @@ const OFFSET: f64 = 0.7e-3;
 const SPURIOUS: f64 = SQRT_2;
 /// Largest `|cot(pi Q)|`: a machine nearer to the integer resonance keeps no beam.
 const STEEPEST: f64 = 20.0;
+/// Steps towards the orbit at a monitor that misreads it, the distance for the slope of the reading [m], and the least slope: one that reads larger positions as smaller
+/// ones has none that can be told.
+const STEPS: usize = 12;
+const NEAR: f64 = 1e-6;
+const FLATTEST: f64 = 0.2;
 
 impl Baseline {
     /// The orbit (x, y) at every element [m] and its properties, from the readings less the response to the kicks (rows frames, columns
@@ -52,8 +59,18 @@ impl Baseline {
         let tunes = Optics::of(ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
         let sensitivity = sensitivity(recorded_tunes, &tunes);
         let spurious = [0, 1].map(|plane| SPURIOUS * per_rms[plane] * rms[plane]);
-        let Kriged { orbit, sigma, .. } = Kriged::of(ring, &baselines, rms)?;
-        Ok((orbit, Self { rms, sensitivity, spurious, sigma, read: baselines }))
+        let Kriged { orbit, sigma, share, .. } = Kriged::of(ring, &baselines, rms)?;
+        Ok((orbit, Self { rms, sensitivity, spurious, sigma, share, read: baselines }))
+    }
+
+    /// The orbit at a monitor that misreads a position x by `m(x)` [m], given the one that was estimated as if it did not: as that one holds the share `w` of
+    /// the monitor's own reading, the solution of `x + w m(x) = estimated`, by bounded Newton steps.
+    pub fn corrected(&self, b: usize, estimated: f64, misreads: impl Fn(f64) -> f64) -> f64 {
+        let step = |x: f64, _| {
+            let slope = (misreads(x + NEAR) - misreads(x - NEAR)) / (2.0 * NEAR);
+            x - (x + self.share[b] * misreads(x) - estimated) / (1.0 + self.share[b] * slope).max(FLATTEST)
+        };
+        (0..STEPS).fold(estimated, step)
     }
 
     /// Displace a machine's quadrupoles so that its orbit without kicks is the estimated one; what it has by itself, off momentum, is not
@@ -118,6 +135,8 @@ struct Kriged {
     sigma: Vec<[f64; 2]>,
     /// Mean kick of each quadrupole [M] [rad].
     kicks: Vec<[f64; 2]>,
+    /// Share of each monitor's own reading in the orbit at its place: the change of the one with the other.
+    share: Vec<f64>,
 }
 
 impl Kriged {
@@ -127,12 +146,13 @@ impl Kriged {
     fn of(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let zero = |count: usize| vec![[0.0; 2]; count];
+        let monitors: Vec<_> = ring.monitors_read().collect();
         let mut kriged = Self {
             orbit: zero(ring.elements.len()),
             sigma: zero(ring.elements.len()),
             kicks: zero(ring.quadrupoles.len()),
+            share: vec![0.0; monitors.len()],
         };
-        let monitors: Vec<_> = ring.monitors_read().collect();
         for (index, plane) in [Plane::X, Plane::Y].into_iter().enumerate() {
             let direction = [[1.0, 0.0], [0.0, 1.0]][index];
             let middle = |element: usize| Place { element, depth: 0.5 * ring.elements[element].length };
@@ -145,10 +165,13 @@ impl Kriged {
             let mean_square = at.norm_squared() / (read.len().max(1)) as f64;
             let variance = if mean_square > 0.0 { rms[index].powi(2) / mean_square } else { 0.0 };
             let noise = DMatrix::from_diagonal_element(read.len(), read.len(), OFFSET.powi(2));
-            let Some(factor) = (&at * at.transpose() * variance + noise).cholesky() else { continue };
+            let Some(factor) = Factor::of(&at * at.transpose() * variance + noise) else { continue };
             let values = DVector::from_iterator(read.len(), read.iter().filter_map(|&b| baselines[b]));
             let kicks = at.tr_mul(&factor.solve(&values)) * variance;
             let (mean, cross) = (&all * &kicks, &all * at.transpose() * variance);
+            for (&b, precision) in read.iter().zip(factor.inverse_diagonal()) {
+                kriged.share[b] = 1.0 - OFFSET.powi(2) * precision;
+            }
             kriged.kicks.iter_mut().zip(kicks.iter()).for_each(|(to, kick)| to[index] = *kick);
             for i in 0..ring.elements.len() {
                 let row = cross.row(i).transpose();

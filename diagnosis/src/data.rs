@@ -506,7 +506,7 @@ impl Data {
     }
 
     /// What a signature does to the reading of a monitor [m], or to a tune, in a pool.
-    fn effect_on(&self, signature: &Signature, c: usize, pool: usize) -> f64 {
+    pub(super) fn effect_on(&self, signature: &Signature, c: usize, pool: usize) -> f64 {
         match c.checked_sub(self.monitors()) {
             None => signature.readings[(pool, c)],
             Some(plane) => signature.tune(plane, pool),
@@ -694,6 +694,17 @@ impl Data {
         mixing.apply(&mut values);
         mixing.apply(&mut values);
         DVector::from_fn(pattern.len(), |b, _| values[(0, b)] * self.channels[b].sigma / mixing.own(0, b))
+    }
+
+    /// The same in every run of a setting: rows pools.
+    pub fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut all = patterns.clone();
+        if !self.mixing.is_none() {
+            for mut row in all.row_iter_mut() {
+                row.copy_from(&self.accompanied(monitors, &row.transpose()).transpose());
+            }
+        }
+        all
     }
 
     /// A signature that steps with time, whitened.

@@ -1,7 +1,7 @@
 //! An unmodelled discrepancy: a part of the data that no effect of the library describes, and its most likely location.
 //!
 //! Each place is tried with free amplitudes: one of standard deviation `omega` for every setting (or stretch of time) at a monitor, a
-//! corrector or a place in the ring that kicks the beam; a quadrupole that changes in time has those of its gradient and, if the beam is off its axis,
+//! corrector or a place in the ring that kicks the beam, and for every run of a setting at a quadrupole whose gradient changes; a quadrupole that changes in time has those of its gradient and, if the beam is off its axis,
 //! of kicks in both planes; an unknown linear element those of the terms of its Hamiltonian, as a solenoid or a wiggler would have them. With `Z` the whitened pattern of those amplitudes,
 //! `P` the projection that removes what the fit's unknowns can absorb, `g = Z^T P r` and `G = Z^T P Z`:
 //!
@@ -17,6 +17,8 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
+mod gradient;
+
 use core::ops::Range;
 
 use estimator::MonitorState;
@@ -30,6 +32,7 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::location::Location;
 use super::settings::Settings;
+use gradient::{Changing, Runs};
 
 /// Free amplitudes at one place, and their evidence.
 #[derive(Debug, Clone)]
@@ -133,8 +136,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
     let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings, &sums[b])).collect();
     let stretches = stretches(data);
-    let in_time = InTime::of(data, &seen, &stretches);
-    let steps = &in_time.sums;
+    let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &stretches)).collect();
     // faulty monitors scatter by themselves
     let healthy = |&b: &usize| data.health()[b].state == MonitorState::Ok;
     let active: Vec<usize> = data.active_monitors().into_iter().filter(healthy).collect();
@@ -172,32 +174,29 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     for (quadrupole, plane, pattern) in &patterns {
         let of_settings = weighted(data, &sums, &active, pattern);
         found.push(linearised.judge(Location::Ring(*quadrupole, *plane), &of_settings, sites));
-        let of_stretches = weighted(data, steps, &active, pattern);
+        let of_stretches = weighted(data, &steps, &active, pattern);
         found.push(linearised.judge(Location::RingInTime(*quadrupole, *plane), &of_stretches, sites));
     }
-    let always = DMatrix::from_element(data.readings.nrows(), 1, 1.0);
     let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
     for q in 0..data.ring.quadrupoles.len() {
         let forms = Element::signatures(&signatures, &data.ring, q);
-        let column = |(_, one): &([usize; 2], Signature)| data.stepped(one, &always, &active).column(0).into_owned();
+        let column = |(_, one): &([usize; 2], Signature)| {
+            data.signature(&(at_monitors(one, &active) * one.rms().recip()))
+        };
         let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(column).collect::<Vec<_>>()), &own);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
             found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
         }
     }
-    let of_quadrupoles = signatures.of_quadrupoles();
-    for (q, signature) in of_quadrupoles.iter().enumerate() {
-        let gradient = data.stepped(signature, &stretches, &active);
-        let own_kicks: Vec<_> = patterns.iter().filter(|(of, ..)| *of == q).map(|(.., pattern)| pattern).collect();
-        let on_axis = Sums::whole(&gradient, &own);
-        let off_axis = in_time.with_kicks(data, &on_axis, &active, &gradient, &own_kicks);
-        let judge = |sums: &Sums| linearised.judge(Location::QuadrupoleInTime(q), sums, of_quadrupoles.len());
-        found.push(judge(&on_axis).or(judge(&off_axis)));
+    let runs = Runs::of(data, &seen, &active);
+    let changing = Changing::all(&machine, &signatures, &drives.orbit, &data.baseline.sigma)?;
+    for one in changing.iter().enumerate() {
+        found.extend(linearised.changing(data, &runs, &stretches, one, changing.len()));
     }
     let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
     found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
-    found.push(linearised.judge_held(Location::Time, &some(steps, &active)));
+    found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
     found.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
     Ok(found)
 }
@@ -311,13 +310,6 @@ impl Discrepancy {
             .fold((0, f64::NEG_INFINITY), |best, (i, &log)| if log > best.1 { (i, log) } else { best });
         let mean = logs.iter().map(|log| (log - largest).exp()).sum::<f64>() / SIZES.len() as f64;
         Self { at, campaign: 0, log_bayes: largest + mean.ln(), size: SIZES[best], sites, adapted: None }
-    }
-
-    /// One of two forms of it, equally likely beforehand: the evidence is their mean, all else that of the better one.
-    fn or(self, other: Self) -> Self {
-        let (better, worse) = if other.log_bayes > self.log_bayes { (other, self) } else { (self, other) };
-        let share = (worse.log_bayes - better.log_bayes).exp();
-        Self { log_bayes: better.log_bayes + (0.5 * (1.0 + share)).ln(), ..better }
     }
 }
 
@@ -450,15 +442,13 @@ impl Data {
         let noise = self.tune_noise(plane)?;
         Some(self.sums(self.monitors() + plane, seen, &(indicator * (noise / self.mean_noise()))))
     }
+}
 
-    /// A signature that sets in at each edge of time, scaled to an rms of 1 at the readings, whitened: one a column. Only some monitors count; the tunes always do.
-    fn stepped(&self, signature: &Signature, stretches: &DMatrix<f64>, monitors: &[usize]) -> DMatrix<f64> {
-        let mut some = Signature { readings: signature.readings.clone() * 0.0, ..signature.clone() };
-        monitors.iter().for_each(|&b| some.readings.set_column(b, &signature.readings.column(b)));
-        let some = some * signature.rms().recip();
-        let columns: Vec<DVector<f64>> = stretches.column_iter().map(|step| self.stepping(&some, &step)).collect();
-        DMatrix::from_columns(&columns)
-    }
+/// The same at some monitors only; the tunes always count.
+fn at_monitors(signature: &Signature, monitors: &[usize]) -> Signature {
+    let mut some = Signature { readings: signature.readings.clone() * 0.0, ..signature.clone() };
+    monitors.iter().for_each(|&b| some.readings.set_column(b, &signature.readings.column(b)));
+    some
 }
 
 impl Seen {
@@ -473,55 +463,6 @@ impl Seen {
         let residual = DMatrix::from_columns(core::slice::from_ref(&own.residual));
         let residual = data.taken_back(&residual).column(0).into_owned();
         Self { residual, jacobian: data.taken_back(&own.jacobian) }
-    }
-}
-
-/// Steps at the edges of the stretches of time, of each monitor.
-struct InTime {
-    sums: Vec<Sums>,
-    /// The steps, whitened.
-    steps: Vec<DMatrix<f64>>,
-}
-
-impl InTime {
-    fn of(data: &Data, seen: &Seen, stretches: &DMatrix<f64>) -> Self {
-        let monitors = 0..data.monitors();
-        let sums = monitors.clone().map(|b| data.sums(b, seen, stretches)).collect();
-        Self { sums, steps: monitors.map(|b| data.whiten_columns(b, stretches)).collect() }
-    }
-
-    /// A gradient that steps, and kicks at its place: off its axis a quadrupole kicks. `gradient`: whitened, one step a column, and `of_gradient` its
-    /// sums; `kicks`: what a kick in each plane does to the monitors.
-    fn with_kicks(
-        &self,
-        data: &Data,
-        of_gradient: &Sums,
-        monitors: &[usize],
-        gradient: &DMatrix<f64>,
-        kicks: &[&DVector<f64>],
-    ) -> Sums {
-        let of_kicks = kicks.iter().map(|pattern| weighted(data, &self.sums, monitors, pattern));
-        let mut all = Sums::stacked(&core::iter::once(of_gradient.clone()).chain(of_kicks).collect::<Vec<_>>());
-        let (n, gradient) = (gradient.ncols(), data.taken_back(gradient));
-        let mut set = |row: usize, column: usize, both: DMatrix<f64>| {
-            all.gram.view_mut((column * n, row * n), (n, n)).copy_from(&both.transpose());
-            all.gram.view_mut((row * n, column * n), (n, n)).copy_from(&both);
-        };
-        let left: Vec<DVector<f64>> = kicks.iter().map(|pattern| data.accompanied(monitors, pattern)).collect();
-        for (i, pattern) in kicks.iter().enumerate() {
-            for j in i + 1..kicks.len() {
-                // a monitor reads both where the planes are coupled
-                let seen = |b: usize| 0.5 * (pattern[b] * left[j][b] + kicks[j][b] * left[i][b]);
-                set(i + 1, j + 1, monitors.iter().map(|&b| &self.sums[b].gram * seen(b)).sum());
-            }
-            let mut both = DMatrix::zeros(n, n);
-            for &b in monitors {
-                let of_monitor = gradient.rows(data.start(b), self.steps[b].nrows());
-                both += of_monitor.tr_mul(&self.steps[b]) * pattern[b];
-            }
-            set(0, i + 1, both);
-        }
-        all
     }
 }
 
@@ -704,17 +645,17 @@ mod tests {
             let near = evidence(&weighted(&data, &sums, &monitors, &pattern));
             of_patterns = of_patterns.max((near - evidence(&whole(&pattern, &indicator))).abs());
         }
-        let in_time = InTime::of(&data, &seen, &stretches);
+        let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives).unwrap();
-        let mut of_quadrupoles = 0.0_f64;
-        for (q, signature) in signatures.of_quadrupoles().iter().enumerate().step_by(8) {
-            let gradient = data.stepped(signature, &stretches, &monitors);
-            let kicks: Vec<_> = kicked.iter().filter(|(of, ..)| *of == q).map(|(.., pattern)| read(pattern)).collect();
-            let (on_axis, kicked) = (Sums::whole(&gradient, &own), kicks.iter().collect::<Vec<_>>());
-            let near = in_time.with_kicks(&data, &on_axis, &monitors, &gradient, &kicked);
-            let of_gradient = gradient.column_iter().map(|column| column.into_owned());
-            let of_kicks = kicks.iter().flat_map(|pattern| columns_of(pattern, &stretches));
-            let exact = of_columns(of_gradient.chain(of_kicks).collect());
+        let (runs, mut of_quadrupoles) = (Runs::of(&data, &seen, &monitors), 0.0_f64);
+        let changing = Changing::all(&machine, &signatures, &drives.orbit, &data.baseline.sigma).unwrap();
+        for one in changing.iter().step_by(8) {
+            let near = runs.of_patterns(&data, &one.patterns()).through(&stretches);
+            let columns_of = |pattern: &Signature| {
+                let pattern = at_monitors(pattern, &monitors);
+                stretches.column_iter().map(|step| data.stepping(&pattern, &step)).collect::<Vec<_>>()
+            };
+            let exact = of_columns(one.patterns().into_iter().flat_map(columns_of).collect());
             of_quadrupoles = of_quadrupoles.max((evidence(&near) - evidence(&exact)).abs());
         }
         println!("{largest} {of_patterns} {of_quadrupoles}");

@@ -237,6 +237,7 @@ impl Hypothesis {
                 Unknown::Orbit(..) | Unknown::Form(..) | Unknown::Ordinary(..) => {}
             }
         }
+        effects.iter().for_each(|effect| correct_orbit(own, &mut drives, effect));
         let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
         Ok((Machine::new(ring, own.believed, &effects)?, drives))
     }
@@ -245,6 +246,16 @@ impl Hypothesis {
     pub fn label(&self, ring: &Ring) -> String {
         let terms: Vec<String> = self.terms.iter().map(|term| term.label(ring)).collect();
         if terms.is_empty() { "nothing".into() } else { terms.join(" + ") }
+    }
+}
+
+/// The orbit at a monitor was estimated as if it read what is there: not so where it misreads large positions.
+fn correct_orbit(data: &Data, drives: &mut Drives, effect: &Effect) {
+    let Site::Monitor(at) = effect.site else { return };
+    let Some(b) = data.ring.read_monitors.iter().position(|&read| read == at) else { return };
+    for (element, plane) in effect.kind.orbit(&data.ring, effect.site) {
+        let orbit = &mut drives.orbit[element][plane.index()];
+        *orbit = data.baseline.corrected(b, *orbit, |x| effect.misreads(x));
     }
 }
 

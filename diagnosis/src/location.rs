@@ -30,6 +30,8 @@ pub enum Location {
     Linear(usize, Linear),
     /// A quadrupole that changes in time, and as the beam is off its axis kicks it.
     QuadrupoleInTime(usize),
+    /// A quadrupole whose gradient differs from run to run of the settings.
+    QuadrupoleInRuns(usize),
     /// All monitors, in time.
     Time,
     /// The tunes, in time.
@@ -48,7 +50,7 @@ pub enum Location {
 }
 
 /// Number of sorts of location that compete with each other, equally likely a priori.
-pub const SORTS: usize = 14;
+pub const SORTS: usize = 15;
 
 impl Location {
     /// The name of the place: a monitor, a corrector, the label of a quadrupole, or a stretch.
@@ -61,7 +63,11 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
-            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::Linear(q, _) | Self::QuadrupoleInTime(q) => {
+            Self::Ring(q, _)
+            | Self::RingInTime(q, _)
+            | Self::Linear(q, _)
+            | Self::QuadrupoleInTime(q)
+            | Self::QuadrupoleInRuns(q) => {
                 ring.label(ring.quadrupoles[q].element).to_owned()
             }
             Self::Time => "time".into(),
@@ -89,6 +95,7 @@ impl Location {
             Self::RingInTime(_, Plane::Y) => format!("kicks near {name} in time, y"),
             Self::Linear(_, does) => format!("unknown element near {name}, {}", does.short()),
             Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
+            Self::QuadrupoleInRuns(_) => format!("quadrupole {name}, from setting to setting"),
             Self::Time => "all monitors, in time".into(),
             Self::Tunes => "tunes, in time".into(),
             Self::Everywhere => "all monitors".into(),
@@ -114,6 +121,7 @@ impl Location {
             Self::RingInTime(_, Plane::Y) => format!("a vertical kick near {name} changes during the campaign"),
             Self::Linear(_, does) => format!("an unknown element near {name} {}", does.phrase()),
             Self::QuadrupoleInTime(_) => format!("the focusing near {name} changes during the campaign"),
+            Self::QuadrupoleInRuns(_) => format!("the focusing near {name} changes from setting to setting"),
             Self::Time => "the orbit changes with time at many monitors".into(),
             Self::Tunes => "the tunes change during the campaign".into(),
             Self::Everywhere => {
@@ -139,7 +147,11 @@ impl Location {
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
             Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
-            Self::Ring(q, _) | Self::RingInTime(q, _) | Self::Linear(q, _) | Self::QuadrupoleInTime(q) => {
+            Self::Ring(q, _)
+            | Self::RingInTime(q, _)
+            | Self::Linear(q, _)
+            | Self::QuadrupoleInTime(q)
+            | Self::QuadrupoleInRuns(q) => {
                 ring.quadrupoles[q].element
             }
             Self::FrameToFrame => data.noise.frame_to_frame.as_ref()?.element(ring)?,

@@ -218,6 +218,7 @@ mod tests {
             Location::RingInTime(5, Plane::Y),
             Location::Linear(5, Linear::Couples),
             Location::QuadrupoleInTime(5),
+            Location::QuadrupoleInRuns(5),
             Location::Time,
             Location::Tunes,
         ] {

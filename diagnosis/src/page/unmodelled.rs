@@ -1,7 +1,7 @@
 //! The decisive picture of an unmodelled discrepancy: the residuals at its place.
 
 use nalgebra::DVector;
-use twin::{Hold, Optics, Plane};
+use twin::{Hold, Optics, Plane, Signatures};
 
 use super::lattice::{STRIP, strip};
 use super::partial::Partial;
@@ -84,6 +84,11 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
             figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);
             figures
         }
+        Location::QuadrupoleInRuns(q) => {
+            let mut figures = vec![left.gradient_in_settings(q)?];
+            figures.extend(tunes::of_model(&found.data, &found.best, &left.title())?);
+            figures
+        }
         Location::Tunes => tunes::of_model(&found.data, &found.best, &left.title())?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
@@ -96,6 +101,12 @@ impl Left<'_> {
     fn of_element(&self) -> Option<(String, Figure)> {
         let element = self.partial.fitted.hypothesis.element.as_ref();
         element.map(|_| slope::of_element(&self.what, &self.partial))
+    }
+
+    /// Of a quadrupole.
+    fn label(&self, q: usize) -> &str {
+        let ring = &self.partial.data.ring;
+        ring.label(ring.quadrupoles[q].element)
     }
 
     fn name(&self, b: usize) -> String {
@@ -211,15 +222,45 @@ impl Left<'_> {
 
     /// The kick at a quadrupole that each setting's residuals would give.
     fn kicks(&self, q: usize, plane: Plane) -> Result<(String, Figure), FitError> {
-        let (data, response) = (self.partial.data, self.response_to(q, plane)?);
+        let response = self.response_to(q, plane)?;
+        let label = self.label(q);
+        // um per urad
+        let figure = self.in_settings(&format!("{} kick near {label} [µrad]", direction(plane)), |one| response[one.monitor]);
+        let caption = format!(
+            "The kick at {label} that describes the residuals of each setting best, the vars held, with its error from the noise. A gradient there \
+             kicks in proportion to the orbit that each corrector makes."
+        );
+        Ok((caption, figure))
+    }
+
+    /// The change of a quadrupole's gradient that each setting's residuals would give.
+    fn gradient_in_settings(&self, q: usize) -> Result<(String, Figure), FitError> {
+        let (machine, drives) = self.partial.fitted.machine(self.partial.data)?;
+        let machine = machine.on_orbit(&drives.orbit);
+        let signatures = Signatures::of(&machine, &drives)?;
+        let does = signatures.of_quadrupoles().swap_remove(q).readings;
+        let label = self.label(q);
+        // um per per cent
+        let figure = self.in_settings(&format!("change of the gradient of {label} [%]"), |one| {
+            1e4 * does[(one.pool, one.monitor)]
+        });
+        let caption = format!(
+            "The change of the gradient of {label} that describes the residuals of all monitors in each setting best, the vars held, with its error \
+             from the noise."
+        );
+        Ok((caption, figure))
+    }
+
+    /// What describes the residuals of each setting best; `does`: what one unit of it does to a reading [µm].
+    fn in_settings(&self, axis: &str, does: impl Fn(&Residual) -> f64) -> Figure {
+        let data = self.partial.data;
         let driven = data.driven_correctors();
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
             for one in &self.residuals {
                 let Some((c, _)) = one.kick.filter(|(_, sign)| *sign == wanted) else { continue };
                 let Some(at) = driven.iter().position(|&of| of == c) else { continue };
-                // um per urad
-                means[at].add(one.value, response[one.monitor] / one.noise);
+                means[at].add(one.value, does(one) / one.noise);
             }
             means
         };
@@ -227,14 +268,8 @@ impl Left<'_> {
             points(label, of_sign(sign).into_iter().enumerate().map(|(i, mean)| (i as f64 + 0.15 * sign, mean)))
         });
         let names: Vec<String> = driven.iter().map(|&c| data.ring.corrector_names()[c].clone()).collect();
-        let label = data.ring.label(data.ring.quadrupoles[q].element);
-        let axis = format!("{} kick near {label} [µrad]", direction(plane));
-        let axes = Axes::new(&self.title(), "corrector that is powered", &axis);
-        let caption = format!(
-            "The kick at {label} that describes the residuals of each setting best, the vars held, with its error from the noise. A gradient there \
-             kicks in proportion to the orbit that each corrector makes."
-        );
-        Ok((caption, Figure::lines(&axes.named(&names).compared(Reference::Level(0.0)), &series)))
+        let axes = Axes::new(&self.title(), "corrector that is powered", axis);
+        Figure::lines(&axes.named(&names).compared(Reference::Level(0.0)), &series)
     }
 
     /// The kick at a quadrupole that the residuals of each stretch of time would give.
@@ -244,8 +279,7 @@ impl Left<'_> {
         for one in &self.residuals {
             means[stretch(one.time)].add(one.value, response[one.monitor] / one.noise);
         }
-        let label = self.partial.data.ring.label(self.partial.data.ring.quadrupoles[q].element);
-        let axis = format!("{} kick near {label} [µrad]", direction(plane));
+        let axis = format!("{} kick near {} [µrad]", direction(plane), self.label(q));
         Ok(self.over_time(&means, &axis, "The kick that describes the residuals of all monitors best, the vars held,"))
     }
 

@@ -239,6 +239,14 @@ pub struct Effect {
 }
 
 impl Effect {
+    /// What its monitor reads beyond a position in its plane [m]; 0 of an effect that is none of a single monitor.
+    pub fn misreads(&self, position: f64) -> f64 {
+        match self.kind.class() {
+            Class::Monitor(how) => how.misreads(self.amplitude, position),
+            Class::Corrector(_) | Class::Field(_) | Class::Hold(_) | Class::Drift(_) => 0.0,
+        }
+    }
+
     /// Read one for a ring.
     ///
     /// # Errors

@@ -61,6 +61,11 @@ impl MonitorEffect {
         }
     }
 
+    /// What is read beyond a position in its own plane [m].
+    pub(super) fn misreads(self, amplitude: f64, position: f64) -> f64 {
+        self.read(Plane::X, amplitude, [position, 0.0])[0] - position
+    }
+
     /// Slope of the own plane's reading in the amplitude, at amplitude 0.
     fn slope(self, plane: Plane, at: [f64; 2]) -> f64 {
         first_derivative(|amplitude| self.read(plane, amplitude, at.map(Into::into))[plane.index()], 0.0).1

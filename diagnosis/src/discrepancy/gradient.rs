@@ -1,0 +1,150 @@
+//! A quadrupole whose gradient changes: in time, or from one run of a setting to the next, as where it follows the correctors' currents or comes and goes.
+//!
+//! In each run of frames it has an amplitude of its own; in time, steps. A gradient also kicks the beam, which is off the quadrupole's axis already
+//! without kicks: by as much as the estimated orbit is, and by free amplitudes of the size of that estimate's error. With `s` what a pattern does to a
+//! channel (a monitor or a tune) in each run, and that channel's sums over runs, the Gram matrix of two patterns' amplitudes is the sum of
+//! `diag(s) E^T S^-1 E diag(s')` over the channels.
+
+use nalgebra::{DMatrix, DVector, MatrixXx2};
+use twin::{Hold, Machine, Optics, OrbitError, Place, Signature, Signatures};
+
+use super::{Data, Discrepancy, Linearised, Seen, Sums};
+use crate::location::Location;
+
+/// Amplitudes of a gradient over those of other places: the tunes show one that moves the readings by far less than their noise.
+const FINER: f64 = 1.0 / 16.0;
+/// Standard deviation of a quadrupole's axis against the monitors' [m], typical of surveys.
+const AXIS: f64 = 0.3e-3;
+/// Standard deviations by which the squared pulls have to exceed what noise makes of them: one in 40 quadrupoles does that by chance.
+const PULLED: f64 = 2.0;
+
+/// The sums of each channel over the runs of settings.
+pub(super) struct Runs {
+    channels: Vec<(usize, Sums)>,
+    /// Monitors that count.
+    monitors: Vec<usize>,
+}
+
+/// What the change of a quadrupole's gradient does, and kicks as large as the error of the orbit makes them.
+pub(super) struct Changing {
+    gradient: Signature,
+    kicks: [Signature; 2],
+}
+
+impl Changing {
+    /// Of each quadrupole; `sigma`: standard deviation of the orbit at every element (x, y) [m].
+    ///
+    /// # Errors
+    /// [`OrbitError`].
+    pub fn all(
+        machine: &Machine,
+        signatures: &Signatures,
+        orbit: &[[f64; 2]],
+        sigma: &[[f64; 2]],
+    ) -> Result<Vec<Self>, OrbitError> {
+        let ring = machine.ring();
+        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+        let monitors = optics.read_monitors();
+        let of = |((quadrupole, k1), mut gradient): ((&_, f64), Signature)| {
+            let twin::Quadrupole { element, .. } = *quadrupole;
+            let length = ring.elements[element].length;
+            let place = Place { element, depth: 0.5 * length };
+            // focusing in x
+            let kick = |[x, y]: [f64; 2]| optics.kick(place, [-k1 * length * x, k1 * length * y]);
+            let [x, y] = sigma[element].map(|sigma| sigma.hypot(AXIS));
+            let response = optics.response(&monitors, &[kick(orbit[element]), kick([x, 0.0]), kick([0.0, y])]);
+            gradient.readings.row_iter_mut().for_each(|mut row| row += response.column(0).transpose());
+            let scale = FINER / gradient.rms();
+            let kicks = [1, 2].map(|plane| {
+                let rows = vec![response.column(plane).transpose(); gradient.readings.nrows()];
+                let none = MatrixXx2::zeros(rows.len());
+                Signature { readings: DMatrix::from_rows(&rows), tunes: [0.0; 2], tune_changes: none } * scale
+            });
+            Self { gradient: gradient * scale, kicks }
+        };
+        Ok(ring.quadrupoles.iter().zip(ring.gradients()).zip(signatures.of_quadrupoles()).map(of).collect())
+    }
+
+    fn patterns(&self) -> [&Signature; 3] {
+        [&self.gradient, &self.kicks[0], &self.kicks[1]]
+    }
+}
+
+impl Runs {
+    /// Of some monitors and the tunes that are known.
+    pub fn of(data: &Data, seen: &Seen, monitors: &[usize]) -> Self {
+        let each = DMatrix::identity(data.pools.count, data.pools.count);
+        let tunes = [0, 1].into_iter().filter(|&plane| data.tune_noise(plane).is_some());
+        let channels = monitors.iter().copied().chain(tunes.map(|plane| data.monitors() + plane));
+        Self { channels: channels.map(|c| (c, data.sums(c, seen, &each))).collect(), monitors: monitors.to_vec() }
+    }
+
+    /// One amplitude a run of each of some patterns.
+    pub fn of_patterns(&self, data: &Data, patterns: &[&Signature]) -> Sums {
+        let (runs, unknowns) = (data.pools.count, self.channels[0].1.cross.ncols());
+        let mut all = Sums::none(patterns.len() * runs, unknowns);
+        let left: Vec<DMatrix<f64>> =
+            patterns.iter().map(|one| data.accompanied_in_runs(&self.monitors, &one.readings)).collect();
+        for (c, own) in &self.channels {
+            let does = |i: usize| DVector::from_fn(runs, |run, _| data.effect_on(patterns[i], *c, run));
+            let does: Vec<DVector<f64>> = (0..patterns.len()).map(does).collect();
+            let leaves = |i: usize| if *c < data.monitors() { left[i].column(*c).into_owned() } else { does[i].clone() };
+            let leaves: Vec<DVector<f64>> = (0..patterns.len()).map(leaves).collect();
+            for i in 0..patterns.len() {
+                for j in i..patterns.len() {
+                    let both = (&does[i] * leaves[j].transpose() + &leaves[i] * does[j].transpose()) * 0.5;
+                    let mut block = all.gram.view_mut((i * runs, j * runs), (runs, runs));
+                    block += own.gram.component_mul(&both);
+                }
+                let mut pull = all.pull.rows_mut(i * runs, runs);
+                pull += own.pull.component_mul(&does[i]);
+                for (from, mut to) in own.cross.column_iter().zip(all.cross.rows_mut(i * runs, runs).column_iter_mut()) {
+                    to += from.component_mul(&does[i]);
+                }
+            }
+        }
+        all.gram.fill_lower_triangle_with_upper_triangle();
+        all
+    }
+}
+
+impl Sums {
+    /// Of amplitudes that are sums of some, block by block: `steps`, rows those of a block.
+    fn through(&self, steps: &DMatrix<f64>) -> Self {
+        let (from, to) = steps.shape();
+        let blocks = self.pull.len() / from;
+        let mut all = Self::none(blocks * to, self.cross.ncols());
+        for i in 0..blocks {
+            for j in 0..blocks {
+                let block = self.gram.view((i * from, j * from), (from, from));
+                all.gram.view_mut((i * to, j * to), (to, to)).copy_from(&(steps.transpose() * block * steps));
+            }
+            all.cross.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.cross.rows(i * from, from)));
+            all.pull.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.pull.rows(i * from, from)));
+        }
+        all
+    }
+}
+
+impl Linearised<'_> {
+    /// A quadrupole of several that changes in time, or from run to run; the latter only where the gradient's pulls are larger than noise makes them.
+    pub(super) fn changing(
+        &self,
+        data: &Data,
+        runs: &Runs,
+        stretches: &DMatrix<f64>,
+        (quadrupole, one): (usize, &Changing),
+        sites: usize,
+    ) -> Vec<Discrepancy> {
+        let sums = runs.of_patterns(data, &one.patterns());
+        let mut found = vec![self.judge(Location::QuadrupoleInTime(quadrupole), &sums.through(stretches), sites)];
+        let of_gradient: Vec<usize> = (0..data.pools.count).collect();
+        let (pull, gram) = self.project(&sums.select(&of_gradient));
+        // of noise alone the squared pulls have the mean tr G and the variance 2 tr G^2
+        if pull.norm_squared() > gram.trace() + PULLED * 2.0_f64.sqrt() * gram.norm() {
+            found.push(self.judge(Location::QuadrupoleInRuns(quadrupole), &sums, sites));
+        }
+        found.iter_mut().for_each(|one| one.size *= FINER);
+        found
+    }
+}
