@@ -9,12 +9,19 @@ use super::hypothesis::Term;
 use super::location::Location;
 use super::noise::Noise;
 use super::scan::Candidate;
+use super::search::UNMODELLED;
 
 /// Probability at which a cause counts as decided.
 pub const DECISIVE: f64 = 0.95;
 /// Probability of missing physics above which a recording is not consistent. A lower limit would call too many recordings without
 /// missing physics ambiguous.
 pub const SUSPICIOUS: f64 = 0.6;
+
+/// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in the validation 3 of 80
+/// that could be seen.
+const ALIKE: f64 = 0.04;
+/// Probability of such a cause over that of the effect that it looks like and itself: no recording tells the two apart.
+const IMITATED: f64 = UNMODELLED * ALIKE / (1.0 - UNMODELLED + UNMODELLED * ALIKE);
 
 /// A possible cause.
 #[derive(Debug, Clone)]
@@ -148,7 +155,7 @@ pub(super) struct Weighed {
 }
 
 impl Weighed {
-    /// Normalise posterior weights (`ln`; that of no effect is 0).
+    /// Normalise posterior weights (`ln`; that of no effect is 0); a share [`IMITATED`] of an effect's is that of what only looks like it.
     pub fn of(mut weights: Vec<(Alternative, f64)>) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
         weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
@@ -157,7 +164,8 @@ impl Weighed {
         let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
         let sum = nothing + something;
         let normalised = |(alternative, weight): (Alternative, f64)| {
-            let probability = (weight - largest).exp() / sum;
+            let itself = if alternative.is_of_library() { 1.0 - IMITATED } else { 1.0 };
+            let probability = itself * (weight - largest).exp() / sum;
             Alternative { probability, ..alternative }
         };
         let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
@@ -183,13 +191,51 @@ impl Competition {
         self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
     }
 
+    /// Probability of physics that the library does not hold and that looks like one of its effects.
+    pub fn imitating(&self) -> f64 {
+        self.library() * IMITATED / (1.0 - IMITATED)
+    }
+
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
-        self.alternatives.iter().filter(|a| !a.is_of_library()).map(|a| a.probability).sum()
+        let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
+        self.imitating() + listed.map(|a| a.probability).sum::<f64>()
     }
 
     /// The exact fit with the most likely effect of the library.
     pub(super) fn leader(&self) -> Option<Fitted> {
         self.alternatives.iter().filter(|a| a.is_of_library()).find_map(|a| a.fitted.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use twin::{EffectKind, Site};
+
+    use super::*;
+
+    /// All probabilities add up to 1, and no effect is more certain than that nothing looks like it.
+    #[test]
+    fn an_effect_is_at_most_as_likely_as_that_nothing_unknown_looks_like_it() {
+        let of = |log_gain: f64, corrector: usize| {
+            let term = Term { kind: EffectKind::CorrectorGain, site: Site::Corrector(corrector) };
+            let alternative = Alternative {
+                cause: Cause::Effect(term),
+                log_gain,
+                probability: 0.0,
+                amplitude: (0.1, 0.01),
+                adapting: DVector::zeros(0),
+                fitted: None,
+            };
+            (alternative, log_gain)
+        };
+        for (first, least) in [(40.0, 0.99), (2.0, 0.6)] {
+            let all = Weighed::of(vec![of(first, 0), of(0.0, 1)]);
+            let library: f64 = all.alternatives.iter().map(|one| one.probability).sum();
+            assert!((all.nothing + library / (1.0 - IMITATED) - 1.0).abs() < 1e-12);
+            let leading = all.alternatives[0].probability;
+            assert!(leading > least && leading <= 1.0 - IMITATED, "{leading}");
+        }
+        assert!((IMITATED - 0.007).abs() < 5e-4, "0.04 of 15 in 100, beside 85");
     }
 }

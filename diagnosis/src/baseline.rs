@@ -63,6 +63,12 @@ impl Baseline {
         Ok((orbit, Self { rms, sensitivity, spurious, sigma, share, read: baselines }))
     }
 
+    /// The same where the orbit is known, whatever the monitors read.
+    #[cfg(test)]
+    pub fn known(self) -> Self {
+        Self { share: vec![0.0; self.share.len()], ..self }
+    }
+
     /// The orbit at a monitor that misreads a position x by `m(x)` [m], given the one that was estimated as if it did not: as that one holds the share `w` of
     /// the monitor's own reading, the solution of `x + w m(x) = estimated`, by bounded Newton steps.
     pub fn corrected(&self, b: usize, estimated: f64, misreads: impl Fn(f64) -> f64) -> f64 {
@@ -181,5 +187,30 @@ impl Kriged {
             }
         }
         Ok(kriged)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A monitor that reads 10 mm as 13, and of whose reading the estimated orbit holds nine tenths.
+    #[test]
+    fn the_orbit_at_a_monitor_that_misreads_it_solves_its_equation() {
+        let baseline = Baseline {
+            rms: [0.0; 2],
+            sensitivity: [1.0; 2],
+            spurious: [0.0; 2],
+            sigma: Vec::new(),
+            share: vec![0.9],
+            read: Vec::new(),
+        };
+        for cubic in [3e3, -1e3, 0.0] {
+            let misreads = |x: f64| cubic * x.powi(3);
+            for x in [-10e-3, 2e-3, 10e-3] {
+                let found = baseline.corrected(0, x + 0.9 * misreads(x), misreads);
+                assert!((found - x).abs() < 1e-9, "{cubic} {x}: {found}");
+            }
+        }
     }
 }

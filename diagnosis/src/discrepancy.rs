@@ -180,9 +180,8 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
     for q in 0..data.ring.quadrupoles.len() {
         let forms = Element::signatures(&signatures, &data.ring, q);
-        let column = |(_, one): &([usize; 2], Signature)| {
-            data.signature(&(at_monitors(one, &active) * one.rms().recip()))
-        };
+        let column =
+            |(_, one): &([usize; 2], Signature)| data.signature(&(at_monitors(one, &active) * one.rms().recip()));
         let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(column).collect::<Vec<_>>()), &own);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();

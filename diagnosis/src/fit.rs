@@ -352,25 +352,44 @@ impl Fitted {
         Ok(sum / (degrees - self.params.len() as f64))
     }
 
-    /// Step of `ln` of the vars, and its covariance, were the same unknowns as wide as those of another hypothesis: to first order. With `D`
-    /// the ratios of the widths, `N = 1 + J^T J`: `N' = 1 + D (N - 1) D`, `u' = N'^-1 D (J^T r + (N - 1) u)`.
+    /// Step of `ln` of the vars, and its covariance, were the same unknowns as wide as those of another hypothesis and some families in the model
+    /// besides: to first order. With `D` the ratios of the widths, `X` what the families do per width and `J' = (J D, X)`:
+    /// `u' = (1 + J'^T J')^-1 J'^T (r + J u)`.
     ///
     /// # Errors
-    /// [`FitError::Degenerate`].
-    pub fn widened(&self, data: &Data, other: &Hypothesis) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
+    /// [`FitError`].
+    pub fn widened(
+        &self,
+        data: &Data,
+        other: &Hypothesis,
+        beside: &[Family],
+    ) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
+        let data = self.data(data);
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
         let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
-        let identity = DMatrix::identity(self.u.len(), self.u.len());
-        let mut matrix = self.factor.matrix() - &identity;
-        let pull = (self.jacobian.tr_mul(&self.residual) + &matrix * &self.u).component_mul(&wider);
-        let scaled = |column: &DVector<f64>, w: f64| column.component_mul(&wider) * w;
-        for (i, w) in wider.iter().enumerate() {
-            let column = scaled(&matrix.column(i).into_owned(), *w);
-            matrix.set_column(i, &column);
-        }
-        let factor = Factor::of(matrix + identity).ok_or(FitError::Degenerate)?;
-        Ok((self.units.step(&(factor.solve(&pull) - &self.u)), self.units.covariance(&factor.inverse())))
+        let besides: Vec<Unknown> = beside.iter().flat_map(|family| family.unknowns(data)).collect();
+        let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
+        let Ordinary { slopes, gram } = Ordinary::about(data, &besides, machine)?;
+        let (p, k) = (self.u.len(), besides.len());
+        let across = self.jacobian.tr_mul(&slopes);
+        let mut matrix = DMatrix::zeros(p + k, p + k);
+        matrix.view_mut((0, 0), (p, p)).copy_from(&(self.factor.matrix() - DMatrix::identity(p, p)));
+        matrix.view_mut((0, p), (p, k)).copy_from(&across);
+        matrix.view_mut((p, 0), (k, p)).copy_from(&across.transpose());
+        matrix.view_mut((p, p), (k, k)).copy_from(&gram);
+        let left = &self.residual + &self.jacobian * &self.u;
+        let mut pull = DVector::zeros(p + k);
+        pull.rows_mut(0, p).copy_from(&self.jacobian.tr_mul(&left));
+        pull.rows_mut(p, k).copy_from(&slopes.tr_mul(&left));
+        let scale = wider.insert_rows(p, k, 1.0);
+        matrix
+            .column_iter_mut()
+            .zip(scale.iter())
+            .for_each(|(mut column, s)| column.component_mul_assign(&(&scale * *s)));
+        let factor = Factor::of(matrix + DMatrix::identity(p + k, p + k)).ok_or(FitError::Degenerate)?;
+        let step = factor.solve(&pull.component_mul(&scale)).rows(0, p) - &self.u;
+        Ok((self.units.step(&step), self.units.covariance(&factor.inverse())))
     }
 
     /// Covariance of `ln` of the vars.

@@ -166,17 +166,13 @@ impl Hypothesis {
             });
             amplitude.into_iter().chain(orbit).collect::<Vec<_>>()
         };
-        let of_family = |family: &Family| {
-            let width = family.width;
-            family.members(data).into_iter().map(move |member| Unknown::Ordinary(member, width))
-        };
         let terms = self.terms.iter().enumerate().flat_map(of_term);
         let of_element = |element: &Element| {
             let quadrupole = element.quadrupole;
             element.forms.clone().into_iter().map(move |(form, sigma)| Unknown::Form(quadrupole, form, sigma))
         };
         let forms = self.element.iter().flat_map(of_element);
-        terms.chain(forms).chain(self.ordinary.iter().flat_map(of_family)).collect()
+        terms.chain(forms).chain(self.ordinary.iter().flat_map(|family| family.unknowns(data))).collect()
     }
 
     /// Without some.

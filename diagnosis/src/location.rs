@@ -1,9 +1,10 @@
 //! Locations of an unmodelled discrepancy, and their descriptions.
 
-use twin::Plane;
+use twin::{Plane, Ring, Site};
 
 use super::data::Data;
 use super::element::Linear;
+use super::hypothesis::Term;
 
 /// Location of an unmodelled discrepancy.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,9 +68,7 @@ impl Location {
             | Self::RingInTime(q, _)
             | Self::Linear(q, _)
             | Self::QuadrupoleInTime(q)
-            | Self::QuadrupoleInRuns(q) => {
-                ring.label(ring.quadrupoles[q].element).to_owned()
-            }
+            | Self::QuadrupoleInRuns(q) => ring.label(ring.quadrupoles[q].element).to_owned(),
             Self::Time => "time".into(),
             Self::Tunes => "tunes".into(),
             Self::Everywhere => "everywhere".into(),
@@ -137,6 +136,19 @@ impl Location {
         }
     }
 
+    /// True if an effect of the library describes the same instrument, in part: one that does something unknown in every setting has seldom a second fault.
+    pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
+        match *self {
+            Self::Monitor(b) | Self::GainInTime(b) | Self::MonitorElsewhere(b) | Self::MonitorCurve(b) => {
+                term.kind.is_of_a_monitor() && term.site == Site::Monitor(ring.read_monitors[b])
+            }
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) => {
+                term.kind.is_of_a_corrector() && term.site == Site::Corrector(c)
+            }
+            _ => false,
+        }
+    }
+
     /// Position along the beam [m].
     pub fn position(&self, data: &Data) -> Option<f64> {
         let ring = &data.ring;
@@ -151,9 +163,7 @@ impl Location {
             | Self::RingInTime(q, _)
             | Self::Linear(q, _)
             | Self::QuadrupoleInTime(q)
-            | Self::QuadrupoleInRuns(q) => {
-                ring.quadrupoles[q].element
-            }
+            | Self::QuadrupoleInRuns(q) => ring.quadrupoles[q].element,
             Self::FrameToFrame => data.noise.frame_to_frame.as_ref()?.element(ring)?,
             Self::Time | Self::Tunes | Self::Everywhere | Self::FirstFrames { .. } => return None,
         };

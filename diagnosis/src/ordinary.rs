@@ -52,6 +52,9 @@ pub struct Family {
 const STANDS_OUT: f64 = 2.3;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
+/// Share of the full width that dipoles which hide something have beside straights that do: in the validation the vars beside either are then right by
+/// their error bars, on average, and those of an empty campaign have error bars that are a fifth larger.
+const HIDDEN: f64 = 0.5;
 /// Steps of the widths at most, and the change, in tolerances, at which they have settled.
 const STEPS: usize = 30;
 const SETTLED: f64 = 0.01;
@@ -115,6 +118,11 @@ impl Family {
         terms.flat_map(of_each).collect()
     }
 
+    /// Its members as unknowns of a fit.
+    pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
+        self.members(data).into_iter().map(|member| Unknown::Ordinary(member, self.width)).collect()
+    }
+
     /// True for what may differ between two times in the cycle: the momentum, and fields of eddy currents.
     fn is_of_a_moment(&self) -> bool {
         matches!(self.kind, EffectKind::MomentumOffset | EffectKind::DipoleSextupole)
@@ -133,15 +141,24 @@ impl Family {
         some.into_iter().filter(|terms| !terms.is_empty()).collect()
     }
 
-    /// The same with room for what a recording cannot show: the vars near a straight absorb a gradient in it. As wide as one gradient of its
-    /// kind's prior in any one of the `n` straights makes it, `scale/sqrt(n)`.
+    /// The same with room for what a recording cannot show, since the vars absorb it: as wide as one effect of its kind's prior at any one of the `n`
+    /// places that it may have makes it, `scale/sqrt(n)`.
     pub fn unseen(&self, data: &Data) -> Self {
-        match (self.kind, self.kind.prior_scale()) {
-            (EffectKind::StrayGradient, Some(scale)) => {
-                Self { width: scale / (self.members(data).len().max(1) as f64).sqrt(), ..*self }
-            }
-            _ => *self,
-        }
+        let scale = self.kind.prior_scale().filter(|_| is_absorbed(self.kind)).unwrap_or(0.0);
+        let places = members(self.kind, data).len().max(1) as f64;
+        Self { width: self.width.max(scale / places.sqrt()), ..*self }
+    }
+
+    /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by [`HIDDEN`] of the
+    /// width above.
+    pub fn hidden(data: &Data) -> Vec<Self> {
+        let of = |(name, kind)| {
+            let one = Self { name, kind, grouping: Grouping::Each, tolerance: 0.0, width: 0.0 }.unseen(data);
+            Self { width: HIDDEN * one.width, ..one }
+        };
+        [("gradients in dipoles", EffectKind::DipoleGradient), ("edge angles of dipoles", EffectKind::DipoleEdge)]
+            .map(of)
+            .into()
     }
 
     /// True if its width is learnt.

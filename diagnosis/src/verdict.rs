@@ -15,6 +15,7 @@ use super::heldout::{Block, Score, VALIDATED, gain_of_choice, lessened, reduced}
 use super::hypothesis::Term;
 use super::imperfection::Imperfection;
 use super::limits::Limits;
+use super::location::Location;
 use super::ordinary;
 use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
@@ -244,9 +245,32 @@ impl Finding {
         Ok(Self { alternatives, ..finding })
     }
 
+    /// True if another one is a part of what an instrument does that no effect describes.
+    fn holds(&self, other: &Self, data: &Data) -> bool {
+        match (&self.cause, other.term()) {
+            (Cause::Unmodelled(one), Some(term)) => one.at.holds(term, &data.campaign(one.campaign).ring),
+            _ => false,
+        }
+    }
+
+    /// With its parts, which are no findings of their own.
+    fn with(self, parts: Vec<Self>) -> Self {
+        let parts: Vec<String> = parts.into_iter().map(|part| part.phrase).collect();
+        if parts.is_empty() {
+            return self;
+        }
+        let phrase = format!("{}, a part of which is that {}", self.phrase, parts.join(" and "));
+        Self { phrase, ..self }
+    }
+
     /// The effect of the library that it is, if any.
     pub fn term(&self) -> Option<&Term> {
         self.cause.term()
+    }
+
+    /// True for what all monitors share from frame to frame.
+    pub fn is_of_noise(&self) -> bool {
+        matches!(&self.cause, Cause::Unmodelled(one) if one.at == Location::FrameToFrame)
     }
 
     /// The word for its kind, or `unknown`.
@@ -365,7 +389,10 @@ pub fn findings(
         _ => None,
     };
     if let Some(first) = open {
-        all.push(Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? });
+        let open = Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? };
+        let (parts, others) = all.into_iter().partition(|finding| open.holds(finding, data));
+        all = others;
+        all.push(open.with(parts));
     }
     all.extend(unmodelled);
     for (index, campaign) in data.campaigns().enumerate() {

@@ -225,7 +225,8 @@ impl Left<'_> {
         let response = self.response_to(q, plane)?;
         let label = self.label(q);
         // um per urad
-        let figure = self.in_settings(&format!("{} kick near {label} [µrad]", direction(plane)), |one| response[one.monitor]);
+        let figure =
+            self.in_settings(&format!("{} kick near {label} [µrad]", direction(plane)), |one| response[one.monitor]);
         let caption = format!(
             "The kick at {label} that describes the residuals of each setting best, the vars held, with its error from the noise. A gradient there \
              kicks in proportion to the orbit that each corrector makes."
@@ -241,9 +242,8 @@ impl Left<'_> {
         let does = signatures.of_quadrupoles().swap_remove(q).readings;
         let label = self.label(q);
         // um per per cent
-        let figure = self.in_settings(&format!("change of the gradient of {label} [%]"), |one| {
-            1e4 * does[(one.pool, one.monitor)]
-        });
+        let figure = self
+            .in_settings(&format!("change of the gradient of {label} [%]"), |one| 1e4 * does[(one.pool, one.monitor)]);
         let caption = format!(
             "The change of the gradient of {label} that describes the residuals of all monitors in each setting best, the vars held, with its error \
              from the noise."

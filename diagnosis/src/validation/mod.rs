@@ -149,7 +149,13 @@ fn stated(diagnosis: &Diagnosis, key: &Truth) -> Stated {
         }
         None => {
             let is_true = key.effects.iter().any(TrueEffect::is_unmodelled);
-            Stated::of("unknown".into(), Sort::Unknown, found.next.unknown(), of_sorts(&found.next), is_true)
+            // what varies from frame to frame is in the noise, and competes with nothing else
+            let own = diagnosis.findings.iter().find(|finding| finding.is_of_noise());
+            let (unknown, of_sorts) = match own.map(|finding| finding.probability) {
+                Some(p) if p > found.next.unknown() => (p, [1.0 - p, 0.0, p]),
+                _ => (found.next.unknown(), of_sorts(&found.next)),
+            };
+            Stated::of("unknown".into(), Sort::Unknown, unknown, of_sorts, is_true)
         }
     }
 }
