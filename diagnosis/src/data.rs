@@ -220,7 +220,7 @@ impl Data {
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
         let pools = Pools::of(&campaign.settings.of_frame);
-        let shared = |b: usize| campaign.following(b).insert_column(0, BASELINE);
+        let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let noise = noise_of(campaign, &design, &drives)?;
         let mut screened = screened.clone();
         noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);

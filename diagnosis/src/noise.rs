@@ -449,7 +449,7 @@ fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
         let values: Vec<f64> = frames.iter().map(|&frame| source.residual[(frame, b)]).collect();
         let repeats = Repeats::of(&frames, &values, &runs);
         let sigma = repeats.of_neighbours().filter(|sigma| *sigma > 0.0)?;
-        let following = campaign.following(b).select_rows(&frames);
+        let following = campaign.following_with_field(b).select_rows(&frames);
         let near = Repeats::of(&frames, &values, &apart).without(&following, sigma);
         let repeats = repeats.without(&following, sigma);
         (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, near, sigma })

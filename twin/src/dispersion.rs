@@ -58,6 +58,12 @@ impl Optics<'_> {
         self.momentum_compaction() - self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(-2)
     }
 
+    /// Momentum offset per relative change `b` of the dipoles' field while the RF frequency is held, `1/(gamma^2 eta)` [1]: with the momentum
+    /// `p_0 (1 + b)(1 + delta)` the path grows by `alpha_c delta`, and the speed by `(b + delta)/gamma^2` as well.
+    pub fn momentum_per_field(&self) -> f64 {
+        (self.ring.particle.gamma(self.orbit.at[0][DELTA]).powi(2) * self.slip_factor()).recip()
+    }
+
     /// RF offset for differences of orbits [1], to one digit: it moves the momentum by 1.9e-3 or so, whatever the slip factor. The
     /// Booster's is 2e-4; with half of it the second order of an orbit changes by 5e-5 of its largest.
     pub fn rf_step(&self) -> f64 {

@@ -2,7 +2,7 @@
 
 use nalgebra::DVector;
 
-use crate::recording::{Header, Recording, Row};
+use crate::recording::{At, Header, Recording, Row};
 
 /// What supplies and correctors do in one frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,11 +27,8 @@ impl Drive {
     /// # Panics
     /// If the row's time is not one of the ramp's: such recordings are refused.
     pub fn of(header: &Header, row: &Row) -> Self {
-        let at = header.ramp.at(row.cycle_time, row.supply.len()).expect("the ramp knows the times of its frames");
-        let rigidity = match (row.dipole, header.nominal_dipole) {
-            (Some(current), Some(nominal)) => current / (nominal * at.dipole),
-            _ => 1.0,
-        };
+        let at = at(header, row);
+        let rigidity = field(header, row);
         let strength = |f: usize| (header.gradient(f, row.supply[f]) / (rigidity * at.gradient[f])).ln();
         let stiffness = rigidity * at.momentum;
         let kick =
@@ -41,6 +38,22 @@ impl Drive {
             strength: DVector::from_fn(row.supply.len(), |f, _| strength(f)),
             rf_offset: row.rf_offset / at.slip,
         }
+    }
+}
+
+/// The ramp's values at the time of a row.
+fn at(header: &Header, row: &Row) -> At {
+    header.ramp.at(row.cycle_time, row.supply.len()).expect("the ramp knows the times of its frames")
+}
+
+/// Field of the dipoles over the one that is nominal at the row's time in the cycle, 1 where their current is not read.
+///
+/// # Panics
+/// If the row's time is not one of the ramp's: such recordings are refused.
+pub(crate) fn field(header: &Header, row: &Row) -> f64 {
+    match (row.dipole, header.nominal_dipole) {
+        (Some(current), Some(nominal)) => current / (nominal * at(header, row).dipole),
+        _ => 1.0,
     }
 }
 

@@ -15,7 +15,7 @@ use core::f64::consts::SQRT_2;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{Machine, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
+use twin::{Hold, Machine, Optics, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
 use crate::recording::Recording;
@@ -76,6 +76,10 @@ pub struct Campaign {
     /// Standard deviation of a baseline's change per `ln` of each supply, in x and y: of a misaligned ring with the orbit and the tunes
     /// of this one [F] [m].
     pub ripple: Vec<[f64; 2]>,
+    /// `ln` of the dipoles' field off its mean, frame by frame; none where their current is not read.
+    field: Vec<f64>,
+    /// What the read monitors see per `ln` of it while the RF frequency is held [B] [m].
+    of_field: Vec<f64>,
 }
 
 impl Campaign {
@@ -115,6 +119,9 @@ impl Campaign {
         let orbit = rms_by_plane(&ring, &baselines);
         let found = ring.with_strengths(&ring.strengths(params.as_slice(), &supplies));
         let ripple = ripple_of_misaligned(&found)?;
+        let optics = Optics::of(&found, Hold::Momentum { delta: 0.0 })?;
+        let per_field = optics.momentum_per_field();
+        let of_field = optics.dispersion_of(&optics.read_monitors()).iter().map(|d| d * per_field).collect();
         // next to a resonance a misaligned ring may have no orbit
         let spurious = spurious_dispersion(&found).unwrap_or(of_design);
         let mut campaign = Self {
@@ -137,6 +144,8 @@ impl Campaign {
             params,
             baselines,
             spurious,
+            field: fields(recording),
+            of_field,
         };
         campaign.meters = campaign.read_meters(&linearised);
         Ok(campaign)
@@ -180,6 +189,18 @@ impl Campaign {
         let sigma = self.ripple.iter().map(|sigma| sigma[self.plane(b)]);
         following.column_iter_mut().zip(sigma).for_each(|(mut column, sigma)| column *= sigma);
         following
+    }
+
+    /// The same, and in one more column how it follows the dipoles' field if the RF frequency is held instead of the momentum.
+    pub fn following_with_field(&self, b: usize) -> DMatrix<f64> {
+        let following = self.following(b);
+        if self.field.is_empty() {
+            return following;
+        }
+        let last = following.ncols();
+        let mut all = following.insert_column(last, 0.0);
+        all.column_mut(last).iter_mut().zip(&self.field).for_each(|(to, field)| *to = self.of_field[b] * field);
+        all
     }
 
     /// Coefficients of what a monitor's readings have in common, a column for each frame: 1 for the baseline at its time in the cycle and
@@ -232,6 +253,13 @@ fn readings(recording: &Recording) -> DMatrix<f64> {
 fn tunes(recording: &Recording) -> DMatrix<f64> {
     let rows = &recording.rows;
     DMatrix::from_fn(rows.len(), 2, |i, plane| rows[i].tune[plane].unwrap_or(f64::NAN))
+}
+
+/// `ln` of the dipoles' field off its mean in each frame; none where their current is not read.
+fn fields(recording: &Recording) -> Vec<f64> {
+    let logs: Vec<f64> = recording.rows.iter().map(|row| drive::field(&recording.header, row).ln()).collect();
+    let mean = logs.iter().sum::<f64>() / logs.len() as f64;
+    if logs.iter().all(|log| *log == 0.0) { Vec::new() } else { logs.iter().map(|log| log - mean).collect() }
 }
 
 /// Rms of the baselines that are known, in x and y [m].
