@@ -723,7 +723,7 @@ pub struct Validate {
     #[arg(long, value_name = "N", default_value_t = 48)]
     pub pair: usize,
     /// Campaigns with an effect that the library does not hold
-    #[arg(long, value_name = "N", default_value_t = 160)]
+    #[arg(long, value_name = "N", default_value_t = 232)]
     pub unknown: usize,
     /// One line a campaign; campaigns already in the file are not run again
     #[arg(long, value_name = "FILE.jsonl", default_value = "target/validate.jsonl")]

@@ -15,8 +15,9 @@ use crate::location::Location;
 const FINER: f64 = 1.0 / 16.0;
 /// Standard deviation of a quadrupole's axis against the monitors' [m], typical of surveys.
 const AXIS: f64 = 0.3e-3;
-/// Standard deviations by which the squared pulls have to exceed what noise makes of them: one in 40 quadrupoles does that by chance.
-const PULLED: f64 = 2.0;
+/// Quadrupoles so many nat, or such a share, behind the best may lead with kicks.
+const BEHIND: f64 = 12.0;
+const BEHIND_SHARE: f64 = 0.1;
 
 /// The sums of each channel over the runs of settings.
 pub(super) struct Runs {
@@ -131,32 +132,36 @@ impl Sums {
 }
 
 impl Linearised<'_> {
-    /// A quadrupole of several that changes in time, or from run to run; the latter only where the gradient's pulls are larger than noise makes them.
+    /// Each quadrupole, as one that changes in time and from run to run. Those near the best are judged again with kicks, which the orbit's error makes.
     pub(super) fn changing(
         &self,
         data: &Data,
         runs: &Runs,
+        all: &[Changing],
         stretches: &DMatrix<f64>,
-        (quadrupole, one): (usize, &Changing),
-        sites: usize,
     ) -> Vec<Discrepancy> {
-        let sums = runs.of_patterns(data, &one.patterns());
-        // each step is of one half up and down
-        let in_time = 0.5 * (stretches.ncols() as f64).sqrt();
-        let mut found =
-            vec![(self.judge(Location::QuadrupoleInTime(quadrupole), &sums.through(stretches), sites), in_time)];
-        let of_gradient: Vec<usize> = (0..data.pools.count).collect();
-        let (pull, gram) = self.project(&sums.select(&of_gradient));
-        // of noise alone the squared pulls have the mean tr G and the variance 2 tr G^2
-        if pull.norm_squared() > gram.trace() + PULLED * 2.0_f64.sqrt() * gram.norm() {
-            found.push((self.judge(Location::QuadrupoleInRuns(quadrupole), &sums, sites), 1.0));
-        }
-        let finished = |(found, share): (Discrepancy, f64)| {
-            let spread = share * one.log_gradient * found.size;
-            let adapted = found.adapted.map(|adapted| self.spread(data, quadrupole, adapted, spread));
-            Discrepancy { size: FINER * found.size, adapted, ..found }
+        let judged = |(quadrupole, one): (usize, &Changing), patterns: &[&Signature]| {
+            let sums = runs.of_patterns(data, patterns);
+            let in_time = self.judge(Location::QuadrupoleInTime(quadrupole), &sums.through(stretches), all.len());
+            [in_time, self.judge(Location::QuadrupoleInRuns(quadrupole), &sums, all.len())].map(|found| {
+                // steps in time are of one half up and down
+                let is_in_time = found.at == Location::QuadrupoleInTime(quadrupole);
+                let steps = if is_in_time { 0.25 * stretches.ncols() as f64 } else { 1.0 };
+                let spread = steps.sqrt() * one.log_gradient * found.size;
+                let adapted = found.adapted.map(|adapted| self.spread(data, quadrupole, adapted, spread));
+                Discrepancy { size: FINER * found.size, adapted, ..found }
+            })
         };
-        found.into_iter().map(finished).collect()
+        let mut found: Vec<_> = all.iter().enumerate().map(|one| judged(one, &[&one.1.gradient])).collect();
+        let log_bayes = |found: &[Discrepancy; 2]| found[0].log_bayes.max(found[1].log_bayes);
+        let best = found.iter().map(log_bayes).fold(0.0, f64::max);
+        let near = best - BEHIND.max(BEHIND_SHARE * best);
+        for (one, found) in all.iter().enumerate().zip(&mut found) {
+            if log_bayes(found) > near.max(0.0) {
+                *found = judged(one, &one.1.patterns());
+            }
+        }
+        found.into_iter().flatten().collect()
     }
 
     /// The factor of a quadrupole that changes is no single number: it is uncertain by as much as it changes, `spread` in `ln`.

@@ -24,9 +24,18 @@
 //! | `stuck_bit` | the bit of weight `a` of a monitor's converter stays at 0 | m |
 //! | `range_switch` | a monitor's gain is `1 + a` from 1.3 rms outwards, until it is back at 0.7 rms | 1 |
 //! | `loss_offset` | large orbits lose beam, which moves a monitor's zero: `+ a w/mean(w)`, w the squared orbit at all monitors, at most `4 a` | m |
+//! | `log_ripple` | a monitor's logarithmic amplifier ripples: `+ a sin(2 pi (x/1.5 mm + phase))` | m |
+//! | `baseline_restorer` | a monitor shows `x - a b`: its baseline restorer follows the beam, `b <- b + (x - b)/10` after each cycle | 1 |
+//! | `third_integrator` | three integrators take turns at a monitor, a cycle each; the gain of one is `1 + a` | 1 |
+//! | `hunting_supply` | a corrector's supply does not settle under load: kick times `1 + a r`, r random from -1 to 1 in each cycle | 1 |
+//! | `forgotten_feedback` | a slow feedback is still on: a corrector's kick `+ f`, `f <- 0.7 f - a sum of kick_c cos(2 pi (c - own)/5)` after each cycle | 1 |
+//! | `induced_kick` | a change of the other correctors' current induces a kick: `+ a (change of their sum since the last cycle)/0.2 mrad` | rad |
+//! | `shifted_girder` | what stands between a drift and the next long one is downstream by `a`: the first drift is longer, the next shorter | m |
+//! | `first_pulse` | the magnets rest while a setting is changed: `ln` of a quadrupole's gradient `+ a 0.4^n` in cycle n = 0, 1, ... of each setting | 1 |
+//! | `current_sharing` | a contact creeps where two quadrupoles are fed in parallel: `ln` of the gradient `+ a s` in one, `- a s` in the next but one, s a random walk of steps up to 0.3 within ±1 | 1 |
 //!
-//! The last nine are by somebody who had seen neither the library nor the diagnosis, written before the code that first met them: they say what
-//! becomes of physics that the diagnosis was not made for. So were the six before these, which have been looked at since.
+//! The last nine are by somebody who had seen neither the library nor the diagnosis, written before the code that first met them was finished, and opened
+//! after that: they say what becomes of physics that the diagnosis was not made for. So were the fifteen before these, which have been looked at since.
 
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
@@ -79,6 +88,24 @@ pub enum UnmodelledKind {
     RangeSwitch,
     /// Lost beam moves a monitor's zero.
     LossOffset,
+    /// A monitor's logarithmic amplifier has a ripple.
+    LogRipple,
+    /// A monitor's baseline follows the beam of the cycles before.
+    BaselineRestorer,
+    /// One of three integrators that a monitor uses in turn has another gain.
+    ThirdIntegrator,
+    /// A corrector's current is unsteady from cycle to cycle while it is on.
+    HuntingSupply,
+    /// A feedback, left on, works a corrector against the orbit of the cycles before.
+    ForgottenFeedback,
+    /// A change of current in the other correctors induces a kick in one.
+    InducedKick,
+    /// Elements with a quadrupole among them stand further downstream than they should.
+    ShiftedGirder,
+    /// A quadrupole is different in the first cycles after every change of the setting.
+    FirstPulse,
+    /// Two quadrupoles share a current unevenly, which hardly moves the tunes.
+    CurrentSharing,
 }
 
 /// One of them: where, and how large.
@@ -103,6 +130,8 @@ const ROOM: f64 = 0.5;
 const ROOM_FOR_TWO: f64 = 0.3;
 /// Correctors of a crate.
 const CRATE: usize = 8;
+/// Change of position over which the ripple of a logarithmic amplifier repeats [m].
+const RIPPLE: f64 = 1.5e-3;
 
 impl UnmodelledKind {
     /// Those that have places in a ring.
@@ -111,7 +140,7 @@ impl UnmodelledKind {
     }
 
     /// Every kind.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 29] = [
         Self::QuadJump,
         Self::WarmUp,
         Self::Saturation,
@@ -132,6 +161,15 @@ impl UnmodelledKind {
         Self::StuckBit,
         Self::RangeSwitch,
         Self::LossOffset,
+        Self::LogRipple,
+        Self::BaselineRestorer,
+        Self::ThirdIntegrator,
+        Self::HuntingSupply,
+        Self::ForgottenFeedback,
+        Self::InducedKick,
+        Self::ShiftedGirder,
+        Self::FirstPulse,
+        Self::CurrentSharing,
     ];
 
     /// True for those that the diagnosis was not made for.
@@ -140,9 +178,12 @@ impl UnmodelledKind {
             Self::QuadJump | Self::WarmUp | Self::Saturation | Self::OrbitDrift | Self::BpmWander => false,
             Self::DeadBand | Self::CablePickup | Self::BusSag => false,
             Self::AlternateCycle | Self::Thermostat | Self::Solenoid => false,
-            Self::CrateSag | Self::CoilHeat | Self::NeighbourPulse => true,
-            Self::LoopGradient | Self::FlickeringTurn | Self::BuckedSolenoids => true,
-            Self::StuckBit | Self::RangeSwitch | Self::LossOffset => true,
+            Self::CrateSag | Self::CoilHeat | Self::NeighbourPulse => false,
+            Self::LoopGradient | Self::FlickeringTurn | Self::BuckedSolenoids => false,
+            Self::StuckBit | Self::RangeSwitch | Self::LossOffset => false,
+            Self::LogRipple | Self::BaselineRestorer | Self::ThirdIntegrator => true,
+            Self::HuntingSupply | Self::ForgottenFeedback | Self::InducedKick => true,
+            Self::ShiftedGirder | Self::FirstPulse | Self::CurrentSharing => true,
         }
     }
 
@@ -150,7 +191,14 @@ impl UnmodelledKind {
     fn is_positive(self) -> bool {
         matches!(
             self,
-            Self::Saturation | Self::CoilHeat | Self::FlickeringTurn | Self::BuckedSolenoids | Self::StuckBit
+            Self::Saturation
+                | Self::CoilHeat
+                | Self::FlickeringTurn
+                | Self::BuckedSolenoids
+                | Self::StuckBit
+                | Self::BaselineRestorer
+                | Self::HuntingSupply
+                | Self::CurrentSharing
         )
     }
 
@@ -177,6 +225,15 @@ impl UnmodelledKind {
             Self::StuckBit => "stuck_bit",
             Self::RangeSwitch => "range_switch",
             Self::LossOffset => "loss_offset",
+            Self::LogRipple => "log_ripple",
+            Self::BaselineRestorer => "baseline_restorer",
+            Self::ThirdIntegrator => "third_integrator",
+            Self::HuntingSupply => "hunting_supply",
+            Self::ForgottenFeedback => "forgotten_feedback",
+            Self::InducedKick => "induced_kick",
+            Self::ShiftedGirder => "shifted_girder",
+            Self::FirstPulse => "first_pulse",
+            Self::CurrentSharing => "current_sharing",
         }
     }
 
@@ -207,6 +264,15 @@ impl UnmodelledKind {
             Self::StuckBit => [2e-5, 1e-3],
             Self::RangeSwitch => [6e-3, 0.3],
             Self::LossOffset => [4e-6, 2e-4],
+            Self::LogRipple => [8e-6, 2.5e-4],
+            Self::BaselineRestorer => [0.01, 0.4],
+            Self::ThirdIntegrator => [4e-3, 0.1],
+            Self::HuntingSupply => [0.015, 0.3],
+            Self::ForgottenFeedback => [3e-4, 0.012],
+            Self::InducedKick => [1e-7, 4e-6],
+            Self::ShiftedGirder => [4e-3, 0.15],
+            Self::FirstPulse => [1e-4, 4e-3],
+            Self::CurrentSharing => [1.5e-4, 8e-3],
         }
     }
 
@@ -220,18 +286,31 @@ impl UnmodelledKind {
             | Self::CablePickup
             | Self::StuckBit
             | Self::RangeSwitch
-            | Self::LossOffset => ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect(),
-            Self::QuadJump | Self::Thermostat | Self::LoopGradient | Self::FlickeringTurn => {
-                (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect()
-            }
+            | Self::LossOffset
+            | Self::LogRipple
+            | Self::BaselineRestorer
+            | Self::ThirdIntegrator => ring.read_monitors.iter().map(|&at| Site::Monitor(at)).collect(),
+            Self::QuadJump
+            | Self::Thermostat
+            | Self::LoopGradient
+            | Self::FlickeringTurn
+            | Self::FirstPulse
+            | Self::CurrentSharing => (0..ring.quadrupoles.len()).map(Site::Quadrupole).collect(),
             Self::OrbitDrift
             | Self::BusSag
             | Self::AlternateCycle
             | Self::CrateSag
             | Self::CoilHeat
-            | Self::NeighbourPulse => (0..ring.correctors.len()).map(Site::Corrector).collect(),
+            | Self::NeighbourPulse
+            | Self::HuntingSupply
+            | Self::ForgottenFeedback
+            | Self::InducedKick => (0..ring.correctors.len()).map(Site::Corrector).collect(),
             Self::Solenoid => drifts(ring, ROOM),
             Self::BuckedSolenoids => drifts(ring, ROOM_FOR_TWO),
+            Self::ShiftedGirder => {
+                let carries = |site: &Site| matches!(*site, Site::Element(at) if girder_end(ring, at).is_some());
+                drifts(ring, ROOM_FOR_TWO).into_iter().filter(carries).collect()
+            }
         }
     }
 }
@@ -278,14 +357,24 @@ impl Beyond for Unmodelled {
                 let second = Element { kind: Kind::Solenoid { ks: -ks }, s: drift.s + drift.length, ..drift.clone() };
                 insert(ring, at + 1, second);
             }
+            UnmodelledKind::ShiftedGirder => {
+                let Some(end) = girder_end(ring, at) else { return };
+                ring.elements[at].length += self.size;
+                ring.elements[at + 1..=end].iter_mut().for_each(|element| element.s += self.size);
+                ring.elements[end].length -= self.size;
+            }
             _ => {}
         }
     }
 
     fn alter_cycles(&self, cycles: &mut [Cycle]) {
         let (mut warmth, mut short) = (0.0, Flicker::of(self.when));
+        let mut random = StdRng::seed_from_u64(self.when.to_bits());
+        let (mut creep, mut trim, mut rest) = (0.0_f64, 0.0_f64, 0.0_f64);
+        let (mut last_others, mut last_kick) = (None::<f64>, Vec::<f64>::new());
         for (count, cycle) in cycles.iter_mut().enumerate() {
             let is_closed = short.next();
+            let draw: f64 = random.random_range(-1.0..=1.0);
             // as if the first cycle were one of several
             let since = |period: usize| (count + ((self.when + 0.5) * period as f64) as usize) % period;
             match self.kind {
@@ -319,6 +408,31 @@ impl Beyond for Unmodelled {
                     cycle.strength[self.index] += self.size * cycle.kick.iter().sum::<f64>() / FULL_KICK;
                 }
                 UnmodelledKind::FlickeringTurn if is_closed => cycle.strength[self.index] += (-self.size).ln_1p(),
+                UnmodelledKind::HuntingSupply => cycle.kick[self.index] *= 1.0 + self.size * draw,
+                UnmodelledKind::ForgottenFeedback => {
+                    let seen = |c: usize| (core::f64::consts::TAU * (c as f64 - self.index as f64) / 5.0).cos();
+                    let orbit: f64 = cycle.kick.iter().enumerate().map(|(c, kick)| kick * seen(c)).sum();
+                    cycle.kick[self.index] += trim;
+                    trim = 0.7 * trim - self.size * orbit;
+                }
+                UnmodelledKind::InducedKick => {
+                    let others = cycle.kick.iter().sum::<f64>() - cycle.kick[self.index];
+                    cycle.kick[self.index] += self.size * (others - last_others.unwrap_or(others)) / FULL_KICK;
+                    last_others = Some(others);
+                }
+                UnmodelledKind::FirstPulse => {
+                    let is_other = |(now, then): (&f64, &f64)| (now - then).abs() > 0.25 * FULL_KICK;
+                    let is_changed = last_kick.is_empty() || cycle.kick.iter().zip(&last_kick).any(is_other);
+                    rest = if is_changed { 1.0 } else { 0.4 * rest };
+                    cycle.strength[self.index] += self.size * rest;
+                    last_kick.clone_from(&cycle.kick);
+                }
+                UnmodelledKind::CurrentSharing => {
+                    creep = (creep + 0.3 * draw).clamp(-1.0, 1.0);
+                    let partner = (self.index + 2) % cycle.strength.len();
+                    cycle.strength[self.index] += self.size * creep;
+                    cycle.strength[partner] -= self.size * creep;
+                }
                 _ => {}
             }
         }
@@ -331,6 +445,7 @@ impl Beyond for Unmodelled {
         let lost = lost(readings);
         let (centre, rms) = (readings.column(self.index).mean(), readings.column(self.index).variance().sqrt());
         let (mut shown, mut is_coarse) = (f64::INFINITY, false);
+        let (mut baseline, mut turn) = (None::<f64>, ((self.when + 0.5) * 3.0) as usize);
         let mut read = |cycle: &Cycle, x: f64, lost: f64| match self.kind {
             UnmodelledKind::WarmUp => x * (1.0 + self.size * (-(cycle.time + 1.0) / 0.5).exp()),
             UnmodelledKind::Saturation => x / (1.0 + (self.size * x).powi(8)).powf(0.125),
@@ -351,6 +466,16 @@ impl Beyond for Unmodelled {
                 if is_coarse { x + self.size * (x - centre) } else { x }
             }
             UnmodelledKind::LossOffset => x + self.size * lost.min(4.0),
+            UnmodelledKind::LogRipple => x + self.size * (core::f64::consts::TAU * (x / RIPPLE + self.when)).sin(),
+            UnmodelledKind::BaselineRestorer => {
+                let base = baseline.unwrap_or(x);
+                baseline = Some(base + 0.1 * (x - base));
+                x - self.size * base
+            }
+            UnmodelledKind::ThirdIntegrator => {
+                turn = (turn + 1) % 3;
+                if turn == 0 { x * (1.0 + self.size) } else { x }
+            }
             _ => x,
         };
         for ((cycle, reading), lost) in cycles.iter().zip(&mut readings.column_mut(self.index)).zip(lost) {
@@ -389,6 +514,13 @@ fn lost(readings: &DMatrix<f64>) -> Vec<f64> {
 fn drifts(ring: &Ring, room: f64) -> Vec<Site> {
     let has_room = |element: &Element| element.kind == Kind::Drift && element.length > room;
     (0..ring.elements.len()).filter(|&at| has_room(&ring.elements[at])).map(Site::Element).collect()
+}
+
+/// The next drift with room behind one, if a quadrupole stands between them.
+fn girder_end(ring: &Ring, at: usize) -> Option<usize> {
+    let has_room = |element: &Element| element.kind == Kind::Drift && element.length > ROOM_FOR_TWO;
+    let end = (at + 1..ring.elements.len()).find(|&end| has_room(&ring.elements[end]))?;
+    ring.quadrupoles.iter().any(|one| (at..end).contains(&one.element)).then_some(end)
 }
 
 /// Put an element into a ring.
