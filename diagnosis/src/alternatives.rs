@@ -20,7 +20,7 @@ pub const SUSPICIOUS: f64 = 0.6;
 /// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in the validation 3 of 80
 /// that could be seen.
 const ALIKE: f64 = 0.04;
-/// Probability of such a cause over that of the effect that it looks like and itself: no recording tells the two apart.
+/// Probability of such a cause over that of it or the effect that it looks like: both explain the readings as well, so that it is the ratio of the priors.
 const IMITATED: f64 = UNMODELLED * ALIKE / (1.0 - UNMODELLED + UNMODELLED * ALIKE);
 
 /// A possible cause.
@@ -141,6 +141,11 @@ impl Alternative {
     }
 }
 
+/// Probability of what looks like one of some effects, from the sum of theirs.
+pub(super) fn imitating(library: f64) -> f64 {
+    library * IMITATED / (1.0 - IMITATED)
+}
+
 /// Probability below which an alternative that was not refitted is not listed.
 const LISTED: f64 = 1e-4;
 
@@ -193,7 +198,7 @@ impl Competition {
 
     /// Probability of physics that the library does not hold and that looks like one of its effects.
     pub fn imitating(&self) -> f64 {
-        self.library() * IMITATED / (1.0 - IMITATED)
+        imitating(self.library())
     }
 
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
@@ -232,7 +237,7 @@ mod tests {
         for (first, least) in [(40.0, 0.99), (2.0, 0.6)] {
             let all = Weighed::of(vec![of(first, 0), of(0.0, 1)]);
             let library: f64 = all.alternatives.iter().map(|one| one.probability).sum();
-            assert!((all.nothing + library / (1.0 - IMITATED) - 1.0).abs() < 1e-12);
+            assert!((all.nothing + library + imitating(library) - 1.0).abs() < 1e-12);
             let leading = all.alternatives[0].probability;
             assert!(leading > least && leading <= 1.0 - IMITATED, "{leading}");
         }

@@ -42,7 +42,7 @@ impl Vars {
     /// The same with room for what the recording cannot show ([`Hypothesis::unseen`], [`Family::hidden`]), to first order.
     ///
     /// # Errors
-    /// [`FitError::Degenerate`].
+    /// [`FitError`].
     pub fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let (step, wide) = best.widened(data, &best.hypothesis.unseen(data), &Family::hidden(data))?;
@@ -86,11 +86,40 @@ impl Vars {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DVector;
     use twin::{Effect, EffectKind};
 
+    use inference::Campaign;
+
+    use super::*;
+    use crate::data::Data;
+    use crate::hypothesis::Hypothesis;
     use crate::testing::{Coloured, template};
     use crate::{Diagnosis, Verdict};
+
+    /// To first order about the fit against a fit with all that: the vars move by little of their error bars, which agree.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn room_for_what_is_hidden_is_that_of_a_fit_with_it() {
+        let (ring, recording) = template();
+        let made = Coloured::white(&ring, &recording, 71).campaign(&ring, &recording, &[]);
+        let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let plain = Hypothesis::plain();
+        let fitted = Fitted::of(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
+        let (wide, hidden) = (plain.unseen(&data), Family::hidden(&data));
+        let (step, covariance) = fitted.widened(&data, &wide, &hidden).unwrap();
+        let ordinary = hidden.into_iter().chain(wide.ordinary.clone()).collect();
+        let whole = Hypothesis { ordinary, ..wide };
+        let exact = Fitted::of(&data, &whole, &fitted.guess(&data, &whole)).unwrap();
+        let of_exact = exact.covariance();
+        let (mut off, mut width) = (0.0_f64, 0.0_f64);
+        for (i, (own, param)) in fitted.params.iter().zip(&exact.params).enumerate() {
+            off = off.max((own + step[i] - param).abs() / of_exact[(i, i)].sqrt());
+            width = width.max((covariance[(i, i)] / of_exact[(i, i)] - 1.0).abs());
+        }
+        println!("{off} {width}");
+        // what the machine changes to second order
+        assert!(off < 0.3 && width < 0.1, "{off} {width}");
+    }
 
     /// A gradient of one prior width in one dipole is nothing that a recording shows, since its neighbours absorb it: their error bars know that. Without that
     /// room the NEES per var of these six is 6.1 on average.

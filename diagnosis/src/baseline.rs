@@ -34,10 +34,11 @@ const OFFSET: f64 = 0.7e-3;
 const SPURIOUS: f64 = SQRT_2;
 /// Largest `|cot(pi Q)|`: a machine nearer to the integer resonance keeps no beam.
 const STEEPEST: f64 = 20.0;
-/// Steps towards the orbit at a monitor that misreads it, the distance for the slope of the reading [m], and the least slope: one that reads larger positions as smaller
-/// ones has none that can be told.
+/// Newton steps towards the orbit at a monitor that misreads it.
 const STEPS: usize = 12;
+/// Distance for the slope of its reading [m].
 const NEAR: f64 = 1e-6;
+/// Slope below which a reading no longer tells the position.
 const FLATTEST: f64 = 0.2;
 
 impl Baseline {
@@ -70,11 +71,12 @@ impl Baseline {
     }
 
     /// The orbit at a monitor that misreads a position x by `m(x)` [m], given the one that was estimated as if it did not: as that one holds the share `w` of
-    /// the monitor's own reading, the solution of `x + w m(x) = estimated`, by bounded Newton steps.
+    /// the monitor's own reading, the solution of `x + w m(x) = estimated`, by Newton steps, which end where the reading hardly grows with the position: what
+    /// there is no longer told by it.
     pub fn corrected(&self, b: usize, estimated: f64, misreads: impl Fn(f64) -> f64) -> f64 {
         let step = |x: f64, _| {
-            let slope = (misreads(x + NEAR) - misreads(x - NEAR)) / (2.0 * NEAR);
-            x - (x + self.share[b] * misreads(x) - estimated) / (1.0 + self.share[b] * slope).max(FLATTEST)
+            let slope = 1.0 + self.share[b] * (misreads(x + NEAR) - misreads(x - NEAR)) / (2.0 * NEAR);
+            if slope < FLATTEST { x } else { x - (x + self.share[b] * misreads(x) - estimated) / slope }
         };
         (0..STEPS).fold(estimated, step)
     }
@@ -194,6 +196,25 @@ impl Kriged {
 mod tests {
     use super::*;
 
+    /// The orbit at a monitor moves by that share of what its own reading does.
+    #[test]
+    fn the_share_of_a_monitor_is_how_far_its_reading_moves_the_orbit_there() {
+        let ring = Ring::booster();
+        let read = |moved: Option<usize>| -> Vec<Option<f64>> {
+            let of = |b: usize| 3e-3 * (b as f64).sin() + if moved == Some(b) { 1e-3 } else { 0.0 };
+            (0..ring.read_monitors.len()).map(|b| (b != 5).then(|| of(b))).collect()
+        };
+        let of = |moved| Kriged::of(&ring, &read(moved), [2e-3; 2]).unwrap();
+        let plain = of(None);
+        for (b, monitor) in ring.monitors_read().enumerate().step_by(4).filter(|(b, _)| *b != 5) {
+            let plane = usize::from(monitor.plane == Plane::Y);
+            let moved = of(Some(b)).orbit[monitor.element][plane] - plain.orbit[monitor.element][plane];
+            assert!((moved / 1e-3 - plain.share[b]).abs() < 1e-9, "{moved} {}", plain.share[b]);
+            assert!((0.3..1.0).contains(&plain.share[b]), "{}", plain.share[b]);
+        }
+        assert_eq!(plain.share[5], 0.0, "it does not read");
+    }
+
     /// A monitor that reads 10 mm as 13, and of whose reading the estimated orbit holds nine tenths.
     #[test]
     fn the_orbit_at_a_monitor_that_misreads_it_solves_its_equation() {
@@ -211,6 +232,11 @@ mod tests {
                 let found = baseline.corrected(0, x + 0.9 * misreads(x), misreads);
                 assert!((found - x).abs() < 1e-9, "{cubic} {x}: {found}");
             }
+        }
+        // beyond the largest reading there is no solution, and no step goes far
+        for cubic in [-1e3, -1.5e3, -3e3, -1e4] {
+            let found = baseline.corrected(0, 13e-3, |x| cubic * x.powi(3));
+            assert!((13e-3..40e-3).contains(&found), "{cubic}: {found}");
         }
     }
 }

@@ -685,26 +685,21 @@ impl Data {
     /// What a pattern over some monitors [m] has to be multiplied by, monitor by monitor, with [`Data::own_share`]: itself with what it leaves
     /// in each by the noise in common.
     pub fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
-        if self.mixing.is_none() {
-            return pattern.clone();
-        }
-        let mixing = Mixing::of(&self.noise.modes, 1, |_, b| monitors.contains(&b));
-        let mut values = DMatrix::zeros(1, pattern.len());
-        monitors.iter().for_each(|&b| values[(0, b)] = pattern[b] / self.channels[b].sigma);
-        mixing.apply(&mut values);
-        mixing.apply(&mut values);
-        DVector::from_fn(pattern.len(), |b, _| values[(0, b)] * self.channels[b].sigma / mixing.own(0, b))
+        let row = DMatrix::from_rows(&[pattern.transpose()]);
+        self.accompanied_in_runs(monitors, &row).row(0).transpose()
     }
 
     /// The same in every run of a setting: rows pools.
     pub fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut all = patterns.clone();
-        if !self.mixing.is_none() {
-            for mut row in all.row_iter_mut() {
-                row.copy_from(&self.accompanied(monitors, &row.transpose()).transpose());
-            }
+        if self.mixing.is_none() {
+            return patterns.clone();
         }
-        all
+        let mixing = Mixing::of(&self.noise.modes, patterns.nrows(), |_, b| monitors.contains(&b));
+        let mut all = DMatrix::zeros(patterns.nrows(), patterns.ncols());
+        monitors.iter().for_each(|&b| all.set_column(b, &(patterns.column(b) / self.channels[b].sigma)));
+        mixing.apply(&mut all);
+        mixing.apply(&mut all);
+        DMatrix::from_fn(all.nrows(), all.ncols(), |run, b| all[(run, b)] * self.channels[b].sigma / mixing.own(run, b))
     }
 
     /// A signature that steps with time, whitened.

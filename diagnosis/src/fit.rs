@@ -370,25 +370,12 @@ impl Fitted {
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
         let besides: Vec<Unknown> = beside.iter().flat_map(|family| family.unknowns(data)).collect();
         let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
-        let Ordinary { slopes, gram } = Ordinary::about(data, &besides, machine)?;
-        let (p, k) = (self.u.len(), besides.len());
-        let across = self.jacobian.tr_mul(&slopes);
-        let mut matrix = DMatrix::zeros(p + k, p + k);
-        matrix.view_mut((0, 0), (p, p)).copy_from(&(self.factor.matrix() - DMatrix::identity(p, p)));
-        matrix.view_mut((0, p), (p, k)).copy_from(&across);
-        matrix.view_mut((p, 0), (k, p)).copy_from(&across.transpose());
-        matrix.view_mut((p, p), (k, k)).copy_from(&gram);
+        let mut all = Ordinary::about(data, &besides, machine)?.beside(self.jacobian.clone());
+        all.column_iter_mut().zip(&wider).for_each(|(mut column, wider)| column *= *wider);
         let left = &self.residual + &self.jacobian * &self.u;
-        let mut pull = DVector::zeros(p + k);
-        pull.rows_mut(0, p).copy_from(&self.jacobian.tr_mul(&left));
-        pull.rows_mut(p, k).copy_from(&slopes.tr_mul(&left));
-        let scale = wider.insert_rows(p, k, 1.0);
-        matrix
-            .column_iter_mut()
-            .zip(scale.iter())
-            .for_each(|(mut column, s)| column.component_mul_assign(&(&scale * *s)));
-        let factor = Factor::of(matrix + DMatrix::identity(p + k, p + k)).ok_or(FitError::Degenerate)?;
-        let step = factor.solve(&pull.component_mul(&scale)).rows(0, p) - &self.u;
+        let identity = DMatrix::identity(all.ncols(), all.ncols());
+        let factor = Factor::of(gram(&all) + identity).ok_or(FitError::Degenerate)?;
+        let step = factor.solve(&all.tr_mul(&left)).rows(0, self.u.len()) - &self.u;
         Ok((self.units.step(&step), self.units.covariance(&factor.inverse())))
     }
 

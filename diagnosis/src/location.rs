@@ -136,7 +136,7 @@ impl Location {
         }
     }
 
-    /// True if an effect of the library describes the same instrument, in part: one that does something unknown in every setting has seldom a second fault.
+    /// True if an effect of the library describes the same instrument, in part: one that does something unknown has seldom a second fault.
     pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
         match *self {
             Self::Monitor(b) | Self::GainInTime(b) | Self::MonitorElsewhere(b) | Self::MonitorCurve(b) => {

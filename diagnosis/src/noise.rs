@@ -177,9 +177,8 @@ impl Noise {
         let noisy = |b: &usize| source.campaign.screened.health[*b].state == MonitorState::Noisy;
         let noisy: Vec<usize> = (0..source.campaign.monitors()).filter(noisy).collect();
         let moves = |one: &Self| one.frame_to_frame.as_ref().is_some_and(|one| one.patterns.ncols() > 0);
-        // where many are called noisy, what moves all of them is seen by these alone
+        // where many are called noisy, what moves all of them is seen by these alone; and it may be the dipoles, whose ripple their repeats are free of
         let all = (moves(&first) || noisy.len() >= MANY).then(|| Self::learn_from(source, &noisy));
-        let all = all.filter(|all| moves(all) || all.momentum.value > 0.0);
         let header = &source.campaign.recording.header.noise;
         let is_sound = |b: &usize| match &all {
             Some(all) => all.own[*b] < NOISY * all.common_scale.value * header[*b],
@@ -494,6 +493,8 @@ fn kurtosis(differences: &DMatrix<f64>) -> Measured {
 
 #[cfg(test)]
 mod tests {
+    use twin::{Effect, Hold, Optics};
+
     use super::*;
     use crate::Diagnosis;
     use crate::data::Data;
@@ -566,5 +567,29 @@ mod tests {
             let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
             assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);
         }
+    }
+
+    /// With the RF frequency held the momentum follows the ripple of the dipoles, whose read-backs tell it. Taken for noise, it hid that the frequency is held.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn a_held_frequency_is_found_beside_the_ripple_of_the_dipoles() {
+        let (ring, recording) = template();
+        let white = Coloured::white(&ring, &recording, 61);
+        let made = recording.powered(&ring).with_vars(&white.vars);
+        let per_field = Optics::of(&made, Hold::Momentum { delta: 0.0 }).unwrap().momentum_per_field();
+        let logs: Vec<f64> = recording.rows.iter().map(|row| row.dipole.unwrap().ln()).collect();
+        let mean = logs.iter().sum::<f64>() / logs.len() as f64;
+        let moved = DVector::from_iterator(logs.len(), logs.iter().map(|log| per_field * (log - mean)));
+        let noise = Coloured { common: moved * white.dispersion.transpose(), ..white };
+        let held = Effect::parse("fixed_rf_frequency=1", &ring).unwrap();
+        let found = Diagnosis::of(&ring, &noise.campaign(&ring, &recording, &[held]), |_| ()).unwrap();
+        assert_eq!(found.verdict, Verdict::Identified, "{}", found.sentence);
+        assert_eq!(found.findings[0].word(), "fixed_rf_frequency", "{}", found.sentence);
+        let (share, sigma) = found.findings[0].amplitude;
+        assert!((share - 1.0).abs() < 3.0 * sigma, "{share} +- {sigma}");
+        let learnt = &found.found.data.noise;
+        // some 0.1 mm at the largest dispersion, of noise of 0.1 mm
+        assert!(learnt.momentum.value < 5e-6, "{:?}", learnt.momentum);
+        assert!((learnt.common_scale.value - 1.0).abs() < 0.05, "{:?}", learnt.common_scale);
     }
 }

@@ -132,7 +132,9 @@ impl Family {
     fn terms(&self, data: &Data) -> Vec<Vec<Term>> {
         let all = members(self.kind, data).into_iter();
         let some: Vec<Vec<Term>> = match self.grouping {
-            Grouping::Each => return all.map(|term| vec![term]).collect(),
+            Grouping::Each => {
+                return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
+            }
             Grouping::Plane(plane) => vec![all.filter(|term| plane_of(&data.ring, term.site) == Some(plane)).collect()],
             Grouping::All => {
                 vec![all.filter(|term| whole_of(self.kind).is_none_or(|site| site == term.site)).collect()]
@@ -142,11 +144,12 @@ impl Family {
     }
 
     /// The same with room for what a recording cannot show, since the vars absorb it: as wide as one effect of its kind's prior at any one of the `n`
-    /// places that it may have makes it, `scale/sqrt(n)`.
+    /// places that it may have makes it, `scale/sqrt(n)`; not so what many places share.
     pub fn unseen(&self, data: &Data) -> Self {
-        let scale = self.kind.prior_scale().filter(|_| is_absorbed(self.kind)).unwrap_or(0.0);
-        let places = members(self.kind, data).len().max(1) as f64;
-        Self { width: self.width.max(scale / places.sqrt()), ..*self }
+        let places = members(self.kind, data).len().max(1);
+        let is_single = self.grouping == Grouping::Each || places == 1;
+        let scale = self.kind.prior_scale().filter(|_| is_absorbed(self.kind) && is_single).unwrap_or(0.0);
+        Self { width: self.width.max(scale / (places as f64).sqrt()), ..*self }
     }
 
     /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by [`HIDDEN`] of the

@@ -128,9 +128,8 @@ impl Truth {
     pub fn grade(&self, diagnosis: &Diagnosis) -> Grade {
         let effects: Vec<&Finding> = diagnosis.findings.iter().collect();
         let named = |truth: &TrueEffect| effects.iter().any(|finding| truth.is(finding));
-        let listed = |truth: &TrueEffect| {
-            effects.iter().any(|f| truth.is(f) || f.alternatives.iter().any(|other| truth.is(other)))
-        };
+        let listed =
+            |truth: &TrueEffect| effects.iter().any(|f| truth.is(f) || f.others().any(|other| truth.is(other)));
         let library = self.effects.iter().all(|effect| !effect.is_unmodelled());
         match diagnosis.verdict {
             Verdict::Consistent if self.effects.is_empty() => Grade::Right,
@@ -157,7 +156,7 @@ impl Truth {
     /// What became of each effect.
     pub fn fates(&self, diagnosis: &Diagnosis) -> Vec<Fate> {
         let findings = &diagnosis.findings;
-        let listed = |truth: &TrueEffect, f: &Finding| truth.is(f) || f.alternatives.iter().any(|a| truth.is(a));
+        let listed = |truth: &TrueEffect, f: &Finding| truth.is(f) || f.others().any(|other| truth.is(other));
         let together = |truth: &TrueEffect, f: &Finding| {
             let is_one = truth.is(f) || f.alternatives.iter().any(|a| a.inseparable && truth.is(a));
             is_one && f.probability < DECISIVE && f.together() >= DECISIVE && f.is_validated()

@@ -197,9 +197,9 @@ impl Search {
     fn further(&self, found: &Found, leader: Fitted) -> Result<Found, FitError> {
         let mut data = found.data.clone();
         // what is ordinary is no longer as wide as the effect had made it
-        let settled = settled(&data, leader.clone());
-        let won = (settled.log_evidence < leader.log_evidence + BETTER).then_some(&found.next);
-        let (mut best, competitions) = self.settle(&data, won.map_or(settled, |_| leader), won)?;
+        let again = settled(&data, leader.clone());
+        let won = (again.log_evidence < leader.log_evidence + BETTER).then_some(&found.next);
+        let (mut best, competitions) = self.settle(&data, won.map_or(again, |_| leader), won)?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
             best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;

@@ -178,6 +178,8 @@ pub struct Finding {
     pub inseparable: bool,
     /// Its alternatives, most likely first.
     pub alternatives: Vec<Finding>,
+    /// Effects of the library in the model that describe a part of it, where it is something unknown.
+    pub parts: Vec<Finding>,
 }
 
 impl Finding {
@@ -212,6 +214,7 @@ impl Finding {
             tested: None,
             inseparable: false,
             alternatives: Vec::new(),
+            parts: Vec::new(),
         }
     }
 
@@ -245,22 +248,14 @@ impl Finding {
         Ok(Self { alternatives, ..finding })
     }
 
-    /// True if another one is a part of what an instrument does that no effect describes.
+    /// True if another one is a part of what an instrument certainly does that no effect describes.
     fn holds(&self, other: &Self, data: &Data) -> bool {
         match (&self.cause, other.term()) {
-            (Cause::Unmodelled(one), Some(term)) => one.at.holds(term, &data.campaign(one.campaign).ring),
+            (Cause::Unmodelled(one), Some(term)) if self.probability >= DECISIVE => {
+                one.at.holds(term, &data.campaign(one.campaign).ring)
+            }
             _ => false,
         }
-    }
-
-    /// With its parts, which are no findings of their own.
-    fn with(self, parts: Vec<Self>) -> Self {
-        let parts: Vec<String> = parts.into_iter().map(|part| part.phrase).collect();
-        if parts.is_empty() {
-            return self;
-        }
-        let phrase = format!("{}, a part of which is that {}", self.phrase, parts.join(" and "));
-        Self { phrase, ..self }
     }
 
     /// The effect of the library that it is, if any.
@@ -268,9 +263,10 @@ impl Finding {
         self.cause.term()
     }
 
-    /// True for what all monitors share from frame to frame.
-    pub fn is_of_noise(&self) -> bool {
-        matches!(&self.cause, Cause::Unmodelled(one) if one.at == Location::FrameToFrame)
+    /// True for something unknown that the means of settings do not show: what passes within them, and what varies from frame to frame.
+    pub fn is_within_settings(&self) -> bool {
+        let is_within = |at: &Location| matches!(at, Location::FrameToFrame | Location::FirstFrames { .. });
+        matches!(&self.cause, Cause::Unmodelled(one) if is_within(&one.at))
     }
 
     /// The word for its kind, or `unknown`.
@@ -291,6 +287,11 @@ impl Finding {
     /// True if held-out frames are predicted better by more than the standard errors asked for.
     pub fn is_validated(&self) -> bool {
         self.tested.is_some_and(|tested| tested.is_passed())
+    }
+
+    /// Its alternatives and its parts.
+    pub fn others(&self) -> impl Iterator<Item = &Self> {
+        self.alternatives.iter().chain(&self.parts)
     }
 
     /// Probability of this cause together with all that the recording cannot separate from it.
@@ -390,9 +391,14 @@ pub fn findings(
     };
     if let Some(first) = open {
         let open = Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? };
-        let (parts, others) = all.into_iter().partition(|finding| open.holds(finding, data));
+        // what passes within settings was found without it
+        let is_part = |finding: &Finding| {
+            let in_model = finding.term().is_some_and(|term| found.best.hypothesis.terms.contains(term));
+            in_model && open.holds(finding, data)
+        };
+        let (parts, others) = all.into_iter().partition(is_part);
         all = others;
-        all.push(open.with(parts));
+        all.push(Finding { parts, ..open });
     }
     all.extend(unmodelled);
     for (index, campaign) in data.campaigns().enumerate() {
@@ -494,7 +500,10 @@ fn undescribed(finding: &Finding) -> String {
     let gain = finding.tested.map(|Tested { gain: (gain, error), .. }| {
         format!("; with it in the model held-out frames gain {gain:.0} ± {error:.0} nat")
     });
-    what + &gain.unwrap_or_default()
+    let parts: Vec<&str> = finding.parts.iter().map(|part| part.phrase.as_str()).collect();
+    let parts =
+        if parts.is_empty() { String::new() } else { format!("; in part it looks like this: {}", parts.join(" and ")) };
+    what + &gain.unwrap_or_default() + &parts
 }
 
 /// A cause, with its probability and the alternatives where it is less than certain.
@@ -574,4 +583,55 @@ pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<
             best.what, best.separation, menu.present
         )
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use inference::Campaign;
+    use twin::Site;
+
+    use super::*;
+    use crate::discrepancy::Discrepancy;
+    use crate::testing::template;
+
+    /// What one monitor does that no effect describes, with a gain of that monitor in the model.
+    #[test]
+    fn an_effect_at_an_instrument_that_does_something_unknown_is_a_part_of_that() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let alternative = |cause: Cause, probability: f64| Alternative {
+            cause,
+            log_gain: 50.0,
+            probability,
+            amplitude: (-0.2, 0.01),
+            adapting: nalgebra::DVector::zeros(0),
+            fitted: None,
+        };
+        let unknown = |at: Location, probability: f64| {
+            let one = Discrepancy { at, campaign: 0, log_bayes: 50.0, size: 1e-4, sites: 33, adapted: None };
+            Finding::of(&data, &alternative(Cause::Unmodelled(one), probability))
+        };
+        let of =
+            |kind: EffectKind, site: Site| Finding::of(&data, &alternative(Cause::Effect(Term { kind, site }), 0.99));
+        let gain = of(EffectKind::BpmGain, Site::Monitor(ring.read_monitors[3]));
+        let curve = unknown(Location::MonitorCurve(3), 0.99);
+        assert!(curve.holds(&gain, &data));
+        assert!(!unknown(Location::MonitorCurve(3), 0.7).holds(&gain, &data), "less than certain");
+        assert!(
+            !unknown(Location::MonitorInTime(3), 0.99).holds(&gain, &data),
+            "what changes with time is no part of it"
+        );
+        assert!(!unknown(Location::Monitor(4), 0.99).holds(&gain, &data), "another monitor");
+        let kick = of(EffectKind::CorrectorEven, Site::Corrector(2));
+        assert!(unknown(Location::Corrector(2), 0.99).holds(&kick, &data) && !curve.holds(&kick, &data));
+        let name = &ring.monitor_names()[3];
+        let said = undescribed(&Finding { parts: vec![gain], ..curve });
+        assert_eq!(
+            said,
+            format!(
+                "monitor {name} reads a nonlinear function of the position, which no effect of the library describes; in part it looks like this: \
+                 BPM {name} reads 20.0 ± 1.0 % low"
+            )
+        );
+    }
 }

@@ -4,6 +4,7 @@ use core::time::Duration;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use diagnosis::validation::UnmodelledKind;
 use inference::nuts::NutsSettings;
 use measured::import::{self, Pattern};
 use twin::EffectText;
@@ -723,7 +724,7 @@ pub struct Validate {
     #[arg(long, value_name = "N", default_value_t = 48)]
     pub pair: usize,
     /// Campaigns with an effect that the library does not hold
-    #[arg(long, value_name = "N", default_value_t = 232)]
+    #[arg(long, value_name = "N", default_value_t = 8 * UnmodelledKind::ALL.len())]
     pub unknown: usize,
     /// One line a campaign; campaigns already in the file are not run again
     #[arg(long, value_name = "FILE.jsonl", default_value = "target/validate.jsonl")]

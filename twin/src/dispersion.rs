@@ -88,12 +88,26 @@ impl Optics<'_> {
 
 #[cfg(test)]
 mod tests {
+    use super::DELTA;
     use crate::{Hold, Optics, Plane, Ring};
 
     #[test]
     fn the_boosters_rf_step_is_one_digit() {
         let ring = Ring::booster();
         assert_eq!(Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap().rf_step(), 2e-4);
+    }
+
+    /// At a held frequency the field moves the momentum by as much as an RF offset that changes the speed alike; Xsuite's ring gives -1.391.
+    #[test]
+    fn the_dipoles_field_moves_the_momentum_at_a_held_frequency() {
+        let ring = Ring::booster();
+        let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
+        let per_field = optics.momentum_per_field();
+        assert!((per_field + 1.391).abs() < 2e-3, "{per_field}");
+        let gamma = ring.particle.gamma(0.0);
+        let step = 1e-6;
+        let moved = Optics::of(&ring, Hold::Frequency { offset: -step / gamma.powi(2) }).unwrap().orbit.at[0][DELTA];
+        assert!((moved / step - per_field).abs() < 1e-3 * per_field.abs(), "{moved}");
     }
 
     #[test]

@@ -1,23 +1,66 @@
 //! A quadrupole whose gradient changes: in time, or from one run of a setting to the next, as where it follows the correctors' currents or comes and goes.
 //!
 //! In each run of frames it has an amplitude of its own; in time, steps. A gradient also kicks the beam, which is off the quadrupole's axis already
-//! without kicks: by as much as the estimated orbit is, and by free amplitudes of the size of that estimate's error. With `s` what a pattern does to a
-//! channel (a monitor or a tune) in each run, and that channel's sums over runs, the Gram matrix of two patterns' amplitudes is the sum of
-//! `diag(s) E^T S^-1 E diag(s')` over the channels.
+//! without kicks: by as much as the estimated orbit is. That estimate has an error, so that quadrupoles near the best are judged with free kicks of its size as well;
+//! the error is one number for all runs, the kicks are free in each, which gives away some evidence. A quadrupole that only those kicks would show is not found here, but as a place
+//! that kicks the beam.
+//!
+//! With `s` what a pattern does to a channel (a monitor or a tune) in each run, and that channel's sums over runs, the Gram matrix of two patterns' amplitudes is
+//! the sum of `diag(s) E^T S^-1 E diag(s')` over the channels; where monitors have noise in common, the mean of that with `s` and with `s'` as they are
+//! accompanied in the other monitors.
 
-use nalgebra::{DMatrix, DVector, MatrixXx2};
-use twin::{Hold, Machine, Optics, OrbitError, Place, Signature, Signatures};
+use nalgebra::{DMatrix, DVector};
+use twin::{Place, Ring, Signature, Signatures};
 
-use super::{Adapted, Data, Discrepancy, Linearised, Seen, Sums};
+use super::{Adapted, Data, Discrepancy, Linearised, Seen, Sums, at_monitors};
 use crate::location::Location;
 
-/// Amplitudes of a gradient over those of other places: the tunes show one that moves the readings by far less than their noise.
-const FINER: f64 = 1.0 / 16.0;
+/// Amplitudes of a gradient over those of other places, 2.5 um to 0.32 mm rms at the monitors: the tunes show one that moves the readings by far less than their noise.
+const FINER: f64 = 1.0 / 8.0;
 /// Standard deviation of a quadrupole's axis against the monitors' [m], typical of surveys.
 const AXIS: f64 = 0.3e-3;
-/// Quadrupoles so many nat, or such a share, behind the best may lead with kicks.
+/// Quadrupoles within so many nat, or this share, of the best are judged with kicks as well.
 const BEHIND: f64 = 12.0;
 const BEHIND_SHARE: f64 = 0.1;
+/// Runs of settings up to which each has an amplitude: the time that takes grows with their cube, to some seconds.
+const MANY: usize = 300;
+
+/// What the change of a quadrupole's gradient does.
+pub(super) struct Changing {
+    /// Change of `ln` of the gradient per unit of the amplitudes [1/m].
+    log_gradient: f64,
+    /// The gradient, and kicks in x and y as large as the error of the orbit makes them.
+    pub(super) patterns: [Signature; 3],
+}
+
+/// What `ln` of each quadrupole's gradient does, with the kick that it gives to an orbit (x, y) at every element [m].
+pub(crate) fn steering(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]]) -> Vec<Signature> {
+    let with_kick = |(q, mut gradient): (usize, Signature)| {
+        gradient += kick(signatures, ring, q, orbit[ring.quadrupoles[q].element]);
+        gradient
+    };
+    signatures.of_quadrupoles().into_iter().enumerate().map(with_kick).collect()
+}
+
+/// What the kick does that `ln` of a quadrupole's gradient gives to a beam off its axis [m]; it focuses in x.
+fn kick(signatures: &Signatures, ring: &Ring, quadrupole: usize, [x, y]: [f64; 2]) -> Signature {
+    let element = ring.quadrupoles[quadrupole].element;
+    let (length, k1) = (ring.elements[element].length, ring.gradients()[quadrupole]);
+    signatures.of_kick(Place { element, depth: 0.5 * length }, [-k1 * length * x, k1 * length * y])
+}
+
+impl Changing {
+    /// Of each quadrupole; `sigma`: standard deviation of the orbit at every element (x, y) [m].
+    pub fn all(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]], sigma: &[[f64; 2]]) -> Vec<Self> {
+        let of = |(q, gradient): (usize, Signature)| {
+            let log_gradient = FINER / gradient.rms().max(f64::MIN_POSITIVE);
+            let [x, y] = sigma[ring.quadrupoles[q].element].map(|sigma| sigma.hypot(AXIS));
+            let patterns = [gradient, kick(signatures, ring, q, [x, 0.0]), kick(signatures, ring, q, [0.0, y])];
+            Self { log_gradient, patterns: patterns.map(|pattern| pattern * log_gradient) }
+        };
+        steering(signatures, ring, orbit).into_iter().enumerate().map(of).collect()
+    }
+}
 
 /// The sums of each channel over the runs of settings.
 pub(super) struct Runs {
@@ -26,70 +69,27 @@ pub(super) struct Runs {
     monitors: Vec<usize>,
 }
 
-/// What the change of a quadrupole's gradient does, and kicks as large as the error of the orbit makes them.
-pub(super) struct Changing {
-    /// Change of `ln` of the gradient per unit of the amplitudes [1/m].
-    log_gradient: f64,
-    gradient: Signature,
-    kicks: [Signature; 2],
-}
-
-impl Changing {
-    /// Of each quadrupole; `sigma`: standard deviation of the orbit at every element (x, y) [m].
-    ///
-    /// # Errors
-    /// [`OrbitError`].
-    pub fn all(
-        machine: &Machine,
-        signatures: &Signatures,
-        orbit: &[[f64; 2]],
-        sigma: &[[f64; 2]],
-    ) -> Result<Vec<Self>, OrbitError> {
-        let ring = machine.ring();
-        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-        let monitors = optics.read_monitors();
-        let of = |((quadrupole, k1), mut gradient): ((&_, f64), Signature)| {
-            let twin::Quadrupole { element, .. } = *quadrupole;
-            let length = ring.elements[element].length;
-            let place = Place { element, depth: 0.5 * length };
-            // focusing in x
-            let kick = |[x, y]: [f64; 2]| optics.kick(place, [-k1 * length * x, k1 * length * y]);
-            let [x, y] = sigma[element].map(|sigma| sigma.hypot(AXIS));
-            let response = optics.response(&monitors, &[kick(orbit[element]), kick([x, 0.0]), kick([0.0, y])]);
-            gradient.readings.row_iter_mut().for_each(|mut row| row += response.column(0).transpose());
-            let scale = FINER / gradient.rms();
-            let kicks = [1, 2].map(|plane| {
-                let rows = vec![response.column(plane).transpose(); gradient.readings.nrows()];
-                let none = MatrixXx2::zeros(rows.len());
-                Signature { readings: DMatrix::from_rows(&rows), tunes: [0.0; 2], tune_changes: none } * scale
-            });
-            Self { log_gradient: scale, gradient: gradient * scale, kicks }
-        };
-        Ok(ring.quadrupoles.iter().zip(ring.gradients()).zip(signatures.of_quadrupoles()).map(of).collect())
-    }
-
-    pub(super) fn patterns(&self) -> [&Signature; 3] {
-        [&self.gradient, &self.kicks[0], &self.kicks[1]]
-    }
-}
-
 impl Runs {
-    /// Of some monitors and the tunes that are known.
-    pub fn of(data: &Data, seen: &Seen, monitors: &[usize]) -> Self {
+    /// Of some monitors and the tunes that are known; none of too many runs.
+    pub fn of(data: &Data, seen: &Seen, monitors: &[usize]) -> Option<Self> {
+        if data.pools.count > MANY {
+            return None;
+        }
         let each = DMatrix::identity(data.pools.count, data.pools.count);
         let tunes = [0, 1].into_iter().filter(|&plane| data.tune_noise(plane).is_some());
         let channels = monitors.iter().copied().chain(tunes.map(|plane| data.monitors() + plane));
-        Self { channels: channels.map(|c| (c, data.sums(c, seen, &each))).collect(), monitors: monitors.to_vec() }
+        let channels = channels.map(|c| (c, data.sums(c, seen, &each))).collect();
+        Some(Self { channels, monitors: monitors.to_vec() })
     }
 
     /// One amplitude a run of each of some patterns.
-    pub fn of_patterns(&self, data: &Data, patterns: &[&Signature]) -> Sums {
+    pub(super) fn of_patterns(&self, data: &Data, patterns: &[Signature]) -> Sums {
         let (runs, unknowns) = (data.pools.count, self.channels[0].1.cross.ncols());
         let mut all = Sums::none(patterns.len() * runs, unknowns);
         let left: Vec<DMatrix<f64>> =
             patterns.iter().map(|one| data.accompanied_in_runs(&self.monitors, &one.readings)).collect();
         for (c, own) in &self.channels {
-            let does = |i: usize| DVector::from_fn(runs, |run, _| data.effect_on(patterns[i], *c, run));
+            let does = |i: usize| DVector::from_fn(runs, |run, _| data.effect_on(&patterns[i], *c, run));
             let does: Vec<DVector<f64>> = (0..patterns.len()).map(does).collect();
             let leaves =
                 |i: usize| if *c < data.monitors() { left[i].column(*c).into_owned() } else { does[i].clone() };
@@ -102,12 +102,13 @@ impl Runs {
                 }
                 let mut pull = all.pull.rows_mut(i * runs, runs);
                 pull += own.pull.component_mul(&does[i]);
-                for (from, mut to) in own.cross.column_iter().zip(all.cross.rows_mut(i * runs, runs).column_iter_mut())
-                {
+                let mut rows = all.cross.rows_mut(i * runs, runs);
+                for (from, mut to) in own.cross.column_iter().zip(rows.column_iter_mut()) {
                     to += from.component_mul(&does[i]);
                 }
             }
         }
+        // the other half is its transpose
         all.gram.fill_lower_triangle_with_upper_triangle();
         all
     }
@@ -129,39 +130,75 @@ impl Sums {
         }
         all
     }
+
+    /// Of patterns that step with time, by whole whitened frames.
+    pub(super) fn stepping(
+        data: &Data,
+        own: &Seen,
+        monitors: &[usize],
+        patterns: &[Signature],
+        steps: &DMatrix<f64>,
+    ) -> Self {
+        let of = |pattern: &Signature| {
+            let pattern = at_monitors(pattern, monitors);
+            steps.column_iter().map(|step| data.stepping(&pattern, &step)).collect::<Vec<_>>()
+        };
+        Self::whole(&DMatrix::from_columns(&patterns.iter().flat_map(of).collect::<Vec<_>>()), own)
+    }
+}
+
+/// The readings in which quadrupoles are looked for.
+pub(super) struct Where<'d> {
+    pub data: &'d Data,
+    pub own: &'d Seen,
+    pub monitors: &'d [usize],
+    pub runs: Option<Runs>,
+    /// Steps in time, rows runs.
+    pub stretches: DMatrix<f64>,
 }
 
 impl Linearised<'_> {
-    /// Each quadrupole, as one that changes in time and from run to run. Those near the best are judged again with kicks, which the orbit's error makes.
-    pub(super) fn changing(
-        &self,
-        data: &Data,
-        runs: &Runs,
-        all: &[Changing],
-        stretches: &DMatrix<f64>,
-    ) -> Vec<Discrepancy> {
-        let judged = |(quadrupole, one): (usize, &Changing), patterns: &[&Signature]| {
-            let sums = runs.of_patterns(data, patterns);
-            let in_time = self.judge(Location::QuadrupoleInTime(quadrupole), &sums.through(stretches), all.len());
-            [in_time, self.judge(Location::QuadrupoleInRuns(quadrupole), &sums, all.len())].map(|found| {
-                // steps in time are of one half up and down
-                let is_in_time = found.at == Location::QuadrupoleInTime(quadrupole);
-                let steps = if is_in_time { 0.25 * stretches.ncols() as f64 } else { 1.0 };
-                let spread = steps.sqrt() * one.log_gradient * found.size;
-                let adapted = found.adapted.map(|adapted| self.spread(data, quadrupole, adapted, spread));
-                Discrepancy { size: FINER * found.size, adapted, ..found }
-            })
-        };
-        let mut found: Vec<_> = all.iter().enumerate().map(|one| judged(one, &[&one.1.gradient])).collect();
-        let log_bayes = |found: &[Discrepancy; 2]| found[0].log_bayes.max(found[1].log_bayes);
-        let best = found.iter().map(log_bayes).fold(0.0, f64::max);
-        let near = best - BEHIND.max(BEHIND_SHARE * best);
-        for (one, found) in all.iter().enumerate().zip(&mut found) {
-            if log_bayes(found) > near.max(0.0) {
-                *found = judged(one, &one.1.patterns());
+    /// Each quadrupole, as one that changes in time and from run to run.
+    pub(super) fn changing(&self, at: &Where, all: &[Changing]) -> Vec<Discrepancy> {
+        let first: Vec<_> = all.iter().enumerate().map(|one| self.changes(at, one, 1, all.len())).collect();
+        let log_bayes = |found: &[Discrepancy]| found.iter().map(|one| one.log_bayes).fold(0.0, f64::max);
+        let best = first.iter().map(|found| log_bayes(found)).fold(0.0, f64::max);
+        let near = (best - BEHIND.max(BEHIND_SHARE * best)).max(0.0);
+        let with_kicks = |(one, first): ((usize, &Changing), Vec<Discrepancy>)| {
+            if log_bayes(&first) <= near {
+                return first;
             }
-        }
-        found.into_iter().flatten().collect()
+            let kicked = self.changes(at, one, 3, all.len());
+            first.into_iter().zip(kicked).map(|(first, kicked)| first.or(kicked)).collect()
+        };
+        all.iter().enumerate().zip(first).flat_map(with_kicks).collect()
+    }
+
+    /// One quadrupole of several in time and, where there are not too many, in runs, by the first of its patterns.
+    fn changes(
+        &self,
+        at: &Where,
+        (quadrupole, one): (usize, &Changing),
+        patterns: usize,
+        sites: usize,
+    ) -> Vec<Discrepancy> {
+        let (data, patterns) = (at.data, &one.patterns[..patterns]);
+        let judged = |location: Location, sums: &Sums, spread: f64| {
+            let found = self.judge(location, sums, sites);
+            let spread = spread * one.log_gradient * found.size;
+            let adapted = found.adapted.map(|adapted| self.spread(data, quadrupole, adapted, spread));
+            Discrepancy { size: FINER * found.size, adapted, ..found }
+        };
+        let in_runs = at.runs.as_ref().map(|runs| runs.of_patterns(data, patterns));
+        let in_time = in_runs.as_ref().map_or_else(
+            || Sums::stepping(data, at.own, at.monitors, patterns, &at.stretches),
+            |in_runs| in_runs.through(&at.stretches),
+        );
+        // the steps add up
+        let of_steps = at.stretches.row(0).norm();
+        let mut found = vec![judged(Location::QuadrupoleInTime(quadrupole), &in_time, of_steps)];
+        found.extend(in_runs.map(|sums| judged(Location::QuadrupoleInRuns(quadrupole), &sums, 1.0)));
+        found
     }
 
     /// The factor of a quadrupole that changes is no single number: it is uncertain by as much as it changes, `spread` in `ln`.
@@ -180,7 +217,7 @@ impl Linearised<'_> {
 mod tests {
     use inference::Campaign;
     use inference::simulate::{self, Beyond, Hardware, Truth};
-    use twin::Ring;
+    use twin::Machine;
 
     use super::*;
     use crate::testing::template;
@@ -213,10 +250,9 @@ mod tests {
         let design = machine(&vec![1.0; ring.parameters.len()]);
         let signatures = Signatures::of(&design, &data.drives).unwrap();
         let orbit = design.orbit().unwrap();
-        let all = Changing::all(&design, &signatures, &orbit, &vec![[0.0; 2]; orbit.len()]).unwrap();
         let own = ring.parameters[changed].quadrupoles[0];
-        let pattern = &all[own].gradient.readings * all[own].log_gradient.recip();
-        let kicked = pattern.row(0) - signatures.of_quadrupoles()[own].readings.row(0);
+        let all = steering(&signatures, &ring, &orbit).swap_remove(own);
+        let kicked = all.readings.row(0) - signatures.of_quadrupoles()[own].readings.row(0);
         let off = (kicked.transpose() - &exact).amax() / exact.amax();
         // the orbit at the entrance of the magnet for that in its middle
         assert!(off < 0.1, "{off}");

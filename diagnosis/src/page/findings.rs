@@ -18,9 +18,10 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         rows.push(row(&format!("{}.", i + 1), finding));
         let or = |other: &Finding| if other.inseparable { "or (inseparable)" } else { "or" };
         rows.extend(finding.alternatives.iter().take(ALTERNATIVES).map(|other| row(or(other), other)));
+        rows.extend(finding.parts.iter().map(|part| row("in part", part)));
     }
     let header = ["", "effect", "at", "s [m]", "amplitude", "gain [nat]", "P", "held-out", "of choice", "chance"];
-    let caption = "Findings, strongest first, and below each the alternatives that explain the same readings. Gain: of ln evidence over the fit without it; P: \
+    let caption = "Findings, strongest first, and below each the alternatives that explain the same readings, or the effects that describe a part of something unknown. Gain: of ln evidence over the fit without it; P: \
                    probability among these, corrected for the number of candidates; \
                    held-out, in nat: gain of log predictive density, all effects against all but this one, ± its standard error, and of choice with kind and place chosen without the held-out \
                    readings; chance is the share of searches with nothing missing that find as much.";

@@ -50,7 +50,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
             "P",
             "Prior times evidence over the sum of all candidates, of unmodelled discrepancies and of nothing. Prior: nothing is missing in half of \
              all campaigns; else 15 % for physics outside the library, and the rest shared equally by the kinds, and by the places of a kind; one effect more beside \
-             others has odds of 1 to 4."
+             others has odds of 1 to 4. Of causes outside the library 4 % are taken to look like an effect: no effect has more than P = 0.993."
                 .into(),
         ),
         row(

@@ -65,7 +65,9 @@ fn bars(data: &Data, competition: &Competition, nothing: &str) -> Vec<Ranked> {
     let shown = competition.alternatives.iter().filter(|one| one.probability > LEAST).take(SHOWN);
     let mut bars: Vec<Ranked> =
         shown.map(|one| bar(label(data, one), usize::from(!one.is_of_library()), one.probability)).collect();
-    bars.push(bar("unknown, and looks like an effect".into(), 1, competition.imitating()));
+    if competition.imitating() > LEAST {
+        bars.push(bar("unknown, and looks like an effect".into(), 1, competition.imitating()));
+    }
     let sum: f64 = bars.iter().map(|bar| bar.value).sum::<f64>() / 100.0;
     bars.push(bar("all others together, of both".into(), 0, (1.0 - sum - competition.nothing).max(0.0)));
     bars.push(bar(nothing.into(), 2, competition.nothing));

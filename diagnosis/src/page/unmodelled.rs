@@ -9,6 +9,7 @@ use super::residuals::Residual;
 use super::{slope, tunes};
 use crate::Diagnosis;
 use crate::discrepancy::Discrepancy;
+use crate::discrepancy::gradient::steering;
 use crate::error::FitError;
 use crate::location::Location;
 use crate::verdict::capitalised;
@@ -239,7 +240,7 @@ impl Left<'_> {
         let (machine, drives) = self.partial.fitted.machine(self.partial.data)?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let does = signatures.of_quadrupoles().swap_remove(q).readings;
+        let does = steering(&signatures, machine.ring(), &drives.orbit).swap_remove(q).readings;
         let label = self.label(q);
         // um per per cent
         let figure = self

@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 use twin::{Effect, EffectKind, Ring};
 
-use crate::alternatives::Competition;
+use crate::alternatives::{Competition, imitating};
 use crate::data::{Data, DataError};
 use crate::fit::Fitted;
 use crate::hypothesis::{Hypothesis, Term};
@@ -149,13 +149,11 @@ fn stated(diagnosis: &Diagnosis, key: &Truth) -> Stated {
         }
         None => {
             let is_true = key.effects.iter().any(TrueEffect::is_unmodelled);
-            // what varies from frame to frame is in the noise, and competes with nothing else
-            let own = diagnosis.findings.iter().find(|finding| finding.is_of_noise());
-            let (unknown, of_sorts) = match own.map(|finding| finding.probability) {
-                Some(p) if p > found.next.unknown() => (p, [1.0 - p, 0.0, p]),
-                _ => (found.next.unknown(), of_sorts(&found.next)),
-            };
-            Stated::of("unknown".into(), Sort::Unknown, unknown, of_sorts, is_true)
+            let within = diagnosis.findings.iter().filter(|finding| finding.is_within_settings());
+            let of_sorts = within.map(of_sorts_of).fold(of_sorts(&found.next), |most, one| {
+                if one[Sort::Unknown as usize] > most[Sort::Unknown as usize] { one } else { most }
+            });
+            Stated::of("unknown".into(), Sort::Unknown, of_sorts[Sort::Unknown as usize], of_sorts, is_true)
         }
     }
 }
@@ -171,7 +169,8 @@ fn of_sorts_of(finding: &Finding) -> [f64; 3] {
     let sum = |is_of_library: bool| -> f64 {
         all().filter(|one| one.term().is_some() == is_of_library).map(|one| one.probability).sum()
     };
-    let (library, unknown) = (sum(true), sum(false));
+    let library = sum(true);
+    let unknown = sum(false) + imitating(library);
     [(1.0 - library - unknown).max(0.0), library, unknown]
 }
 

@@ -100,6 +100,9 @@ struct FindingResult {
     #[serde(skip_serializing_if = "core::ops::Not::not")]
     inseparable: bool,
     alternatives: Vec<FindingResult>,
+    /// Effects in the model that describe a part of something unknown.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    parts: Vec<FindingResult>,
 }
 
 #[derive(Debug, Serialize)]
@@ -357,6 +360,9 @@ impl fmt::Display for DiagnosisResult {
             finding.alternatives.iter().take(5).for_each(|other| {
                 table.add_row(other.row("or "));
             });
+            finding.parts.iter().for_each(|part| {
+                table.add_row(part.row("part "));
+            });
         }
         // a word of the library is looked for elsewhere, so that it is not broken
         if let Some(words) = table.column_mut(0) {
@@ -429,6 +435,7 @@ impl FindingResult {
             chance: finding.tested.and_then(|tested| tested.chance),
             inseparable: finding.inseparable,
             alternatives: finding.alternatives.iter().map(Self::of).collect(),
+            parts: finding.parts.iter().map(Self::of).collect(),
         }
     }
 

@@ -28,7 +28,7 @@ impl Drive {
     /// If the row's time is not one of the ramp's: such recordings are refused.
     pub fn of(header: &Header, row: &Row) -> Self {
         let at = at(header, row);
-        let rigidity = field(header, row);
+        let rigidity = field(header, row).unwrap_or(1.0);
         let strength = |f: usize| (header.gradient(f, row.supply[f]) / (rigidity * at.gradient[f])).ln();
         let stiffness = rigidity * at.momentum;
         let kick =
@@ -46,15 +46,13 @@ fn at(header: &Header, row: &Row) -> At {
     header.ramp.at(row.cycle_time, row.supply.len()).expect("the ramp knows the times of its frames")
 }
 
-/// Field of the dipoles over the one that is nominal at the row's time in the cycle, 1 where their current is not read.
+/// Field of the dipoles over the one that is nominal at the row's time in the cycle, where their current is read.
 ///
 /// # Panics
 /// If the row's time is not one of the ramp's: such recordings are refused.
-pub(crate) fn field(header: &Header, row: &Row) -> f64 {
-    match (row.dipole, header.nominal_dipole) {
-        (Some(current), Some(nominal)) => current / (nominal * at(header, row).dipole),
-        _ => 1.0,
-    }
+pub(crate) fn field(header: &Header, row: &Row) -> Option<f64> {
+    let (current, nominal) = row.dipole.zip(header.nominal_dipole)?;
+    Some(current / (nominal * at(header, row).dipole))
 }
 
 /// Mean `ln` of each supply's factor over a recording [F]: the currents at which its tunes were measured.

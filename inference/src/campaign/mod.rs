@@ -77,7 +77,7 @@ pub struct Campaign {
     /// of this one [F] [m].
     pub ripple: Vec<[f64; 2]>,
     /// `ln` of the dipoles' field off its mean, frame by frame; none where their current is not read.
-    field: Vec<f64>,
+    field: Option<Vec<f64>>,
     /// What the read monitors see per `ln` of it while the RF frequency is held [B] [m].
     of_field: Vec<f64>,
 }
@@ -194,12 +194,10 @@ impl Campaign {
     /// The same, and in one more column how it follows the dipoles' field if the RF frequency is held instead of the momentum.
     pub fn following_with_field(&self, b: usize) -> DMatrix<f64> {
         let following = self.following(b);
-        if self.field.is_empty() {
-            return following;
-        }
+        let Some(field) = &self.field else { return following };
         let last = following.ncols();
         let mut all = following.insert_column(last, 0.0);
-        all.column_mut(last).iter_mut().zip(&self.field).for_each(|(to, field)| *to = self.of_field[b] * field);
+        all.column_mut(last).iter_mut().zip(field).for_each(|(to, field)| *to = self.of_field[b] * field);
         all
     }
 
@@ -256,10 +254,11 @@ fn tunes(recording: &Recording) -> DMatrix<f64> {
 }
 
 /// `ln` of the dipoles' field off its mean in each frame; none where their current is not read.
-fn fields(recording: &Recording) -> Vec<f64> {
-    let logs: Vec<f64> = recording.rows.iter().map(|row| drive::field(&recording.header, row).ln()).collect();
+fn fields(recording: &Recording) -> Option<Vec<f64>> {
+    let logs = recording.rows.iter().map(|row| drive::field(&recording.header, row).map(f64::ln));
+    let logs = logs.collect::<Option<Vec<f64>>>()?;
     let mean = logs.iter().sum::<f64>() / logs.len() as f64;
-    if logs.iter().all(|log| *log == 0.0) { Vec::new() } else { logs.iter().map(|log| log - mean).collect() }
+    Some(logs.into_iter().map(|log| log - mean).collect())
 }
 
 /// Rms of the baselines that are known, in x and y [m].

@@ -172,6 +172,13 @@ impl<'m> Signatures<'m> {
         self.as_read(self.of_gradient(&self.optics.thin_linear(place, form), 1.0))
     }
 
+    /// Derivative with respect to a kick in (x, y) [1] at a place, the same in every frame.
+    pub fn of_kick(&self, place: Place, direction: [f64; 2]) -> Signature {
+        let response = self.held.response(&self.optics, &self.observers, &[self.optics.kick(place, direction)]);
+        let rows = vec![response.column(0).transpose(); self.kick.nrows()];
+        self.as_read(Signature { readings: DMatrix::from_rows(&rows), ..self.nothing() })
+    }
+
     /// What kicks and RF offset do to the orbit at a read monitor: its position and slope in the monitor's plane,
     /// then in the other, rows frames [m, rad]. But for dispersion, the orbit anywhere near is a sum of these where no kick is in
     /// between.
