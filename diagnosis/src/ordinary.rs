@@ -53,7 +53,7 @@ const STANDS_OUT: f64 = 2.3;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
 /// Share of the full width that dipoles which hide something have beside straights that do: in the validation the vars beside either are then right by
-/// their error bars, on average, and those of an empty campaign have error bars that are a fifth larger.
+/// their error bars, on average, and those of an empty campaign have error bars that are a twentieth larger.
 const HIDDEN: f64 = 0.4;
 /// Steps of the widths at most, and the change, in tolerances, at which they have settled.
 const STEPS: usize = 30;

@@ -23,7 +23,7 @@ const AXIS: f64 = 0.3e-3;
 const BEHIND: f64 = 12.0;
 const BEHIND_SHARE: f64 = 0.1;
 /// Runs of settings up to which each has an amplitude: the time that takes grows with their cube, to some seconds.
-const MANY: usize = 300;
+const MANY: usize = 200;
 
 /// What the change of a quadrupole's gradient does.
 pub(super) struct Changing {
