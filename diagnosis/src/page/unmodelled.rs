@@ -12,6 +12,7 @@ use crate::discrepancy::Discrepancy;
 use crate::discrepancy::gradient::steering;
 use crate::error::FitError;
 use crate::location::Location;
+use crate::settings::Settings;
 use crate::verdict::capitalised;
 use report::{Axes, Figure, Map, Reference, Series};
 
@@ -30,6 +31,11 @@ impl Mean {
     fn add(&mut self, value: f64, size: f64) {
         self.pull += size * value;
         self.weight += size * size;
+    }
+
+    /// With another sum.
+    fn and(self, other: Self) -> Self {
+        Self { pull: self.pull + other.pull, weight: self.weight + other.weight }
     }
 
     fn value(self) -> f64 {
@@ -85,11 +91,7 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
             figures.extend([left.kick_in_time(q, Plane::X)?, left.kick_in_time(q, Plane::Y)?]);
             figures
         }
-        Location::QuadrupoleInRuns(q) => {
-            let mut figures = vec![left.gradient_in_settings(q)?];
-            figures.extend(tunes::of_model(&found.data, &found.best, &left.title())?);
-            figures
-        }
+        Location::QuadrupoleInRuns(q) => left.gradient(q)?,
         Location::Tunes => tunes::of_model(&found.data, &found.best, &left.title())?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
@@ -224,10 +226,11 @@ impl Left<'_> {
     /// The kick at a quadrupole that each setting's residuals would give.
     fn kicks(&self, q: usize, plane: Plane) -> Result<(String, Figure), FitError> {
         let response = self.response_to(q, plane)?;
-        let label = self.label(q);
+        let mut runs = self.no_means();
         // um per urad
-        let figure =
-            self.in_settings(&format!("{} kick near {label} [µrad]", direction(plane)), |one| response[one.monitor]);
+        self.residuals.iter().for_each(|one| runs[one.pool].add(one.value, response[one.monitor] / one.noise));
+        let label = self.label(q);
+        let figure = self.in_settings(&format!("{} kick near {label} [µrad]", direction(plane)), &runs);
         let caption = format!(
             "The kick at {label} that describes the residuals of each setting best, the vars held, with its error from the noise. A gradient there \
              kicks in proportion to the orbit that each corrector makes."
@@ -235,33 +238,54 @@ impl Left<'_> {
         Ok((caption, figure))
     }
 
-    /// The change of a quadrupole's gradient that each setting's residuals would give.
-    fn gradient_in_settings(&self, q: usize) -> Result<(String, Figure), FitError> {
-        let (machine, drives) = self.partial.fitted.machine(self.partial.data)?;
+    /// The change of a quadrupole's gradient that the residuals of each setting, and of each run of frames, would give.
+    fn gradient(&self, q: usize) -> Result<Vec<(String, Figure)>, FitError> {
+        let (data, fitted) = (self.partial.data, self.partial.fitted);
+        let (machine, drives) = fitted.machine(data)?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let does = steering(&signatures, machine.ring(), &drives.orbit).swap_remove(q).readings;
+        // of one per cent
+        let does = steering(&signatures, machine.ring(), &drives.orbit).swap_remove(q) * 0.01;
+        let mut runs = self.no_means();
+        for one in &self.residuals {
+            runs[one.pool].add(one.value, 1e6 * does.readings[(one.pool, one.monitor)] / one.noise);
+        }
+        let miss = data.miss(&fitted.predicted(data)?);
+        for (plane, noise) in [0, 1].into_iter().filter_map(|plane| Some((plane, data.tune_noise(plane)?))) {
+            for (run, readings) in data.tune_pools(plane) {
+                let sigma = noise / readings.sqrt();
+                runs[run].add(miss[(run, data.monitors() + plane)] / sigma, does.tune(plane, run) / sigma);
+            }
+        }
         let label = self.label(q);
-        // um per per cent
-        let figure = self
-            .in_settings(&format!("change of the gradient of {label} [%]"), |one| 1e4 * does[(one.pool, one.monitor)]);
-        let caption = format!(
-            "The change of the gradient of {label} that describes the residuals of all monitors in each setting best, the vars held, with its error \
-             from the noise."
-        );
-        Ok((caption, figure))
+        let axis = format!("change of the gradient of {label} [%]");
+        let in_settings = self.in_settings(&axis, &runs);
+        let in_time = points("run of frames", data.drives.time.iter().copied().zip(runs));
+        let axes = Axes::new(&self.title(), "time, \u{2212}1 at the start to 1 at the end [1]", &axis);
+        let in_time = Figure::lines(&axes.compared(Reference::Level(0.0)), &[in_time]);
+        let what = |of: &str| {
+            format!(
+                "The change of the gradient of {label} that describes the readings of all monitors and the tunes of {of} best, the vars held, with its \
+                 error from the noise."
+            )
+        };
+        Ok(vec![(what("each setting"), in_settings), (what("each run of frames"), in_time)])
     }
 
-    /// What describes the residuals of each setting best; `does`: what one unit of it does to a reading [µm].
-    fn in_settings(&self, axis: &str, does: impl Fn(&Residual) -> f64) -> Figure {
+    fn no_means(&self) -> Vec<Mean> {
+        vec![Mean::default(); self.partial.data.pools.count]
+    }
+
+    /// The mean of each setting, from those of runs of frames.
+    fn in_settings(&self, axis: &str, runs: &[Mean]) -> Figure {
         let data = self.partial.data;
-        let driven = data.driven_correctors();
+        let (driven, settings) = (data.driven_correctors(), Settings::of(&data.drives));
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
-            for one in &self.residuals {
-                let Some((c, _)) = one.kick.filter(|(_, sign)| *sign == wanted) else { continue };
+            for (run, mean) in runs.iter().enumerate() {
+                let Some((c, _)) = settings.kick(run).filter(|(_, sign)| *sign == wanted) else { continue };
                 let Some(at) = driven.iter().position(|&of| of == c) else { continue };
-                means[at].add(one.value, does(one) / one.noise);
+                means[at] = means[at].and(*mean);
             }
             means
         };
