@@ -588,7 +588,7 @@ mod tests {
         let (share, sigma) = found.findings[0].amplitude;
         assert!((share - 1.0).abs() < 3.0 * sigma, "{share} +- {sigma}");
         let learnt = &found.found.data.noise;
-        // some 0.1 mm at the largest dispersion, of noise of 0.1 mm
+        // the ripple moves the beam by 1 mm rms at the largest dispersion, of noise of 0.1 mm
         assert!(learnt.momentum.value < 5e-6, "{:?}", learnt.momentum);
         assert!((learnt.common_scale.value - 1.0).abs() < 0.05, "{:?}", learnt.common_scale);
     }
