@@ -1,7 +1,7 @@
 //! An unmodelled discrepancy: a part of the data that no effect of the library describes, and its most likely location.
 //!
 //! Each place is tried with free amplitudes: one of standard deviation `omega` for every setting (or stretch of time) at a monitor, a
-//! corrector or a place in the ring that kicks the beam, and for every run of a setting or stretch of time at a quadrupole whose gradient changes ([`gradient`]); an unknown linear element those of the terms of its Hamiltonian, as a solenoid or a wiggler would have them. With `Z` the whitened pattern of those amplitudes,
+//! corrector or a place in the ring that kicks the beam, and for every run of a setting or stretch of time at a quadrupole whose gradient changes (`discrepancy/gradient.rs`); an unknown linear element those of the terms of its Hamiltonian, as a solenoid or a wiggler would have them. With `Z` the whitened pattern of those amplitudes,
 //! `P` the projection that removes what the fit's unknowns can absorb, `g = Z^T P r` and `G = Z^T P Z`:
 //!
 //! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,

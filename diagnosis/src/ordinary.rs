@@ -152,7 +152,7 @@ impl Family {
         Self { width: self.width.max(scale / (places as f64).sqrt()), ..*self }
     }
 
-    /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by [`HIDDEN`] of the
+    /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by a share of the
     /// width above.
     pub fn hidden(data: &Data) -> Vec<Self> {
         let of = |(name, kind)| {
