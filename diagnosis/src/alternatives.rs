@@ -110,16 +110,15 @@ impl Alternative {
         }
     }
 
+    /// A cause without a fit of its own, its probability still open.
+    pub(super) fn unfitted(cause: Cause, log_gain: f64, amplitude: (f64, f64)) -> Self {
+        Self { cause, log_gain, probability: 0.0, amplitude, adapting: DVector::zeros(0), fitted: None }
+    }
+
     /// An unmodelled discrepancy.
     pub(super) fn unmodelled(discrepancy: Discrepancy) -> Self {
-        Self {
-            amplitude: (discrepancy.size, 0.0),
-            log_gain: discrepancy.log_bayes,
-            cause: Cause::Unmodelled(discrepancy),
-            probability: 0.0,
-            adapting: DVector::zeros(0),
-            fitted: None,
-        }
+        let (log_gain, amplitude) = (discrepancy.log_bayes, (discrepancy.size, 0.0));
+        Self::unfitted(Cause::Unmodelled(discrepancy), log_gain, amplitude)
     }
 
     /// What varies from frame to frame in the noise of a campaign and is not ordinary, if anything does.
@@ -224,15 +223,7 @@ mod tests {
     fn an_effect_is_at_most_as_likely_as_that_nothing_unknown_looks_like_it() {
         let of = |log_gain: f64, corrector: usize| {
             let term = Term { kind: EffectKind::CorrectorGain, site: Site::Corrector(corrector) };
-            let alternative = Alternative {
-                cause: Cause::Effect(term),
-                log_gain,
-                probability: 0.0,
-                amplitude: (0.1, 0.01),
-                adapting: DVector::zeros(0),
-                fitted: None,
-            };
-            (alternative, log_gain)
+            (Alternative::unfitted(Cause::Effect(term), log_gain, (0.1, 0.01)), log_gain)
         };
         for (first, least) in [(40.0, 0.99), (2.0, 0.6)] {
             let all = Weighed::of(vec![of(first, 0), of(0.0, 1)]);

@@ -30,6 +30,13 @@ impl Vars {
         Self { mean: DVector::from_column_slice(&fitted.params), covariance: fitted.covariance() }
     }
 
+    /// Normalised estimation error squared, per var, for the `ln` of the true ones.
+    pub fn nees(&self, truth: &DVector<f64>) -> f64 {
+        let off = &self.mean - truth;
+        let solved = self.covariance.clone().cholesky().map(|factor| factor.solve(&off));
+        solved.map_or(f64::INFINITY, |solved| off.dot(&solved) / off.len() as f64)
+    }
+
     /// The vars averaged over the alternatives of the least certain finding.
     pub fn averaged(found: &Found) -> Self {
         let certainty = |competition: &&Competition| {
@@ -134,11 +141,9 @@ mod tests {
             let made = Coloured::white(&ring, &recording, 40 + seed as u64);
             let found = Diagnosis::of(&ring, &made.campaign(&ring, &recording, &[effect]), |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Consistent, "{}", found.sentence);
-            let truth = DVector::from_iterator(48, made.vars.iter().map(|var| var.ln()));
+            let truth = DVector::from_vec(made.vars).map(f64::ln);
             for (mean, vars) in means.iter_mut().zip([&found.vars_before, &found.vars_after]) {
-                let off = &truth - &vars.mean;
-                let factor = vars.covariance.clone().cholesky().unwrap();
-                *mean += off.dot(&factor.solve(&off)) / 48.0 / 6.0;
+                *mean += vars.nees(&truth) / 6.0;
             }
         }
         let [before, after] = means;

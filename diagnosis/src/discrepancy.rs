@@ -602,9 +602,7 @@ mod tests {
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 10_397_415_869_173_073_767).unwrap();
         let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
         assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
-        let off = DVector::from_iterator(vars.len(), vars.iter().map(|var| var.ln())) - &found.vars_after.mean;
-        let factor = found.vars_after.covariance.clone().cholesky().unwrap();
-        let off = off.dot(&factor.solve(&off)) / vars.len() as f64;
+        let off = found.vars_after.nees(&DVector::from_vec(vars).map(f64::ln));
         println!("{off}");
         assert!(found.beyond.len() < 3 && off < 2.0, "{off}: {}", found.sentence);
     }
@@ -652,14 +650,15 @@ mod tests {
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives).unwrap();
         let (runs, mut of_quadrupoles) = (Runs::of(&data, &seen, &monitors).unwrap(), 0.0_f64);
+        let at = Where { data: &data, own: &own, monitors: &monitors, runs: None, stretches };
         let changing = Changing::all(&signatures, machine.ring(), &drives.orbit, &data.baseline.sigma);
         let each = DMatrix::identity(data.pools.count, data.pools.count);
         for (i, one) in changing.iter().enumerate().step_by(8) {
             let in_runs = runs.of_patterns(&data, &one.patterns);
-            let exact = Sums::stepping(&data, &own, &monitors, &one.patterns, &stretches);
-            of_quadrupoles = of_quadrupoles.max((evidence(&in_runs.through(&stretches)) - evidence(&exact)).abs());
+            let (in_time, exact) = (in_runs.through(&at.stretches), at.stepping(&one.patterns, &at.stretches));
+            of_quadrupoles = of_quadrupoles.max((evidence(&in_time) - evidence(&exact)).abs());
             if i == 0 {
-                let exact = Sums::stepping(&data, &own, &monitors, &one.patterns, &each);
+                let exact = at.stepping(&one.patterns, &each);
                 of_quadrupoles = of_quadrupoles.max((evidence(&in_runs) - evidence(&exact)).abs());
             }
         }

@@ -184,11 +184,8 @@ impl Truth {
 
     /// Normalised estimation error squared of the vars, per var; NaN if the key lacks one.
     pub fn nees(&self, names: &[String], vars: &Vars) -> f64 {
-        let truth = |name: &String| self.vars.get(name).map_or(f64::NAN, |var| var.ln());
-        let off = names.iter().zip(vars.mean.iter()).map(|(name, mean)| mean - truth(name));
-        let off = DVector::from_iterator(names.len(), off);
-        let solved = vars.covariance.clone().cholesky().map(|factor| factor.solve(&off));
-        solved.map_or(f64::INFINITY, |solved| off.dot(&solved) / names.len() as f64)
+        let truth = names.iter().map(|name| self.vars.get(name).map_or(f64::NAN, |var| var.ln()));
+        vars.nees(&DVector::from_iterator(names.len(), truth))
     }
 }
 

@@ -600,12 +600,8 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let alternative = |cause: Cause, probability: f64| Alternative {
-            cause,
-            log_gain: 50.0,
             probability,
-            amplitude: (-0.2, 0.01),
-            adapting: nalgebra::DVector::zeros(0),
-            fitted: None,
+            ..Alternative::unfitted(cause, 50.0, (-0.2, 0.01))
         };
         let unknown = |at: Location, probability: f64| {
             let one = Discrepancy { at, campaign: 0, log_bayes: 50.0, size: 1e-4, sites: 33, adapted: None };

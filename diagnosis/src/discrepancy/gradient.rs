@@ -130,21 +130,6 @@ impl Sums {
         }
         all
     }
-
-    /// Of patterns that step with time, by whole whitened frames.
-    pub(super) fn stepping(
-        data: &Data,
-        own: &Seen,
-        monitors: &[usize],
-        patterns: &[Signature],
-        steps: &DMatrix<f64>,
-    ) -> Self {
-        let of = |pattern: &Signature| {
-            let pattern = at_monitors(pattern, monitors);
-            steps.column_iter().map(|step| data.stepping(&pattern, &step)).collect::<Vec<_>>()
-        };
-        Self::whole(&DMatrix::from_columns(&patterns.iter().flat_map(of).collect::<Vec<_>>()), own)
-    }
 }
 
 /// The readings in which quadrupoles are looked for.
@@ -155,6 +140,17 @@ pub(super) struct Where<'d> {
     pub runs: Option<Runs>,
     /// Steps in time, rows runs.
     pub stretches: DMatrix<f64>,
+}
+
+impl Where<'_> {
+    /// Of patterns that step with time, by whole whitened frames.
+    pub fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
+        let of = |pattern: &Signature| {
+            let pattern = at_monitors(pattern, self.monitors);
+            steps.column_iter().map(|step| self.data.stepping(&pattern, &step)).collect::<Vec<_>>()
+        };
+        Sums::whole(&DMatrix::from_columns(&patterns.iter().flat_map(of).collect::<Vec<_>>()), self.own)
+    }
 }
 
 impl Linearised<'_> {
@@ -174,7 +170,7 @@ impl Linearised<'_> {
         all.iter().enumerate().zip(first).flat_map(with_kicks).collect()
     }
 
-    /// One quadrupole of several in time and, where there are not too many, in runs, by the first of its patterns.
+    /// One quadrupole of several in time and, where there are not too many, in runs, by the first `patterns` of its own.
     fn changes(
         &self,
         at: &Where,
@@ -190,10 +186,9 @@ impl Linearised<'_> {
             Discrepancy { size: FINER * found.size, adapted, ..found }
         };
         let in_runs = at.runs.as_ref().map(|runs| runs.of_patterns(data, patterns));
-        let in_time = in_runs.as_ref().map_or_else(
-            || Sums::stepping(data, at.own, at.monitors, patterns, &at.stretches),
-            |in_runs| in_runs.through(&at.stretches),
-        );
+        let in_time = in_runs
+            .as_ref()
+            .map_or_else(|| at.stepping(patterns, &at.stretches), |in_runs| in_runs.through(&at.stretches));
         // the steps add up
         let of_steps = at.stretches.row(0).norm();
         let mut found = vec![judged(Location::QuadrupoleInTime(quadrupole), &in_time, of_steps)];

@@ -398,14 +398,7 @@ impl<'c> Within<'c> {
 
 impl Fit {
     fn alternative(&self) -> Alternative {
-        Alternative {
-            cause: Cause::Effect(self.term),
-            log_gain: self.log_bayes,
-            probability: 0.0,
-            amplitude: (self.amplitude, self.sigma),
-            adapting: DVector::zeros(0),
-            fitted: None,
-        }
+        Alternative::unfitted(Cause::Effect(self.term), self.log_bayes, (self.amplitude, self.sigma))
     }
 }
 

@@ -100,14 +100,13 @@ impl Unmodelled {
     /// What its corrector does in a cycle.
     fn kick(&self, cycle: &mut Cycle, past: &mut Past) {
         let kicks = &mut cycle.kick;
-        let others = || kicks.iter().enumerate().filter(|(c, _)| *c != self.index);
-        let sum: f64 = kicks.iter().sum();
         let change = match self.kind {
             UnmodelledKind::OrbitDrift => self.size * self.slow_variation(cycle.time),
             UnmodelledKind::BusSag => self.size * kicks.iter().map(|kick| kick.abs()).sum::<f64>() / FULL_KICK,
             UnmodelledKind::AlternateCycle if past.count % 2 == 1 => self.size,
             UnmodelledKind::CrateSag => {
-                let of_crate = others().filter(|(c, _)| c / CRATE == self.index / CRATE);
+                let is_beside = |c: usize| c != self.index && c / CRATE == self.index / CRATE;
+                let of_crate = kicks.iter().enumerate().filter(|(c, _)| is_beside(*c));
                 self.size * of_crate.map(|(_, kick)| kick.abs()).sum::<f64>() / FULL_KICK
             }
             UnmodelledKind::CoilHeat => {
@@ -129,7 +128,7 @@ impl Unmodelled {
                 trim
             }
             UnmodelledKind::InducedKick => {
-                let others = sum - kicks[self.index];
+                let others = kicks.iter().sum::<f64>() - kicks[self.index];
                 let before = past.others.replace(others).unwrap_or(others);
                 self.size * (others - before) / FULL_KICK
             }
