@@ -19,7 +19,7 @@ use super::scan::SignatureScore;
 /// Recordings drawn: a probability of 1 % is then known to a half.
 const DRAWS: usize = 499;
 const SEED: u64 = 1;
-/// Share of its power by which a signature differs from all others at least.
+/// Share of its power, and of 1 nat, by which a signature differs from all others and from none at least.
 const ROUNDING: f64 = 1e-9;
 
 /// Probability that the best of the candidates is at least as much better than its penalty as in this recording, were none of them there.
@@ -32,8 +32,8 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
         |scores: &mut dyn Iterator<Item = SignatureScore>| choice.log_weights(scores).fold(f64::NEG_INFINITY, f64::max);
     let own = best(&mut scores());
     let mut covariance = choice.columns.transpose() * &choice.left;
-    // alike signatures leave no more than rounding between them
-    (0..covariance.nrows()).for_each(|i| covariance[(i, i)] *= 1.0 + ROUNDING);
+    // alike signatures leave no more than rounding between them; one of an instrument that is dead is zero
+    (0..covariance.nrows()).for_each(|i| covariance[(i, i)] += ROUNDING * (1.0 + covariance[(i, i)]));
     let factor = Factor::of(covariance).ok_or(FitError::Degenerate)?;
     let mut rng = StdRng::seed_from_u64(SEED);
     let normal = DMatrix::<f64>::from_fn(choice.scores.len(), DRAWS, |_, _| rng.sample(StandardNormal));

@@ -13,6 +13,8 @@
 //!
 //! Source: D. J. C. MacKay, Neural Comput. 4 (1992) 415, eq. 4.8; A. Gelman, Bayesian Anal. 1 (2006) 515, half-normal priors of widths.
 
+use core::iter;
+
 use inference::Factor;
 use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Measured, Plane, Ring, Site};
@@ -213,7 +215,7 @@ impl Projected {
         let families = &fitted.hypothesis.ordinary;
         let sized = |(f, family): (usize, &Family)| {
             let scale = family.tolerance / family.width;
-            core::iter::repeat_n((f, scale), family.members(data).len())
+            iter::repeat_n((f, scale), family.members(data).len())
         };
         let (family, scale): (Vec<usize>, Vec<f64>) = families.iter().enumerate().flat_map(sized).unzip();
         let m = family.len();
@@ -282,7 +284,7 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
 }
 
 /// The member of each learnt family that stands out most of it: it may have made the family as wide as it is, and then hide in it. An instrument
-/// whose gain does may be reversed, which a gain of -2 in a wide family hides as well.
+/// whose gain does may be reversed or dead, which a gain of -2 or -1 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     let members: Vec<(Term, f64)> = (unknowns.iter())
@@ -297,17 +299,17 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
         own.max_by(|(_, one), (_, other)| one.total_cmp(other)).map(|(term, _)| *term)
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
-    stands_out.flat_map(|term| [Some(term), reversed(term)]).flatten().collect()
+    stands_out.flat_map(|term| iter::once(term).chain(failures(term))).collect()
 }
 
-/// The reversed instrument of a gain.
-fn reversed(gain: Term) -> Option<Term> {
-    let kind = match gain.kind {
-        EffectKind::BpmGain => EffectKind::BpmPolarity,
-        EffectKind::CorrectorGain => EffectKind::CorrectorPolarity,
-        _ => return None,
+/// The instrument of a gain reversed, and dead.
+fn failures(gain: Term) -> impl Iterator<Item = Term> {
+    let kinds: &[EffectKind] = match gain.kind {
+        EffectKind::BpmGain => &[EffectKind::BpmPolarity, EffectKind::BpmDead],
+        EffectKind::CorrectorGain => &[EffectKind::CorrectorPolarity, EffectKind::CorrectorDead],
+        _ => &[],
     };
-    Some(Term { kind, ..gain })
+    kinds.iter().map(move |&kind| Term { kind, ..gain })
 }
 
 /// The sizes of the ordinary imperfections in a fit, of several recordings those of the first where each has its own. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's

@@ -70,9 +70,11 @@ impl Form {
             EffectKind::StrayGradient | EffectKind::DipoleGradient | EffectKind::DipoleEdge => Self::Optics,
             EffectKind::BpmGain
             | EffectKind::BpmPolarity
+            | EffectKind::BpmDead
             | EffectKind::BpmSwap
             | EffectKind::CorrectorGain
             | EffectKind::CorrectorPolarity
+            | EffectKind::CorrectorDead
             | EffectKind::CorrectorSwap
             | EffectKind::MomentumOffset => Self::Instruments,
             EffectKind::BpmRoll
@@ -109,6 +111,9 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
             (EffectKind::BpmPolarity, Site::Monitor(at)) => {
                 read(at).into_iter().for_each(|b| instruments.monitor_gain[b] *= -1.0);
             }
+            (EffectKind::BpmDead, Site::Monitor(at)) => {
+                read(at).into_iter().for_each(|b| instruments.monitor_gain[b] = 0.0);
+            }
             (EffectKind::BpmSwap, Site::MonitorPair(one, other)) => {
                 if let (Some(one), Some(other)) = (read(one), read(other)) {
                     instruments.monitor.swap(one, other);
@@ -117,6 +122,7 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
             }
             (EffectKind::CorrectorGain, Site::Corrector(c)) => *instruments.gain_of(c) *= 1.0 + amplitude,
             (EffectKind::CorrectorPolarity, Site::Corrector(c)) => *instruments.gain_of(c) *= -1.0,
+            (EffectKind::CorrectorDead, Site::Corrector(c)) => *instruments.gain_of(c) = 0.0,
             (EffectKind::CorrectorSwap, Site::CorrectorPair(one, other)) => {
                 let [one, other] = [one, other].map(|c| instruments.supply_of(c));
                 instruments.corrector.swap(one, other);

@@ -191,6 +191,7 @@ impl Lattice {
         match how {
             MonitorEffect::Gain => self.monitors[monitor].gain *= 1.0 + amplitude,
             MonitorEffect::Polarity => self.monitors[monitor].gain *= -1.0,
+            MonitorEffect::Dead => self.monitors[monitor].gain = 0.0,
             MonitorEffect::Roll => {
                 let element = self.monitors[monitor].element;
                 let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);
@@ -208,6 +209,7 @@ impl Lattice {
         match how {
             CorrectorEffect::Gain => channel.gain *= 1.0 + amplitude,
             CorrectorEffect::Polarity => channel.gain = -channel.gain,
+            CorrectorEffect::Dead => channel.gain = 0.0,
             // the ring has it
             CorrectorEffect::Roll => {}
             CorrectorEffect::Swap

@@ -1,6 +1,6 @@
-//! Errors of correctors: gain, roll, reversed polarity, exchanged cables, even part, a share of the kick that goes to another one or stays.
+//! Errors of correctors: gain, roll, reversed polarity, no kick, exchanged cables, even part, a share of the kick that goes to another one or stays.
 //!
-//! Of a gain, a polarity and an even part the actual kick is one function of the nominal kick and of an amplitude,
+//! Of a gain, a polarity, a dead one and an even part the actual kick is one function of the nominal kick and of an amplitude,
 //! [`CorrectorEffect::kick`]; a rolled magnet kicks in both planes, as an element of the ring. Crosstalk adds `a` times the kick of one to that of the next; a
 //! corrector with hysteresis kicks `k + a k_before`, `k_before` what it had before its present setting; one that settles lacks `a` of each change in the frame
 //! after it, `a^2` in the next: in frame i it kicks `j_i = k_i + a (j_(i-1) - k_i)`.
@@ -24,6 +24,8 @@ pub enum CorrectorEffect {
     Roll,
     /// Its sign is reversed.
     Polarity,
+    /// It does not kick, whatever its read-back says.
+    Dead,
     /// Its cable and another one's are exchanged: each gives the kick that is believed of the other.
     Swap,
     /// Its kick differs between its signs by twice this share of the nominal one; cancels in the difference that a response is.
@@ -55,6 +57,7 @@ impl CorrectorEffect {
         match self {
             Self::Gain => believed * (amplitude + 1.0),
             Self::Polarity => -believed,
+            Self::Dead => believed * 0.0,
             Self::Even => believed + amplitude * believed * believed / nominal,
             Self::Roll | Self::Swap | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
         }
@@ -75,6 +78,7 @@ impl Mechanism for CorrectorEffect {
             Self::Gain => "corrector_gain",
             Self::Roll => "corrector_roll",
             Self::Polarity => "corrector_polarity",
+            Self::Dead => "corrector_dead",
             Self::Swap => "corrector_swap",
             Self::Even => "corrector_even",
             Self::Crosstalk => "corrector_crosstalk",
@@ -95,7 +99,7 @@ impl Mechanism for CorrectorEffect {
             Self::Even | Self::Crosstalk => Some(0.05),
             Self::Hysteresis => Some(0.03),
             Self::Settling => Some(0.1),
-            Self::Polarity | Self::Swap => None,
+            Self::Polarity | Self::Dead | Self::Swap => None,
         }
     }
 
@@ -103,7 +107,7 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Gain | Self::Even | Self::Crosstalk | Self::Hysteresis | Self::Settling => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
-            Self::Polarity | Self::Swap => Unit::NONE,
+            Self::Polarity | Self::Dead | Self::Swap => Unit::NONE,
         }
     }
 
@@ -112,7 +116,7 @@ impl Mechanism for CorrectorEffect {
             return pairs(ring);
         }
         let is_one = |&at: &usize| match self {
-            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => true,
+            Self::Gain | Self::Polarity | Self::Dead | Self::Even | Self::Hysteresis | Self::Settling => true,
             Self::Roll => rolled(ring, at) == at,
             Self::Crosstalk => next(ring, at).is_some(),
             Self::Swap => false,
@@ -122,7 +126,9 @@ impl Mechanism for CorrectorEffect {
 
     fn expected(&self) -> &'static str {
         match self {
-            Self::Gain | Self::Roll | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => "a corrector",
+            Self::Gain | Self::Roll | Self::Polarity | Self::Dead | Self::Even | Self::Hysteresis | Self::Settling => {
+                "a corrector"
+            }
             Self::Crosstalk => "a corrector with another one in its plane",
             Self::Swap => "two correctors of one plane",
         }
@@ -131,7 +137,9 @@ impl Mechanism for CorrectorEffect {
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         let one = || Site::corrector(ring, name);
         match self {
-            Self::Gain | Self::Polarity | Self::Even | Self::Hysteresis | Self::Settling => one().map(Site::Corrector),
+            Self::Gain | Self::Polarity | Self::Dead | Self::Even | Self::Hysteresis | Self::Settling => {
+                one().map(Site::Corrector)
+            }
             Self::Roll => one().map(|at| Site::Corrector(rolled(ring, at))),
             Self::Crosstalk => one().filter(|&at| next(ring, at).is_some()).map(Site::Corrector),
             Self::Swap => {
@@ -154,7 +162,7 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Swap => return Err(self.misplaced(ring, site.name(ring))),
             Self::Roll => ring.elements[ring.correctors[corrector].element].misalignment.roll += amplitude,
-            Self::Gain | Self::Polarity | Self::Even => {
+            Self::Gain | Self::Polarity | Self::Dead | Self::Even => {
                 machine.correctors.push(Kick::Changed { how: *self, corrector, amplitude });
             }
             Self::Crosstalk => {
@@ -187,7 +195,7 @@ impl Mechanism for CorrectorEffect {
                     signature.readings.ger(1.0, &about.kick.column(at), &turned(about, at), 1.0);
                 }
             }
-            Self::Gain | Self::Polarity | Self::Even => {
+            Self::Gain | Self::Polarity | Self::Dead | Self::Even => {
                 let nominal = about.drives.nominal_kick;
                 let change = about.kick.column(corrector).map(|kick| self.change(kick, nominal));
                 signature.readings = change * about.response.column(corrector).transpose();
@@ -220,6 +228,7 @@ impl Mechanism for CorrectorEffect {
             }
             Self::Roll => format!("corrector {name} is rolled by {} mrad", amplitude.signed(1e3)),
             Self::Polarity => format!("corrector {name} has the wrong polarity"),
+            Self::Dead => format!("corrector {name} does not kick"),
             Self::Swap => format!("the cables of correctors {} are exchanged", site.names(ring).join(" and ")),
             Self::Even => {
                 let more = amplitude.by_sign("more", "less");

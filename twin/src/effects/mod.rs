@@ -86,10 +86,14 @@ kinds! {
     BpmCubic => Monitor(MonitorEffect::Cubic),
     /// A monitor's sign is reversed.
     BpmPolarity => Monitor(MonitorEffect::Polarity),
+    /// A monitor does not see the beam.
+    BpmDead => Monitor(MonitorEffect::Dead),
     /// Two monitors' names are exchanged.
     BpmSwap => Monitor(MonitorEffect::Swap),
     /// A corrector's sign is reversed.
     CorrectorPolarity => Corrector(CorrectorEffect::Polarity),
+    /// A corrector does not kick.
+    CorrectorDead => Corrector(CorrectorEffect::Dead),
     /// Two correctors' cables are exchanged.
     CorrectorSwap => Corrector(CorrectorEffect::Swap),
     /// A corrector's strength differs between its signs; cancels in the difference that a response is.
@@ -467,9 +471,11 @@ mod tests {
             ("quad_roll@D8=0.01", 0.0005, "quadrupole D8 is rolled by +10.00 ± 0.50 mrad"),
             ("bpm_cubic@x_A6=1e-3", 1e-4, "BPM x_A6 is not linear: +2.50 ± 0.25 % of the position at 5 mm"),
             ("bpm_polarity@x_E4", 0.0, "BPM x_E4 reads with the wrong sign"),
+            ("bpm_dead@x_E4", 0.0, "BPM x_E4 does not see the beam"),
             ("bpm_swap@x_E4,x_E6", 0.0, "BPMs x_E4 and x_E6 are exchanged"),
             ("corrector_swap@H_E4,H_E6", 0.0, "the cables of correctors H_E4 and H_E6 are exchanged"),
             ("corrector_polarity@H_A4", 0.0, "corrector H_A4 has the wrong polarity"),
+            ("corrector_dead@H_A4", 0.0, "corrector H_A4 does not kick"),
             ("corrector_even@H_A4=0.04", 0.01, "corrector H_A4 kicks 8.0 ± 2.0 % more at + than at -"),
             ("stray_gradient@SLOT_F6=0.02", 0.001, "there is a gradient K1L = +0.0200 ± 0.0010 /m at SLOT_F6"),
             ("stray_skew_gradient@F6=-0.02", 0.001, "there is a skew gradient K1sL = -0.0200 ± 0.0010 /m at SLOT_F6"),

@@ -1,6 +1,6 @@
-//! Errors of monitors: gain, roll, cubic term, reversed sign, exchanged names, a share of another monitor or of the frame before.
+//! Errors of monitors: gain, roll, cubic term, reversed sign, none of the beam, exchanged names, a share of another monitor or of the frame before.
 //!
-//! Of the first four the reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
+//! Of the first five the reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
 //! cycle is its value, a frame's is a difference of two values, the response its slope in the position, the signature its slope in
 //! the amplitude: the last two by dual numbers. The others are linear in the positions: a monitor with crosstalk reads `x + a x_next`,
 //! one that is late `(1 - a) x_k + a x_(k-1)` in frame k, and the signature is what `a` multiplies.
@@ -25,6 +25,8 @@ pub enum MonitorEffect {
     Cubic,
     /// Its sign is reversed.
     Polarity,
+    /// It does not see the beam.
+    Dead,
     /// Its name and another one's are exchanged.
     Swap,
     /// It reads a share of the next one of its plane as well, in the order of reading, the last one of the first.
@@ -49,6 +51,7 @@ impl MonitorEffect {
             Self::Gain => position * (amplitude + 1.0),
             Self::Cubic => position + amplitude * (position * 1e3).powi(2) * position,
             Self::Polarity => position * (amplitude * -2.0 + 1.0),
+            Self::Dead => position * (-amplitude + 1.0),
             Self::Roll | Self::Swap | Self::Crosstalk | Self::Timing => position,
         };
         match (self, plane) {
@@ -75,7 +78,9 @@ impl MonitorEffect {
     fn monitors(self, ring: &Ring, monitor: usize) -> Vec<usize> {
         match self {
             Self::Roll => of_element(ring, ring.monitors[monitor].element).collect(),
-            Self::Gain | Self::Cubic | Self::Polarity | Self::Swap | Self::Crosstalk | Self::Timing => vec![monitor],
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Swap | Self::Crosstalk | Self::Timing => {
+                vec![monitor]
+            }
         }
     }
 
@@ -84,6 +89,7 @@ impl MonitorEffect {
         match self {
             Self::Gain => 1.0 + amplitude,
             Self::Polarity => 1.0 - 2.0 * amplitude,
+            Self::Dead => 1.0 - amplitude,
             Self::Roll | Self::Cubic | Self::Swap | Self::Crosstalk | Self::Timing => 1.0,
         }
     }
@@ -96,6 +102,7 @@ impl Mechanism for MonitorEffect {
             Self::Roll => "bpm_roll",
             Self::Cubic => "bpm_cubic",
             Self::Polarity => "bpm_polarity",
+            Self::Dead => "bpm_dead",
             Self::Swap => "bpm_swap",
             Self::Crosstalk => "bpm_crosstalk",
             Self::Timing => "bpm_timing",
@@ -114,7 +121,7 @@ impl Mechanism for MonitorEffect {
             Self::Cubic => Some(1.5e-3),
             Self::Crosstalk => Some(0.05),
             Self::Timing => Some(0.2),
-            Self::Polarity | Self::Swap => None,
+            Self::Polarity | Self::Dead | Self::Swap => None,
         }
     }
 
@@ -123,14 +130,14 @@ impl Mechanism for MonitorEffect {
             Self::Gain | Self::Crosstalk | Self::Timing => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
             Self::Cubic => Unit::PER_SQUARE_MILLIMETRE,
-            Self::Polarity | Self::Swap => Unit::NONE,
+            Self::Polarity | Self::Dead | Self::Swap => Unit::NONE,
         }
     }
 
     fn sites(&self, ring: &Ring) -> Vec<Site> {
         let read = &ring.read_monitors;
         match self {
-            Self::Gain | Self::Cubic | Self::Polarity | Self::Timing => {
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => {
                 read.iter().map(|&at| Site::Monitor(at)).collect()
             }
             Self::Crosstalk => {
@@ -153,7 +160,7 @@ impl Mechanism for MonitorEffect {
 
     fn expected(&self) -> &'static str {
         match self {
-            Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Timing => "a monitor",
+            Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => "a monitor",
             Self::Crosstalk => "a monitor with another one in its plane",
             Self::Swap => "two monitors of one plane",
         }
@@ -161,7 +168,9 @@ impl Mechanism for MonitorEffect {
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         match self {
-            Self::Gain | Self::Cubic | Self::Polarity | Self::Timing => Site::monitor(ring, name).map(Site::Monitor),
+            Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => {
+                Site::monitor(ring, name).map(Site::Monitor)
+            }
             Self::Crosstalk => Site::monitor(ring, name).filter(|&at| next(ring, at).is_some()).map(Site::Monitor),
             Self::Roll => either_plane(ring, name).map(|at| Site::Monitor(rolled(ring, at))),
             Self::Swap => {
@@ -178,7 +187,7 @@ impl Mechanism for MonitorEffect {
             (Self::Swap, Site::MonitorPair(one, other)) => {
                 Reading::Exchanged { plane: ring.monitors[one].plane, monitors: [one, other] }
             }
-            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity, Site::Monitor(at)) => {
+            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead, Site::Monitor(at)) => {
                 Reading::Distorted { how: *self, monitors: self.monitors(ring, at), amplitude }
             }
             (Self::Crosstalk, Site::Monitor(monitor)) => {
@@ -208,7 +217,7 @@ impl Mechanism for MonitorEffect {
                 signature.readings.set_column(j, &-&difference);
                 signature.readings.set_column(i, &difference);
             }
-            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity, Site::Monitor(at)) => {
+            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead, Site::Monitor(at)) => {
                 let read =
                     self.monitors(ring, at).into_iter().filter_map(|monitor| Some((monitor, about.read(monitor)?)));
                 let read: Vec<(usize, usize)> = read.collect();
@@ -248,6 +257,7 @@ impl Mechanism for MonitorEffect {
                 format!("BPM {name} is not linear: {} % of the position at 5 mm", amplitude.signed(25.0 * 100.0))
             }
             Self::Polarity => format!("BPM {name} reads with the wrong sign"),
+            Self::Dead => format!("BPM {name} does not see the beam"),
             Self::Swap => format!("BPMs {} are exchanged", site.names(ring).join(" and ")),
             Self::Crosstalk => {
                 let Site::Monitor(at) = site else { unreachable!("it acts on monitors") };
