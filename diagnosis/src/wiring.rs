@@ -1,13 +1,14 @@
 //! Wiring and units, before any physics: whether the columns of a recording are what its header says.
 //!
 //! The measured response, least squares of each monitor's readings on all kicks and the RF offset, is compared with that of the
-//! design under each wiring `w`: planes exchanged, signs reversed, units or scales wrong, columns shifted. With `M_w` the measured
+//! design under each wiring `w`: planes exchanged, signs reversed, units or scales wrong, columns shifted, readings of another frame. With `M_w` the measured
 //! response as it would be if the columns were put right, in units of the design's rms response (each plane for itself),
 //!
 //! `d_w^2 = mean square of (M_w - R)`,   `ln L(w) = -(v + n)/2 ln(1 + n d_w^2/(v s^2)) - n ln(scale_w)`,
 //!
 //! a Student distribution: `s` is what the priors of the vars scatter the design's response by, known to a factor or so (`v` degrees of
-//! freedom), and `n` is the number of independent errors that a response can have, two of each instrument (beta function and phase). `R`
+//! freedom), and `n` is the number of independent errors that a response can have, two of each instrument (beta function and phase). Readings that
+//! are taken for those of another frame leave another residual `q`, noise unknown, so that `-N/2 ln(q_w/q)` is added for each monitor. `R`
 //! is the design at the tunes that suit the wiring best, and with what may be held, since a machine may be run in another way. A response with a single reversed or exchanged
 //! instrument resembles the design more than any other wiring: those are effects (`bpm_polarity`, `bpm_swap`, `corrector_polarity`).
 //!
@@ -39,6 +40,8 @@ const ROUNDS: i32 = 4;
 const USUAL: f64 = 0.15;
 /// Columns that a table may be shifted by.
 const SHIFTS: [isize; 6] = [1, -1, 2, -2, 3, -3];
+/// Frames by which the readings may lie behind the kicks: a counter that begins at the other end of the cycle.
+const LATE: [isize; 2] = [1, -1];
 /// Factors by which kicks or readings may be off: mm for m, mrad for rad.
 const UNITS: [f64; 2] = [1e3, 1e-3];
 /// Factors by which all kicks may be off: amplitude for peak to peak, one pole for two.
@@ -64,6 +67,8 @@ pub enum Fault {
     Scaled(f64),
     /// Each stands this many columns further right than its name, the last ones first.
     Shifted(isize),
+    /// Each row holds those of the frame this many before.
+    Late(isize),
 }
 
 /// A wrong wiring, and how likely it is.
@@ -106,6 +111,9 @@ struct Measured<'r> {
     ring: &'r Ring,
     /// As [`Designs`].
     response: DMatrix<f64>,
+    /// The same, were each row's readings those of the frame before, or of that after, and `ln` likelihood of the readings about it relative to that
+    /// about the stated one.
+    late: [(DMatrix<f64>, f64); 2],
     /// Variance of its noise.
     variance: DMatrix<f64>,
     /// Rms of the design's response of each plane [m/rad], and of its dispersive orbit in x [m].
@@ -151,6 +159,7 @@ fn wirings() -> Vec<(Columns, Fault)> {
     }
     all.extend(SCALES.map(|factor| (Columns::Kicks(None), Fault::Scaled(factor))));
     all.extend([Columns::Readings(None), Columns::Kicks(None)].map(|columns| (columns, Fault::Exchanged)));
+    all.extend(LATE.map(|by| (Columns::Readings(None), Fault::Late(by))));
     all
 }
 
@@ -263,49 +272,23 @@ impl<'r> Measured<'r> {
             kick.push(rf_offset).transpose()
         });
         let drive = DMatrix::from_rows(&rows.collect::<Vec<_>>());
-        let mut measured = Self {
-            ring,
-            response: DMatrix::zeros(design.nrows(), kicks + 1),
-            variance: DMatrix::zeros(design.nrows(), kicks + 1),
-            scale,
-            scatter: ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design),
+        let regressed = |by: isize| -> Vec<Regressed> {
+            (0..design.nrows()).map(|b| Regressed::of(recording, &drive, by, b, &prior(ring, scale, b))).collect()
         };
-        for b in 0..design.nrows() {
-            measured.regress(recording, b, &drive);
-        }
-        measured
+        let rows = |of: &[Regressed], row: fn(&Regressed) -> &DVector<f64>| {
+            DMatrix::from_columns(&of.iter().map(|one| row(one).clone()).collect::<Vec<_>>()).transpose()
+        };
+        let stated = regressed(0);
+        let late = LATE.map(|by| {
+            let late = regressed(by);
+            let log_likelihood = stated.iter().zip(&late).map(|(stated, late)| late.log_likelihood(stated)).sum();
+            (rows(&late, |one| &one.response), log_likelihood)
+        });
+        let response = rows(&stated, |one| &one.response);
+        let variance = rows(&stated, |one| &one.variance);
+        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design);
+        Self { ring, response, late, variance, scale, scatter }
     }
-
-    /// Least squares of a monitor's readings on what drove the beam, and a baseline, with the design's rms as the prior's width.
-    fn regress(&mut self, recording: &Recording, b: usize, drive: &DMatrix<f64>) {
-        let read = recording.rows.iter().enumerate().filter_map(|(i, row)| Some((i, row.reading[b]?)));
-        let (frames, readings): (Vec<usize>, Vec<f64>) = read.unzip();
-        let prior = DVector::from_fn(drive.ncols(), |c, _| self.unit(b, c));
-        if frames.is_empty() {
-            (0..drive.ncols()).for_each(|c| self.variance[(b, c)] = prior[c].powi(2));
-            return;
-        }
-        let mut columns = drive.select_rows(&frames);
-        columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
-        let noise = recording.header.noise[b];
-        columns.column_iter_mut().zip(prior.iter()).for_each(|(mut column, prior)| column *= prior / noise);
-        let readings = DVector::from_vec(readings) / noise;
-        let normal = columns.tr_mul(&columns) + DMatrix::identity(drive.ncols(), drive.ncols());
-        let factor = normal.cholesky().expect("at least 1 everywhere");
-        let found = factor.solve(&columns.tr_mul(&readings.add_scalar(-readings.mean())));
-        let covariance = factor.inverse();
-        for c in 0..drive.ncols() {
-            self.response[(b, c)] = found[c] * prior[c];
-            self.variance[(b, c)] = covariance[(c, c)] * prior[c].powi(2);
-        }
-    }
-
-    /// Rms of the design's response in the plane of a monitor, of a column.
-    fn unit(&self, b: usize, c: usize) -> f64 {
-        let plane = usize::from(b >= self.ring.horizontal_monitors());
-        if c == self.ring.correctors.len() { self.scale[2] } else { self.scale[plane] }
-    }
-
     /// Columns of the monitors and of the correctors that a wiring concerns.
     fn range(&self, columns: Columns) -> core::ops::Range<usize> {
         let (first, all, plane) = match columns {
@@ -319,10 +302,16 @@ impl<'r> Measured<'r> {
         }
     }
 
+    /// The response as it is with readings of another frame, and `ln` likelihood of these.
+    fn late(&self, fault: Fault) -> Option<&(DMatrix<f64>, f64)> {
+        LATE.iter().position(|by| fault == Fault::Late(*by)).map(|i| &self.late[i])
+    }
+
     /// The measured response with the columns put right, and `ln` of the change of its unit.
     fn put_right(&self, wiring: Option<(Columns, Fault)>) -> (DMatrix<f64>, f64) {
-        let mut response = self.response.clone();
-        let Some((columns, fault)) = wiring else { return (response, 0.0) };
+        let Some((columns, fault)) = wiring else { return (self.response.clone(), 0.0) };
+        let stated = self.late(fault).map_or(&self.response, |(late, _)| late);
+        let mut response = stated.clone();
         let range = self.range(columns);
         let of_readings = matches!(columns, Columns::Readings(_));
         let factor = match (fault, of_readings) {
@@ -342,7 +331,7 @@ impl<'r> Measured<'r> {
             for c in 0..response.ncols() {
                 let (row, column) = if of_readings { (from(b), c) } else { (b, from(c)) };
                 let concerned = range.contains(if of_readings { &b } else { &c });
-                response[(b, c)] = self.response[(row, column)] * if concerned { factor } else { 1.0 };
+                response[(b, c)] = stated[(row, column)] * if concerned { factor } else { 1.0 };
             }
         }
         let share = range.len() as f64 / if of_readings { response.nrows() } else { response.ncols() } as f64;
@@ -383,13 +372,14 @@ impl<'r> Measured<'r> {
     fn best(&self, designs: &Designs, wiring: Option<(Columns, Fault)>) -> Best {
         let (response, log_scale) = self.put_right(wiring);
         let n = 2.0 * (response.nrows() + response.ncols()) as f64;
+        let of_readings = wiring.and_then(|(_, fault)| self.late(fault)).map_or(0.0, |(_, of_readings)| *of_readings);
         let off: Vec<[f64; 2]> = designs.at.iter().map(|at| self.off(&response, Self::design(at, wiring))).collect();
         // the orbit in a plane is that of its own tune
         let pairs = (0..off.len()).flat_map(|x| (0..off.len()).map(move |y| [x, y]));
         let of = |at: [usize; 2]| {
             let spread = n * (off[at[0]][0] + off[at[1]][1]) / (FREEDOM * self.scatter);
             let prior: f64 = at.iter().map(|&i| designs.log_prior(i)).sum();
-            Best { log_likelihood: prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale, at }
+            Best { log_likelihood: prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale + of_readings, at }
         };
         let best = pairs.map(of).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
         best.expect("at least the design")
@@ -401,8 +391,9 @@ impl<'r> Measured<'r> {
         let (mut off, mut weights) = ([0.0; 2], 0.0);
         for b in 0..response.nrows() {
             let plane = usize::from(b >= self.ring.horizontal_monitors());
+            let unit = prior(self.ring, self.scale, b);
             for c in 0..response.ncols() {
-                let unit = self.unit(b, c).powi(2);
+                let unit = unit[c].powi(2);
                 // the prior's width is what an idle corrector leaves
                 let unknown = (self.variance[(b, c)] / unit).min(1.0);
                 let weight = (1.0 - unknown) / (1.0 - unknown + unknown / self.scatter);
@@ -431,6 +422,55 @@ impl<'r> Measured<'r> {
         let wiring = Some((columns, fault));
         let right = Self::design(&designs.at[0], wiring);
         [between(&self.response, designs.stated()), between(&self.put_right(wiring).0, right)]
+    }
+}
+
+/// Rms of the design's response in the plane of a monitor, of each column [m/rad], of the last [m].
+fn prior(ring: &Ring, scale: [f64; 3], b: usize) -> DVector<f64> {
+    let plane = usize::from(b >= ring.horizontal_monitors());
+    DVector::from_element(ring.correctors.len(), scale[plane]).push(scale[2])
+}
+
+/// What a monitor's readings say of the response.
+struct Regressed {
+    response: DVector<f64>,
+    variance: DVector<f64>,
+    /// Number of readings, and the square of what is left of them, in units of the noise.
+    readings: f64,
+    left: f64,
+}
+
+impl Regressed {
+    /// Least squares on what drove the beam in the frame so many before, and a baseline, with the prior's widths.
+    fn of(recording: &Recording, drive: &DMatrix<f64>, by: isize, b: usize, prior: &DVector<f64>) -> Self {
+        let frame = |i: usize| i.checked_add_signed(-by).filter(|frame| *frame < drive.nrows());
+        let read = recording.rows.iter().enumerate().filter_map(|(i, row)| Some((frame(i)?, row.reading[b]?)));
+        let (frames, readings): (Vec<usize>, Vec<f64>) = read.unzip();
+        let square = prior.component_mul(prior);
+        if frames.is_empty() {
+            return Self { response: DVector::zeros(prior.len()), variance: square, readings: 0.0, left: 0.0 };
+        }
+        let mut columns = drive.select_rows(&frames);
+        columns.column_iter_mut().for_each(|mut column| column.add_scalar_mut(-column.mean()));
+        let noise = recording.header.noise[b];
+        columns.column_iter_mut().zip(prior.iter()).for_each(|(mut column, prior)| column *= prior / noise);
+        let readings = DVector::from_vec(readings) / noise;
+        let readings = readings.add_scalar(-readings.mean());
+        let normal = columns.tr_mul(&columns) + DMatrix::identity(drive.ncols(), drive.ncols());
+        let factor = normal.cholesky().expect("at least 1 everywhere");
+        let found = factor.solve(&columns.tr_mul(&readings));
+        Self {
+            response: found.component_mul(prior),
+            variance: factor.inverse().diagonal().component_mul(&square),
+            readings: readings.len() as f64,
+            left: (&readings - columns * found).norm_squared(),
+        }
+    }
+
+    /// `ln` likelihood relative to that of others, the noise unknown.
+    fn log_likelihood(&self, other: &Self) -> f64 {
+        let mean = |one: &Self| one.left.max(f64::MIN_POSITIVE) / one.readings.max(1.0);
+        -0.5 * self.readings.min(other.readings) * (mean(self) / mean(other)).ln()
     }
 }
 
@@ -496,6 +536,10 @@ impl fmt::Display for Wiring {
                 write!(f, "{what} look {} times too small: multiply {factors} by it", 1.0 / factor)
             }
             Fault::Scaled(factor) => write!(f, "{what} look {factor} times too large: divide {factors} by it"),
+            Fault::Late(by) => {
+                let other = if by > 0 { "before" } else { "after" };
+                write!(f, "{what} look like those of the frame {other}: move {names} by one row against the others")
+            }
             Fault::Shifted(by) => {
                 let way = if by > 0 { "right" } else { "left" };
                 write!(
@@ -592,7 +636,15 @@ mod tests {
                 (kicks(&|all| all.rotate_right(1)), Kicks(None), Fault::Shifted(1)),
                 (kicks(&|all| all[..horizontal].rotate_left(1)), Kicks(x), Fault::Shifted(-1)),
             ];
-            for (recording, columns, fault) in cases {
+            let moved = |by: isize| {
+                let mut moved = recording.clone();
+                for (row, from) in moved.rows.iter_mut().zip((0_isize..).map(|i| i - by)) {
+                    let own = usize::try_from(from).ok().and_then(|from| recording.rows.get(from));
+                    row.reading = own.map_or_else(|| vec![None; ring.read_monitors.len()], |own| own.reading.clone());
+                }
+                (moved, Readings(None), Fault::Late(by))
+            };
+            for (recording, columns, fault) in cases.into_iter().chain([moved(1), moved(-1)]) {
                 let found = judge(&ring, &recording).unwrap_or_else(|| panic!("{name}: {columns:?} {fault:?} missed"));
                 let is_it = |one: &Wiring| one.columns == columns && one.fault == fault;
                 assert!(found.wirings().iter().any(is_it), "{name}: {columns:?} {fault:?}: {found}");
