@@ -52,6 +52,8 @@ pub struct Family {
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
 const STANDS_OUT: f64 = 2.3;
+/// Gain error below which an instrument is nearer to one that is dead than to a sound one.
+const FAILS: f64 = -0.5;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
 /// Share of the full width that dipoles which hide something have beside straights that do. Beside one such dipole the NEES per var is 2.1 with none, 1.2 with 0.4; but
@@ -284,29 +286,30 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Vec<Family> {
 }
 
 /// The member of each learnt family that stands out most of it: it may have made the family as wide as it is, and then hide in it. An instrument
-/// whose gain does may be reversed or dead, which a gain of -2 or -1 in a wide family hides as well.
+/// whose gain is nearer to none than to 1 may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
-    let members: Vec<(Term, f64)> = (unknowns.iter())
+    // the amplitude of each member in widths of its family, and in its unit
+    let members: Vec<(Term, f64, f64)> = (unknowns.iter())
         .zip(fitted.u.iter().skip(fitted.params.len()))
         .filter_map(|(unknown, u)| match unknown {
-            Unknown::Ordinary(member, _) if member.terms.len() == 1 => Some((member.terms[0], u.abs())),
+            Unknown::Ordinary(member, width) if member.terms.len() == 1 => Some((member.terms[0], u.abs(), u * width)),
             _ => None,
         })
         .collect();
     let most = |family: &Family| {
-        let own = members.iter().filter(|(term, u)| term.kind == family.kind && *u > STANDS_OUT);
-        own.max_by(|(_, one), (_, other)| one.total_cmp(other)).map(|(term, _)| *term)
+        let own = members.iter().filter(|(term, u, _)| term.kind == family.kind && *u > STANDS_OUT);
+        own.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
-    stands_out.flat_map(|term| iter::once(term).chain(failures(term))).collect()
+    stands_out.flat_map(|(term, _, amplitude)| iter::once(*term).chain(failures(*term, *amplitude))).collect()
 }
 
-/// The instrument of a gain reversed, and dead.
-fn failures(gain: Term) -> impl Iterator<Item = Term> {
+/// The instrument of a gain dead, and reversed, where that is nearer than a sound one.
+fn failures(gain: Term, amplitude: f64) -> impl Iterator<Item = Term> {
     let kinds: &[EffectKind] = match gain.kind {
-        EffectKind::BpmGain => &[EffectKind::BpmPolarity, EffectKind::BpmDead],
-        EffectKind::CorrectorGain => &[EffectKind::CorrectorPolarity, EffectKind::CorrectorDead],
+        EffectKind::BpmGain if amplitude < FAILS => &[EffectKind::BpmDead, EffectKind::BpmPolarity],
+        EffectKind::CorrectorGain if amplitude < FAILS => &[EffectKind::CorrectorDead, EffectKind::CorrectorPolarity],
         _ => &[],
     };
     kinds.iter().map(move |&kind| Term { kind, ..gain })
