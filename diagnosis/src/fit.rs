@@ -166,7 +166,8 @@ impl Fitted {
         let within = Within::of(&factor, &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let of_widths: f64 = problem.hypothesis.ordinary.iter().map(Family::log_prior).sum();
-        let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + of_widths;
+        let log_prior = of_widths + problem.hypothesis.log_prior();
+        let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
         let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
         Ok(Self {

@@ -20,6 +20,8 @@ pub struct Term {
 pub struct Hypothesis {
     /// Effects that count as findings.
     pub terms: Vec<Term>,
+    /// Those of them that are gross, whose amplitudes have a wider prior.
+    pub gross: Vec<Term>,
     /// Something that the library does not hold.
     pub element: Option<Element>,
     /// Ordinary imperfections.
@@ -27,6 +29,11 @@ pub struct Hypothesis {
     /// Effects of known amplitude.
     pub given: Vec<Effect>,
 }
+
+/// Prior probability that an effect is gross, an attenuator of 6 dB that was left in, half of a coil that is shorted, and the width of its prior over that of
+/// others: a gain is then off by 40 %.
+const GROSS: f64 = 0.1;
+const WIDER: f64 = 5.0;
 
 /// One unknown besides the vars, with its prior standard deviation.
 #[derive(Debug, Clone, PartialEq)]
@@ -147,17 +154,33 @@ impl Hypothesis {
         more
     }
 
+    /// The same with one of its effects gross.
+    pub fn with_gross(&self, index: usize) -> Self {
+        let mut gross = self.clone();
+        gross.gross.push(self.terms[index]);
+        gross
+    }
+
     /// Without one.
     pub fn without(&self, index: usize) -> Self {
-        let mut less = self.clone();
-        less.terms.remove(index);
-        less
+        let term = self.terms[index];
+        self.without_terms(|one| *one == term)
+    }
+
+    /// `ln` prior of its effects that are gross, relative to that of others.
+    pub fn log_prior(&self) -> f64 {
+        self.gross.len() as f64 * GROSS.ln()
+    }
+
+    /// Prior standard deviation of a term's amplitude; none for a switch.
+    fn scale(&self, term: &Term) -> Option<f64> {
+        term.kind.prior_scale().map(|scale| scale * if self.gross.contains(term) { WIDER } else { 1.0 })
     }
 
     /// The unknowns besides the vars.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
         let of_term = |(i, term): (usize, &Term)| {
-            let amplitude = term.kind.prior_scale().map(|scale| Unknown::Amplitude(i, scale));
+            let amplitude = self.scale(term).map(|scale| Unknown::Amplitude(i, scale));
             let seen = term.kind.orbit(&data.ring, term.site);
             let orbit = data.campaigns().enumerate().flat_map(|(campaign, own)| {
                 seen.iter().map(move |&(element, plane)| {
@@ -179,6 +202,7 @@ impl Hypothesis {
     pub fn without_terms(&self, is_one: impl Fn(&Term) -> bool) -> Self {
         let mut less = self.clone();
         less.terms.retain(|term| !is_one(term));
+        less.gross.retain(|term| !is_one(term));
         less
     }
 

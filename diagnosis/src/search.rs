@@ -521,7 +521,18 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
         return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
     };
-    Alternative::exact(data, fitted, refitted, last)
+    Alternative::exact(data, fitted, gross(data, refitted, last), last)
+}
+
+/// The same fit, or with one of its effects gross where that is the better.
+fn gross(data: &Data, fitted: Fitted, term: usize) -> Fitted {
+    let stands_out = |(at, _): (usize, f64)| fitted.u[at].abs() > ordinary::STANDS_OUT;
+    if !fitted.unknown(data, term).is_some_and(stands_out) {
+        return fitted;
+    }
+    let hypothesis = fitted.hypothesis.with_gross(term);
+    let again = Fitted::of(data, &hypothesis, &fitted.guess(data, &hypothesis)).ok();
+    again.filter(|again| again.log_evidence > fitted.log_evidence && again.is_stable(data)).unwrap_or(fitted)
 }
 
 /// Refit the best of some weighted candidates, and those that stand out of their family, with the ordinary widths that the recording shows
