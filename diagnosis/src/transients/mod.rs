@@ -77,8 +77,10 @@ const LEADERS: usize = 4;
 /// Steps of such a fit, and the step of its derivative.
 const STEPS: usize = 5;
 const DIFFERENCE: f64 = 1e-3;
-/// Largest share that anything keeps.
+/// Largest share that a corrector keeps: with 1 it would never move.
 const LARGEST: f64 = 0.95;
+/// Largest share of the frame before that a monitor reads: 1 where it is late by a whole frame, and somewhat more where the fit does not know the size well.
+const LATEST: f64 = 1.25;
 /// Standard deviations of a share of the former orbit that are tried.
 const SHARES: [f64; 4] = [0.01, 0.03, 0.1, 0.3];
 /// Median of a normal number's square.
@@ -310,6 +312,7 @@ impl<'c> Within<'c> {
     fn fit(&self, at: usize) -> Fit {
         let term = self.terms[at];
         let (readings, width) = (&self.readings, width(term));
+        let largest = if term.kind.is_of_a_corrector() { LARGEST } else { LATEST };
         let mut amplitude = 0.0_f64;
         let mut signal = DMatrix::zeros(readings.nrows(), readings.ncols());
         for _ in 0..STEPS {
@@ -318,7 +321,7 @@ impl<'c> Within<'c> {
             let left = self.differences.whiten(&(readings - signals.of_effect(term, amplitude)));
             let information = slope.norm_squared() + width.powi(-2);
             amplitude += (slope.dot(&left) - amplitude / width.powi(2)) / information;
-            amplitude = amplitude.clamp(-LARGEST, LARGEST);
+            amplitude = amplitude.clamp(-largest, largest);
             signal = signals.of_effect(term, amplitude);
         }
         let without = readings - &signal;
