@@ -83,7 +83,7 @@ impl Verdict {
     /// From the competition of each effect, and how it stood its tests.
     pub fn of(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
-        if next.unknown() > SUSPICIOUS {
+        if next.unknown() > SUSPICIOUS || found.best.is_gross() {
             return Self::Unexplained;
         }
         if found.competitions.is_empty() {
@@ -430,12 +430,17 @@ pub fn sentence(
         }
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => {
-            let last = findings.last().map_or_else(String::new, undescribed);
+            let last = findings.len() - usize::from(findings.last().is_some_and(|f| f.term().is_none()));
             // what is less than certain stands in the table, with its probability
-            let named = findings.iter().take(findings.len().saturating_sub(1)).filter(|f| f.probability >= DECISIVE);
+            let named = findings[..last].iter().filter(|f| f.probability >= DECISIVE);
             let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
             let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
-            format!("{named}{last}")
+            let undescribed = findings[last..].iter().map(undescribed);
+            let poor = found.best.is_gross().then(|| {
+                let chi2 = found.best.residual.norm_squared() / found.best.residual.len() as f64;
+                format!("the model does not describe the readings, chi2 of each is {chi2:.1}")
+            });
+            format!("{named}{}", undescribed.chain(poor).collect::<Vec<_>>().join("; "))
         }
     };
     let contradicted = contradictions.iter().map(|one| within(data, &one.recording, one.to_string()));

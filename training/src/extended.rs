@@ -84,7 +84,8 @@ impl Form {
             | EffectKind::BpmCrosstalk
             | EffectKind::CorrectorCrosstalk
             | EffectKind::FixedRfFrequency
-            | EffectKind::RadialLoop => Self::Term,
+            | EffectKind::RadialLoop
+            | EffectKind::RfStep => Self::Term,
             EffectKind::BpmCubic
             | EffectKind::CorrectorEven
             | EffectKind::CorrectorHysteresis

@@ -152,8 +152,9 @@ fn signatures_hold_about_a_machine_with_effects() {
     let held = |kind: EffectKind| matches!(kind.class(), Class::Hold(_));
     assert(&about("momentum_offset=0.002"), &held, 5e-5);
     // where not the momentum is held, but for the curvature of a field, which is taken at constant momentum
-    // what is held beside it is held already: of a full loop nothing is left
-    let holds = |kind: EffectKind| matches!(kind, EffectKind::FixedRfFrequency | EffectKind::RadialLoop);
+    // what is held beside it is held already: a full loop leaves nothing, of a step of the RF frequency neither
+    let held = [EffectKind::FixedRfFrequency, EffectKind::RadialLoop, EffectKind::RfStep];
+    let holds = |kind: EffectKind| held.contains(&kind);
     let is_curved = |kind: EffectKind| {
         matches!(kind, EffectKind::SextupoleError | EffectKind::DipoleSextupole | EffectKind::StrayOctupole)
     };

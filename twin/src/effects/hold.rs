@@ -6,7 +6,7 @@
 //!
 //! `R - D m`, `m = a (R_i + R_j)/(D_i + D_j)` the momentum that brings the mean back.
 //!
-//! A loop also takes back its share of a step of the RF frequency, which moves the orbit by `-D/eta`: `1 - a` of it is left. A loop that the
+//! A step of the RF frequency moves the orbit by `-D/eta`; one that is larger than recorded by a share `a` by `1 + a` of that. A loop also takes back its share of it: `1 - a` is left. A loop that the
 //! operators have on they open for such a step, since they could not measure the dispersion otherwise.
 //!
 //! Exact orbits close at the share of the way to the momentum that exactly holds the frequency, or the mean of the pair; the derivative is a difference of two machines.
@@ -30,6 +30,8 @@ pub enum HoldEffect {
     Frequency,
     /// The mean of two horizontal monitors is held instead of the momentum, as a fraction.
     RadialLoop,
+    /// Steps of the RF frequency are larger than recorded by a fraction: -1 if none is made, -2 if their sign is wrong.
+    Steps,
 }
 
 /// What the RF system holds.
@@ -49,6 +51,8 @@ pub struct Holding {
     /// Share of the response at fixed RF frequency.
     frequency_share: f64,
     radial_loop: Option<RadialLoop>,
+    /// Fraction by which steps of the RF frequency are larger than recorded.
+    more_of_steps: f64,
 }
 
 /// A loop that holds the mean of two monitors.
@@ -90,7 +94,7 @@ impl Holding {
 
     /// Share of a step of the RF frequency that reaches the beam.
     fn share_of_rf_steps(&self) -> f64 {
-        1.0 - self.radial_loop.map_or(0.0, |one| one.of_rf_steps)
+        (1.0 + self.more_of_steps) * (1.0 - self.radial_loop.map_or(0.0, |one| one.of_rf_steps))
     }
 }
 
@@ -100,43 +104,45 @@ impl Mechanism for HoldEffect {
             Self::Momentum => "momentum_offset",
             Self::Frequency => "fixed_rf_frequency",
             Self::RadialLoop => "radial_loop",
+            Self::Steps => "rf_step",
         }
     }
 
     /// A radial position is known to some mm at a dispersion of 2 m. A loop holds all of its error, or with a gain of 1 to 10 a share of
-    /// 0.5 to 0.9: as a normal of width 0.5 these are one to two standard deviations.
+    /// 0.5 to 0.9: as a normal of width 0.5 these are one to two standard deviations. Steps are typed in, or read off a meter, to some per cent.
     fn prior_scale(&self) -> Option<f64> {
         match self {
             Self::Momentum => Some(3e-3),
             Self::Frequency | Self::RadialLoop => Some(0.5),
+            Self::Steps => Some(0.1),
         }
     }
 
     fn unit(&self) -> Unit {
         match self {
             Self::Momentum => Unit::PER_MILLE,
-            Self::Frequency | Self::RadialLoop => Unit::PERCENT,
+            Self::Frequency | Self::RadialLoop | Self::Steps => Unit::PERCENT,
         }
     }
 
     /// A radial loop holds monitors that only the recording's header knows.
     fn sites(&self, _ring: &Ring) -> Vec<Site> {
         match self {
-            Self::Momentum | Self::Frequency => vec![Site::Ring],
+            Self::Momentum | Self::Frequency | Self::Steps => vec![Site::Ring],
             Self::RadialLoop => Vec::new(),
         }
     }
 
     fn expected(&self) -> &'static str {
         match self {
-            Self::Momentum | Self::Frequency => "no place",
+            Self::Momentum | Self::Frequency | Self::Steps => "no place",
             Self::RadialLoop => "two horizontal monitors",
         }
     }
 
     fn site(&self, ring: &Ring, name: &str) -> Option<Site> {
         match self {
-            Self::Momentum | Self::Frequency => name.is_empty().then_some(Site::Ring),
+            Self::Momentum | Self::Frequency | Self::Steps => name.is_empty().then_some(Site::Ring),
             Self::RadialLoop => {
                 let [one, other] = Site::monitors(ring, name)?;
                 is_horizontal(ring, [one, other]).then(|| Site::pair(one, other))
@@ -149,6 +155,7 @@ impl Mechanism for HoldEffect {
         match (self, site) {
             (Self::Momentum, Site::Ring) => hold.delta += amplitude,
             (Self::Frequency, Site::Ring) => hold.frequency_share += amplitude,
+            (Self::Steps, Site::Ring) => hold.more_of_steps += amplitude,
             (Self::RadialLoop, _) => {
                 let pair = pair_of(ring, site)?;
                 let known = hold.radial_loop.filter(|one| one.pair == pair);
@@ -173,6 +180,10 @@ impl Mechanism for HoldEffect {
                     "a radial loop held the mean of {pair} instead of the momentum, by {} %",
                     amplitude.signed(100.0)
                 )
+            }
+            Self::Steps => {
+                let whole = Measured { value: 1.0 + amplitude.value, ..amplitude };
+                format!("the RF frequency was stepped by {} times what is recorded", whole.signed(1.0))
             }
         }
     }
@@ -294,12 +305,12 @@ impl Closing {
     /// The orbit on which the beam runs in a ring that kicks have changed; a step of the RF frequency sets the momentum, of which a loop takes
     /// back its share.
     pub fn orbit(&self, ring: &Ring, rf_offset: f64) -> Result<ClosedOrbit, OrbitError> {
-        let Holding { delta, frequency_share, radial_loop } = self.holding;
+        let Holding { delta, frequency_share, radial_loop, more_of_steps } = self.holding;
         let at = |hold: Hold| ClosedOrbit::near(ring, hold, &self.plain);
         let at_frequency = |offset: f64| at(Hold::Frequency { offset: self.frequency + offset });
         let at_momentum = |delta: f64| at(Hold::Momentum { delta });
         let orbit = if rf_offset != 0.0 {
-            at_frequency(rf_offset)?
+            at_frequency((1.0 + more_of_steps) * rf_offset)?
         } else if frequency_share != 0.0 {
             let full = at_frequency(0.0)?.at[0][DELTA];
             at_momentum(delta + frequency_share * (full - delta))?
@@ -376,6 +387,16 @@ mod tests {
         let held = mean_of_pair(Rf::FixedMomentum, &[effect(PAIR)], 1e-3, 0.0);
         // one step along the dispersion alone leaves its second order
         assert!(free.abs() > 5e-3 && held.abs() < HELD * free.abs(), "{free:e} {held:e}");
+    }
+
+    #[test]
+    fn a_step_that_is_not_made_moves_nothing_and_one_of_the_wrong_sign_moves_back() {
+        let at = |more: f64| {
+            let effect = Effect { amplitude: more, ..effect("rf_step") };
+            mean_of_pair(Rf::FixedMomentum, &[effect], 0.0, 2e-4)
+        };
+        assert!(at(-1.0).abs() < ROUNDING && (at(1.0) / at(0.0) - 2.0).abs() < 0.02, "second order of the momentum");
+        assert!((at(-2.0) / at(0.0) + 1.0).abs() < 0.02, "second order of the momentum");
     }
 
     #[test]

@@ -118,6 +118,8 @@ kinds! {
     FixedRfFrequency => Hold(HoldEffect::Frequency),
     /// The mean of two monitors is held instead of the momentum, as a fraction; `@x_D8,x_E6`.
     RadialLoop => Hold(HoldEffect::RadialLoop),
+    /// Steps of the RF frequency are larger than recorded, as a fraction.
+    RfStep => Hold(HoldEffect::Steps),
     /// A monitor reads this share of the next one of its plane as well.
     BpmCrosstalk => Monitor(MonitorEffect::Crosstalk),
     /// This share of a corrector's kick goes to the next one of its plane as well.
@@ -492,6 +494,7 @@ mod tests {
                 0.01,
                 "a radial loop held the mean of x_D8 and x_E6 instead of the momentum, by +80.0 ± 1.0 %",
             ),
+            ("rf_step=-0.05", 0.01, "the RF frequency was stepped by +0.950 ± 0.010 times what is recorded"),
             ("bpm_crosstalk@x_F8=-0.05", 0.01, "BPM x_F8 reads -5.0 ± 1.0 % of x_A6 as well"),
             ("corrector_crosstalk@H_A2=0.05", 0.01, "+5.0 ± 1.0 % of the kick of corrector H_A2 goes to H_A4 as well"),
             (
