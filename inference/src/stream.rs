@@ -336,7 +336,8 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
     for (to, &from) in frame.magnets.supply.iter_mut().zip(&row.supply) {
         *to = current(from)?;
     }
-    for (b, (to, from)) in frame.reading.iter_mut().zip(&row.reading).enumerate() {
+    let read = if row.is_without_beam() { &[] } else { row.reading.as_slice() };
+    for (b, (to, from)) in frame.reading.iter_mut().zip(read).enumerate() {
         if let Some(position) = *from {
             *to = PositionCode::nearest(position).ok_or_else(|| beyond("reading", position))?;
             frame.valid.put(b, true);

@@ -109,7 +109,7 @@ impl Campaign {
             times: &times,
             settings: &settings,
             groups: Groups::of(&drives, &times, &settings),
-            readings: &readings,
+            readings: &of_beam(recording, &readings),
             noise: &recording.header.noise,
             sharing: &drive::sharing(&drives),
             // each of two opposite offsets is given one of its own
@@ -246,6 +246,14 @@ fn readings(recording: &Recording) -> DMatrix<f64> {
     let rows = &recording.rows;
     let monitors = rows.first().map_or(0, |row| row.reading.len());
     DMatrix::from_fn(rows.len(), monitors, |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
+}
+
+/// The same without those of frames that had no beam.
+fn of_beam(recording: &Recording, readings: &DMatrix<f64>) -> DMatrix<f64> {
+    let mut readings = readings.clone();
+    let lost = recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam());
+    lost.for_each(|(i, _)| readings.row_mut(i).fill(f64::NAN));
+    readings
 }
 
 fn tunes(recording: &Recording) -> DMatrix<f64> {

@@ -47,7 +47,19 @@ impl Row {
     pub fn setting(&self, corrector: usize) -> Option<f64> {
         self.correctors.iter().find(|(c, _)| *c == corrector).map(|(_, setting)| *setting)
     }
+
+    /// True where nearly all monitors read one and the same number, as their electronics do without a beam: readings of a beam differ.
+    pub fn is_without_beam(&self) -> bool {
+        let mut read: Vec<u64> = self.reading.iter().flatten().map(|position| position.to_bits()).collect();
+        read.sort_unstable();
+        let most = read.chunk_by(|one, other| one == other).map(<[u64]>::len).max().unwrap_or(0);
+        most >= FEWEST && most as f64 > NEARLY * read.len() as f64
+    }
 }
+
+/// Share of a frame's readings, and their number at least, that are alike without a beam: some monitors are stuck at another number.
+const NEARLY: f64 = 0.8;
+const FEWEST: usize = 4;
 
 /// All rows, and the columns of other currents.
 pub(super) fn parse(

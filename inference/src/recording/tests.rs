@@ -88,6 +88,20 @@ fn example_of_the_document_reads_in_si_units() {
     assert_eq!(row.tune, [Some(0.80674), None]);
 }
 
+/// Zeros and other numbers that mean nothing, one monitor stuck elsewhere; not so few monitors that may agree by chance.
+#[test]
+fn a_frame_whose_monitors_read_one_number_has_no_beam() {
+    let toy = read(block("toml").as_bytes(), block("csv").as_bytes()).expect("the example is right");
+    let with = |reading: &[f64]| Row { reading: reading.iter().map(|x| Some(*x)).collect(), ..toy.rows[0].clone() };
+    assert!(with(&[0.0; 15]).is_without_beam() && with(&[-99.9e-3; 4]).is_without_beam());
+    let mut stuck = [0.0; 15];
+    stuck[3] = 1.2e-3;
+    assert!(with(&stuck).is_without_beam());
+    assert!(!with(&[0.0; 3]).is_without_beam() && !with(&[]).is_without_beam());
+    assert!(!with(&[1e-3, 1e-3, 2e-3, -1e-3, 1e-3]).is_without_beam());
+    assert!(toy.rows.iter().all(|row| !row.is_without_beam()));
+}
+
 #[test]
 fn example_errors_of_the_document_are_verbatim() {
     let errors = [
