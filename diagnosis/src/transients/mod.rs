@@ -418,7 +418,8 @@ fn steady(campaign: &Campaign) -> DMatrix<f64> {
         let means = run_means(&of_kicks, &campaign.settings.of_frame);
         Ok(of_kicks - means + of_supplies.columns(0, campaign.monitors()))
     };
-    moved().map_or_else(|_| campaign.readings.clone(), |moved| &campaign.readings - moved)
+    let readings = campaign.readings_of_beam();
+    moved().map_or_else(|_| readings.clone(), |moved| &readings - moved)
 }
 
 /// Variance of whitened readings along the former orbits, where the frame after takes the place of each: 1 for white noise, more where monitors share

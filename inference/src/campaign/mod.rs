@@ -151,6 +151,11 @@ impl Campaign {
         Ok(campaign)
     }
 
+    /// The readings without those of frames that had no beam, rows frames, columns monitors [m].
+    pub fn readings_of_beam(&self) -> DMatrix<f64> {
+        of_beam(&self.recording, &self.readings)
+    }
+
     /// Number of frames.
     pub fn frames(&self) -> usize {
         self.drives.len()
@@ -248,7 +253,7 @@ fn readings(recording: &Recording) -> DMatrix<f64> {
     DMatrix::from_fn(rows.len(), monitors, |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
 }
 
-/// The same without those of frames that had no beam.
+/// Readings without those of frames that had no beam.
 fn of_beam(recording: &Recording, readings: &DMatrix<f64>) -> DMatrix<f64> {
     let mut readings = readings.clone();
     let lost = recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam());
