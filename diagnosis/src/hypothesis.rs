@@ -30,8 +30,8 @@ pub struct Hypothesis {
     pub given: Vec<Effect>,
 }
 
-/// Prior probability that an effect is gross, an attenuator of 6 dB that was left in, half of a coil that is shorted, and the width of its prior over that of
-/// others: a gain is then off by 40 %.
+/// Prior probability that an effect of an instrument is gross, an attenuator of 6 dB that was left in, half of a coil that is shorted, and the width of its
+/// prior over that of others: a gain is then off by 40 %.
 const GROSS: f64 = 0.1;
 const WIDER: f64 = 5.0;
 
@@ -154,11 +154,16 @@ impl Hypothesis {
         more
     }
 
-    /// The same with one of its effects gross.
-    pub fn with_gross(&self, index: usize) -> Self {
-        let mut gross = self.clone();
-        gross.gross.push(self.terms[index]);
-        gross
+    /// The same with one of its effects gross; none for a field, which iron and alignment bound.
+    pub fn with_gross(&self, index: usize) -> Option<Self> {
+        let term = self.terms[index];
+        let kind = term.kind;
+        let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector() || kind == EffectKind::RfStep;
+        is_of_an_instrument.then(|| {
+            let mut gross = self.clone();
+            gross.gross.push(term);
+            gross
+        })
     }
 
     /// Without one.

@@ -550,7 +550,7 @@ fn gross(data: &Data, fitted: Fitted, term: usize) -> Fitted {
         return fitted;
     }
     let hypothesis = fitted.hypothesis.with_gross(term);
-    let again = Fitted::of(data, &hypothesis, &fitted.guess(data, &hypothesis)).ok();
+    let again = hypothesis.and_then(|gross| Fitted::of(data, &gross, &fitted.guess(data, &gross)).ok());
     again.filter(|again| again.log_evidence > fitted.log_evidence && again.is_stable(data)).unwrap_or(fitted)
 }
 
