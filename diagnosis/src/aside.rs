@@ -67,10 +67,15 @@ mod tests {
         let other = broken.rows[120].reading.clone();
         broken.rows[30].reading = other;
         broken.rows[90].reading.iter_mut().enumerate().for_each(|(b, r)| *r = r.map(|_| 1e-3 * (b as f64 - 16.0)));
+        // without a beam the electronics read zero
+        broken.rows[200].reading.iter_mut().for_each(|r| *r = r.map(|_| 0.0));
         // what was not read is not put aside
         broken.rows[150].reading.fill(None);
         let told = Aside::all(&data(&broken));
         assert_eq!(told.len(), 1);
-        assert_eq!(told[0].to_string(), "in frames 30, 90 many readings are not those of the setting, and left out");
+        assert_eq!(
+            told[0].to_string(),
+            "in frames 30, 90, 200 many readings are not those of the setting, and left out"
+        );
     }
 }

@@ -218,8 +218,7 @@ impl Search {
     fn about_effects(&self, found: &Found, mut data: Data, best: Fitted) -> Result<Found, FitError> {
         data.is_about_effects = true;
         let null = null_beside(&data, found.null.clone(), &found.data);
-        let each = 0..best.hypothesis.terms.len();
-        let competitions = each.map(|i| self.without(&data, &best, i)).collect::<Result<_, _>>()?;
+        let (best, competitions) = self.compete(&data, best, None)?;
         let next = self.one_more(&data, &best)?;
         Ok(Found { data, null, best, competitions, next })
     }

@@ -718,7 +718,7 @@ pub struct Validate {
     #[arg(long, value_name = "N", default_value_t = 300)]
     pub empty: usize,
     /// Campaigns with one effect of the library
-    #[arg(long, value_name = "N", default_value_t = 250)]
+    #[arg(long, value_name = "N", default_value_t = 280)]
     pub single: usize,
     /// Campaigns with two
     #[arg(long, value_name = "N", default_value_t = 48)]

@@ -128,7 +128,7 @@ fn leaks_and_memories_are_named_and_so_are_plain_faults() {
     }
 }
 
-/// Instruments that fail, or nearly so: far beyond the priors of gains, and in recordings whose first fit is poor.
+/// Instruments that fail, or nearly so, and RF steps that are not made: far beyond the usual sizes, and in recordings whose first fit is poor.
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn gross_faults_are_named_at_their_size() {
@@ -139,9 +139,26 @@ fn gross_faults_are_named_at_their_size() {
         (74, "bpm_dead@y_A1"),
         (75, "corrector_dead@V_D3"),
         (76, "corrector_dead@H_A4"),
+        (77, "rf_step=-1"),
+        (78, "rf_step=-2"),
     ] {
         assert_named(text, seed);
     }
+}
+
+/// Three monitors whose columns went round, and a fourth that reads tenfold: no effect or unknown cause is all of that.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_recording_that_the_model_does_not_describe_is_unexplained() {
+    let mut recording = simulated(&[], 79);
+    for row in &mut recording.rows {
+        row.reading[8..11].rotate_left(1);
+        row.reading[20] = row.reading[20].map(|position| 10.0 * position);
+    }
+    let diagnosis = Diagnosis::of(&Ring::booster(), &recording, |_| ()).unwrap();
+    assert_eq!(diagnosis.verdict, Verdict::Unexplained, "{}", diagnosis.sentence);
+    let is_poor = diagnosis.found.best.is_gross();
+    assert_eq!(diagnosis.sentence.contains("does not describe the readings"), is_poor, "{}", diagnosis.sentence);
 }
 
 /// That an effect is identified, it alone, with its amplitude.

@@ -74,7 +74,7 @@ impl Recording {
         let (rows, other) = frames::parse(&frames_file, &frames()?, &header, &ring, &names)?;
         let recording = Self { name: name(folder), header, other, rows };
         let refuse = |(key, what): (&str, String)| header::refuse(&file, header_text, key, &what);
-        plausible::check(&recording).map_err(refuse)?;
+        plausible::check(&recording, &names.supplies).map_err(refuse)?;
         Ok(recording)
     }
 

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use super::limit::in_milli;
 use super::{Recording, Row};
+use crate::campaign::Drive;
 
 /// A key of the header, and what is wrong with its value.
 type Fault = (&'static str, String);
@@ -14,6 +15,9 @@ const CONTRADICTS: f64 = 30.0;
 const LARGEST_KICK: f64 = 0.1;
 /// Relative change of a supply's current between two frames above which it was moved: ripple is 2e-4.
 const MOVED: f64 = 1e-3;
+/// Factor that the currents make of a family's gradient, over the dipoles' field, above which, or below its inverse, they are in another unit: the ring would
+/// keep no beam.
+const ANOTHER_UNIT: f64 = 2.0;
 /// Step in which a corrector's read-back is taken, as a share of the largest one: in one setting they scatter by 1e-3.
 const SCATTER: f64 = 1e-2;
 /// Fewest differences of repeats that tell a monitor's noise.
@@ -25,9 +29,34 @@ const MEDIAN: f64 = 0.9539;
 ///
 /// # Errors
 /// The first one.
-pub(super) fn check(recording: &Recording) -> Result<(), Fault> {
+pub(super) fn check(recording: &Recording, supplies: &[String]) -> Result<(), Fault> {
+    check_supplies(recording, supplies)?;
     check_kick(recording)?;
     check_noise(recording)
+}
+
+fn check_supplies(recording: &Recording, supplies: &[String]) -> Result<(), Fault> {
+    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    let ordinary = -ANOTHER_UNIT.ln()..=ANOTHER_UNIT.ln();
+    // a read-back that fails in some frames is no fault of the header
+    let is_never = |f: &usize| !drives.iter().any(|drive| ordinary.contains(&drive.strength[*f]));
+    let Some(f) = (0..supplies.len()).find(is_never).filter(|_| !drives.is_empty()) else { return Ok(()) };
+    let factor = drives[0].strength[f].exp();
+    let makes =
+        if factor.is_finite() { format!("{factor:.2e} times the design's gradient") } else { "no gradient".into() };
+    let mean = |of: &dyn Fn(&Row) -> f64| recording.rows.iter().map(of).sum::<f64>() / recording.rows.len() as f64;
+    let expected = recording.header.nominal[f];
+    let found = mean(&|row| row.supply[f]);
+    let dipole = recording.header.nominal_dipole.map_or_else(String::new, |nominal| {
+        format!("; in the dipoles {nominal:?} A and {:.4} A", mean(&|row| row.dipole.unwrap_or(nominal)))
+    });
+    let supply = &supplies[f];
+    Err((
+        "nominal_A",
+        format!(
+            "the currents make {makes} of supply {supply}: expected about {expected:?} A, found {found:.4} A{dipole}"
+        ),
+    ))
 }
 
 fn check_kick(recording: &Recording) -> Result<(), Fault> {

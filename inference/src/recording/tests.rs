@@ -88,6 +88,18 @@ fn example_of_the_document_reads_in_si_units() {
     assert_eq!(row.tune, [Some(0.80674), None]);
 }
 
+/// Kiloamperes, or a nominal current of another machine: the ring of the design would keep no beam.
+#[test]
+fn currents_in_another_unit_are_refused() {
+    let nominal = "nominal_A = { dipole = 2400.0, qh = 1800.0, qv = 1790.0 }";
+    let error = header_error(nominal, "nominal_A = { dipole = 2400.0, qh = 1.8, qv = 1790.0 }");
+    println!("{error}");
+    assert!(error.starts_with("toy/header.toml, line ") && error.contains("key nominal_A: the currents make "));
+    assert!(
+        error.contains("times the design's gradient of supply ") && error.contains(": expected about 1.8 A, found ")
+    );
+}
+
 /// Zeros and other numbers that mean nothing, one monitor stuck elsewhere; not so few monitors that may agree by chance.
 #[test]
 fn a_frame_whose_monitors_read_one_number_has_no_beam() {
