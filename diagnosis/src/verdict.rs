@@ -429,19 +429,7 @@ pub fn sentence(
             format!("{}; held-out frames gain {} nat", phrases("; "), gain.join(" and "))
         }
         Verdict::Ambiguous => ambiguous(findings),
-        Verdict::Unexplained => {
-            let last = findings.len() - usize::from(findings.last().is_some_and(|f| f.term().is_none()));
-            // what is less than certain stands in the table, with its probability
-            let named = findings[..last].iter().filter(|f| f.probability >= DECISIVE);
-            let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
-            let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
-            let undescribed = findings[last..].iter().map(undescribed);
-            let poor = found.best.is_gross().then(|| {
-                let chi2 = found.best.residual.norm_squared() / found.best.residual.len() as f64;
-                format!("the model does not describe the readings, chi2 of each is {chi2:.1}")
-            });
-            format!("{named}{}", undescribed.chain(poor).collect::<Vec<_>>().join("; "))
-        }
+        Verdict::Unexplained => unexplained(found, findings),
     };
     let contradicted = contradictions.iter().map(|one| within(data, &one.recording, one.to_string()));
     let mut said: Vec<String> = contradicted.chain(beyond.iter().map(Beyond::to_string)).collect();
@@ -494,6 +482,24 @@ fn wandering(own: &Data) -> Vec<String> {
     let said =
         |(b, walk): &(usize, Measured)| format!("monitor {} wanders, by {} mm until the end", names[*b], far(walk));
     own.noise.wandering.iter().map(said).collect()
+}
+
+/// What is certain, and what no effect describes.
+fn unexplained(found: &Found, findings: &[Finding]) -> String {
+    let last = findings.len() - usize::from(findings.last().is_some_and(|f| f.term().is_none()));
+    // what is less than certain stands in the table, with its probability
+    let named = findings[..last].iter().filter(|f| f.probability >= DECISIVE);
+    let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
+    let undescribed: Vec<String> = findings[last..].iter().map(undescribed).collect();
+    if !found.best.is_gross() {
+        let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
+        return format!("{named}{}", undescribed.join("; "));
+    }
+    let chi2 = found.best.residual.norm_squared() / found.best.residual.len() as f64;
+    let poor = format!("the model does not describe the readings, chi2 of each is {chi2:.1}");
+    // what is named beside so much that is not described may be wrong
+    let nearest = named.into_iter().map(str::to_owned).chain(undescribed).collect::<Vec<_>>().join("; ");
+    if nearest.is_empty() { poor } else { format!("{poor}; the nearest that was found: {nearest}") }
 }
 
 /// What is missing and not in the library.
