@@ -336,8 +336,7 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
     for (to, &from) in frame.magnets.supply.iter_mut().zip(&row.supply) {
         *to = current(from)?;
     }
-    let read = if row.is_without_beam() { &[] } else { row.reading.as_slice() };
-    for (b, (to, from)) in frame.reading.iter_mut().zip(read).enumerate() {
+    for (b, (to, from)) in frame.reading.iter_mut().zip(&row.reading).enumerate() {
         if let Some(position) = *from {
             *to = PositionCode::nearest(position).ok_or_else(|| beyond("reading", position))?;
             frame.valid.put(b, true);
