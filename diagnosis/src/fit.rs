@@ -53,7 +53,7 @@ pub struct Fitted {
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
 /// Chi-square per number above which a fit is poor.
-const GROSS: f64 = 1.3;
+const POOR: f64 = 1.3;
 /// Number of steps after which a fit is abandoned if its cost exceeds a rival's by a factor, and that factor.
 const TRIAL: usize = 4;
 const HOPELESS: f64 = 1.5;
@@ -165,8 +165,7 @@ impl Fitted {
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
         let within = Within::of(&factor, &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
-        let of_widths: f64 = problem.hypothesis.ordinary.iter().map(Family::log_prior).sum();
-        let log_prior = of_widths + problem.hypothesis.log_prior();
+        let log_prior = problem.hypothesis.log_prior();
         let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
         let hypothesis = problem.hypothesis.clone();
         let Point { u, residual, cost } = here;
@@ -198,8 +197,13 @@ impl Fitted {
     }
 
     /// True where the fit is so poor that its vars are strongly biased.
-    pub fn is_gross(&self) -> bool {
-        self.residual.norm_squared() > GROSS * self.residual.len() as f64
+    pub fn is_poor(&self) -> bool {
+        self.chi2_per_number() > POOR
+    }
+
+    /// Mean square of the whitened residuals.
+    pub fn chi2_per_number(&self) -> f64 {
+        self.residual.norm_squared() / self.residual.len() as f64
     }
 
     /// `ln` posterior at the best point, up to a constant of the recording: the evidence without its determinant.

@@ -172,9 +172,9 @@ impl Hypothesis {
         self.without_terms(|one| *one == term)
     }
 
-    /// `ln` prior of its effects that are gross, relative to that of others.
+    /// `ln` prior of the widths that its unknowns have: of ordinary families relative to none, of gross effects to usual ones.
     pub fn log_prior(&self) -> f64 {
-        self.gross.len() as f64 * GROSS.ln()
+        self.ordinary.iter().map(Family::log_prior).sum::<f64>() + self.gross.len() as f64 * GROSS.ln()
     }
 
     /// Prior standard deviation of a term's amplitude; none for a switch.

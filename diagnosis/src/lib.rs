@@ -177,7 +177,7 @@ impl Diagnosis {
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
         // a poor fit says nothing of single vars
-        let beyond = if found.best.is_gross() { Vec::new() } else { Beyond::all(&data.ring, &vars_after) };
+        let beyond = if found.best.is_poor() { Vec::new() } else { Beyond::all(&data.ring, &vars_after) };
         let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
         Ok(Self {
             found,

@@ -18,7 +18,7 @@ pub(super) const CURVED: f64 = 4.0;
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    if !fitted.is_gross() && data.trim_each(&fitted.residual) {
+    if !fitted.is_poor() && data.trim_each(&fitted.residual) {
         fitted = Fitted::of(data, hypothesis, &fitted.u)?;
     }
     for _ in 0..PASSES {
@@ -38,7 +38,7 @@ pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
     let mut own = fitted.data(data).clone();
     let linearise = |own: &mut Data, fitted: &Fitted| own.linearise_each(&fitted.machines(own)?);
     for pass in 0..PASSES {
-        if fitted.is_gross() {
+        if fitted.is_poor() {
             break;
         }
         let Ok(moved) = linearise(&mut own, &fitted) else { break };

@@ -51,7 +51,7 @@ pub struct Family {
 }
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
-pub const STANDS_OUT: f64 = 2.3;
+pub(super) const STANDS_OUT: f64 = 2.3;
 /// Gain error below which an instrument is nearer to one that is dead than to a sound one.
 const FAILS: f64 = -0.5;
 /// Share of its tolerance below which a family does not count.

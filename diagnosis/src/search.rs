@@ -185,7 +185,7 @@ impl Search {
         data.is_about_effects = false;
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
-        let ordinary = if first.is_gross() { Vec::new() } else { ordinary::learnt(&data, &first) };
+        let ordinary = if first.is_poor() { Vec::new() } else { ordinary::learnt(&data, &first) };
         let hypothesis = Hypothesis { ordinary, ..plain };
         let guess = first.guess(&data, &hypothesis);
         let fitted = linearise::fit(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
@@ -356,7 +356,7 @@ impl Search {
     fn leaders(&self, data: &Data, fitted: &Fitted, scanned: &[Candidate]) -> Result<Vec<usize>, FitError> {
         let ring = &data.ring;
         let mut leaders = self.first(ring, scanned, &fitted.hypothesis);
-        if fitted.is_gross() {
+        if fitted.is_poor() {
             let at_mean = Fitted::unfitted(data, &fitted.hypothesis).and_then(|start| scan(data, &start, &self.terms));
             leaders
                 .extend(at_mean.map_or_else(|_| Vec::new(), |scanned| self.first(ring, &scanned, &fitted.hypothesis)));
@@ -383,7 +383,7 @@ impl Search {
 fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
     let start = DVector::zeros(data.units.len());
     let first = Fitted::of(data, plain, &start)?;
-    if !first.is_gross() {
+    if !first.is_poor() {
         return Ok(first);
     }
     let of_vars = Fitted::of(data, &Hypothesis::default(), &start).ok();
@@ -486,7 +486,7 @@ impl Wander {
 /// in repeats shows in what a fit leaves, since it then has all settings to compare.
 fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
     let Found { data, best, next, .. } = found;
-    let leader = next.alternatives.first().filter(|_| next.is_suspicious() && !best.is_gross());
+    let leader = next.alternatives.first().filter(|_| next.is_suspicious() && !best.is_poor());
     let Some(Alternative { cause: Cause::Unmodelled(leading), probability, .. }) = leader else { return Ok(None) };
     let Some(wander) = Wander::of(data, leading) else { return Ok(None) };
     let log_likelihood = |value: f64| {
@@ -513,7 +513,7 @@ fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) -> Alt
     }
     let mut guesses = vec![guess];
     // what is ordinary may have gone where a reversed or exchanged instrument leaves it
-    if fitted.is_gross() || candidate.term.kind.is_switch() {
+    if fitted.is_poor() || candidate.term.kind.is_switch() {
         guesses.push(DVector::zeros(fitted.params.len()));
     }
     let fits = guesses.iter().filter_map(|guess| at_rest(data, &hypothesis, guess, least).ok());
@@ -533,7 +533,7 @@ fn at_rest(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f6
     let mut start = guess.rows(0, vars).into_owned();
     for _ in 1..PASSES {
         let is_at_rest = (fitted.u.rows(0, vars) - &start).norm() < STILL;
-        if is_at_rest || fitted.is_gross() || hypothesis.ordinary.is_empty() {
+        if is_at_rest || fitted.is_poor() || hypothesis.ordinary.is_empty() {
             break;
         }
         start = fitted.u.rows(0, vars).into_owned();
@@ -581,7 +581,7 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
 /// that are of first order in the fit may leave none. A poor one stays as it is; one that was poor before
 /// gets the ordinary imperfections that it lacks. One that has readings of its own keeps them.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
-    if fitted.is_gross() {
+    if fitted.is_poor() {
         return fitted;
     }
     let own = fitted.has_own().then(|| fitted.data(data).clone());

@@ -83,7 +83,7 @@ impl Verdict {
     /// From the competition of each effect, and how it stood its tests.
     pub fn of(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
-        if next.unknown() > SUSPICIOUS || found.best.is_gross() {
+        if next.unknown() > SUSPICIOUS || found.best.is_poor() {
             return Self::Unexplained;
         }
         if found.competitions.is_empty() {
@@ -323,7 +323,7 @@ pub fn tests(
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
         let rival = if is_all { before } else { &Score::of(data, without, blocks)? };
         let gain = after.gain_over(rival);
-        if without.is_gross() {
+        if without.is_poor() {
             return Ok(Tested { gain, of_choice: None, chance: None });
         }
         let choice = Choice::of(data, without, candidates, penalty)?;
@@ -491,11 +491,11 @@ fn unexplained(found: &Found, findings: &[Finding]) -> String {
     let named = findings[..last].iter().filter(|f| f.probability >= DECISIVE);
     let named: Vec<&str> = named.map(|finding| finding.phrase.as_str()).collect();
     let undescribed: Vec<String> = findings[last..].iter().map(undescribed).collect();
-    if !found.best.is_gross() {
+    if !found.best.is_poor() {
         let named = if named.is_empty() { String::new() } else { format!("{}; besides, ", named.join("; ")) };
         return format!("{named}{}", undescribed.join("; "));
     }
-    let chi2 = found.best.residual.norm_squared() / found.best.residual.len() as f64;
+    let chi2 = found.best.chi2_per_number();
     let poor = format!("the model does not describe the readings, chi2 of each is {chi2:.1}");
     // what is named beside so much that is not described may be wrong
     let nearest = named.into_iter().map(str::to_owned).chain(undescribed).collect::<Vec<_>>().join("; ");

@@ -9,8 +9,8 @@
 //! a Student distribution: `s` is what the priors of the vars scatter the design's response by, known to a factor or so (`v` degrees of
 //! freedom), and `n` is the number of independent errors that a response can have, two of each instrument (beta function and phase). Readings that
 //! are taken for those of another frame leave another residual `q`, noise unknown, so that `-N/2 ln(q_w/q)` is added for each monitor. `R`
-//! is the design at the tunes that suit the wiring best, and with what may be held, since a machine may be run in another way. A response with a single reversed or exchanged
-//! instrument resembles the design more than any other wiring: those are effects (`bpm_polarity`, `bpm_swap`, `corrector_polarity`).
+//! is the design at the tunes that suit the wiring best, and with what may be held, since a machine may be run in another way. A response with a single reversed, dead or exchanged
+//! instrument resembles the design more than any other wiring: those are effects (`bpm_polarity`, `bpm_dead`, `bpm_swap`, and those of correctors).
 //!
 //! Source: A. Gelman et al., Bayesian Data Analysis (2013), sec. 3.2, for the Student distribution of an unknown scatter.
 
@@ -289,6 +289,7 @@ impl<'r> Measured<'r> {
         let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design);
         Self { ring, response, late, variance, scale, scatter }
     }
+
     /// Columns of the monitors and of the correctors that a wiring concerns.
     fn range(&self, columns: Columns) -> core::ops::Range<usize> {
         let (first, all, plane) = match columns {

@@ -419,7 +419,10 @@ fn steady(campaign: &Campaign) -> DMatrix<f64> {
         Ok(of_kicks - means + of_supplies.columns(0, campaign.monitors()))
     };
     let readings = campaign.readings_of_beam();
-    moved().map_or_else(|_| readings.clone(), |moved| &readings - moved)
+    match moved() {
+        Ok(moved) => readings - moved,
+        Err(_) => readings,
+    }
 }
 
 /// Variance of whitened readings along the former orbits, where the frame after takes the place of each: 1 for white noise, more where monitors share

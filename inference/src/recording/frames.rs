@@ -13,6 +13,10 @@ use super::limit::{
 };
 use super::names::Names;
 
+/// Share of a frame's readings, and their number at least, that are alike without a beam: some monitors are stuck at another number.
+const NEARLY: f64 = 0.8;
+const FEWEST: usize = 4;
+
 /// One machine cycle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row {
@@ -56,10 +60,6 @@ impl Row {
         most >= FEWEST && most as f64 > NEARLY * read.len() as f64
     }
 }
-
-/// Share of a frame's readings, and their number at least, that are alike without a beam: some monitors are stuck at another number.
-const NEARLY: f64 = 0.8;
-const FEWEST: usize = 4;
 
 /// All rows, and the columns of other currents.
 pub(super) fn parse(
