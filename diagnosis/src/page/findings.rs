@@ -12,7 +12,7 @@ const ALTERNATIVES: usize = 5;
 
 /// Verdict, decisive pictures, findings.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
-    let text = vec![format!("Verdict: {}. {}", diagnosis.verdict.word(), meaning(diagnosis.verdict))];
+    let text = vec![format!("Verdict: {}. {}", diagnosis.verdict.word(), meaning(diagnosis))];
     let mut rows = Vec::new();
     for (i, finding) in diagnosis.findings.iter().enumerate() {
         rows.push(row(&format!("{}.", i + 1), finding));
@@ -30,8 +30,8 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     Ok(Section { heading: "What was found".into(), text, figures, tables })
 }
 
-fn meaning(verdict: Verdict) -> &'static str {
-    match verdict {
+fn meaning(diagnosis: &Diagnosis) -> &'static str {
+    match diagnosis.verdict {
         Verdict::Consistent => "Nothing was found at the noise level of the recording.",
         Verdict::Identified => {
             "The effects below are decided (probability at least 95 %) and predict frames that they were not fitted to better by more than two \
@@ -39,6 +39,9 @@ fn meaning(verdict: Verdict) -> &'static str {
         }
         Verdict::Ambiguous => {
             "Physics may be missing in the model; the data cannot separate the alternatives, or exclude chance."
+        }
+        Verdict::Unexplained if diagnosis.found.best.is_poor() => {
+            "The model does not describe the readings; what is listed is the nearest that was found, and may be wrong."
         }
         Verdict::Unexplained => {
             "The readings contain a discrepancy that no effect of the library describes; its most likely location is given."

@@ -46,6 +46,7 @@ fn a_daemon_connects_again_and_says_so_once() {
     let folder = tempfile::tempdir().unwrap();
     let socket = folder.path().join("front-end");
     let place = Place::new("again", &format!("unix:{}", socket.display()), "connect", "");
+    place.change("timeout_ms = 60000", "timeout_ms = 1000");
     let mut subscriber = Subscriber::try_new(&place.service).unwrap();
     let mut daemon = place.start();
     place.hear("tried again until it works");

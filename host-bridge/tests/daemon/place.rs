@@ -16,7 +16,7 @@ use twin::Ring;
 
 pub const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 /// Longest wait for anything.
-pub const SOON: Duration = Duration::from_secs(20);
+pub const SOON: Duration = Duration::from_secs(60);
 
 /// A daemon's folder, configuration and service.
 pub struct Place {
@@ -25,11 +25,12 @@ pub struct Place {
 }
 
 impl Place {
+    /// Its line may be silent for as long as anything is waited for: a machine that is busy pauses for seconds.
     pub fn new(test: &str, address: &str, role: &str, more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let service = format!("orbitcal/test/{}/{test}", std::process::id());
         let text = format!(
-            "[machine]\nrecording = {RECORDING:?}\n[source]\naddress = {address:?}\nrole = {role:?}\ntimeout_ms = 1000\n\
+            "[machine]\nrecording = {RECORDING:?}\n[source]\naddress = {address:?}\nrole = {role:?}\ntimeout_ms = 60000\n\
              backoff_first_ms = 10\nbackoff_most_ms = 50\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\n{more}"
         );
         fs::write(folder.path().join("config.toml"), text).unwrap();

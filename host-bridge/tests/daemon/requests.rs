@@ -68,12 +68,9 @@ fn what_is_allowed_is_done() {
     let mut subscriber = Subscriber::try_new(&place.service).unwrap();
     let mut health = HealthReader::try_new(&place.service).unwrap();
     let (mut daemon, frames) = (place.start(), Frames::new());
-    // a line of its own for each part: the daemon gives up one that is silent meanwhile
-    let connect = || connected(|| TcpStream::connect(("127.0.0.1", port)));
-    let mut line = connect();
+    let mut line = connected(|| TcpStream::connect(("127.0.0.1", port)));
     (1..=346).for_each(|sequence| line.write_all(&frames.wire(sequence)).unwrap());
     let before = listening(&mut subscriber, 346).pop().unwrap();
-    drop(line);
     assert!(before.is_usable());
     let rolled = Effect::parse("quad_roll@D8=0.009", &frames.ring).unwrap();
     let extended = training::extended::tables(&frames.recording.powered(&frames.ring), &[rolled], &[1.0; 48]).unwrap();
@@ -81,7 +78,7 @@ fn what_is_allowed_is_done() {
     model_file::write(&file, &frames.ring.name, &extended.tables).unwrap();
     let model = request(&place, &["model", text(&file)]);
     assert!(said(&model).contains("the tables are now"), "{}", said(&model));
-    connect().write_all(&frames.wire(347)).unwrap();
+    line.write_all(&frames.wire(347)).unwrap();
     let other = listening(&mut subscriber, 1).pop().unwrap();
     assert_eq!((other.frames, other.tables), (347, Some(extended.tables.digest::<LINE>())));
     assert_ne!(other.tables, before.tables);
@@ -89,7 +86,7 @@ fn what_is_allowed_is_done() {
     assert!(said(&wrong).contains("refused: "), "{}", said(&wrong));
     let reset = request(&place, &["reset"]);
     assert!(reset.status.success() && said(&reset).contains("the core is at its prior"), "{}", said(&reset));
-    connect().write_all(&frames.wire(348)).unwrap();
+    line.write_all(&frames.wire(348)).unwrap();
     let after = listening(&mut subscriber, 1).pop().unwrap();
     assert_eq!(after.frames, 1);
     assert!(after.sigma[0] > 2.0 * before.sigma[0], "{} {}", after.sigma[0], before.sigma[0]);
