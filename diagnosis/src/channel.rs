@@ -1,13 +1,14 @@
 //! The pooled readings of one monitor, or of one tune, whitened.
 //!
 //! A pool's mean has the noise of its frames: `sigma^2/n` of white noise, and otherwise the mean of the memory's covariance over the
-//! frames of both pools. With `A` the inverse of the root of that covariance, and the common terms of the readings as the thin decomposition
+//! frames of both pools; more where their level is higher ([`Levels`]). With `A` the inverse of the root of that covariance, and the common terms of the readings as the thin decomposition
 //! `A U = Q D V^T`, the whitening is
 //!
 //! `T = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T) A`, so that `T^T T = (C + U U^T)^-1`.
 
 use nalgebra::{DMatrix, DVector, DVectorViewMut};
 
+use super::levels::Levels;
 use super::memory::Memory;
 use inference::factor::solve_lower_mut;
 
@@ -30,7 +31,7 @@ pub struct Channel {
 /// Root of the covariance of the means, in units of the noise of one reading.
 #[derive(Debug, Clone)]
 enum Root {
-    /// White noise: the roots of the numbers of readings.
+    /// White noise: the roots of the numbers of readings, of such as have the ordinary level.
     White(DVector<f64>),
     /// The lower factor of a regular covariance.
     Remembers(DMatrix<f64>),
@@ -38,18 +39,23 @@ enum Root {
 
 impl Root {
     /// `frames` of each row.
-    fn of(memory: Memory, frames: &[Vec<usize>]) -> Option<Self> {
+    fn of(memory: Memory, levels: &Levels, frames: &[Vec<usize>]) -> Option<Self> {
         if memory.is_none() {
-            return Some(Self::White(DVector::from_iterator(
-                frames.len(),
-                frames.iter().map(|of_row| (of_row.len() as f64).sqrt()),
-            )));
+            let root = |of_row: &Vec<usize>| {
+                let square: f64 = of_row.iter().map(|&frame| levels.at(frame).powi(2)).sum();
+                ((of_row.len() as f64).powi(2) / square).sqrt()
+            };
+            return Some(Self::White(DVector::from_iterator(frames.len(), frames.iter().map(root))));
         }
         let all = || frames.iter().flatten().copied();
         let (first, last) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
         // by the distance of two frames, and of the walk the frames that both have seen
         let apart: Vec<f64> = (first..=last).map(|frame| memory.covariance(0, frame - first)).collect();
-        let both = |i: usize, j: usize| apart[i.abs_diff(j)] + memory.steps.powi(2) * (i.min(j) - first) as f64;
+        let level: Vec<f64> = (first..=last).map(|frame| levels.at(frame)).collect();
+        let both = |i: usize, j: usize| {
+            let walk = memory.steps.powi(2) * (i.min(j) - first) as f64;
+            apart[i.abs_diff(j)] * (level[i - first] * level[j - first]) + walk
+        };
         let mean = |one: &[usize], other: &[usize]| {
             let sum: f64 = one.iter().flat_map(|&i| other.iter().map(move |&j| (i, j))).map(|(i, j)| both(i, j)).sum();
             sum / (one.len() * other.len()) as f64
@@ -79,9 +85,16 @@ impl Root {
 }
 
 impl Channel {
-    /// Of the readings in some frames of each row, with noise `sigma` each, and their common terms in standard deviations [rows][factors].
-    pub fn of(rows: Vec<usize>, frames: &[Vec<usize>], sigma: f64, memory: Memory, common: DMatrix<f64>) -> Self {
-        let root = Root::of(memory, frames).unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
+    /// Of the readings in some frames of each row, with noise `sigma` each at the ordinary level, and their common terms in standard deviations
+    /// [rows][factors].
+    pub fn of(
+        rows: Vec<usize>,
+        frames: &[Vec<usize>],
+        (sigma, memory, levels): (f64, Memory, &Levels),
+        common: DMatrix<f64>,
+    ) -> Self {
+        let root =
+            Root::of(memory, levels, frames).unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
         let mut common = common / sigma;
         root.whiten(&mut common);
         let (basis, of_common) = match rows.is_empty() {
@@ -141,7 +154,7 @@ impl Channel {
         }
     }
 
-    /// Readings of each row of white noise.
+    /// Readings of each row of white noise: as many as tell as much at the ordinary level.
     pub fn readings(&self) -> DVector<f64> {
         match &self.root {
             Root::White(roots) => roots.map(|root| root * root),
@@ -163,10 +176,18 @@ mod tests {
         let common = DMatrix::from_fn(4, 2, |i, k| (1.3 * i as f64 + k as f64).sin() * [4.0, 0.3][k]);
         let sigma = 0.7;
         let none = Memory::NONE;
-        for memory in [none, Memory { share: 0.3, time: 4.0, steps: 0.1 }] {
-            let channel = Channel::of(vec![0, 1, 2, 3], &frames, sigma, memory, common.clone());
+        let remembers = Memory { share: 0.3, time: 4.0, steps: 0.1 };
+        let louder = Levels::some(2..6, 3.0);
+        for (memory, levels) in
+            [(none, &Levels::EVEN), (remembers, &Levels::EVEN), (none, &louder), (remembers, &louder)]
+        {
+            let channel = Channel::of(vec![0, 1, 2, 3], &frames, (sigma, memory, levels), common.clone());
+            let covariance = |i: usize, j: usize| {
+                let walk = memory.steps.powi(2) * i.min(j) as f64;
+                (memory.covariance(i, j) - walk) * levels.at(i) * levels.at(j) + walk
+            };
             let mean = |one: &[usize], other: &[usize]| {
-                let all = one.iter().flat_map(|&i| other.iter().map(move |&j| memory.covariance(i, j)));
+                let all = one.iter().flat_map(|&i| other.iter().map(move |&j| covariance(i, j)));
                 all.sum::<f64>() / (one.len() * other.len()) as f64
             };
             let noise = DMatrix::from_fn(4, 4, |i, j| sigma * sigma * mean(&frames[i], &frames[j]));

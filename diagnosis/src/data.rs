@@ -30,6 +30,7 @@ use super::evidence::Units;
 use super::exact::Exact;
 use super::frame_to_frame::Shape;
 use super::joint::following;
+use super::levels::Levels;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
@@ -402,12 +403,13 @@ impl Data {
         match c.checked_sub(self.monitors()) {
             None => {
                 let common = self.common(c, &rows, &frames);
-                Channel::of(rows, &frames, self.noise.own[c], self.noise.memory(c), common)
+                let Noise { own, levels, .. } = &self.noise;
+                Channel::of(rows, &frames, (own[c], self.noise.memory(c), levels), common)
             }
             Some(plane) => {
                 let common = DMatrix::from_element(rows.len(), 1, TUNE_CALIBRATION);
                 let noise = self.frames.tune_noise[plane].unwrap_or(TUNE_CALIBRATION);
-                Channel::of(rows, &frames, noise, Memory::NONE, common)
+                Channel::of(rows, &frames, (noise, Memory::NONE, &Levels::EVEN), common)
             }
         }
     }
@@ -424,9 +426,10 @@ impl Data {
             frames.iter().enumerate().flat_map(|(row, frames)| frames.iter().map(move |&frame| (row, frame))).collect();
         let readings =
             each.iter().map(|&(row, frame)| self.frames.readings[(frame, b)] - self.readings[(rows[row], b)]);
-        let readings = DVector::from_iterator(each.len(), readings) / sigma;
+        let noise = DVector::from_fn(each.len(), |i, _| sigma * self.noise.levels.at(each[i].1));
+        let readings = DVector::from_iterator(each.len(), readings).component_div(&noise);
         let terms =
-            DMatrix::from_fn(each.len(), all.ncols(), |i, k| all[(each[i].1, k)] - means[(each[i].0, k)]) / sigma;
+            DMatrix::from_fn(each.len(), all.ncols(), |i, k| (all[(each[i].1, k)] - means[(each[i].0, k)]) / noise[i]);
         let within = Within::of(&readings, &terms);
         let told = &means * within.mean;
         rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
@@ -655,12 +658,9 @@ impl Data {
             let mut terms = self.drifting_with(b, &rows, &self.frames.drives, shared) / self.channels[b].sigma;
             terms.column_mut(0).fill(1.0);
             let mut residual = values.select_rows(&rows).columns(b, 1).into_owned();
-            let memory = self.noise.memory(b);
-            if !memory.is_none() {
-                let filter = Filter::of(memory, rows[0], &rows);
-                filter.whiten_columns(&mut terms);
-                filter.whiten_columns(&mut residual);
-            }
+            let filter = Filter::of(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
+            filter.whiten_columns(&mut terms);
+            filter.whiten_columns(&mut residual);
             let (chi2, freedom) = chi_square(&residual.column(0).into_owned(), &terms.transpose(), 1, 1.0);
             sums = (sums.0 + chi2, sums.1 + freedom);
         }

@@ -457,7 +457,7 @@ mod tests {
             ] {
                 let noise = case.learnt(&truth.campaign(&case.ring, &case.recording, &[]));
                 assert!(noise.unordinary().is_none(), "{seed} {:?}", noise.frame_to_frame);
-                assert!(noise.remark().is_none(), "{:?}", noise.common_scale);
+                assert!(noise.remarks().is_empty(), "{:?}", noise.common_scale);
             }
         }
     }
@@ -469,7 +469,7 @@ mod tests {
         let white = || Coloured::white(&case.ring, &case.recording, 8);
         let louder = Coloured { noise: 3.0 * case.noise.noise, ..white() };
         let noise = case.learnt(&louder.campaign(&case.ring, &case.recording, &[]));
-        assert!(noise.unordinary().is_none() && noise.remark().is_some(), "{:?}", noise.common_scale);
+        assert!(noise.unordinary().is_none() && !noise.remarks().is_empty(), "{:?}", noise.common_scale);
         // the orbit moves by six times the noise where the dispersion is largest
         let momentum = 6.0 * case.noise.noise / case.noise.dispersion.amax();
         let jitter = Coloured { momentum, ..white() };

@@ -6,12 +6,14 @@
 //!
 //! Whitening is the Kalman filter of these two states: with the noise expected from the frames before, `m`, and its variance, `F`, the
 //! innovations `(e - m)/sqrt F` are independent and of variance 1, and the determinant of the covariance is the product of all `F`. It
-//! is a linear map and costs a few operations a frame. Frames without a reading that counts are gaps.
+//! is a linear map and costs a few operations a frame. White and slow noise are larger by the level of the frame ([`Levels`]), the walk is not. Frames without a reading that counts are gaps.
 //!
 //! Source: A. C. Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), ch. 3.4; J. Durbin and
 //! S. J. Koopman, Time Series Analysis by State Space Methods (2012), ch. 4.3 and 4.4.
 
-use nalgebra::{DMatrix, Matrix2};
+use nalgebra::{DMatrix, Matrix2, Vector2};
+
+use super::levels::Levels;
 
 /// What of a monitor's noise remembers the frames before.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,8 +35,9 @@ pub struct Filter {
 /// One frame of the filter.
 #[derive(Debug, Clone, Copy)]
 struct Step {
-    /// What is left of the slow noise of the frame before.
+    /// What is left of the slow noise of the frame before, and the level at which it is seen.
     decay: f64,
+    level: f64,
     /// Share of an innovation that goes to the slow noise and to the walk.
     gain: [f64; 2],
     /// `sqrt F`.
@@ -72,15 +75,17 @@ impl Memory {
 
 impl Filter {
     /// Over some frames in rising order, the walk counted from `origin`.
-    pub fn of(memory: Memory, origin: usize, frames: &[usize]) -> Self {
+    pub fn of(memory: Memory, levels: &Levels, origin: usize, frames: &[usize]) -> Self {
         let (mut at, mut after) = (origin, Matrix2::new(memory.share, 0.0, 0.0, 0.0));
         let step = |&frame: &usize| {
             let (carried, before) = memory.carry(&after, frame - at);
-            let seen = before.column_sum();
-            let variance = seen.sum() + 1.0 - memory.share;
+            let level = levels.at(frame);
+            let of_states = Vector2::new(level, 1.0);
+            let seen = before * of_states;
+            let variance = of_states.dot(&seen) + level * level * (1.0 - memory.share);
             at = frame;
             after = before - seen * seen.transpose() / variance;
-            Step { decay: carried[(0, 0)], gain: (seen / variance).into(), root: variance.sqrt() }
+            Step { decay: carried[(0, 0)], level, gain: (seen / variance).into(), root: variance.sqrt() }
         };
         Self { steps: frames.iter().map(step).collect() }
     }
@@ -90,7 +95,7 @@ impl Filter {
         let (mut slow, mut walk) = (0.0, 0.0);
         for (value, step) in noise.zip(&self.steps) {
             slow *= step.decay;
-            let innovation = *value - slow - walk;
+            let innovation = *value - step.level * slow - walk;
             slow += step.gain[0] * innovation;
             walk += step.gain[1] * innovation;
             *value = innovation / step.root;
@@ -113,9 +118,14 @@ mod tests {
     /// Frames with gaps.
     const FRAMES: [usize; 9] = [3, 4, 5, 9, 10, 17, 18, 30, 31];
 
-    fn dense(memory: Memory, origin: usize, rows: &[usize], columns: &[usize]) -> DMatrix<f64> {
-        let at = |i: usize, j: usize| memory.covariance(rows[i] - origin, columns[j] - origin);
-        DMatrix::from_fn(rows.len(), columns.len(), at)
+    fn dense(memory: Memory, levels: &Levels, origin: usize) -> DMatrix<f64> {
+        let of_walk = Memory { share: 1.0, time: f64::MIN_POSITIVE, ..memory };
+        let at = |i: usize, j: usize| {
+            let [one, other] = [FRAMES[i], FRAMES[j]];
+            let walk = of_walk.covariance(one - origin, other - origin) - if i == j { 1.0 } else { 0.0 };
+            (memory.covariance(one - origin, other - origin) - walk) * levels.at(one) * levels.at(other) + walk
+        };
+        DMatrix::from_fn(FRAMES.len(), FRAMES.len(), at)
     }
 
     fn some_noise(n: usize) -> DVector<f64> {
@@ -127,20 +137,22 @@ mod tests {
         for memory in
             [SLOW_AND_WALKING, Memory { steps: 0.0, ..SLOW_AND_WALKING }, Memory { share: 0.0, ..SLOW_AND_WALKING }]
         {
-            let factor = dense(memory, 2, &FRAMES, &FRAMES).cholesky().unwrap();
-            let noise = some_noise(FRAMES.len());
-            let expected = factor.l().solve_lower_triangular(&noise).unwrap();
-            let filter = Filter::of(memory, 2, &FRAMES);
-            let mut found = noise;
-            filter.whiten(found.iter_mut());
-            assert!((found - expected).amax() < 1e-12, "rounding");
+            for levels in [Levels::EVEN, Levels::some(5..18, 2.5)] {
+                let factor = dense(memory, &levels, 2).cholesky().unwrap();
+                let noise = some_noise(FRAMES.len());
+                let expected = factor.l().solve_lower_triangular(&noise).unwrap();
+                let filter = Filter::of(memory, &levels, 2, &FRAMES);
+                let mut found = noise;
+                filter.whiten(found.iter_mut());
+                assert!((found - expected).amax() < 1e-12, "rounding");
+            }
         }
     }
 
     #[test]
     fn white_noise_stays_as_it_is_to_the_bit() {
         let noise = some_noise(FRAMES.len());
-        let filter = Filter::of(Memory::NONE, 0, &FRAMES);
+        let filter = Filter::of(Memory::NONE, &Levels::EVEN, 0, &FRAMES);
         let mut found = noise.clone();
         filter.whiten(found.iter_mut());
         assert_eq!(found, noise);

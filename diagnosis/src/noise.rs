@@ -1,6 +1,6 @@
 //! The noise of a recording as it is: learnt from its repeats, with the header's noise as a prior.
 //!
-//! Of each monitor the scale of its noise; of all together what the noise remembers ([`super::slow`]), the jitter of the momentum and
+//! Of each monitor the scale of its noise; of all together its level in time ([`super::levels`]), what the noise remembers ([`super::slow`]), the jitter of the momentum and
 //! what crates of monitors have in common (`jitter.rs`), and any other pattern that they share ([`super::frame_to_frame`]). Everything comes from differences between readings of the same setting
 //! (`repeats.rs`), so that physics that the model lacks does not enter, with two exceptions: what changes with time alone, such as
 //! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size; and the walk of one
@@ -19,6 +19,7 @@ use super::alternatives::SUSPICIOUS;
 use super::frame_to_frame::{self, Found, FrameToFrame, Known, Like, Shape};
 use super::imperfection::{Imperfection, Measure};
 use super::jitter::{CRATE, Crate, Differences, beside, groups, with_crates};
+use super::levels::{Levels, Stretch};
 use super::memory::Memory;
 use super::modes::Modes;
 use super::period::Period;
@@ -39,6 +40,8 @@ pub struct Noise {
     pub common_scale: Measured,
     /// Scatter of the scales between monitors, relative [1].
     pub scatter: Measured,
+    /// Its level in time; scales are those of the frames outside of its stretches.
+    pub levels: Levels,
     /// Slow noise and walk.
     pub slow: Slow,
     /// Rms jitter of the momentum from frame to frame [1].
@@ -98,6 +101,13 @@ struct Learner {
     sigma: f64,
 }
 
+impl Learner {
+    fn at_levels(self, levels: &Levels) -> Self {
+        let at = |repeats: Repeats| repeats.at_levels(levels);
+        Self { repeats: at(self.repeats), near: at(self.near), ..self }
+    }
+}
+
 /// Noise in common: the momentum's jitter, in the units of what it is learnt from, and crates.
 struct Shared {
     momentum: Measured,
@@ -147,6 +157,7 @@ impl Noise {
             scale: vec![1.0; monitors],
             common_scale: Measured { value: 1.0, sigma: 0.0 },
             scatter: nothing,
+            levels: Levels::EVEN,
             slow: Slow::NONE,
             momentum: nothing,
             crate_share: nothing,
@@ -177,8 +188,10 @@ impl Noise {
         let noisy = |b: &usize| source.campaign.screened.health[*b].state == MonitorState::Noisy;
         let noisy: Vec<usize> = (0..source.campaign.monitors()).filter(noisy).collect();
         let moves = |one: &Self| one.frame_to_frame.as_ref().is_some_and(|one| one.patterns.ncols() > 0);
-        // where many are called noisy, what moves all of them is seen by these alone; and it may be the dipoles, whose ripple their repeats are free of
-        let all = (moves(&first) || noisy.len() >= MANY).then(|| Self::learn_from(source, &noisy));
+        // where many are called noisy, what moves all of them is seen by these alone; and it may be the dipoles, whose ripple their repeats are free of, or
+        // a stretch of the recording
+        let all =
+            (moves(&first) || !first.levels.is_even() || noisy.len() >= MANY).then(|| Self::learn_from(source, &noisy));
         let header = &source.campaign.recording.header.noise;
         let is_sound = |b: &usize| match &all {
             Some(all) => all.own[*b] < NOISY * all.common_scale.value * header[*b],
@@ -195,15 +208,16 @@ impl Noise {
         if learners.is_empty() {
             return Self::screened(campaign).at_weights(campaign);
         }
+        let size = (campaign.frames(), campaign.monitors());
+        let levels = Levels::learn(&differences(&learners, |one| &one.near, &Slow::NONE, size));
+        learners = learners.into_iter().map(|one| one.at_levels(&levels)).collect();
         let (repeats, sigma): (Vec<Repeats>, Vec<f64>) =
             learners.iter().map(|one| (one.repeats.clone(), one.sigma)).unzip();
         let slow = Slow::of(&repeats, &sigma, campaign.frames());
         for one in &mut learners {
             one.sigma = one.repeats.weigh(slow.memory(one.sigma)).sigma().unwrap_or(one.sigma);
         }
-        let of = |repeats: fn(&Learner) -> &Repeats| {
-            Differences::of(differences(&learners, repeats, &slow, (campaign.frames(), campaign.monitors())))
-        };
+        let of = |repeats: fn(&Learner) -> &Repeats| Differences::of(differences(&learners, repeats, &slow, size));
         let (differences, near) = (of(|one| &one.repeats), of(|one| &one.near));
         let kurtosis = kurtosis(&differences.all);
         // per momentum, in units of the noise of whole readings
@@ -236,6 +250,7 @@ impl Noise {
         let noise = Self {
             common_scale: Measured { value: scale, sigma: scale * common.sigma },
             scatter,
+            levels,
             slow,
             momentum,
             crate_share: crates.iter().max_by(largest).map_or(one_more, |found| found.share),
@@ -302,11 +317,13 @@ impl Noise {
         (probability > SUSPICIOUS).then_some((one, probability))
     }
 
-    /// What the sentence says of noise that is far from the header's.
-    pub fn remark(&self) -> Option<String> {
+    /// What the sentence says of noise that is far from the header's, or in a part of the recording from that of the rest.
+    pub fn remarks(&self) -> Vec<String> {
         let scale = self.common_scale.value;
         let far = frame_to_frame::beyond_ordinary(scale.ln().abs() / QUOTED) > correction_of_sort();
-        far.then(|| format!("the noise is {scale:.1} times the header's"))
+        let of_all = far.then(|| format!("the noise is {scale:.1} times the header's"));
+        let of_stretches = self.levels.stretches.iter().filter(|one| one.factor.value > NOISY).map(Stretch::said);
+        of_all.into_iter().chain(of_stretches).collect()
     }
 
     /// True for a monitor that is noisy only because its reading has the momentum's jitter too.
@@ -371,7 +388,8 @@ impl Noise {
 
     /// True if everything is as the header says.
     pub fn is_as_stated(&self) -> bool {
-        self.slow.is_none()
+        self.levels.is_even()
+            && self.slow.is_none()
             && self.wandering.is_empty()
             && self.modes.is_none()
             && self.scale.iter().all(|scale| *scale == 1.0)
@@ -409,6 +427,7 @@ impl Noise {
             mean(("noise that a crate has in common", "crate_noise"), self.crate_share, Unit::PERCENT, CRATE),
         ];
         rows.extend(varying);
+        rows.extend(self.levels.stretches.iter().map(Stretch::row));
         rows.extend(self.of_wandering(names));
         rows
     }

@@ -8,13 +8,14 @@
 //! with an unknown change of each run of frames in one setting, but for the setting that comes back most, as a rule all correctors at
 //! 0 A: its frames are repeats of each other at all distances. Baseline and changes are diffuse states beside those of [`Memory`], so
 //! that the density is that of the differences within settings, and no missing physics of a setting enters it. The noise's scale is
-//! taken out in closed form.
+//! taken out in closed form. Where the level of the noise changes in time ([`Levels`]), that of a frame's white and slow noise is the larger by its factor.
 //!
 //! Source: J. Durbin and S. J. Koopman, Time Series Analysis by State Space Methods (2012), ch. 5 and 7.2, the diffuse likelihood, which
 //! is that of H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545, for contrasts.
 
 use nalgebra::DMatrix;
 
+use super::levels::Levels;
 use super::memory::Memory;
 
 /// A monitor's readings less their prediction, in frames that count.
@@ -32,6 +33,8 @@ struct Repeat {
     /// [m]
     value: f64,
     run: Run,
+    /// Level of its noise [1].
+    level: f64,
 }
 
 /// How a frame's setting goes on from the frame before.
@@ -93,7 +96,7 @@ impl Repeats {
             let since = readings.last().map_or(0, |last| last.frame + 1);
             let begins = runs[since..=frame].iter().any(|run| *run != Run::Same) || readings.is_empty();
             let run = if runs[frame] == Run::Same && begins { Run::New } else { runs[frame] };
-            readings.push(Repeat { frame, value: value - first, run });
+            readings.push(Repeat { frame, value: value - first, run, level: 1.0 });
         }
         Self { readings, fitted: 0.0 }
     }
@@ -113,6 +116,13 @@ impl Repeats {
         let off = following * factor.solve(&(known.tr_mul(&values) / sigma.powi(2)));
         self.readings.iter_mut().zip(off.iter()).for_each(|(reading, off)| reading.value -= off);
         self.fitted = factor.solve(&information).trace();
+        self
+    }
+
+    /// With the level of the noise in each frame.
+    #[must_use]
+    pub fn at_levels(mut self, levels: &Levels) -> Self {
+        self.readings.iter_mut().for_each(|reading| reading.level = levels.at(reading.frame));
         self
     }
 
@@ -214,13 +224,14 @@ impl State {
         }
         let c = &mut self.covariance;
         let states = if reading.run == Run::Base { 2 } else { 3 };
-        let mut seen = [c[0][0] + c[1][0], c[1][0] + c[1][1], 0.0];
-        let mut expected = self.mean[0] + self.mean[1];
+        let level = reading.level;
+        let mut seen = [level * c[0][0] + c[1][0], level * c[1][0] + c[1][1], 0.0];
+        let mut expected = level * self.mean[0] + self.mean[1];
         if states == 3 {
-            seen = [seen[0] + c[2][0], seen[1] + c[2][1], c[2][0] + c[2][1] + c[2][2]];
+            seen = [seen[0] + c[2][0], seen[1] + c[2][1], level * c[2][0] + c[2][1] + c[2][2]];
             expected += self.mean[2];
         }
-        let variance = seen[..states].iter().sum::<f64>() + 1.0 - memory.share;
+        let variance = level * seen[0] + seen[1] + seen[2] + level * level * (1.0 - memory.share);
         let innovation = reading.value - expected;
         for i in 0..states {
             let gain = seen[i] / variance;
@@ -240,9 +251,13 @@ mod tests {
     use super::*;
 
     /// `ln` density of contrasts, `-(y^T P y + ln det S + ln det X^T S^-1 X)/2`, X the unknown baseline and changes.
-    fn restricted(memory: Memory, frames: &[usize], y: &DVector<f64>, x: &DMatrix<f64>) -> (f64, f64) {
+    fn restricted(memory: Memory, levels: &Levels, frames: &[usize], y: &DVector<f64>, x: &DMatrix<f64>) -> (f64, f64) {
         let n = frames.len();
-        let s = DMatrix::from_fn(n, n, |i, j| memory.covariance(frames[i], frames[j]));
+        let s = DMatrix::from_fn(n, n, |i, j| {
+            let [one, other] = [frames[i], frames[j]];
+            let walk = memory.steps.powi(2) * one.min(other) as f64;
+            (memory.covariance(one, other) - walk) * levels.at(one) * levels.at(other) + walk
+        });
         let factor = s.clone().cholesky().unwrap();
         let solved = factor.solve(x);
         let information = x.tr_mul(&solved);
@@ -263,18 +278,21 @@ mod tests {
             if k == 0 || k == setting { 1.0 } else { 0.0 }
         });
         let repeats = Repeats::of(&frames, y.as_slice(), &runs);
-        let both = |memory: Memory| {
-            let (square, log_det) = restricted(memory, &frames, &y, &x);
-            let found = repeats.weigh(memory);
+        let louder = Levels::some(3..9, 2.0);
+        let both_at = |memory: Memory, levels: &Levels| {
+            let (square, log_det) = restricted(memory, levels, &frames, &y, &x);
+            let found = repeats.clone().at_levels(levels).weigh(memory);
             assert_eq!(found.count, frames.len() as f64 - 4.0);
             // the diffuse variance is 1e8
             assert!((found.square - square).abs() < 1e-5 * square, "{} {square}", found.square);
             found.log_det - log_det
         };
+        let both = |memory: Memory| both_at(memory, &Levels::EVEN);
         let slow = Memory { share: 0.3, time: 4.0, steps: 0.0 };
         let walking = Memory { share: 0.1, time: 3.0, steps: 0.2 };
         assert!((both(slow) - both(walking)).abs() < 1e-5);
         assert!((both(slow) - both(Memory::NONE)).abs() < 1e-5);
+        assert!((both(slow) - both_at(walking, &louder)).abs() < 1e-5);
     }
 
     #[test]

@@ -456,8 +456,8 @@ fn remarks(data: &Data, found: &Found) -> Vec<String> {
     if !large.is_empty() {
         remarks.push(format!("larger than ordinary: {}", large.join(", ")));
     }
-    remarks.extend(data.noise.remark());
     for own in data.campaigns() {
+        remarks.extend(own.noise.remarks().into_iter().map(|said| within(data, &own.name, said)));
         remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
     }
     remarks.extend(Aside::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
