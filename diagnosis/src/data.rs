@@ -35,6 +35,7 @@ use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
+use super::readmit::readmitted;
 use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
@@ -222,8 +223,7 @@ impl Data {
         drives.orbit = orbit;
         let pools = Pools::of(&campaign.settings.of_frame);
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
-        let noise = noise_of(campaign, &design, &drives)?;
-        let mut screened = screened.clone();
+        let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
@@ -770,8 +770,9 @@ fn beside(readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> DMatrix<f64> {
     all
 }
 
-/// The noise, learnt from the readings about the machine that the screening ends with, or about the design where that keeps no beam.
-fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<Noise, DataError> {
+/// The noise, learnt from the readings about the machine that the screening ends with, or about the design where that keeps no beam; and which
+/// readings count by that noise.
+fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(Noise, Screened), DataError> {
     let ring = &campaign.ring;
     let found = ring.with_strengths(&ring.strengths(campaign.params.as_slice(), &campaign.supplies));
     let found = Machine::new(found, Rf::FixedMomentum, &[]).ok();
@@ -783,7 +784,13 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<No
     let known = found.as_ref().and_then(|machine| of(machine).ok());
     let (predicted, dispersion, shapes) = known.map_or_else(|| of(design), Ok)?;
     let residual = &campaign.readings - predicted;
-    Ok(Noise::learn(&Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes }))
+    let source = Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes };
+    let noise = Noise::learn(&source);
+    let again = if noise.levels.is_even() { None } else { readmitted(&source, &noise) };
+    Ok(match again {
+        Some(again) => (Noise::learn(&Source { campaign: &again, ..source }), again.screened),
+        None => (noise, campaign.screened.clone()),
+    })
 }
 
 /// What the supplies' fluctuations off their means do to the kicked orbits and the tunes, to first order, rows frames, columns monitors [m] and

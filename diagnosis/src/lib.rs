@@ -47,6 +47,7 @@ pub mod period;
 pub mod place_scan;
 pub mod pools;
 pub mod readback;
+mod readmit;
 mod repeats;
 pub mod sample;
 mod scale;
