@@ -177,9 +177,9 @@ mod tests {
         let sigma = 0.7;
         let none = Memory::NONE;
         let remembers = Memory { share: 0.3, time: 4.0, steps: 0.1 };
-        let louder = Levels::some(2..6, 3.0);
+        let larger = Levels::some(2..6, 3.0);
         for (memory, levels) in
-            [(none, &Levels::EVEN), (remembers, &Levels::EVEN), (none, &louder), (remembers, &louder)]
+            [(none, &Levels::CONSTANT), (remembers, &Levels::CONSTANT), (none, &larger), (remembers, &larger)]
         {
             let channel = Channel::of(vec![0, 1, 2, 3], &frames, (sigma, memory, levels), common.clone());
             let covariance = |i: usize, j: usize| {

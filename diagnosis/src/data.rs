@@ -195,6 +195,8 @@ const FIRST_ORDER: f64 = 2e-5;
 const BASELINE: f64 = 20e-3;
 /// Whitened residual above which a reading of a faulty monitor is dropped.
 const FAULTY: f64 = 4.0;
+/// Passes over noise and readings that count, where the level of the noise changes.
+const PASSES: usize = 3;
 /// Fewest monitors, and fewest correctors, for a diagnosis.
 pub const LEAST: usize = 4;
 
@@ -221,9 +223,9 @@ impl Data {
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
-        let pools = Pools::of(&campaign.settings.of_frame);
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
+        let pools = Pools::of(&campaign.settings.of_frame, &noise.levels);
         noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
@@ -363,6 +365,7 @@ impl Data {
     /// A hypothetical campaign with other drives, by itself; its readings are ignored.
     pub fn driven_by(&self, drives: &Drives) -> Self {
         let mut data = Self { drives: drives.clone(), others: Vec::new(), ..self.clone() };
+        data.noise.levels = Levels::CONSTANT;
         data.prepare();
         data
     }
@@ -383,7 +386,7 @@ impl Data {
             self.channels.push(channel);
         }
         let count = self.pools.counts(monitors, |frame, b| self.counts(frame, b));
-        self.mixing = Mixing::of(&self.noise.modes, self.pools.count, |pool, b| count[(pool, b)] > 0.0);
+        self.mixing = Mixing::of(&self.noise.modes, &self.levels_of_pools(), |pool, b| count[(pool, b)] > 0.0);
         if !self.mixing.is_none() {
             let mean = |c: usize| {
                 let rows = &self.channels[c].rows;
@@ -391,6 +394,13 @@ impl Data {
             };
             self.centre = DVector::from_fn(columns, |c, _| if c < monitors { mean(c) } else { 0.0 });
         }
+    }
+
+    /// Level of the noise in each pool.
+    fn levels_of_pools(&self) -> Vec<f64> {
+        let mut levels = vec![1.0; self.pools.count];
+        self.pools.of_frame.iter().enumerate().for_each(|(frame, &pool)| levels[pool] = self.noise.levels.at(frame));
+        levels
     }
 
     /// Prepare a channel, from the frames of each pool.
@@ -409,7 +419,7 @@ impl Data {
             Some(plane) => {
                 let common = DMatrix::from_element(rows.len(), 1, TUNE_CALIBRATION);
                 let noise = self.frames.tune_noise[plane].unwrap_or(TUNE_CALIBRATION);
-                Channel::of(rows, &frames, (noise, Memory::NONE, &Levels::EVEN), common)
+                Channel::of(rows, &frames, (noise, Memory::NONE, &Levels::CONSTANT), common)
             }
         }
     }
@@ -649,7 +659,8 @@ impl Data {
                 values[(frame, b)] = (miss - self.centre[b]) / self.channels[b].sigma;
             }
         }
-        Mixing::of(&self.noise.modes, frames, |frame, b| self.counts(frame, b)).apply(&mut values);
+        let levels: Vec<f64> = (0..frames).map(|frame| self.noise.levels.at(frame)).collect();
+        Mixing::of(&self.noise.modes, &levels, |frame, b| self.counts(frame, b)).apply(&mut values);
         let is_ok = |b: &usize| self.health()[*b].state == MonitorState::Ok;
         let mut sums = (0.0, 0.0);
         for b in self.active_monitors().into_iter().filter(is_ok) {
@@ -686,15 +697,20 @@ impl Data {
     /// in each by the noise in common.
     pub fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
         let row = DMatrix::from_rows(&[pattern.transpose()]);
-        self.accompanied_in_runs(monitors, &row).row(0).transpose()
+        self.accompanied_at(&[1.0], monitors, &row).row(0).transpose()
     }
 
     /// The same in every run of a setting: rows pools.
     pub fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
+        self.accompanied_at(&self.levels_of_pools(), monitors, patterns)
+    }
+
+    /// The same at the level of the noise in each row.
+    fn accompanied_at(&self, levels: &[f64], monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
         if self.mixing.is_none() {
             return patterns.clone();
         }
-        let mixing = Mixing::of(&self.noise.modes, patterns.nrows(), |_, b| monitors.contains(&b));
+        let mixing = Mixing::of(&self.noise.modes, levels, |_, b| monitors.contains(&b));
         let mut all = DMatrix::zeros(patterns.nrows(), patterns.ncols());
         monitors.iter().for_each(|&b| all.set_column(b, &(patterns.column(b) / self.channels[b].sigma)));
         mixing.apply(&mut all);
@@ -720,6 +736,11 @@ impl Data {
             common += row;
         }
         (alone, common)
+    }
+
+    /// A reading of a monitor as recorded [m], not a number where there is none.
+    pub fn recorded(&self, frame: usize, b: usize) -> f64 {
+        self.frames.recorded[(frame, b)]
     }
 
     /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
@@ -785,12 +806,18 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
     let (predicted, dispersion, shapes) = known.map_or_else(|| of(design), Ok)?;
     let residual = &campaign.readings - predicted;
     let source = Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes };
-    let noise = Noise::learn(&source);
-    let again = if noise.levels.is_even() { None } else { readmitted(&source, &noise) };
-    Ok(match again {
-        Some(again) => (Noise::learn(&Source { campaign: &again, ..source }), again.screened),
-        None => (noise, campaign.screened.clone()),
-    })
+    let (mut noise, mut screened) = (Noise::learn(&source), campaign.screened.clone());
+    // with the readings that were put aside for their size the noise is larger, and more of them are what it makes
+    for _ in 0..PASSES {
+        let again = if noise.levels.is_constant() { campaign.screened.clone() } else { readmitted(&source, &noise) };
+        if again.accepted == screened.accepted && again.health == screened.health {
+            break;
+        }
+        screened = again.clone();
+        let campaign = Campaign { screened: again, ..campaign.clone() };
+        noise = Noise::learn(&Source { campaign: &campaign, ..source });
+    }
+    Ok((noise, screened))
 }
 
 /// What the supplies' fluctuations off their means do to the kicked orbits and the tunes, to first order, rows frames, columns monitors [m] and

@@ -35,7 +35,7 @@ mod jitter;
 pub mod joint;
 mod laplace;
 pub mod levels;
-mod limits;
+pub mod limits;
 mod linearise;
 pub mod location;
 mod memory;
@@ -56,6 +56,7 @@ pub mod score;
 pub mod search;
 pub mod settings;
 pub mod slow;
+pub mod stuck;
 pub mod transients;
 pub mod validation;
 pub mod verdict;
@@ -222,7 +223,7 @@ impl Diagnosis {
     pub fn imperfections(&self) -> Vec<Imperfection> {
         let Found { data, best, .. } = &self.found;
         let names = data.ring.monitor_names();
-        let of_others = data.campaigns().skip(1).flat_map(|own| own.noise.of_wandering(&names));
+        let of_others = data.campaigns().skip(1).flat_map(|own| own.noise.of_parts(&own.name, &names));
         ordinary::rows(data, best).into_iter().chain(data.noise.rows(&names)).chain(of_others).collect()
     }
 

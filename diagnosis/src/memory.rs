@@ -137,7 +137,7 @@ mod tests {
         for memory in
             [SLOW_AND_WALKING, Memory { steps: 0.0, ..SLOW_AND_WALKING }, Memory { share: 0.0, ..SLOW_AND_WALKING }]
         {
-            for levels in [Levels::EVEN, Levels::some(5..18, 2.5)] {
+            for levels in [Levels::CONSTANT, Levels::some(5..18, 2.5)] {
                 let factor = dense(memory, &levels, 2).cholesky().unwrap();
                 let noise = some_noise(FRAMES.len());
                 let expected = factor.l().solve_lower_triangular(&noise).unwrap();
@@ -152,7 +152,7 @@ mod tests {
     #[test]
     fn white_noise_stays_as_it_is_to_the_bit() {
         let noise = some_noise(FRAMES.len());
-        let filter = Filter::of(Memory::NONE, &Levels::EVEN, 0, &FRAMES);
+        let filter = Filter::of(Memory::NONE, &Levels::CONSTANT, 0, &FRAMES);
         let mut found = noise.clone();
         filter.whiten(found.iter_mut());
         assert_eq!(found, noise);

@@ -2,7 +2,7 @@
 //! electronics, the same in neighbouring monitors.
 //!
 //! In units of the monitors' own noise a frame has the covariance `1 + F F^T`, a column of F for each mode, over the monitors whose
-//! readings count in that frame; with the thin decomposition `F = Q D V^T` it is whitened by the symmetric
+//! readings count in that frame; where their own noise is larger by a level, F is smaller by it. With the thin decomposition `F = Q D V^T` it is whitened by the symmetric
 //! `M = 1 - Q (1 - (1 + D^2)^(-1/2)) Q^T`.
 
 use nalgebra::{DMatrix, DVector};
@@ -42,10 +42,10 @@ impl Modes {
 }
 
 impl Mixing {
-    /// Over the readings that count, rows frames.
-    pub fn of(modes: &Modes, frames: usize, counts: impl Fn(usize, usize) -> bool) -> Self {
-        let of = |frame: usize| {
-            let mut factors = modes.factors.clone();
+    /// Over the readings that count in frames of which the noise has a level, rows frames.
+    pub fn of(modes: &Modes, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
+        let of = |(frame, level): (usize, &f64)| {
+            let mut factors = &modes.factors / *level;
             for (b, mut row) in factors.row_iter_mut().enumerate() {
                 if !counts(frame, b) {
                     row.fill(0.0);
@@ -53,7 +53,7 @@ impl Mixing {
             }
             Mixed::of(factors)
         };
-        Self { frames: if modes.is_none() { Vec::new() } else { (0..frames).map(of).collect() } }
+        Self { frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(of).collect() } }
     }
 
     /// True if monitors have nothing in common.
@@ -104,10 +104,12 @@ mod tests {
     fn a_frame_is_whitened_by_the_symmetric_root_of_its_covariance() {
         let factors = DMatrix::from_row_slice(4, 2, &[0.5, 0.0, -0.7, 0.0, 0.3, 0.6, 0.9, 0.6]);
         let counts = |frame: usize, b: usize| frame == 0 || b != 1;
-        let mixing = Mixing::of(&Modes { factors: factors.clone() }, 2, counts);
+        let levels = [1.0, 3.0];
+        let mixing = Mixing::of(&Modes { factors: factors.clone() }, &levels, counts);
         let mut log_det = 0.0;
         for frame in 0..2 {
-            let kept = DMatrix::from_fn(4, 2, |b, k| if counts(frame, b) { factors[(b, k)] } else { 0.0 });
+            let kept =
+                DMatrix::from_fn(4, 2, |b, k| if counts(frame, b) { factors[(b, k)] / levels[frame] } else { 0.0 });
             let covariance = DMatrix::identity(4, 4) + &kept * kept.transpose();
             log_det += covariance.determinant().ln();
             let mut root = DMatrix::zeros(4, 4);

@@ -1,11 +1,12 @@
 //! Readings that the screening put aside where the noise of all monitors is larger: they are what that noise makes, and count again.
 //!
-//! The screening judges by the noise of the whole recording. In a stretch of larger noise ([`super::levels`]) it puts the largest readings aside, which makes
-//! the rest look quieter than they are, and calls the monitors that have many of them faulty. Readings within five standard deviations of the stretch's
-//! noise are taken back, and with them the monitors that jump in such stretches alone. A frame without a beam, or with another orbit, stays out.
+//! The screening judges by the noise of the whole recording. In a part with more noise ([`super::levels`]) it puts the largest readings aside, which makes
+//! the others' noise too small, and calls the monitors that have many of them faulty. Readings within five standard deviations of the noise there are
+//! taken back, and with them the monitors of which nearly none are left aside. Three kinds of readings stay out: those of a monitor that repeats its
+//! value, those of a frame without a beam, and those of a frame with another orbit.
 
 use estimator::MonitorState;
-use inference::Campaign;
+use inference::{Campaign, Screened};
 
 use super::noise::{Noise, Source};
 
@@ -13,42 +14,45 @@ use super::noise::{Noise, Source};
 const WITHIN: f64 = 5.0;
 /// Share of a frame's readings that may be further away; a frame with more has another orbit.
 const FEW: f64 = 0.2;
-/// Share of a monitor's readings elsewhere that may be put aside: a sound one has as many by chance.
-const BY_CHANCE: f64 = 0.01;
+/// Share of a monitor's readings that may be left aside: with more the screening calls it one that jumps.
+const JUMPS: f64 = 0.01;
 
-/// The campaign with these readings, if there are any.
-pub fn readmitted(source: &Source, noise: &Noise) -> Option<Campaign> {
+/// What counts with the noise that was learnt.
+pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
     let Source { campaign, residual, .. } = *source;
     let monitors = campaign.monitors();
-    let level = |frame: usize| noise.levels.at(frame);
-    let loud: Vec<usize> = (0..campaign.frames()).filter(|&frame| level(frame) > 1.0).collect();
-    let middle: Vec<f64> = (0..monitors).map(|b| middle(source, b)).collect();
+    let middles: Vec<f64> = (0..monitors).map(|b| middle(source, b)).collect();
     let is_near = |frame: usize, b: usize| {
-        let sigma = campaign.recording.header.noise[b] * noise.common_scale.value * level(frame);
-        (residual[(frame, b)] - middle[b]).abs() < WITHIN * sigma
+        let sigma = noise_of(campaign, noise, b) * noise.levels.at(frame);
+        (residual[(frame, b)] - middles[b]).abs() < WITHIN * sigma
     };
-    let is_read = |frame: usize, b: usize| !residual[(frame, b)].is_nan() && !middle[b].is_nan();
-    let mut again = campaign.clone();
-    let mut is_changed = false;
-    for &frame in loud.iter().filter(|&&frame| !campaign.recording.rows[frame].is_without_beam()) {
-        let read: Vec<usize> = (0..monitors).filter(|&b| is_read(frame, b)).collect();
-        let far = read.iter().filter(|&&b| !is_near(frame, b)).count();
-        if far as f64 > FEW * read.len() as f64 {
-            continue;
+    let is_of_orbit = |frame: &usize| {
+        let read: Vec<usize> = (0..monitors).filter(|&b| !(residual[(*frame, b)] - middles[b]).is_nan()).collect();
+        let far = read.iter().filter(|&&b| !is_near(*frame, b)).count();
+        !campaign.recording.rows[*frame].is_without_beam() && far as f64 <= FEW * read.len() as f64
+    };
+    let frames: Vec<usize> = (0..campaign.frames()).filter(is_of_orbit).collect();
+    let mut again = campaign.screened.clone();
+    for (b, health) in again.health.iter_mut().enumerate().filter(|(_, health)| health.state != MonitorState::Dead) {
+        let larger = frames.iter().filter(|&&frame| noise.levels.at(frame) > 1.0);
+        let back =
+            larger.filter(|&&frame| !campaign.counts(frame, b) && is_near(frame, b) && !repeats(campaign, frame, b));
+        for &frame in back {
+            again.accepted[(frame, b)] = true;
+            health.rejected = health.rejected.saturating_sub(1);
         }
-        for b in read.into_iter().filter(|&b| is_near(frame, b) && !campaign.counts(frame, b)) {
-            again.screened.accepted[(frame, b)] = true;
-            is_changed = true;
-        }
-    }
-    for (b, health) in again.screened.health.iter_mut().enumerate() {
-        let elsewhere = || (0..campaign.frames()).filter(|&frame| level(frame) == 1.0 && is_read(frame, b));
-        let aside = elsewhere().filter(|&frame| !campaign.counts(frame, b)).count();
-        if health.state == MonitorState::Jumps && aside as f64 <= BY_CHANCE * elsewhere().count() as f64 {
+        let read: Vec<usize> = frames.iter().copied().filter(|&frame| !residual[(frame, b)].is_nan()).collect();
+        let aside = read.iter().filter(|&&frame| !again.accepted[(frame, b)]).count();
+        if health.state == MonitorState::Jumps && aside as f64 <= JUMPS * read.len() as f64 {
             (health.state, health.weighted_as) = (MonitorState::Ok, health.noise);
         }
     }
-    is_changed.then_some(again)
+    again
+}
+
+/// Noise of a monitor where the level is ordinary [m]: as learnt from its repeats, or the header's at the scale of all.
+fn noise_of(campaign: &Campaign, noise: &Noise, b: usize) -> f64 {
+    if campaign.is_ok(b) { noise.own[b] } else { campaign.recording.header.noise[b] * noise.common_scale.value }
 }
 
 /// Median of what a monitor's readings that count leave, not a number without any.
@@ -57,4 +61,11 @@ fn middle(source: &Source, b: usize) -> f64 {
     let mut values: Vec<f64> = frames.map(|frame| source.residual[(frame, b)]).collect();
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+/// True for a reading that is the same as the one before or after.
+fn repeats(campaign: &Campaign, frame: usize, b: usize) -> bool {
+    let readings = campaign.readings.column(b);
+    let is_same = |other: usize| readings.get(other).is_some_and(|reading| *reading == readings[frame]);
+    frame.checked_sub(1).is_some_and(is_same) || is_same(frame + 1)
 }

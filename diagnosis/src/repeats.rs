@@ -278,7 +278,7 @@ mod tests {
             if k == 0 || k == setting { 1.0 } else { 0.0 }
         });
         let repeats = Repeats::of(&frames, y.as_slice(), &runs);
-        let louder = Levels::some(3..9, 2.0);
+        let larger = Levels::some(3..9, 2.0);
         let both_at = |memory: Memory, levels: &Levels| {
             let (square, log_det) = restricted(memory, levels, &frames, &y, &x);
             let found = repeats.clone().at_levels(levels).weigh(memory);
@@ -287,12 +287,12 @@ mod tests {
             assert!((found.square - square).abs() < 1e-5 * square, "{} {square}", found.square);
             found.log_det - log_det
         };
-        let both = |memory: Memory| both_at(memory, &Levels::EVEN);
+        let both = |memory: Memory| both_at(memory, &Levels::CONSTANT);
         let slow = Memory { share: 0.3, time: 4.0, steps: 0.0 };
         let walking = Memory { share: 0.1, time: 3.0, steps: 0.2 };
         assert!((both(slow) - both(walking)).abs() < 1e-5);
         assert!((both(slow) - both(Memory::NONE)).abs() < 1e-5);
-        assert!((both(slow) - both_at(walking, &louder)).abs() < 1e-5);
+        assert!((both(slow) - both_at(walking, &larger)).abs() < 1e-5);
     }
 
     #[test]

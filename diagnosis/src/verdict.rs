@@ -21,6 +21,7 @@ use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
 use super::scan::separations;
 use super::search::{Found, corrections};
+use super::stuck::Stuck;
 use super::transients::Transient;
 
 /// The result of a diagnosis.
@@ -460,6 +461,7 @@ fn remarks(data: &Data, found: &Found) -> Vec<String> {
         remarks.extend(own.noise.remarks().into_iter().map(|said| within(data, &own.name, said)));
         remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
     }
+    remarks.extend(Stuck::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
     remarks.extend(Aside::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)

@@ -81,6 +81,7 @@ fn kill(test: &str, kills: usize) {
     assert_ne!(left_by(&[daemon.0.id()]), [""; 0], "the daemon that lives has shared memory");
     let took = daemon.stop();
     println!("SIGTERM took {took:?}");
+    assert!(took < SOON, "SIGTERM took {took:?}");
     ends.store(true, Ordering::Relaxed);
     feeder.join().unwrap();
     drop(subscriber);
