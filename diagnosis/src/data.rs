@@ -35,7 +35,7 @@ use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
-use super::readmit::readmitted;
+use super::readmit::{JUMPS, left_aside, readmitted};
 use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
@@ -226,7 +226,10 @@ impl Data {
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         let pools = Pools::of(&campaign.settings.of_frame, &noise.levels);
-        noise.sound.iter().for_each(|&b| screened.health[b].state = MonitorState::Ok);
+        for &b in &noise.sound {
+            let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
+            screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
+        }
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
@@ -813,9 +816,10 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
         if again.accepted == screened.accepted && again.health == screened.health {
             break;
         }
-        screened = again.clone();
-        let campaign = Campaign { screened: again, ..campaign.clone() };
-        noise = Noise::learn(&Source { campaign: &campaign, ..source });
+        let mut counting = campaign.clone();
+        counting.screened.clone_from(&again);
+        noise = Noise::learn(&Source { campaign: &counting, ..source });
+        screened = again;
     }
     Ok((noise, screened))
 }

@@ -40,8 +40,9 @@ const ODDS: f64 = 0.1;
 const WIDTH: f64 = core::f64::consts::LN_2;
 /// Parts that are tried at most.
 const MOST: usize = 8;
-/// Fewest frames with differences in a part, and about how many ends are tried at first; in longer recordings those near the best follow.
-const SHORTEST: usize = 4;
+/// Fewest frames with differences in a part, since in fewer its patterns cannot be told from noise; and about how many ends are tried at first: in longer
+/// recordings those near the best follow.
+const SHORTEST: usize = 8;
 const ENDS: usize = 400;
 /// Patterns in which a beam moves: two phases in x and y each, one of which the momentum has.
 const PATTERNS: usize = 4;
@@ -127,23 +128,15 @@ impl Levels {
     /// Learn from whitened differences, rows frames, columns monitors; not a number where there is none.
     pub fn learn(differences: &DMatrix<f64>) -> Self {
         let squares = Squares::of(differences);
-        let (mut tried, mut found) = (Vec::new(), Vec::new());
-        while tried.len() < MOST
-            && let Some(frames) = squares.best(&tried)
-        {
-            if squares.is_noise(&frames, &tried) {
-                found.push(frames.clone());
-            }
-            tried.push(frames);
-        }
-        found.sort_by_key(|frames| frames.start);
+        let tried = squares.parts();
         let rest = squares.rest(&tried);
         let part = |frames: Range<usize>| {
             let factor = squares.sums(&frames).over(rest, squares.dispersion);
             Part { frames, factor }
         };
+        let found = tried.into_iter().filter(|frames| squares.is_noise(frames, rest));
         let mut parts: Vec<Part> = Vec::new();
-        for next in found.into_iter().map(part) {
+        for next in found.map(part) {
             match parts.last_mut().filter(|last| squares.continues(last, &next)) {
                 Some(last) => *last = part(last.frames.start..next.frames.end),
                 None => parts.push(next),
@@ -199,6 +192,24 @@ impl<'d> Squares<'d> {
         parts.iter().fold(self.sums(&(0..self.frames())), |rest, one| rest.less(self.sums(one)))
     }
 
+    /// All parts with larger squares, in rising order.
+    fn parts(&self) -> Vec<Range<usize>> {
+        let mut parts = Vec::new();
+        while parts.len() < MOST
+            && let Some(frames) = self.best(&parts)
+        {
+            parts.push(frames);
+        }
+        // the first ones were found without the others
+        for i in 0..parts.len() {
+            let others: Vec<Range<usize>> =
+                parts.iter().enumerate().filter(|(k, _)| *k != i).map(|(_, one)| one.clone()).collect();
+            parts[i] = self.best(&others).unwrap_or_else(|| parts[i].clone());
+        }
+        parts.sort_by_key(|frames| frames.start);
+        parts
+    }
+
     /// True for a part that follows another without a difference in between, with the same factor.
     fn continues(&self, one: &Part, next: &Part) -> bool {
         let between = self.sums(&(one.frames.end..next.frames.start));
@@ -244,10 +255,9 @@ impl<'d> Squares<'d> {
     }
 
     /// True for the noise of three monitors in four that is in no few patterns.
-    fn is_noise(&self, frames: &Range<usize>, tried: &[Range<usize>]) -> bool {
-        let inside = self.sums(frames);
-        let outside = self.rest(tried).less(inside).variance();
-        let ratio = inside.variance() / outside;
+    fn is_noise(&self, frames: &Range<usize>, rest: Sums) -> bool {
+        let outside = rest.variance();
+        let ratio = self.sums(frames).variance() / outside;
         let values = self.differences.rows_range(frames.clone());
         let each = values
             .column_iter()

@@ -636,8 +636,12 @@ mod tests {
         assert!(frames.start.abs_diff(part.start) <= 3 && frames.end.abs_diff(part.end) <= 3, "{frames:?}");
         // three quiet frames among 73 make 2 % less, sampling 2 %
         assert!((learnt.value / factor - 1.0).abs() < 0.08, "{learnt:?}");
-        let states = |data: &Data| data.health().iter().map(|one| one.state).collect::<Vec<_>>();
+        // readings that jump stay out; their monitor is no longer called faulty, which a few of them do not show beside so much noise
+        let states = |data: &Data| data.health().iter().map(|one| one.state == MonitorState::Noisy).collect::<Vec<_>>();
         assert_eq!(states(data), states(&sound));
+        let jumps = |b: usize| (0..150).filter(|&frame| sound.is_aside(frame, b)).collect::<Vec<_>>();
+        let jumping = (0..sound.monitors()).max_by_key(|b| jumps(*b).len()).unwrap();
+        assert!(jumps(jumping).len() >= 3 && jumps(jumping).iter().all(|frame| data.is_aside(*frame, jumping)));
 
         let (jumping, stuck) = (4, 9);
         made.rows[part.clone()]

@@ -1,8 +1,8 @@
-//! Readings that the screening put aside where the noise of all monitors is larger: they are what that noise makes, and count again.
+//! Readings that the screening put aside where the level of the noise changes ([`super::levels`]): they are what the noise makes, and count again.
 //!
-//! The screening judges by the noise of the whole recording. In a part with more noise ([`super::levels`]) it puts the largest readings aside, which makes
-//! the others' noise too small, and calls the monitors that have many of them faulty. Readings within five standard deviations of the noise there are
-//! taken back, and with them the monitors of which nearly none are left aside. Three kinds of readings stay out: those of a monitor that repeats its
+//! The screening judges by one noise for the whole recording. In a part with more it puts the largest readings aside, which makes the others' noise too
+//! small, calls the monitors that have many of them faulty, and may follow some that agree by chance instead of good ones of the same setting elsewhere.
+//! Readings within some standard deviations of the noise in their frame are taken back, and with them the monitors of which nearly none are left aside. Three kinds of readings stay out: those of a monitor that repeats its
 //! value, those of a frame without a beam, and those of a frame with another orbit.
 
 use estimator::MonitorState;
@@ -10,12 +10,14 @@ use inference::{Campaign, Screened};
 
 use super::noise::{Noise, Source};
 
-/// Standard deviations of the noise of its frame within which a reading is taken back.
-const WITHIN: f64 = 5.0;
+/// Standard deviations of the noise within which a reading is taken back, where the level is larger and where it is ordinary: there a small jump is
+/// further away.
+const WITHIN: [f64; 2] = [5.0, 3.0];
 /// Share of a frame's readings that may be further away; a frame with more has another orbit.
 const FEW: f64 = 0.2;
-/// Share of a monitor's readings that may be left aside: with more the screening calls it one that jumps.
-const JUMPS: f64 = 0.01;
+/// Share of a monitor's readings that may be left aside: of one that the screening calls jumping one in a hundred jumps at least, and some of these within
+/// larger noise.
+pub const JUMPS: f64 = 1.0 / 300.0;
 
 /// What counts with the noise that was learnt.
 pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
@@ -23,8 +25,9 @@ pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
     let monitors = campaign.monitors();
     let middles: Vec<f64> = (0..monitors).map(|b| middle(source, b)).collect();
     let is_near = |frame: usize, b: usize| {
-        let sigma = noise_of(campaign, noise, b) * noise.levels.at(frame);
-        (residual[(frame, b)] - middles[b]).abs() < WITHIN * sigma
+        let level = noise.levels.at(frame);
+        let sigma = noise_of(campaign, noise, b) * level;
+        (residual[(frame, b)] - middles[b]).abs() < WITHIN[usize::from(level == 1.0)] * sigma
     };
     let is_of_orbit = |frame: &usize| {
         let read: Vec<usize> = (0..monitors).filter(|&b| !(residual[(*frame, b)] - middles[b]).is_nan()).collect();
@@ -34,20 +37,29 @@ pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
     let frames: Vec<usize> = (0..campaign.frames()).filter(is_of_orbit).collect();
     let mut again = campaign.screened.clone();
     for (b, health) in again.health.iter_mut().enumerate().filter(|(_, health)| health.state != MonitorState::Dead) {
-        let larger = frames.iter().filter(|&&frame| noise.levels.at(frame) > 1.0);
-        let back =
-            larger.filter(|&&frame| !campaign.counts(frame, b) && is_near(frame, b) && !repeats(campaign, frame, b));
-        for &frame in back {
+        let is_back =
+            |frame: &&usize| !campaign.counts(**frame, b) && is_near(**frame, b) && !repeats(campaign, **frame, b);
+        for &frame in frames.iter().filter(is_back) {
             again.accepted[(frame, b)] = true;
             health.rejected = health.rejected.saturating_sub(1);
         }
-        let read: Vec<usize> = frames.iter().copied().filter(|&frame| !residual[(frame, b)].is_nan()).collect();
-        let aside = read.iter().filter(|&&frame| !again.accepted[(frame, b)]).count();
-        if health.state == MonitorState::Jumps && aside as f64 <= JUMPS * read.len() as f64 {
-            (health.state, health.weighted_as) = (MonitorState::Ok, health.noise);
+    }
+    for b in 0..monitors {
+        if again.health[b].state == MonitorState::Jumps && left_aside(campaign, &again, b) <= JUMPS {
+            again.health[b].weighted_as = again.health[b].noise;
+            again.health[b].state = MonitorState::Ok;
         }
     }
     again
+}
+
+/// Share of a monitor's readings that are left aside in frames in which few others are.
+pub fn left_aside(campaign: &Campaign, screened: &Screened, b: usize) -> f64 {
+    let is_aside = |frame: usize, b: usize| !campaign.readings[(frame, b)].is_nan() && !screened.accepted[(frame, b)];
+    let monitors = campaign.monitors();
+    let few = |frame: &usize| (0..monitors).filter(|&b| is_aside(*frame, b)).count() as f64 <= FEW * monitors as f64;
+    let frames: Vec<usize> = (0..campaign.frames()).filter(few).collect();
+    frames.iter().filter(|&&frame| is_aside(frame, b)).count() as f64 / frames.len().max(1) as f64
 }
 
 /// Noise of a monitor where the level is ordinary [m]: as learnt from its repeats, or the header's at the scale of all.
