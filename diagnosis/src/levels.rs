@@ -44,7 +44,7 @@ const MOST: usize = 8;
 /// recordings those near the best follow.
 const SHORTEST: usize = 8;
 const ENDS: usize = 400;
-/// Patterns in which a beam moves: two phases in x and y each, one of which the momentum has.
+/// Patterns in which a beam moves, at most: two phases of betatron motion in x and two in y.
 const PATTERNS: usize = 4;
 /// Median of chi-square of one degree of freedom.
 const MEDIAN: f64 = 0.455;
@@ -315,10 +315,10 @@ mod tests {
     /// Differences of runs of three frames, of which the first has none.
     fn differences(seed: u64, noise: impl Fn(&mut StdRng) -> f64, scale: impl Fn(usize, usize) -> f64) -> DMatrix<f64> {
         let mut random = StdRng::seed_from_u64(seed);
-        let mut of = |frame: usize, b: usize| {
+        let of = |frame: usize, b: usize| {
             if frame.is_multiple_of(3) { f64::NAN } else { noise(&mut random) * scale(frame, b) }
         };
-        DMatrix::from_fn(FRAMES, MONITORS, |frame, b| of(frame, b))
+        DMatrix::from_fn(FRAMES, MONITORS, of)
     }
 
     fn normal(random: &mut StdRng) -> f64 {
