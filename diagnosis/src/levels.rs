@@ -1,6 +1,6 @@
 //! The level of the noise in time: parts of the recording in which all monitors are noisier by one factor than in the rest.
 //!
-//! With `n` whitened differences ([`super::repeats`]) and `q` the sum of their squares, and `in` and `out` for sums over a part and over
+//! With `n` whitened differences (`repeats.rs`) and `q` the sum of their squares, and `in` and `out` for sums over a part and over
 //! the rest, the noise is larger by `f = sqrt((q_in/n_in)/(q_out/n_out))`, and the `ln` likelihood by
 //!
 //! `(n ln(q/n) - n_in ln(q_in/n_in) - n_out ln(q_out/n_out))/(2 D)`.
