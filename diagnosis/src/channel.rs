@@ -50,11 +50,10 @@ impl Root {
         let all = || frames.iter().flatten().copied();
         let (first, last) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
         // by the distance of two frames, and of the walk the frames that both have seen
-        let apart: Vec<f64> = (first..=last).map(|frame| memory.covariance(0, frame - first)).collect();
+        let apart: Vec<f64> = (0..=last - first).map(|apart| memory.stationary(apart)).collect();
         let level: Vec<f64> = (first..=last).map(|frame| levels.at(frame)).collect();
         let both = |i: usize, j: usize| {
-            let walk = memory.steps.powi(2) * (i.min(j) - first) as f64;
-            apart[i.abs_diff(j)] * (level[i - first] * level[j - first]) + walk
+            apart[i.abs_diff(j)] * (level[i - first] * level[j - first]) + memory.walked(i - first, j - first)
         };
         let mean = |one: &[usize], other: &[usize]| {
             let sum: f64 = one.iter().flat_map(|&i| other.iter().map(move |&j| (i, j))).map(|(i, j)| both(i, j)).sum();
@@ -182,10 +181,7 @@ mod tests {
             [(none, &Levels::CONSTANT), (remembers, &Levels::CONSTANT), (none, &larger), (remembers, &larger)]
         {
             let channel = Channel::of(vec![0, 1, 2, 3], &frames, (sigma, memory, levels), common.clone());
-            let covariance = |i: usize, j: usize| {
-                let walk = memory.steps.powi(2) * i.min(j) as f64;
-                (memory.covariance(i, j) - walk) * levels.at(i) * levels.at(j) + walk
-            };
+            let covariance = |i: usize, j: usize| memory.covariance(levels, 0, [i, j]);
             let mean = |one: &[usize], other: &[usize]| {
                 let all = one.iter().flat_map(|&i| other.iter().map(move |&j| covariance(i, j)));
                 all.sum::<f64>() / (one.len() * other.len()) as f64

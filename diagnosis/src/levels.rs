@@ -259,9 +259,7 @@ impl<'d> Squares<'d> {
         let outside = rest.variance();
         let ratio = self.sums(frames).variance() / outside;
         let values = self.differences.rows_range(frames.clone());
-        let each = values
-            .column_iter()
-            .map(|column| column.iter().copied().fold(Sums::default(), |sums, z| sums.plus(Sums::of([z].into_iter()))));
+        let each = values.column_iter().map(|column| Sums::of(column.iter().copied()));
         let mut each: Vec<Sums> = each.filter(|sums| sums.count > 0.0).collect();
         each.sort_by(|one, other| one.variance().total_cmp(&other.variance()));
         let quarter = each[each.len() / 4];

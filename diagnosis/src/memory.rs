@@ -58,10 +58,22 @@ impl Memory {
         (-(frames as f64) / self.time).exp()
     }
 
-    /// Covariance of the noise in two frames, the walk counted from frame 0.
-    pub fn covariance(self, one: usize, other: usize) -> f64 {
-        let white = if one == other { 1.0 - self.share } else { 0.0 };
-        white + self.share * self.decay(one.abs_diff(other)) + self.steps * self.steps * one.min(other) as f64
+    /// Covariance of white and slow noise in two frames so far apart, at the ordinary level.
+    pub fn stationary(self, apart: usize) -> f64 {
+        let white = if apart == 0 { 1.0 - self.share } else { 0.0 };
+        white + self.share * self.decay(apart)
+    }
+
+    /// Covariance of the walk in two frames, counted from where it begins.
+    pub fn walked(self, one: usize, other: usize) -> f64 {
+        self.steps * self.steps * one.min(other) as f64
+    }
+
+    /// Covariance of the noise in two frames, the walk counted from `origin`.
+    #[cfg(test)]
+    pub fn covariance(self, levels: &Levels, origin: usize, [one, other]: [usize; 2]) -> f64 {
+        let stationary = self.stationary(one.abs_diff(other)) * levels.at(one) * levels.at(other);
+        stationary + self.walked(one - origin, other - origin)
     }
 
     /// Covariance of the states, some frames later.
@@ -119,12 +131,7 @@ mod tests {
     const FRAMES: [usize; 9] = [3, 4, 5, 9, 10, 17, 18, 30, 31];
 
     fn dense(memory: Memory, levels: &Levels, origin: usize) -> DMatrix<f64> {
-        let of_walk = Memory { share: 1.0, time: f64::MIN_POSITIVE, ..memory };
-        let at = |i: usize, j: usize| {
-            let [one, other] = [FRAMES[i], FRAMES[j]];
-            let walk = of_walk.covariance(one - origin, other - origin) - if i == j { 1.0 } else { 0.0 };
-            (memory.covariance(one - origin, other - origin) - walk) * levels.at(one) * levels.at(other) + walk
-        };
+        let at = |i: usize, j: usize| memory.covariance(levels, origin, [FRAMES[i], FRAMES[j]]);
         DMatrix::from_fn(FRAMES.len(), FRAMES.len(), at)
     }
 

@@ -26,7 +26,7 @@ pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
     let middles: Vec<f64> = (0..monitors).map(|b| middle(source, b)).collect();
     let is_near = |frame: usize, b: usize| {
         let level = noise.levels.at(frame);
-        let sigma = noise_of(campaign, noise, b) * level;
+        let sigma = ordinary_noise(campaign, noise, b) * level;
         (residual[(frame, b)] - middles[b]).abs() < WITHIN[usize::from(level == 1.0)] * sigma
     };
     let is_of_orbit = |frame: &usize| {
@@ -63,7 +63,7 @@ pub fn left_aside(campaign: &Campaign, screened: &Screened, b: usize) -> f64 {
 }
 
 /// Noise of a monitor where the level is ordinary [m]: as learnt from its repeats, or the header's at the scale of all.
-fn noise_of(campaign: &Campaign, noise: &Noise, b: usize) -> f64 {
+fn ordinary_noise(campaign: &Campaign, noise: &Noise, b: usize) -> f64 {
     if campaign.is_ok(b) { noise.own[b] } else { campaign.recording.header.noise[b] * noise.common_scale.value }
 }
 

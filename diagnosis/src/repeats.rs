@@ -253,11 +253,7 @@ mod tests {
     /// `ln` density of contrasts, `-(y^T P y + ln det S + ln det X^T S^-1 X)/2`, X the unknown baseline and changes.
     fn restricted(memory: Memory, levels: &Levels, frames: &[usize], y: &DVector<f64>, x: &DMatrix<f64>) -> (f64, f64) {
         let n = frames.len();
-        let s = DMatrix::from_fn(n, n, |i, j| {
-            let [one, other] = [frames[i], frames[j]];
-            let walk = memory.steps.powi(2) * one.min(other) as f64;
-            (memory.covariance(one, other) - walk) * levels.at(one) * levels.at(other) + walk
-        });
+        let s = DMatrix::from_fn(n, n, |i, j| memory.covariance(levels, 0, [frames[i], frames[j]]));
         let factor = s.clone().cholesky().unwrap();
         let solved = factor.solve(x);
         let information = x.tr_mul(&solved);
