@@ -65,10 +65,11 @@ impl Menu {
     /// # Errors
     /// [`FitError`].
     pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
+        let sigma = &fitted.units.sigma;
         let of_recording = |campaign: usize| {
             let (machine, drives) = fitted.machine_in(data, campaign)?;
             let weight = data.momentum / data.campaign(campaign).momentum;
-            Derivatives::of(data.campaign(campaign), &machine, &drives, one.0, other, weight)
+            Derivatives::of(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
         };
         let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
         let (machine, drives) = fitted.machine(data)?;
@@ -77,7 +78,8 @@ impl Menu {
         let mut proposals = Vec::new();
         for Scenario { what, change, machine, drives, weight } in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is not proposed
-            let Ok(new) = Derivatives::of(data, &machine, &drives, one.0, other, weight) else { continue };
+            let new = Derivatives::of(data, (&machine, &drives), sigma, (one.0, other), weight);
+            let Ok(new) = new else { continue };
             let both: Vec<&Derivatives> = present.iter().chain([&new]).collect();
             proposals.push(Proposal { what, change, separation: separation(&both, amplitude, free) });
         }
@@ -87,13 +89,12 @@ impl Menu {
 }
 
 impl Derivatives {
-    /// `weight`: size of the cause over its present size.
+    /// `sigma`: standard deviations of the vars; `weight`: size of the cause over its present size.
     fn of(
         data: &Data,
-        machine: &Machine,
-        drives: &Drives,
-        one: &Term,
-        other: Option<&Term>,
+        (machine, drives): (&Machine, &Drives),
+        sigma: &DVector<f64>,
+        (one, other): (&Term, Option<&Term>),
         weight: f64,
     ) -> Result<Self, FitError> {
         let machine = machine.on_orbit(&drives.orbit);
@@ -101,7 +102,7 @@ impl Derivatives {
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
         let columns: Vec<_> =
-            of_vars.iter().zip(&data.units.sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
+            of_vars.iter().zip(sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, FitError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);

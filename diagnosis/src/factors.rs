@@ -4,9 +4,11 @@
 //! frame, and noise e of each monitor by itself, of an unknown variance. With the prior `G ~ N(0, omega^2)` of every element, and
 //! posteriors of amplitudes and patterns that are taken as independent of each other, a lower limit of `ln` evidence has a closed form:
 //!
-//! `L = sum over readings of <ln p(z|x, G)> - KL(x) - KL(G)`.
+//! `L = sum over readings of <ln p(z|x, G)> - KL(x) - KL(G) - KL(e)`.
 //!
-//! Each step of the fit (the amplitudes of each frame, the pattern at each monitor, its own noise) raises it. Readings that are missing are left
+//! The variance of a monitor's own noise counts as known by a few differences of variance 1, of which the inverse gamma prior makes its part of L, with `n`
+//! differences and their mean square `<|z - F y - G x|^2>` summed to q, `-(OWN + n)/2 ln((OWN + q)/(OWN + n))` up to a constant: as many patterns as there are frames
+//! leave no noise, and would be free otherwise. Each step of the fit (the amplitudes of each frame, the pattern at each monitor, its own noise) raises L. Readings that are missing are left
 //! out of the sums. As a lower limit it never overstates a pattern; a pattern that is not needed shrinks to zero.
 //!
 //! Source: C. M. Bishop, Variational principal components, ICANN (1999) 509; Z. Ghahramani and M. J. Beal, Variational inference for Bayesian
@@ -28,8 +30,8 @@ const WIDTHS: [f64; 4] = [0.1, 0.2, 0.4, 0.8];
 /// Most steps, and the gain by one that ends them.
 const STEPS: usize = 150;
 const SETTLED: f64 = 3e-3;
-/// Least variance of a monitor's own noise, and that with which the fit begins.
-const OWN: f64 = 1e-3;
+/// Differences of variance 1 that the prior of a monitor's own noise counts as, and the least variance with which the fit begins.
+const OWN: f64 = 2.0;
 const LEAST: f64 = 0.1;
 
 /// What is fitted.
@@ -181,11 +183,11 @@ impl<'s> Fit<'s> {
         self.covariance[b] = factor.inverse();
         let (square, row) = (self.square(b), self.mean.row(b));
         let left = squares - 2.0 * (row * &sums.cross)[0] + square.component_mul(&sums.amplitudes).sum();
-        self.own[b] = (left / count).max(OWN);
+        self.own[b] = (OWN + left) / (OWN + count);
         let log_det = -2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>();
         let prior = square.view_range(known.., known..).trace() / self.variance;
         let of_pattern = 0.5 * (log_det + unknown as f64 * (1.0 - self.variance.ln()) - prior);
-        of_pattern - 0.5 * (count * self.own[b].ln() + left / self.own[b])
+        of_pattern - 0.5 * (OWN + count) * self.own[b].ln()
     }
 }
 
@@ -205,8 +207,8 @@ mod tests {
     }
 
     /// Differences with some patterns in common, a tenth of them missing.
-    fn differences(patterns: &DMatrix<f64>, random: &mut StdRng) -> Seen {
-        let mut all = DMatrix::zeros(FRAMES, MONITORS);
+    fn differences(frames: usize, patterns: &DMatrix<f64>, random: &mut StdRng) -> Seen {
+        let mut all = DMatrix::zeros(frames, patterns.nrows());
         for mut row in all.row_iter_mut() {
             let x = DVector::from_fn(patterns.ncols(), |_, _| normal(random));
             let common = patterns * x;
@@ -220,11 +222,26 @@ mod tests {
         DMatrix::from_fn(MONITORS, columns, |_, _| 0.3 * normal(random))
     }
 
+    /// A campaign that goes back to 0 A after every frame has few neighbours of one setting.
+    #[test]
+    fn few_frames_of_many_monitors_have_no_pattern() {
+        let mut random = StdRng::seed_from_u64(3);
+        let none = DMatrix::zeros(MONITORS, 0);
+        for frames in [1, 2, 3, 5, 10, 30] {
+            for columns in 1..4 {
+                let z = differences(frames, &none, &mut random);
+                let nothing = Factors::of(&z, &none, &none).log_evidence;
+                let gain = Factors::of(&z, &none, &start(&mut random, columns)).log_evidence - nothing;
+                assert!(gain < 1.0, "{frames} {columns}: {gain}");
+            }
+        }
+    }
+
     #[test]
     fn a_pattern_is_found_with_readings_missing() {
         let mut random = StdRng::seed_from_u64(1);
         let truth = DMatrix::from_fn(MONITORS, 1, |b, _| 0.7 * (1.3 * b as f64).cos());
-        let z = differences(&truth, &mut random);
+        let z = differences(FRAMES, &truth, &mut random);
         let none = DMatrix::zeros(MONITORS, 0);
         let found = Factors::of(&z, &none, &start(&mut random, 1));
         let nothing = Factors::of(&z, &none, &none);
@@ -243,7 +260,7 @@ mod tests {
         let mut random = StdRng::seed_from_u64(2);
         let none = DMatrix::zeros(MONITORS, 0);
         for _ in 0..20 {
-            let z = differences(&none, &mut random);
+            let z = differences(FRAMES, &none, &mut random);
             let nothing = Factors::of(&z, &none, &none).log_evidence;
             for columns in 1..3 {
                 let gain = Factors::of(&z, &none, &start(&mut random, columns)).log_evidence - nothing;

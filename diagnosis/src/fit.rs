@@ -148,7 +148,7 @@ impl Fitted {
         let start = guess.clone().resize_vertically(size, 0.0);
         let problem = Problem::new(data, hypothesis, &start)?;
         let hopeful = |steps, cost| steps < TRIAL || cost <= HOPELESS * rival;
-        let found = minimise(&problem, &start, &data.units.bounds(size), &LIMITS, hopeful);
+        let found = minimise(&problem, &start, &hypothesis.units(data).bounds(size), &LIMITS, hopeful);
         let found = found.map_err(|error| match error {
             OptimiseError::Start(error) => FitError::Effect(error),
             OptimiseError::Degenerate => FitError::Degenerate,
@@ -159,7 +159,7 @@ impl Fitted {
     }
 
     fn at(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
-        let (data, units) = (problem.data, problem.data.units.clone());
+        let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
         let jacobian = problem.ordinary.beside(slopes);
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
@@ -238,7 +238,8 @@ impl Fitted {
             Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
         };
         let others = other.unknowns(data);
-        let all = self.u.iter().copied().take(self.params.len());
+        let units = other.units(data);
+        let all = units.unknowns(&self.params);
         DVector::from_vec(all.chain(others.iter().map(|unknown| value(unknown).unwrap_or(0.0))).collect())
     }
 
@@ -321,7 +322,7 @@ impl Fitted {
         let (machine, drives) = self.machine(data)?;
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives)?;
-        let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
+        let of_vars = signatures.of_vars().into_iter().zip(&self.units.sigma);
         let mut slopes: Vec<Signature> = of_vars.map(|(signature, sigma)| signature * *sigma).collect();
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
@@ -428,11 +429,12 @@ impl<'d> Problem<'d> {
     fn jacobian(&self, u: &DVector<f64>) -> Result<DMatrix<f64>, EffectError> {
         let (data, vars) = (self.data, self.data.units.len());
         let held = self.held(u);
+        let sigma = self.hypothesis.units(data).sigma;
         let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
             let (machine, drives) = machine_at(data, self.hypothesis, campaign, &held)?;
             let machine = machine.on_orbit(&drives.orbit);
             let signatures = Signatures::of(&machine, &drives)?;
-            let of_vars = signatures.of_vars().into_iter().zip(&data.units.sigma);
+            let of_vars = signatures.of_vars().into_iter().zip(&sigma);
             let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
             let of_others = self.unknowns[..self.others() - vars].iter();
             let of_others = of_others.map(|unknown| of_linear(data, campaign, &signatures, unknown));
@@ -485,7 +487,7 @@ fn machine_at(
     campaign: usize,
     u: &DVector<f64>,
 ) -> Result<(Machine, Drives), EffectError> {
-    hypothesis.machine_in(data, campaign, &data.units.params(u), &u.as_slice()[data.units.len()..])
+    hypothesis.machine_in(data, campaign, &hypothesis.units(data).params(u), &u.as_slice()[data.units.len()..])
 }
 
 /// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element. How the vars change what the element does is

@@ -4,7 +4,9 @@ use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
 use super::element::Element;
+use super::evidence::Units;
 use super::ordinary::{Family, is_absorbed};
+use super::scatter::Scatter;
 
 /// One effect that a hypothesis holds, its amplitude unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -26,6 +28,8 @@ pub struct Hypothesis {
     pub element: Option<Element>,
     /// Ordinary imperfections.
     pub ordinary: Vec<Family>,
+    /// Scatter of the vars.
+    pub scatter: Scatter,
     /// Effects of known amplitude.
     pub given: Vec<Effect>,
 }
@@ -172,9 +176,16 @@ impl Hypothesis {
         self.without_terms(|one| *one == term)
     }
 
-    /// `ln` prior of the widths that its unknowns have: of ordinary families relative to none, of gross effects to usual ones.
+    /// `ln` prior of the widths that its unknowns have: of vars relative to that of their prior, of ordinary families to none, of gross effects to usual
+    /// ones.
     pub fn log_prior(&self) -> f64 {
-        self.ordinary.iter().map(Family::log_prior).sum::<f64>() + self.gross.len() as f64 * GROSS.ln()
+        let of_families: f64 = self.ordinary.iter().map(Family::log_prior).sum();
+        self.scatter.log_prior() + of_families + self.gross.len() as f64 * GROSS.ln()
+    }
+
+    /// The vars in units of their scatter.
+    pub fn units(&self, data: &Data) -> Units {
+        self.scatter.units(&data.units)
     }
 
     /// Prior standard deviation of a term's amplitude; none for a switch.

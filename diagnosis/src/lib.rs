@@ -52,6 +52,7 @@ mod repeats;
 pub mod sample;
 mod scale;
 pub mod scan;
+pub mod scatter;
 pub mod score;
 pub mod search;
 pub mod settings;

@@ -185,8 +185,8 @@ impl Search {
         data.is_about_effects = false;
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
-        let ordinary = if first.is_poor() { Vec::new() } else { ordinary::learnt(&data, &first) };
-        let hypothesis = Hypothesis { ordinary, ..plain };
+        let bare = || Hypothesis { ordinary: Vec::new(), ..plain };
+        let hypothesis = if first.is_poor() { bare() } else { ordinary::learnt(&data, &first) };
         let guess = first.guess(&data, &hypothesis);
         let fitted = linearise::fit(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
         let null = fitted.map_or_else(|| linearise::fit(&mut data, &Hypothesis::default(), &start), Ok)?;
@@ -586,12 +586,10 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     }
     let own = fitted.has_own().then(|| fitted.data(data).clone());
     let data = own.as_ref().unwrap_or(data);
-    let again = |ordinary: Vec<Family>, from: &Fitted| {
-        let hypothesis = Hypothesis { ordinary, ..from.hypothesis.clone() };
-        Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis))
-    };
+    let again = |hypothesis: Hypothesis, from: &Fitted| Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis));
     let lacks_all = fitted.hypothesis.ordinary.is_empty();
-    let begun = if lacks_all { again(Family::all(), &fitted) } else { Ok(fitted.clone()) };
+    let with_all = || Hypothesis { ordinary: Family::all(), ..fitted.hypothesis.clone() };
+    let begun = if lacks_all { again(with_all(), &fitted) } else { Ok(fitted.clone()) };
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
     let best = learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
