@@ -101,8 +101,7 @@ impl Derivatives {
         let signatures = Signatures::of(&machine, drives)?;
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
-        let columns: Vec<_> =
-            of_vars.iter().zip(sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
+        let columns: Vec<_> = of_vars.iter().zip(sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
         let of = |term: &Term| -> Result<DVector<f64>, FitError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);

@@ -212,6 +212,16 @@ struct Projected {
     pull: DVector<f64>,
     /// Whose width each has.
     of: Vec<Whose>,
+    /// The vars of focusing quadrupoles, and those of defocusing ones.
+    groups: Vec<Vec<usize>>,
+}
+
+/// Posterior of all in units of their widths.
+struct Posterior {
+    mean: DVector<f64>,
+    variance: DVector<f64>,
+    /// Variance of the mean of each group of vars.
+    of_means: Vec<f64>,
 }
 
 /// Whose width it is.
@@ -276,35 +286,54 @@ impl Projected {
         gram.column_iter_mut()
             .zip(scale.iter())
             .for_each(|(mut column, s)| column.component_mul_assign(&(&scale * *s)));
-        Some(Self { gram, pull, of })
+        Some(Self { gram, pull, of, groups: groups(&data.ring) })
     }
 
-    /// Posterior mean and variance of each in units of its width.
-    fn posterior(&self, widths: &Widths) -> Option<(DVector<f64>, DVector<f64>)> {
+    fn posterior(&self, widths: &Widths) -> Option<Posterior> {
         let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.of(whose)));
         let mut matrix = self.gram.clone();
         matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
         (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
         let factor = Factor::of(matrix)?;
-        let mean = factor.solve(&self.pull.component_mul(&w));
-        Some((mean, DVector::from_vec(factor.inverse_diagonal())))
+        let of_mean = |group: &Vec<usize>| {
+            let mut each = DVector::zeros(w.len());
+            group.iter().for_each(|&i| each[i] = 1.0 / group.len() as f64);
+            factor.whiten(&each).norm_squared()
+        };
+        Some(Posterior {
+            mean: factor.solve(&self.pull.component_mul(&w)),
+            variance: DVector::from_vec(factor.inverse_diagonal()),
+            of_means: self.groups.iter().map(of_mean).collect(),
+        })
+    }
+
+    /// Sum of squares of the vars about the mean of their group, in widths, and how many of these differences the recording shows: what all have in common may
+    /// be something else that the vars absorb, such as a gradient in all dipoles, and is no scatter.
+    fn scatter(&self, Posterior { mean, variance, of_means }: &Posterior) -> (f64, f64) {
+        let of_group = |(group, of_mean): (&Vec<usize>, &f64)| {
+            let count = group.len() as f64;
+            let middle = group.iter().map(|&i| mean[i]).sum::<f64>() / count;
+            let squares: f64 = group.iter().map(|&i| (mean[i] - middle).powi(2)).sum();
+            let left = group.iter().map(|&i| variance[i]).sum::<f64>() - count * of_mean;
+            (squares, count - 1.0 - left)
+        };
+        let of_each = self.groups.iter().zip(of_means).map(of_group);
+        of_each.fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
     /// The most likely widths of the vars and of the families that are learnt, from a start.
     fn widths(&self, mut widths: Widths, is_learnt: &[bool]) -> Widths {
         for _ in 0..STEPS {
-            let Some((mean, variance)) = self.posterior(&widths) else { break };
-            // sum of squares in widths, and how many the recording shows
-            let sums = |whose: Whose| {
-                let own = || (0..mean.len()).filter(|&i| self.of[i] == whose);
-                (own().map(|i| mean[i].powi(2)).sum::<f64>(), own().map(|i| 1.0 - variance[i]).sum::<f64>())
-            };
+            let Some(posterior) = self.posterior(&widths) else { break };
+            let Posterior { mean, variance, .. } = &posterior;
             let of_family = |(f, &width): (usize, &f64)| {
-                let (squares, known) = sums(Whose::Family(f));
+                let own = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
+                let squares: f64 = own().map(|i| mean[i].powi(2)).sum();
+                let known: f64 = own().map(|i| 1.0 - variance[i]).sum();
                 let next = width * (squares / (known + width.powi(2)).max(f64::MIN_POSITIVE)).sqrt();
                 if is_learnt[f] { next } else { width }
             };
-            let (squares, known) = sums(Whose::Vars);
+            let (squares, known) = self.scatter(&posterior);
             let next = Widths {
                 vars: Scatter::of(squares * widths.vars.0.powi(2), known),
                 families: widths.families.iter().enumerate().map(of_family).collect(),
@@ -317,6 +346,14 @@ impl Projected {
         }
         widths
     }
+}
+
+/// The vars of focusing quadrupoles, and those of defocusing ones.
+fn groups(ring: &Ring) -> Vec<Vec<usize>> {
+    let gradients = ring.gradients();
+    let focuses = |i: &usize| ring.parameters[*i].quadrupoles.first().is_some_and(|&q| gradients[q] > 0.0);
+    let (focusing, defocusing): (Vec<usize>, Vec<usize>) = (0..ring.parameters.len()).partition(focuses);
+    [focusing, defocusing].into_iter().filter(|group| !group.is_empty()).collect()
 }
 
 /// The hypothesis of a fit with the widths that its recording shows, of vars and families; families that it shows none of are left out.
@@ -387,9 +424,7 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         let width = family.width;
         let (value, sigma) = match family.grouping {
             _ if own.is_empty() => continue,
-            Grouping::Each if family.is_learnt() => {
-                (width, width / information(&covariance, own).sqrt())
-            }
+            Grouping::Each if family.is_learnt() => (width, width / information(&covariance, own).sqrt()),
             Grouping::Each => continue,
             Grouping::Plane(_) | Grouping::All => {
                 (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
@@ -425,12 +460,25 @@ mod tests {
         let of = [Whose::Family(0); 20].into_iter().chain([Whose::Family(1); 20]).collect();
         let amplitudes = DVector::from_fn(40, |i, _| if i < 20 { f64::sin(2.4 * i as f64) } else { 0.0 });
         let gram = DMatrix::from_diagonal_element(40, 40, 1e6);
-        let projected = Projected { pull: &gram * amplitudes, gram, of };
+        let projected = Projected { pull: &gram * amplitudes, gram, of, groups: Vec::new() };
         let start = Widths { vars: Scatter::default(), families: vec![1.0, 1.0] };
         let Widths { vars, families: width } = projected.widths(start, &[true, true]);
         assert_eq!(vars, Scatter::default(), "there are none");
         // rms 0.71 of 20, and the prior of width 1 takes the square root of 1 - 0.5/20
         assert!((width[0] - 0.70).abs() < 0.02 && width[1] < NONE, "{width:?}");
+    }
+
+    /// Two groups of 20 whose means are 3 and -2 prior widths.
+    #[test]
+    fn what_all_vars_have_in_common_is_no_scatter() {
+        let groups: Vec<Vec<usize>> = vec![(0..20).collect(), (20..40).collect()];
+        let own = |i: usize| f64::sin(2.4 * i as f64);
+        let amplitudes = DVector::from_fn(40, |i, _| own(i) + if i < 20 { 3.0 } else { -2.0 });
+        let gram = DMatrix::from_diagonal_element(40, 40, 1e6);
+        let projected = Projected { pull: &gram * amplitudes, gram, of: vec![Whose::Vars; 40], groups };
+        let Widths { vars, .. } = projected.widths(Widths { vars: Scatter::default(), families: vec![] }, &[]);
+        // mean square 0.5 of 38, and that of the prior, 1, of two more
+        assert!((vars.0 - (21.0_f64 / 40.0).sqrt()).abs() < 0.02, "{vars:?}");
     }
 
     /// Vars of half and of the whole width of their prior, in four campaigns each: the scatter is known to a tenth or so.

@@ -63,6 +63,8 @@ pub struct Weighed {
 /// sigma, and rounding spoils a filter at 1e12.
 const DIFFUSE: f64 = 1e8;
 const TELLING: f64 = 1e4;
+/// Neighbours of one setting from which on they tell the noise by themselves.
+const FEW: usize = 6;
 
 /// The states of the filter: slow noise, walk with the baseline, and the change of the setting; lower half of their covariance.
 struct State {
@@ -144,7 +146,7 @@ impl Repeats {
         }
     }
 
-    /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none without any.
+    /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none where there are few.
     pub fn of_neighbours(&self) -> Option<f64> {
         let repeated = |pair: &&[Repeat]| {
             let [one, other] = [pair[0], pair[1]];
@@ -152,7 +154,7 @@ impl Repeats {
         };
         let squares: Vec<f64> =
             self.readings.windows(2).filter(repeated).map(|pair| (pair[1].value - pair[0].value).powi(2)).collect();
-        (!squares.is_empty()).then(|| (0.5 * squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
+        (squares.len() >= FEW).then(|| (0.5 * squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
     }
 
     /// Number of readings.

@@ -6,8 +6,8 @@
 //!
 //! `ln p(ln s) = -COUNTS (ln s + (1/s^2 - 1)/2)`,
 //!
-//! largest, 0, at 1. With the factors `a` of the vars in prior widths and `known` the number of them that the recording shows, the most likely scatter
-//! obeys `s^2 = (sum of a^2 + COUNTS)/(known + COUNTS)`.
+//! largest, 0, at 1. With the factors `a` of the vars in prior widths, about the means of focusing and defocusing quadrupoles, and `known` the number of
+//! them that the recording shows, the most likely scatter obeys `s^2 = (sum of a^2 + COUNTS)/(known + COUNTS)`.
 //!
 //! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 2.6, the scaled inverse chi-square prior of a variance.
 
@@ -17,8 +17,9 @@ use super::evidence::Units;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scatter(pub f64);
 
-/// Quadrupoles that the prior's width counts as: so many give a standard deviation to a quarter, as a width is quoted.
-pub const COUNTS: f64 = 8.0;
+/// Quadrupoles that the prior's width counts as: so many give a standard deviation to half. The published table of the Booster scatters by 0.42 of the width that
+/// its authors took for the prior.
+pub const COUNTS: f64 = 2.0;
 
 impl Default for Scatter {
     /// As the prior says.
@@ -54,7 +55,7 @@ mod tests {
         let (squares, known) = (12.0, 30.0);
         let log_density = |s: f64| Scatter(s).log_prior() - known * s.ln() - 0.5 * squares / s.powi(2);
         let Scatter(best) = Scatter::of(squares, known);
-        assert!((best - (20.0_f64 / 38.0).sqrt()).abs() < 1e-12);
+        assert!((best - (14.0_f64 / 32.0).sqrt()).abs() < 1e-12);
         assert!(log_density(best) > log_density(1.01 * best) && log_density(best) > log_density(0.99 * best));
         assert_eq!(Scatter::default().log_prior(), 0.0);
         // one that the recording shows nothing of is as the prior says
