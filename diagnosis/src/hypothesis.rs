@@ -185,7 +185,7 @@ impl Hypothesis {
 
     /// The vars in units of their scatter.
     pub fn units(&self, data: &Data) -> Units {
-        self.scatter.units(&data.units)
+        data.units.scaled(self.scatter.0)
     }
 
     /// Prior standard deviation of a term's amplitude; none for a switch.

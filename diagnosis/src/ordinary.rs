@@ -286,7 +286,8 @@ impl Projected {
         gram.column_iter_mut()
             .zip(scale.iter())
             .for_each(|(mut column, s)| column.component_mul_assign(&(&scale * *s)));
-        Some(Self { gram, pull, of, groups: groups(&data.ring) })
+        let groups = data.ring.params_by_focusing().into_iter().filter(|group| !group.is_empty()).collect();
+        Some(Self { gram, pull, of, groups })
     }
 
     fn posterior(&self, widths: &Widths) -> Option<Posterior> {
@@ -346,14 +347,6 @@ impl Projected {
         }
         widths
     }
-}
-
-/// The vars of focusing quadrupoles, and those of defocusing ones.
-fn groups(ring: &Ring) -> Vec<Vec<usize>> {
-    let gradients = ring.gradients();
-    let focuses = |i: &usize| ring.parameters[*i].quadrupoles.first().is_some_and(|&q| gradients[q] > 0.0);
-    let (focusing, defocusing): (Vec<usize>, Vec<usize>) = (0..ring.parameters.len()).partition(focuses);
-    [focusing, defocusing].into_iter().filter(|group| !group.is_empty()).collect()
 }
 
 /// The hypothesis of a fit with the widths that its recording shows, of vars and families; families that it shows none of are left out.

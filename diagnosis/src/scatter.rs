@@ -11,8 +11,6 @@
 //!
 //! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 2.6, the scaled inverse chi-square prior of a variance.
 
-use super::evidence::Units;
-
 /// Scatter of the vars over the width of their prior.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scatter(pub f64);
@@ -37,11 +35,6 @@ impl Scatter {
     /// `ln` prior, relative to that of the prior's own width.
     pub fn log_prior(self) -> f64 {
         -COUNTS * (self.0.ln() + 0.5 * (self.0.powi(-2) - 1.0))
-    }
-
-    /// The vars in units of their scatter, from those in units of their prior.
-    pub fn units(self, prior: &Units) -> Units {
-        prior.scaled(self.0)
     }
 }
 

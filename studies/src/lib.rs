@@ -255,9 +255,7 @@ fn tunes(tunes: &[FittedTune; 2]) -> String {
 
 /// Mean standard deviation of the focusing and of the defocusing vars, which come after them.
 fn widths(ring: &Ring, reference: &Sampled) -> String {
-    let gradients = ring.gradients();
-    let focuses = |i: &usize| ring.parameters[*i].quadrupoles.first().is_some_and(|q| gradients[*q] > 0.0);
-    let (focusing, others): (Vec<usize>, Vec<usize>) = (0..ring.parameters.len()).partition(focuses);
+    let [focusing, others] = ring.params_by_focusing();
     let mean = |of: &[usize]| 100.0 * of.iter().map(|i| reference.summary[*i].sd).sum::<f64>() / of.len() as f64;
     let each = [("horizontally focusing quadrupoles", focusing), ("vertically focusing ones", others)];
     let words = each.iter().filter(|(_, of)| !of.is_empty()).map(|(name, of)| format!("{name} {:.2} %", mean(of)));

@@ -156,6 +156,14 @@ impl Ring {
         self.quadrupoles.iter().map(|q| self.k1(q.element)).collect()
     }
 
+    /// The params of horizontally focusing quadrupoles, by their first, and the others.
+    pub fn params_by_focusing(&self) -> [Vec<usize>; 2] {
+        let gradients = self.gradients();
+        let focuses = |i: &usize| self.parameters[*i].quadrupoles.first().is_some_and(|&q| gradients[q] > 0.0);
+        let (focusing, others) = (0..self.parameters.len()).partition(focuses);
+        [focusing, others]
+    }
+
     fn k1(&self, element: usize) -> f64 {
         match self.elements[element].kind {
             Kind::Quadrupole { k1 } => k1,
