@@ -12,7 +12,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     let text = match rows.len() {
         0 => "Nothing beyond two standard deviations.",
         _ => {
-            "Every machine has imperfections that are nobody's discovery: noise, scatter of gains and rolls, common factors. They are part of the \
+            "Every machine has imperfections that are nobody's discovery: noise, scatter of strengths, gains and rolls, common factors. They are part of the \
              model, with these sizes. A kick constant and the gain of all monitors cannot be told apart by kicks alone: each gets half."
         }
     };
