@@ -22,10 +22,15 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
         fitted = Fitted::of(data, hypothesis, &fitted.u)?;
     }
     for _ in 0..PASSES {
+        let mut linearised = data.clone();
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = data.linearise_each(&fitted.machines(data)?) else { break };
-        let Ok(again) = Fitted::of(data, hypothesis, &fitted.u) else { break };
-        fitted = again;
+        let Ok(moved) = linearised.linearise_each(&fitted.machines(data)?) else { break };
+        let Ok(again) = Fitted::of(&linearised, hypothesis, &fitted.u) else { break };
+        // nor is one that is far off, whose exact orbits may be metres: each pass then goes further away
+        if again.is_poor() && again.cost > fitted.cost {
+            break;
+        }
+        (*data, fitted) = (linearised, again);
         if moved < CURVED {
             break;
         }
