@@ -1,5 +1,6 @@
 //! The host screens a campaign as the core does, frame by frame in f32: on every committed recording.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use estimator::{Health, MonitorState, Walk};
@@ -160,4 +161,72 @@ fn a_screening_ends_at_a_stable_ring() {
             panic!("{seed}: {error}");
         }
     }
+}
+
+/// A simulated campaign that takes each setting once, and how far each of its readings jumps [m]; with one effect or none.
+fn each_setting_once(ring: &Ring, effect: Option<&str>, seed: u64) -> (Recording, DMatrix<f64>) {
+    let mut template = read(ring, "paper-vars");
+    let mut known = BTreeSet::new();
+    template.rows.retain(|row| known.insert(format!("{:?} {}", row.correctors, row.rf_offset)));
+    let jumping = Hardware::shipped(ring, &template);
+    let steady = Hardware { jumps: Vec::new(), ..jumping.clone() };
+    let effects: Vec<Effect> = effect.iter().map(|text| Effect::parse(text, ring).unwrap()).collect();
+    let vars = simulate::vars(ring, true, seed).unwrap();
+    let truth = Truth { vars: &vars, effects: &effects, ..Truth::default() };
+    let [jumps, none] =
+        [jumping, steady].map(|hardware| simulate::campaign(&template, ring, &truth, &hardware, seed).unwrap());
+    let jump = |i: usize, b: usize| match [&jumps, &none].map(|recording| recording.rows[i].reading[b]) {
+        [Some(one), Some(other)] => (one - other).abs(),
+        _ => 0.0,
+    };
+    let jump = DMatrix::from_fn(jumps.rows.len(), ring.read_monitors.len(), jump);
+    (jumps, jump)
+}
+
+/// A jump beyond this is none of the noise of the monitors that jump, five times 0.6 mm [m].
+const BEYOND_NOISE: f64 = 3e-3;
+
+/// Readings that no repeat confirms count where they contradict the model and not where a monitor jumps: a reversed corrector, a kick that is 12 % off,
+/// two exchanged monitors, a reversed monitor, nothing. Of the readings that do not jump one in 300 is put aside at most.
+#[test]
+fn what_contradicts_the_model_counts_without_a_repeat() {
+    let ring = Ring::booster();
+    let effects = ["corrector_polarity@H_D4", "corrector_gain@V_B5=0.12", "bpm_swap@y_A1,y_A7", "bpm_polarity@x_D6"];
+    for effect in effects.into_iter().map(Some).chain([None]) {
+        let (recording, jump) = each_setting_once(&ring, effect, 5);
+        let campaign = Campaign::of(&ring, &recording).unwrap();
+        let counts = campaign.screened.accepted.iter().zip(&jump).zip(&campaign.readings);
+        let (mut far, mut sound, mut aside) = ([0, 0], 0, 0);
+        for ((counts, jump), _) in counts.filter(|(_, reading)| !reading.is_nan()) {
+            if *jump > BEYOND_NOISE {
+                far[usize::from(*counts)] += 1;
+            } else if *jump == 0.0 {
+                (sound, aside) = (sound + 1, aside + usize::from(!counts));
+            }
+        }
+        println!("{effect:?}: of the jumps {far:?} count, {aside} of {sound} other readings do not");
+        assert!(far[0] > 0 && far[1] == 0, "{effect:?}: jumps that do not count and that do: {far:?}");
+        assert!(300 * aside <= sound, "{effect:?}: {aside} of {sound} put aside");
+    }
+}
+
+/// A cycle without a beam, in which every monitor reads its own noise, is put aside; nothing repeats it.
+#[test]
+fn a_lost_beam_is_put_aside_without_a_repeat() {
+    let ring = Ring::booster();
+    let (mut recording, _) = each_setting_once(&ring, None, 6);
+    let lost = [20, 51, 80];
+    for (n, frame) in lost.into_iter().enumerate() {
+        for (b, reading) in recording.rows[frame].reading.iter_mut().enumerate() {
+            *reading = Some(1e-4 * (1.7 * (33 * n + b) as f64).sin());
+        }
+    }
+    let campaign = Campaign::of(&ring, &recording).unwrap();
+    for frame in 0..campaign.frames() {
+        let counting = (0..campaign.monitors()).filter(|&b| campaign.counts(frame, b)).count();
+        assert_eq!(counting == 0, lost.contains(&frame), "frame {frame}: {counting}");
+    }
+    let names = ring.monitor_names();
+    let faulty: Vec<&str> = (0..names.len()).filter(|&b| !campaign.is_ok(b)).map(|b| names[b].as_str()).collect();
+    assert!(faulty.iter().all(|name| ["x_C6", "y_B5"].contains(name)), "{faulty:?}");
 }

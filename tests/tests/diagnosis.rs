@@ -1,6 +1,8 @@
 //! Missing physics is found, without false identifications: on recordings of an independent code whose effects are concealed,
 //! and on simulated ones of every kind. The error bars agree with those of the exact posterior.
 
+use std::collections::BTreeSet;
+
 use diagnosis::fit::Fitted;
 use diagnosis::hypothesis::{Hypothesis, Term};
 use diagnosis::imperfection::{Imperfection, Measure};
@@ -144,6 +146,20 @@ fn gross_faults_are_named_at_their_size() {
     ] {
         assert_named(text, seed);
     }
+}
+
+/// A campaign by an independent code, of which the first frame of each setting is left: nothing repeats what contradicts the model, and it counts.
+#[test]
+#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+fn a_reversed_corrector_is_named_where_no_setting_is_repeated() {
+    let ring = Ring::booster();
+    let mut recording = read("concealed/open-07");
+    let mut known = BTreeSet::new();
+    recording.rows.retain(|row| known.insert(format!("{:?} {}", row.correctors, row.rf_offset)));
+    assert_eq!(recording.rows.len(), 110);
+    let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+    let truth = Truth::read(&repository("recordings/concealed/open-07"), &ring).unwrap();
+    assert_eq!(truth.grade(&diagnosis), Grade::Right, "{}", diagnosis.sentence);
 }
 
 /// Three monitors whose columns went round, and a fourth that reads tenfold: no effect or unknown cause is all of that.

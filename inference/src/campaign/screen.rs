@@ -4,6 +4,8 @@
 //! Frames are taken in the order of time. A reading is judged by the repeats of its setting; the first one by the model with all
 //! that is known of the params so far, in normal equations that are relinearised when the params have moved.
 
+mod unconfirmed;
+
 use std::collections::BTreeMap;
 
 use estimator::{Beside, ByRepeats, Gate, Health, Monitor, MonitorState, PositionCode, Verdict};
@@ -94,6 +96,8 @@ const MOST: usize = 8;
 struct Repeats {
     /// Frames whose reading counts.
     frames: Vec<usize>,
+    /// Frames whose reading was put aside, confirmed since or not.
+    held: Vec<usize>,
     /// The last frame with a reading, and how many in a row that agree, that one included, wait for one that confirms them.
     last: Option<usize>,
     waiting: u8,
@@ -167,6 +171,7 @@ impl Screener<'_> {
             screening.linearise_if_due(frame);
             screening.take(frame);
         }
+        screening.take_back_unconfirmed();
         screening.drop_stuck();
         let Screening { accepted, monitors, model, best, normal, .. } = screening;
         let health = monitors.iter().map(Monitor::health).collect();
@@ -191,6 +196,11 @@ impl Screener<'_> {
     /// Which of them a reading has.
     fn channel(&self, frame: usize, b: usize) -> usize {
         self.times.of_frame[frame] * self.noise.len() + b
+    }
+
+    /// 0 for a monitor that reads x, 1 for one that reads y.
+    fn plane(&self, b: usize) -> usize {
+        usize::from(b >= self.ring.horizontal_monitors())
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
@@ -305,7 +315,10 @@ impl<'c> Screening<'c> {
         let repeats = &mut self.repeats[setting][b];
         match verdict {
             Verdict::Accepted => {}
-            Verdict::Held { .. } => self.monitors[b].reject(),
+            Verdict::Held { .. } => {
+                repeats.held.push(frame);
+                self.monitors[b].reject();
+            }
             Verdict::Confirms { outvotes } => {
                 self.monitors[b].pardon(repeats.waiting);
                 self.stale = true;
@@ -352,12 +365,17 @@ impl<'c> Screening<'c> {
 
     /// True if the model, with all its uncertainty, expects a reading.
     fn is_expected(&self, frame: usize, b: usize) -> bool {
+        self.is_expected_within(frame, b, 0.0)
+    }
+
+    /// The same, where a reading has a further variance [m^2].
+    fn is_expected_within(&self, frame: usize, b: usize, further: f64) -> bool {
         let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
         let channel = self.of.channel(frame, b);
         let expectation = self.normal.expect(channel, slope, &TERMS, &self.best.step, &self.best.factor);
         let (expected, of_baseline, of_params) = expectation.expect("a baseline's prior is known");
         let innovation = (self.residual(frame, b) - expected) as f32;
-        let certain = self.variance(frame, b) + of_baseline;
+        let certain = self.variance(frame, b) + of_baseline + further;
         // the uncertainty of the params is only worked out for readings that need it
         self.gate.expects(innovation, certain as f32)
             || self.gate.expects(innovation, (certain + (1.0 + UNDERWEIGHT) * of_params()) as f32)
@@ -369,7 +387,7 @@ impl<'c> Screening<'c> {
 
     /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
     fn variance(&self, frame: usize, b: usize) -> f64 {
-        let plane = usize::from(b >= self.of.ring.horizontal_monitors());
+        let plane = self.of.plane(b);
         let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
         // frames of one RF offset share it, and so do those of all times in the cycle
         let sharing = self.of.sharing[frame] * self.of.times.count() as f64;

@@ -7,6 +7,8 @@ use super::drive::Drive;
 pub struct Settings {
     /// Setting of each frame; none of a frame in which several things were moved and that no other repeats.
     pub of_frame: Vec<Option<usize>>,
+    /// Of each frame the corrector that alone is moved in it.
+    pub corrector: Vec<Option<usize>>,
     /// How many there are.
     pub count: usize,
 }
@@ -40,8 +42,13 @@ impl Settings {
             at
         };
         let of_frame: Vec<usize> = drives.iter().zip(times).map(&mut index).collect();
+        let corrector = |at: &usize| settings[*at].0.only_corrector();
         let alone = |at: &usize| settings[*at].1 == 1 && settings[*at].0.things() > 1;
-        Self { of_frame: of_frame.iter().map(|at| (!alone(at)).then_some(*at)).collect(), count: settings.len() }
+        Self {
+            corrector: of_frame.iter().map(corrector).collect(),
+            of_frame: of_frame.iter().map(|at| (!alone(at)).then_some(*at)).collect(),
+            count: settings.len(),
+        }
     }
 }
 
@@ -54,6 +61,10 @@ impl Moved {
     /// How many things are moved.
     fn things(&self) -> usize {
         self.kicks.len() + usize::from(self.rf_offset.abs() > SAME_OFFSET)
+    }
+
+    fn only_corrector(&self) -> Option<usize> {
+        (self.things() == 1).then(|| self.kicks.first().map(|(corrector, _)| *corrector)).flatten()
     }
 
     fn is_repeated_by(&self, other: &Self) -> bool {
@@ -91,6 +102,7 @@ mod tests {
         let settings = Settings::of(&frames, &[0; 7], 2e-4);
         assert_eq!(settings.of_frame, [0, 1, 0, 2, 3, 4, 5].map(Some));
         assert_eq!(settings.count, 6);
+        assert_eq!(settings.corrector, [Some(0), None, Some(0), Some(0), Some(0), Some(2), None]);
         let at_two_times = Settings::of(&frames, &[0, 0, 1, 0, 0, 0, 0], 2e-4);
         assert_eq!(at_two_times.of_frame, [0, 1, 2, 3, 4, 5, 6].map(Some));
     }
