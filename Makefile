@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -158,6 +158,10 @@ adversary: build .venv ## 220 blind campaigns by pyAT of machines with ordinary 
 blind: build .venv-export ## 52 blind campaigns by Xsuite of machines whose vars may be out of range, simulated by a program written without sight of the diagnosis, and their scores; ten minutes
 	.venv-export/bin/python tests/peers/blind_xsuite.py --machine machines/booster.json --template recordings/concealed/open-10 --out target/blind
 	$(ORBITCAL) challenge target/blind --json target/blind.json
+
+rings: build .venv ## 40 blind campaigns by pyAT on five other rings, simulated by programs written without sight of the diagnosis, and their scores; an hour
+	.venv/bin/python tests/peers/rings/campaigns.py --out target/rings
+	for ring in 1 2 3 4 5; do $(ORBITCAL) challenge target/rings/ring$$ring --machine target/rings/ring$$ring/ring.json --json target/ring$$ring.json; done
 
 validate-short: build ## the same with 80 campaigns, four minutes, and an error at a false identification (unmodelled physics apart)
 	rm -f target/validate-short.jsonl

@@ -1,9 +1,10 @@
 //! Readings that surprised the model and that no repeat could confirm: in a campaign that takes each setting once, every one that surprises.
 //!
-//! While frames come in the model alone judges such a reading, by what is known so far, and it is put aside. When all frames are there, it is asked
-//! once more what is at fault. Monitors fail one at a time, and seldom. A beam that is lost surprises monitors of both planes, and what fails in one
-//! cycle, such as a corrector that trips, does not in other cycles with that corrector. What is left is none of these: a corrector that is reversed surprises the monitors of its plane at both signs, two
-//! monitors that are exchanged surprise in nearly every frame, and monitors whose gains scatter do where the orbit is large. Those readings count, since a fit has to explain them.
+//! While frames come in the model alone judges such a reading, by what is known so far, and it is put aside. When all frames are there, it is
+//! asked once more what is at fault. Monitors fail one at a time, and seldom. A beam that is lost surprises monitors of both planes, and what fails
+//! in one cycle, such as a corrector that trips, does not in other cycles with that corrector. What is left is none of these: a corrector that is
+//! reversed surprises the monitors of its plane at both signs, two monitors that are exchanged surprise in nearly every frame, and monitors whose
+//! gains scatter do where the orbit is large. Those readings count, since a fit has to explain them.
 
 use std::collections::BTreeSet;
 
