@@ -86,11 +86,14 @@ pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
     if path == Path::new("-") { say(text) } else { bytes(path, (text + "\n").as_bytes()) }
 }
 
-/// Write bytes to a file.
+/// Write bytes to a file; what is no file is written through, see [`is_written_through`].
 ///
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
 pub fn bytes(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
+    if is_written_through(path) {
+        return std::fs::write(path, bytes).map_err(|e| OutputError::of(path, e.kind()));
+    }
     let mut file = temporary(path)?;
     file.write_all(bytes).map_err(|e| OutputError::of(path, e.kind()))?;
     file.persist(path).map_err(|e| OutputError::of(path, e.error.kind()))?;
@@ -105,7 +108,12 @@ pub fn check(path: &Path) -> Result<(), OutputError> {
     if path.is_dir() {
         return Err(OutputError::of(path, "expected a file, found a folder"));
     }
-    if path == Path::new("-") { Ok(()) } else { temporary(path).map(drop) }
+    if path == Path::new("-") || is_written_through(path) { Ok(()) } else { temporary(path).map(drop) }
+}
+
+/// True for a device, a pipe or a link: a new file in its place would make an ordinary file of `/dev/null`.
+fn is_written_through(path: &Path) -> bool {
+    path.symlink_metadata().is_ok_and(|there| !there.is_file() && !there.is_dir())
 }
 
 /// The same for a folder that need not be there yet.
@@ -160,6 +168,23 @@ mod tests {
         json(&path, &[3]).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "[\n  3\n]\n");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file is left");
+    }
+
+    /// A link, and the device behind `/dev/null`, stay what they are.
+    #[test]
+    #[cfg(unix)]
+    fn what_is_no_file_is_written_through() {
+        let folder = tempfile::tempdir().unwrap();
+        let [link, file, null] = ["link", "file", "null"].map(|name| folder.path().join(name));
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        std::os::unix::fs::symlink("/dev/null", &null).unwrap();
+        for path in [&link, &null] {
+            check(path).unwrap();
+            json(path, &[3]).unwrap();
+            assert!(path.is_symlink(), "{}", path.display());
+        }
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "[\n  3\n]\n");
+        assert_eq!(std::fs::read_to_string(&null).unwrap(), "");
     }
 
     #[test]
