@@ -357,10 +357,14 @@ impl<'c> Screening<'c> {
 
     /// True if the model expects nearly all readings of a frame, those of dead monitors left out.
     fn is_expected_but_for_a_few(&self, frame: usize, expected: &[bool]) -> bool {
-        let is_alive =
-            |b: &usize| !self.of.readings[(frame, *b)].is_nan() && self.monitors[*b].state() != MonitorState::Dead;
-        let alive: Vec<usize> = (0..self.monitors.len()).filter(is_alive).collect();
+        let alive: Vec<usize> = self.alive(frame).collect();
         MOST * alive.iter().filter(|b| !expected[**b]).count() <= alive.len()
+    }
+
+    /// The monitors that report in a frame, without dead ones.
+    fn alive(&self, frame: usize) -> impl Iterator<Item = usize> {
+        let reports = move |b: &usize| !self.of.readings[(frame, *b)].is_nan();
+        (0..self.monitors.len()).filter(reports).filter(|b| self.monitors[*b].state() != MonitorState::Dead)
     }
 
     /// True if the model, with all its uncertainty, expects a reading.

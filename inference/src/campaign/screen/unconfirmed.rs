@@ -8,7 +8,7 @@
 
 use std::collections::BTreeSet;
 
-use estimator::{Monitor, MonitorState};
+use estimator::MonitorState;
 
 use super::{MOST, Repeats, Screening};
 
@@ -87,7 +87,7 @@ impl Screening<'_> {
             repeats.unconfirmed().into_iter().flatten().map(|&frame| (frame, b)).collect()
         };
         let all = self.repeats.iter().flat_map(|setting| setting.iter().enumerate().flat_map(of_monitor));
-        all.filter(|&(_, b)| is_working(&self.monitors[b])).collect()
+        all.filter(|&(_, b)| self.monitors[b].state() != MonitorState::Dead).collect()
     }
 
     /// What becomes of them.
@@ -144,10 +144,7 @@ impl Screening<'_> {
 
     /// True if more than a few monitors of a plane surprise; none if nothing reads it.
     fn surprises(&self, frame: usize, plane: usize) -> Option<bool> {
-        let is_alive = |b: &usize| {
-            self.of.plane(*b) == plane && !self.of.readings[(frame, *b)].is_nan() && is_working(&self.monitors[*b])
-        };
-        let alive: Vec<usize> = (0..self.monitors.len()).filter(is_alive).collect();
+        let alive: Vec<usize> = self.alive(frame).filter(|&b| self.of.plane(b) == plane).collect();
         let surprising = alive.iter().filter(|&&b| !self.is_ordinary((frame, b))).count();
         (!alive.is_empty()).then_some(MOST * surprising > alive.len())
     }
@@ -165,8 +162,4 @@ impl Screening<'_> {
     fn is_ordinary(&self, (frame, b): Reading) -> bool {
         self.is_expected_within(frame, b, (SCATTER * self.model.orbit[(frame, b)]).powi(2))
     }
-}
-
-fn is_working(monitor: &Monitor) -> bool {
-    monitor.state() != MonitorState::Dead
 }
