@@ -86,7 +86,7 @@ pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
     if path == Path::new("-") { say(text) } else { bytes(path, (text + "\n").as_bytes()) }
 }
 
-/// Write bytes to a file; what is no file is written through, see [`is_written_through`].
+/// Write bytes to a file; what is no file (a device, a pipe, a link) is written through.
 ///
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
