@@ -124,9 +124,13 @@ impl Standard {
         let scanned = scan(&data, &null, &candidates(&data, pair)).unwrap();
         let best = |kind: &EffectKind| {
             let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == *kind);
-            of_kind.max_by(|one, other| one.power.total_cmp(&other.power)).unwrap().term
+            Some(of_kind.max_by(|one, other| one.power.total_cmp(&other.power))?.term)
         };
-        EffectKind::ALL.iter().filter(|kind| !kind.is_transient()).map(best).collect()
+        let lasting: Vec<EffectKind> = EffectKind::ALL.iter().copied().filter(|kind| !kind.is_transient()).collect();
+        let seen: Vec<Term> = lasting.iter().filter_map(best).collect();
+        // the Booster has no instrument of both planes that could couple them
+        assert_eq!(seen.len() + 2, lasting.len());
+        seen
     }
 }
 

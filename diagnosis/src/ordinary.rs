@@ -32,6 +32,8 @@ use super::scatter::{self, Scatter};
 pub enum Grouping {
     /// None.
     Each,
+    /// Both planes of an instrument.
+    Instrument,
     /// All in a plane.
     Plane(Plane),
     /// All.
@@ -67,11 +69,13 @@ const STEPS: usize = 30;
 const SETTLED: f64 = 0.01;
 
 /// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles; a common
+/// the planes of an instrument that reads or kicks in both are coupled by a per cent, each by itself: half of the sum of both couplings is one of these
+/// families, half of the difference a roll; a common
 /// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
 /// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
 ///
 /// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
-const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
+const FAMILIES: [(&str, EffectKind, Grouping, f64); 17] = [
     ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
     ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
     ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
@@ -85,6 +89,8 @@ const FAMILIES: [(&str, EffectKind, Grouping, f64); 15] = [
     ("gain of all vertical correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::Y), 0.03),
     ("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
     ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
+    ("couplings of monitors", EffectKind::BpmCoupling, Grouping::Instrument, 0.01),
+    ("couplings of correctors", EffectKind::CorrectorCoupling, Grouping::Instrument, 0.01),
     ("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
     ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, 0.001),
 ];
@@ -142,6 +148,12 @@ impl Family {
             Grouping::Each => {
                 return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
             }
+            Grouping::Instrument => {
+                let element = |term: &Term| element_of(&data.ring, term.site);
+                let mut all: Vec<Term> = all.collect();
+                all.sort_by_key(element);
+                return all.chunk_by(|one, other| element(one) == element(other)).map(<[Term]>::to_vec).collect();
+            }
             Grouping::Plane(plane) => vec![all.filter(|term| plane_of(&data.ring, term.site) == Some(plane)).collect()],
             Grouping::All => {
                 vec![all.filter(|term| whole_of(self.kind).is_none_or(|site| site == term.site)).collect()]
@@ -173,7 +185,7 @@ impl Family {
 
     /// True if its width is learnt.
     pub fn is_learnt(&self) -> bool {
-        self.grouping == Grouping::Each && self.kind != EffectKind::StrayGradient
+        matches!(self.grouping, Grouping::Each | Grouping::Instrument) && self.kind != EffectKind::StrayGradient
     }
 
     /// The instruments or magnets that it holds: `x`, `y`, `H`, `V` or `all`.
@@ -183,7 +195,7 @@ impl Family {
             (Grouping::Plane(Plane::Y), EffectKind::CorrectorGain) => "V",
             (Grouping::Plane(Plane::X), _) => "x",
             (Grouping::Plane(Plane::Y), _) => "y",
-            (Grouping::Each | Grouping::All, _) => "all",
+            (Grouping::Each | Grouping::Instrument | Grouping::All, _) => "all",
         }
     }
 
@@ -202,6 +214,15 @@ fn plane_of(ring: &Ring, site: Site) -> Option<Plane> {
     match site {
         Site::Monitor(at) => Some(ring.monitors[at].plane),
         Site::Corrector(at) => Some(ring.correctors[at].plane),
+        _ => None,
+    }
+}
+
+/// The element of an instrument.
+fn element_of(ring: &Ring, site: Site) -> Option<usize> {
+    match site {
+        Site::Monitor(at) => Some(ring.monitors[at].element),
+        Site::Corrector(at) => Some(ring.correctors[at].element),
         _ => None,
     }
 }
@@ -417,8 +438,10 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         let width = family.width;
         let (value, sigma) = match family.grouping {
             _ if own.is_empty() => continue,
-            Grouping::Each if family.is_learnt() => (width, width / information(&covariance, own).sqrt()),
-            Grouping::Each => continue,
+            Grouping::Each | Grouping::Instrument if family.is_learnt() => {
+                (width, width / information(&covariance, own).sqrt())
+            }
+            Grouping::Each | Grouping::Instrument => continue,
             Grouping::Plane(_) | Grouping::All => {
                 (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
             }

@@ -79,7 +79,9 @@ fn every_kind_is_found_when_it_is_strong() {
     let null = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
     let scanned = scan(&data, &null, &candidates(&data, Some(&loop_on))).unwrap();
-    for &kind in EffectKind::ALL.iter().filter(|kind| !kind.is_transient()) {
+    // no instrument of this ring is of both planes
+    let has_none = [EffectKind::BpmCoupling, EffectKind::CorrectorCoupling];
+    for &kind in EffectKind::ALL.iter().filter(|kind| !kind.is_transient() && !has_none.contains(kind)) {
         let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == kind);
         let seen = of_kind.max_by(|a, b| a.power.total_cmp(&b.power)).unwrap();
         // a gain of 40 nat, if the prior allows it and the beam is kept

@@ -81,6 +81,8 @@ impl Form {
             | EffectKind::CorrectorRoll
             | EffectKind::QuadRoll
             | EffectKind::StraySkewGradient
+            | EffectKind::BpmCoupling
+            | EffectKind::CorrectorCoupling
             | EffectKind::BpmCrosstalk
             | EffectKind::CorrectorCrosstalk
             | EffectKind::FixedRfFrequency

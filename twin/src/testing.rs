@@ -25,6 +25,18 @@ pub fn ring_of(elements: &[Value]) -> Ring {
     parse(&json!({"name": "test", "circumference_m": end, "k1": {}, "reference": reference, "elements": elements}))
 }
 
+/// The Booster with a monitor, E4, that reads both planes, and a corrector, A4, that kicks in both.
+pub fn dual() -> Ring {
+    booster_with(|file| {
+        for element in file["elements"].as_array_mut().expect("a list") {
+            if element["name"] == "PUH_E4" || element["name"] == "DCH_A4" {
+                element["plane"] = "HV".into();
+            }
+        }
+        file["data"]["bpm_y"].as_array_mut().expect("a list").push("E4".into());
+    })
+}
+
 pub fn parse(file: &Value) -> Ring {
     Ring::parse(&file.to_string(), "test.json").expect("a good machine file")
 }

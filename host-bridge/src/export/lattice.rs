@@ -197,9 +197,11 @@ impl Lattice {
                 let planes = self.monitors.iter_mut().filter(|channel| channel.element == element);
                 planes.for_each(|channel| channel.roll += amplitude);
             }
-            MonitorEffect::Cubic | MonitorEffect::Swap | MonitorEffect::Crosstalk | MonitorEffect::Timing => {
-                return false;
-            }
+            MonitorEffect::Coupling
+            | MonitorEffect::Cubic
+            | MonitorEffect::Swap
+            | MonitorEffect::Crosstalk
+            | MonitorEffect::Timing => return false,
         }
         true
     }
@@ -212,7 +214,8 @@ impl Lattice {
             CorrectorEffect::Dead => channel.gain = 0.0,
             // the ring has it
             CorrectorEffect::Roll => {}
-            CorrectorEffect::Swap
+            CorrectorEffect::Coupling
+            | CorrectorEffect::Swap
             | CorrectorEffect::Even
             | CorrectorEffect::Crosstalk
             | CorrectorEffect::Hysteresis

@@ -7,6 +7,7 @@ use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signature, Si
 use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
 use crate::site::Site;
+use crate::testing::dual;
 
 const NOMINAL: f64 = 2e-4;
 
@@ -27,18 +28,6 @@ fn drives(ring: &Ring, orbit: Vec<[f64; 2]>) -> Drives {
     let rf_offset = DVector::from_vec(vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-4, -1e-4]);
     let time = DVector::from_vec(vec![-1.0, -0.7, -0.2, 0.1, 0.5, 0.6, 0.8, 1.0]);
     Drives { kick, rf_offset, time, nominal_kick: NOMINAL, orbit }
-}
-
-/// The ring with a monitor that reads both planes and a corrector that kicks in both.
-fn dual() -> Ring {
-    let mut file: serde_json::Value = serde_json::from_str(include_str!("../../../machines/booster.json")).unwrap();
-    for element in file["elements"].as_array_mut().unwrap() {
-        if ["PUH_E4", "DCH_A4"].contains(&element["name"].as_str().unwrap()) {
-            element["plane"] = "HV".into();
-        }
-    }
-    file["data"]["bpm_y"].as_array_mut().unwrap().push("E4".into());
-    Ring::parse(&file.to_string(), "dual.json").unwrap()
 }
 
 /// The ring with one quadrupole of each family out of its place: an orbit of several mm in both planes.
@@ -73,8 +62,8 @@ fn effects(ring: &Ring) -> Vec<Effect> {
             _ => (kind.sites(ring), 7),
         };
         let amplitude = kind.prior_scale().unwrap_or(1.0);
-        let last = sites.len() - 1;
-        let some = sites.into_iter().enumerate().filter(move |(i, _)| i % step == 0 || *i == last);
+        let count = sites.len();
+        let some = sites.into_iter().enumerate().filter(move |(i, _)| i % step == 0 || i + 1 == count);
         some.map(move |(_, site)| Effect { kind, site, amplitude }).collect::<Vec<_>>()
     };
     EffectKind::ALL.iter().flat_map(of).collect()
@@ -279,6 +268,31 @@ fn what_reads_or_kicks_in_both_planes_is_rolled_in_both() {
     // all correctors kick in one of the frames
     assert_derivatives(&ring, &[], &[monitor, corrector], 2e-4);
     for effect in [monitor, corrector] {
+        let [kicked, rf, change, _] = compare(&ring, &ring, &effect);
+        assert!(kicked < 2e-3 * change && rf < 0.07 * change, "{effect:?}: {kicked:e} {rf:e} of {change:e}");
+    }
+}
+
+/// What couples the planes in both alike is no roll: a roll by `a` reads `x + a y` and `y - a x`.
+#[test]
+fn an_instrument_of_both_planes_couples_each_by_itself() {
+    let ring = dual();
+    let of = |text: &str| Effect::parse(text, &ring).unwrap();
+    let coupled = ["bpm_coupling@x_E4=0.03", "bpm_coupling@y_E4=-0.02", "corrector_coupling@V_A4=0.04"].map(of);
+    let sites = |kind: EffectKind| kind.sites(&ring).len();
+    assert_eq!([EffectKind::BpmCoupling, EffectKind::CorrectorCoupling].map(sites), [2, 2]);
+    let respond = |effects: &[Effect]| machine(&ring, effects).response().unwrap();
+    let [plain, x_alone, both] = [&[][..], &coupled[..1], &coupled[..2]].map(respond);
+    let [x, y] = [Plane::X, Plane::Y].map(|plane| ring.monitor(plane, "E4").unwrap());
+    assert!((x_alone.x.row(x) - plain.x.row(x) - plain.y.row(x) * 0.03).abs().max() < 1e-12);
+    assert_eq!(x_alone.y, plain.y);
+    assert!((both.y.row(y) - plain.y.row(y) + plain.x.row(y) * 0.02).abs().max() < 1e-12);
+    let [h, v] = ["H_A4", "V_A4"].map(|name| ring.corrector_names().iter().position(|own| own == name).unwrap());
+    let kicked = respond(&coupled[2..]);
+    assert!((kicked.x.column(v) - plain.x.column(v) - plain.x.column(h) * 0.04).abs().max() < 1e-12);
+    assert_eq!(kicked.y.column(h), plain.y.column(h));
+    assert_derivatives(&ring, &[], &coupled, 2e-4);
+    for effect in coupled {
         let [kicked, rf, change, _] = compare(&ring, &ring, &effect);
         assert!(kicked < 2e-3 * change && rf < 0.07 * change, "{effect:?}: {kicked:e} {rf:e} of {change:e}");
     }

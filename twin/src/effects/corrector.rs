@@ -1,7 +1,8 @@
-//! Errors of correctors: gain, roll, reversed polarity, no kick, exchanged cables, even part, a share of the kick that goes to another one or stays.
+//! Errors of correctors: gain, roll, coupling, reversed polarity, no kick, exchanged cables, even part, a share of the kick that goes to another one or stays.
 //!
 //! Of a gain, a polarity, a dead one and an even part the actual kick is one function of the nominal kick and of an amplitude,
-//! [`CorrectorEffect::kick`]; a rolled magnet kicks in both planes, as an element of the ring. Crosstalk adds `a` times the kick of one to that of the next; a
+//! [`CorrectorEffect::kick`]; a rolled magnet kicks in both planes, as an element of the ring. Crosstalk adds `a` times the kick of one to that of the next, a coupling to the
+//! one of the same magnet in the other plane; a
 //! corrector with hysteresis kicks `k + a k_before`, `k_before` what it had before its present setting; one that settles lacks `a` of each change in the frame
 //! after it, `a^2` in the next: in frame i it kicks `j_i = k_i + a (j_(i-1) - k_i)`.
 
@@ -22,6 +23,8 @@ pub enum CorrectorEffect {
     Gain,
     /// It is rotated [rad]; a magnet that kicks in both planes is so in both.
     Roll,
+    /// A magnet of both planes gives a share of its kick in one to the other plane as well, as where its coils are not at right angles.
+    Coupling,
     /// Its sign is reversed.
     Polarity,
     /// It does not kick, whatever its read-back says.
@@ -59,7 +62,16 @@ impl CorrectorEffect {
             Self::Polarity => -believed,
             Self::Dead => believed * 0.0,
             Self::Even => believed + amplitude * believed * believed / nominal,
-            Self::Roll | Self::Swap | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
+            Self::Roll | Self::Coupling | Self::Swap | Self::Crosstalk | Self::Hysteresis | Self::Settling => believed,
+        }
+    }
+
+    /// The corrector that a share of the kick goes to as well.
+    fn with(self, ring: &Ring, corrector: usize) -> Option<usize> {
+        match self {
+            Self::Coupling => other_plane(ring, corrector),
+            Self::Crosstalk => next(ring, corrector),
+            _ => None,
         }
     }
 
@@ -77,6 +89,7 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Gain => "corrector_gain",
             Self::Roll => "corrector_roll",
+            Self::Coupling => "corrector_coupling",
             Self::Polarity => "corrector_polarity",
             Self::Dead => "corrector_dead",
             Self::Swap => "corrector_swap",
@@ -87,7 +100,8 @@ impl Mechanism for CorrectorEffect {
         }
     }
 
-    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a magnet by 50 mrad; a return that two supplies
+    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a magnet by 50 mrad, and coils are wound to some per cent of a right angle;
+    /// a return that two supplies
     /// share, or a controller's channels, leak some per cent; iron keeps some per mille of its field, a magnet with closed gaps some
     /// per cent. A slow regulator or eddy currents in a thick chamber leave some per cent of a change to the next cycle, a wrong time constant tens.
     ///
@@ -96,7 +110,7 @@ impl Mechanism for CorrectorEffect {
         match self {
             Self::Gain => Some(0.08),
             Self::Roll => Some(0.06),
-            Self::Even | Self::Crosstalk => Some(0.05),
+            Self::Coupling | Self::Even | Self::Crosstalk => Some(0.05),
             Self::Hysteresis => Some(0.03),
             Self::Settling => Some(0.1),
             Self::Polarity | Self::Dead | Self::Swap => None,
@@ -105,7 +119,9 @@ impl Mechanism for CorrectorEffect {
 
     fn unit(&self) -> Unit {
         match self {
-            Self::Gain | Self::Even | Self::Crosstalk | Self::Hysteresis | Self::Settling => Unit::PERCENT,
+            Self::Gain | Self::Coupling | Self::Even | Self::Crosstalk | Self::Hysteresis | Self::Settling => {
+                Unit::PERCENT
+            }
             Self::Roll => Unit::ANGLE,
             Self::Polarity | Self::Dead | Self::Swap => Unit::NONE,
         }
@@ -118,7 +134,7 @@ impl Mechanism for CorrectorEffect {
         let is_one = |&at: &usize| match self {
             Self::Gain | Self::Polarity | Self::Dead | Self::Even | Self::Hysteresis | Self::Settling => true,
             Self::Roll => rolled(ring, at) == at,
-            Self::Crosstalk => next(ring, at).is_some(),
+            Self::Coupling | Self::Crosstalk => self.with(ring, at).is_some(),
             Self::Swap => false,
         };
         (0..ring.correctors.len()).filter(is_one).map(Site::Corrector).collect()
@@ -129,6 +145,7 @@ impl Mechanism for CorrectorEffect {
             Self::Gain | Self::Roll | Self::Polarity | Self::Dead | Self::Even | Self::Hysteresis | Self::Settling => {
                 "a corrector"
             }
+            Self::Coupling => "a corrector that kicks in both planes",
             Self::Crosstalk => "a corrector with another one in its plane",
             Self::Swap => "two correctors of one plane",
         }
@@ -141,7 +158,7 @@ impl Mechanism for CorrectorEffect {
                 one().map(Site::Corrector)
             }
             Self::Roll => one().map(|at| Site::Corrector(rolled(ring, at))),
-            Self::Crosstalk => one().filter(|&at| next(ring, at).is_some()).map(Site::Corrector),
+            Self::Coupling | Self::Crosstalk => one().filter(|&at| self.with(ring, at).is_some()).map(Site::Corrector),
             Self::Swap => {
                 let [one, other] = Site::correctors(ring, name)?;
                 of_a_plane(ring, one, other).then(|| Site::corrector_pair(one, other))
@@ -165,8 +182,8 @@ impl Mechanism for CorrectorEffect {
             Self::Gain | Self::Polarity | Self::Dead | Self::Even => {
                 machine.correctors.push(Kick::Changed { how: *self, corrector, amplitude });
             }
-            Self::Crosstalk => {
-                let with = next(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
+            Self::Coupling | Self::Crosstalk => {
+                let with = self.with(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
                 machine.correctors.push(Kick::Shared { corrector, with, share: amplitude });
             }
             Self::Hysteresis => machine.correctors.push(Kick::Kept { corrector, share: amplitude }),
@@ -200,8 +217,8 @@ impl Mechanism for CorrectorEffect {
                 let change = about.kick.column(corrector).map(|kick| self.change(kick, nominal));
                 signature.readings = change * about.response.column(corrector).transpose();
             }
-            Self::Crosstalk => {
-                let with = next(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
+            Self::Coupling | Self::Crosstalk => {
+                let with = self.with(ring, corrector).ok_or_else(|| self.misplaced(ring, site.name(ring)))?;
                 signature.readings = about.kick.column(corrector) * about.response.column(with).transpose();
             }
             Self::Hysteresis => {
@@ -234,9 +251,9 @@ impl Mechanism for CorrectorEffect {
                 let more = amplitude.by_sign("more", "less");
                 format!("corrector {name} kicks {} % {more} at + than at -", amplitude.size(2.0 * 100.0))
             }
-            Self::Crosstalk => {
+            Self::Coupling | Self::Crosstalk => {
                 let Site::Corrector(at) = site else { unreachable!("it acts on correctors") };
-                let other = next(ring, at).map_or_else(String::new, |other| ring.corrector_name(other));
+                let other = self.with(ring, at).map_or_else(String::new, |other| ring.corrector_name(other));
                 format!("{} % of the kick of corrector {name} goes to {other} as well", amplitude.signed(100.0))
             }
             Self::Hysteresis => {
@@ -306,6 +323,12 @@ fn before(kick: &DVectorView<f64>, nominal: f64) -> DVector<f64> {
         }
         before
     })
+}
+
+/// The corrector of the same element in the other plane.
+fn other_plane(ring: &Ring, corrector: usize) -> Option<usize> {
+    let crate::lattice::Corrector { element, plane } = ring.correctors[corrector];
+    of_element(ring, element).find(|&other| ring.correctors[other].plane != plane)
 }
 
 /// The next corrector in the plane of one; after the last the first.

@@ -131,6 +131,10 @@ kinds! {
     CorrectorSettling => Corrector(CorrectorEffect::Settling),
     /// A monitor reads this share of the frame before instead of its own; a response, whose settings last, does not show it.
     BpmTiming => Monitor(MonitorEffect::Timing),
+    /// A monitor of both planes reads this share of the other plane as well in one of them.
+    BpmCoupling => Monitor(MonitorEffect::Coupling),
+    /// This share of the kick of a corrector of both planes in one of them goes to the other plane as well.
+    CorrectorCoupling => Corrector(CorrectorEffect::Coupling),
     /// All quadrupoles drift from -a to +a during a run; its mean, which a response is, does not move.
     QuadDrift => Drift(DriftEffect::Quadrupoles),
 }
@@ -373,6 +377,7 @@ pub enum EffectError {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing;
 
     #[test]
     fn words_parse_and_unknown_ones_are_refused() {
@@ -427,7 +432,7 @@ mod tests {
 
     #[test]
     fn every_site_is_a_place_of_its_kind() {
-        let ring = Ring::booster();
+        let ring = testing::dual();
         for &kind in EffectKind::ALL {
             let sites = kind.sites(&ring);
             assert_eq!(sites.is_empty(), kind == EffectKind::RadialLoop, "{kind}");
@@ -457,6 +462,9 @@ mod tests {
                 EffectKind::StrayOctupole,
                 EffectKind::DipoleGradient,
                 EffectKind::SextupoleError,
+                // these instruments are of one plane
+                EffectKind::BpmCoupling,
+                EffectKind::CorrectorCoupling,
             ];
             assert_eq!(acting, usize::from(!elsewhere.contains(&kind)), "{kind}");
         }
@@ -464,7 +472,7 @@ mod tests {
 
     #[test]
     fn phrases_are_those_of_a_control_room() {
-        let ring = Ring::booster();
+        let ring = testing::dual();
         let cases = [
             ("bpm_gain@x_E4=-0.0721", 0.0081, "BPM x_E4 reads 7.21 ± 0.81 % low"),
             ("corrector_gain@V_D3=0.05", 0.01, "corrector V_D3 kicks 5.0 ± 1.0 % too much"),
@@ -495,6 +503,8 @@ mod tests {
                 "a radial loop held the mean of x_D8 and x_E6 instead of the momentum, by +80.0 ± 1.0 %",
             ),
             ("rf_step=-0.05", 0.01, "the RF frequency was stepped by +0.950 ± 0.010 times what is recorded"),
+            ("bpm_coupling@x_E4=0.03", 0.002, "BPM x_E4 reads +3.00 ± 0.20 % of y_E4 as well"),
+            ("corrector_coupling@V_A4=0.02", 0.01, "+2.0 ± 1.0 % of the kick of corrector V_A4 goes to H_A4 as well"),
             ("bpm_crosstalk@x_F8=-0.05", 0.01, "BPM x_F8 reads -5.0 ± 1.0 % of x_A6 as well"),
             ("corrector_crosstalk@H_A2=0.05", 0.01, "+5.0 ± 1.0 % of the kick of corrector H_A2 goes to H_A4 as well"),
             (

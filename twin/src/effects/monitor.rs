@@ -1,6 +1,6 @@
-//! Errors of monitors: gain, roll, cubic term, reversed sign, none of the beam, exchanged names, a share of another monitor or of the frame before.
+//! Errors of monitors: gain, roll, coupling, cubic term, reversed sign, none of the beam, exchanged names, a share of another monitor or of the frame before.
 //!
-//! Of the first five the reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
+//! Of the first six the reading is one function of position and amplitude, [`MonitorEffect::read`]. The reading of a
 //! cycle is its value, a frame's is a difference of two values, the response its slope in the position, the signature its slope in
 //! the amplitude: the last two by dual numbers. The others are linear in the positions: a monitor with crosstalk reads `x + a x_next`,
 //! one that is late `(1 - a) x_k + a x_(k-1)` in frame k, and the signature is what `a` multiplies.
@@ -21,6 +21,8 @@ pub enum MonitorEffect {
     Gain,
     /// It is rotated [rad]; one that reads both planes is so in both.
     Roll,
+    /// One of both planes reads a share of the other plane as well, `x + a y` or `y + a x`, as where buttons differ.
+    Coupling,
     /// It reads `x (1 + a x^2)`, x the true position in mm, before its offset.
     Cubic,
     /// Its sign is reversed.
@@ -52,13 +54,15 @@ impl MonitorEffect {
             Self::Cubic => position + amplitude * (position * 1e3).powi(2) * position,
             Self::Polarity => position * (amplitude * -2.0 + 1.0),
             Self::Dead => position * (-amplitude + 1.0),
-            Self::Roll | Self::Swap | Self::Crosstalk | Self::Timing => position,
+            Self::Roll | Self::Coupling | Self::Swap | Self::Crosstalk | Self::Timing => position,
         };
         match (self, plane) {
             (Self::Roll, _) => {
                 let (sin, cos) = amplitude.sin_cos();
                 [x * cos + y * sin, y * cos - x * sin]
             }
+            (Self::Coupling, Plane::X) => [x + amplitude * y, y],
+            (Self::Coupling, Plane::Y) => [x, y + amplitude * x],
             (_, Plane::X) => [own(x), y],
             (_, Plane::Y) => [x, own(y)],
         }
@@ -78,19 +82,24 @@ impl MonitorEffect {
     fn monitors(self, ring: &Ring, monitor: usize) -> Vec<usize> {
         match self {
             Self::Roll => of_element(ring, ring.monitors[monitor].element).collect(),
-            Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Swap | Self::Crosstalk | Self::Timing => {
-                vec![monitor]
-            }
+            Self::Gain
+            | Self::Coupling
+            | Self::Cubic
+            | Self::Polarity
+            | Self::Dead
+            | Self::Swap
+            | Self::Crosstalk
+            | Self::Timing => vec![monitor],
         }
     }
 
-    /// The factor on small changes in the own plane; those of a roll and of a cubic term are of second order.
+    /// The factor on small changes in the own plane; those of a roll, a coupling and a cubic term are of second order.
     fn factor(self, amplitude: f64) -> f64 {
         match self {
             Self::Gain => 1.0 + amplitude,
             Self::Polarity => 1.0 - 2.0 * amplitude,
             Self::Dead => 1.0 - amplitude,
-            Self::Roll | Self::Cubic | Self::Swap | Self::Crosstalk | Self::Timing => 1.0,
+            Self::Roll | Self::Coupling | Self::Cubic | Self::Swap | Self::Crosstalk | Self::Timing => 1.0,
         }
     }
 }
@@ -100,6 +109,7 @@ impl Mechanism for MonitorEffect {
         match self {
             Self::Gain => "bpm_gain",
             Self::Roll => "bpm_roll",
+            Self::Coupling => "bpm_coupling",
             Self::Cubic => "bpm_cubic",
             Self::Polarity => "bpm_polarity",
             Self::Dead => "bpm_dead",
@@ -109,7 +119,8 @@ impl Mechanism for MonitorEffect {
         }
     }
 
-    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a monitor by 50 mrad; a button monitor is
+    /// Gains found by LOCO scatter by 2 to 5 %, faulty ones by 10 %; a bracket's play turns a monitor by 50 mrad; buttons of unlike gains, or cables of
+    /// unlike loss, give each plane some per cent of the other; a button monitor is
     /// off by some per cent at 5 mm; channels of one crate are 40 dB apart, and a lost screen leaves 26 dB, 5 %; a gate that is set to the
     /// wrong turn takes a fifth of its time from the frame before.
     ///
@@ -119,7 +130,7 @@ impl Mechanism for MonitorEffect {
             Self::Gain => Some(0.08),
             Self::Roll => Some(0.06),
             Self::Cubic => Some(1.5e-3),
-            Self::Crosstalk => Some(0.05),
+            Self::Coupling | Self::Crosstalk => Some(0.05),
             Self::Timing => Some(0.2),
             Self::Polarity | Self::Dead | Self::Swap => None,
         }
@@ -127,7 +138,7 @@ impl Mechanism for MonitorEffect {
 
     fn unit(&self) -> Unit {
         match self {
-            Self::Gain | Self::Crosstalk | Self::Timing => Unit::PERCENT,
+            Self::Gain | Self::Coupling | Self::Crosstalk | Self::Timing => Unit::PERCENT,
             Self::Roll => Unit::ANGLE,
             Self::Cubic => Unit::PER_SQUARE_MILLIMETRE,
             Self::Polarity | Self::Dead | Self::Swap => Unit::NONE,
@@ -139,6 +150,10 @@ impl Mechanism for MonitorEffect {
         match self {
             Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => {
                 read.iter().map(|&at| Site::Monitor(at)).collect()
+            }
+            Self::Coupling => {
+                let of_both = |&&at: &&usize| other_plane(ring, at).is_some();
+                read.iter().filter(of_both).map(|&at| Site::Monitor(at)).collect()
             }
             Self::Crosstalk => {
                 let has_next = |&&at: &&usize| next(ring, at).is_some();
@@ -161,6 +176,7 @@ impl Mechanism for MonitorEffect {
     fn expected(&self) -> &'static str {
         match self {
             Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => "a monitor",
+            Self::Coupling => "a monitor that reads both planes",
             Self::Crosstalk => "a monitor with another one in its plane",
             Self::Swap => "two monitors of one plane",
         }
@@ -170,6 +186,9 @@ impl Mechanism for MonitorEffect {
         match self {
             Self::Gain | Self::Cubic | Self::Polarity | Self::Dead | Self::Timing => {
                 Site::monitor(ring, name).map(Site::Monitor)
+            }
+            Self::Coupling => {
+                Site::monitor(ring, name).filter(|&at| other_plane(ring, at).is_some()).map(Site::Monitor)
             }
             Self::Crosstalk => Site::monitor(ring, name).filter(|&at| next(ring, at).is_some()).map(Site::Monitor),
             Self::Roll => either_plane(ring, name).map(|at| Site::Monitor(rolled(ring, at))),
@@ -184,12 +203,14 @@ impl Mechanism for MonitorEffect {
         let ring = &machine.ring;
         let misplaced = || self.misplaced(ring, site.name(ring));
         machine.monitors.push(match (self, site) {
+            (Self::Coupling, Site::Monitor(at)) if other_plane(ring, at).is_none() => return Err(misplaced()),
             (Self::Swap, Site::MonitorPair(one, other)) => {
                 Reading::Exchanged { plane: ring.monitors[one].plane, monitors: [one, other] }
             }
-            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead, Site::Monitor(at)) => {
-                Reading::Distorted { how: *self, monitors: self.monitors(ring, at), amplitude }
-            }
+            (
+                Self::Gain | Self::Roll | Self::Coupling | Self::Cubic | Self::Polarity | Self::Dead,
+                Site::Monitor(at),
+            ) => Reading::Distorted { how: *self, monitors: self.monitors(ring, at), amplitude },
             (Self::Crosstalk, Site::Monitor(monitor)) => {
                 let (plane, from) = (ring.monitors[monitor].plane, next(ring, monitor).ok_or_else(misplaced)?);
                 Reading::Mixed { plane, monitor, from, share: amplitude }
@@ -217,7 +238,10 @@ impl Mechanism for MonitorEffect {
                 signature.readings.set_column(j, &-&difference);
                 signature.readings.set_column(i, &difference);
             }
-            (Self::Gain | Self::Roll | Self::Cubic | Self::Polarity | Self::Dead, Site::Monitor(at)) => {
+            (
+                Self::Gain | Self::Roll | Self::Coupling | Self::Cubic | Self::Polarity | Self::Dead,
+                Site::Monitor(at),
+            ) => {
                 let read =
                     self.monitors(ring, at).into_iter().filter_map(|monitor| Some((monitor, about.read(monitor)?)));
                 let read: Vec<(usize, usize)> = read.collect();
@@ -259,9 +283,10 @@ impl Mechanism for MonitorEffect {
             Self::Polarity => format!("BPM {name} reads with the wrong sign"),
             Self::Dead => format!("BPM {name} does not see the beam"),
             Self::Swap => format!("BPMs {} are exchanged", site.names(ring).join(" and ")),
-            Self::Crosstalk => {
+            Self::Coupling | Self::Crosstalk => {
                 let Site::Monitor(at) = site else { unreachable!("it acts on monitors") };
-                let other = next(ring, at).map_or_else(String::new, |other| ring.monitor_name(other));
+                let other = if *self == Self::Coupling { other_plane(ring, at) } else { next(ring, at) };
+                let other = other.map_or_else(String::new, |other| ring.monitor_name(other));
                 format!("BPM {name} reads {} % of {other} as well", amplitude.signed(100.0))
             }
             Self::Timing => format!("{} % of what BPM {name} reads is the frame before", amplitude.signed(100.0)),
@@ -401,6 +426,12 @@ fn next(ring: &Ring, monitor: usize) -> Option<usize> {
         read.filter(move |&other| other != monitor && ring.monitors[other].plane == ring.monitors[monitor].plane)
     };
     others().find(|&other| other > monitor).or_else(|| others().next())
+}
+
+/// The monitor at the same element that reads the other plane, if it is read.
+fn other_plane(ring: &Ring, monitor: usize) -> Option<usize> {
+    let crate::Monitor { element, plane } = ring.monitors[monitor];
+    of_element(ring, element).find(|&other| ring.monitors[other].plane != plane && ring.read_monitors.contains(&other))
 }
 
 /// Derivative of what is read with respect to the position (x, y).
