@@ -11,7 +11,7 @@ use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
-use super::heldout::{Block, Score, VALIDATED, gain_of_choice, lessened, reduced};
+use super::heldout::{Block, CHANCE, SUPPORTED, Score, VALIDATED, gain_of_choice, lessened, reduced};
 use super::hypothesis::Term;
 use super::imperfection::Imperfection;
 use super::limits::Limits;
@@ -124,7 +124,9 @@ impl Tested {
     /// True if held-out readings are predicted better by more than the standard errors asked for, by the choice too.
     pub fn is_passed(&self) -> bool {
         let (gain, error) = self.gain;
-        gain > VALIDATED * error && self.of_choice.is_none_or(|gain| gain > 0.0)
+        let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
+        let is_chance = self.chance.is_none_or(|chance| chance > CHANCE);
+        of_choice > 0.0 && gain > error * if is_chance { VALIDATED } else { SUPPORTED }
     }
 }
 
@@ -606,6 +608,16 @@ mod tests {
     use super::*;
     use crate::discrepancy::Discrepancy;
     use crate::testing::template;
+
+    /// At 1.5 standard errors chance decides, and without a choice that predicts nothing does.
+    #[test]
+    fn what_chance_does_not_give_needs_less_of_what_is_held_out() {
+        let passed = |gain: f64, of_choice, chance| Tested { gain: (gain, 1.0), of_choice, chance }.is_passed();
+        assert!(passed(2.1, Some(0.1), Some(0.3)) && !passed(1.5, Some(0.1), Some(0.02)));
+        assert!(passed(1.5, Some(0.1), Some(0.002)) && !passed(0.9, Some(0.1), Some(0.002)));
+        assert!(!passed(5.0, Some(-0.1), Some(0.002)));
+        assert!(passed(2.1, None, None) && !passed(1.5, None, Some(0.002)));
+    }
 
     /// What one monitor does that no effect describes, with a gain of that monitor in the model.
     #[test]

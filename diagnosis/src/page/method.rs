@@ -4,7 +4,7 @@ use super::table;
 use crate::Diagnosis;
 use crate::alternatives::{DECISIVE, SUSPICIOUS};
 use crate::error::FitError;
-use crate::heldout::VALIDATED;
+use crate::heldout::{CHANCE, SUPPORTED, VALIDATED};
 use inference::recording::Recording;
 use report::Section;
 
@@ -74,7 +74,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         row(
             "verdict",
             format!(
-                "identified: P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors and one of the choice above zero for every effect, and nothing further suspected; consistent: P(nothing) ≥ {:.1}; \
+                "identified: P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors ({SUPPORTED:.0} where chance is at most {CHANCE}) and one of the choice above zero for every effect, and nothing further suspected; consistent: P(nothing) ≥ {:.1}; \
                  unexplained: an unmodelled discrepancy has P > {SUSPICIOUS:.1}; ambiguous: the rest.",
                 1.0 - SUSPICIOUS
             ),
