@@ -74,6 +74,7 @@ impl Element {
                 // both act at the position at which the beam enters, which neither changes
                 thin(z, *k1l, *k1sl, *k2l);
                 octupole(z, *k3l);
+                drift(z, depth);
             }
             Kind::Solenoid { ks } => solenoid(z, *ks, depth),
             Kind::Bend(bend) => {
@@ -416,7 +417,7 @@ mod tests {
             rolled,
             element(Kind::Solenoid { ks: 0.3 }, 0.7),
             element(Kind::Sextupole { k2: 3.0 }, 0.3),
-            element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.0),
+            element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.5),
             bend(0.0, 0.0),
             bend(0.4, 0.1),
         ];

@@ -21,7 +21,7 @@ impl Element {
             Kind::Drift | Kind::Marker | Kind::Monitor | Kind::Sextupole { .. } => Some(body(0.0, 0.0, depth)),
             Kind::Corrector { kick } => (*kick == [0.0; 2]).then(|| body(0.0, 0.0, depth)),
             Kind::Quadrupole { k1 } => Some(body(0.0, *k1, depth)),
-            Kind::Multipole { k1l, k1sl, .. } => Some(thin(*k1l, *k1sl)),
+            Kind::Multipole { k1l, k1sl, .. } => Some(body(0.0, 0.0, depth) * thin(*k1l, *k1sl)),
             Kind::Solenoid { .. } => None,
             Kind::Bend(bend) => {
                 let inside = body(bend.curvature, bend.k1, depth) * bend.edge(bend.e1);
@@ -88,7 +88,7 @@ mod tests {
             (element(Kind::Quadrupole { k1: -0.57 }, 0.5), 1e-13),
             (element(Kind::Corrector { kick: [0.0; 2] }, 0.2), 1e-13),
             (element(Kind::Sextupole { k2: 3.0 }, 0.3), 1e-13),
-            (element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.0), 1e-13),
+            (element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.5), 1e-13),
             (bend(0.072, 0.0, 0.0, 0.0, 0.0), 1e-13),
             (bend(0.072, 0.0, 0.1, -0.05, 0.02), 1e-13),
             (bend(0.072, 1e-3, 0.1, 0.0, 0.02), 1e-6),

@@ -20,7 +20,7 @@
 
 use nalgebra::{DMatrix, Matrix5, Matrix6, RowVector6, Vector6};
 
-use crate::lattice::{Corrector, Element, Plane, Ring};
+use crate::lattice::{Corrector, Element, Kind, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, inverse};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError, invert};
 
@@ -195,10 +195,11 @@ impl<'r> Optics<'r> {
         Source { place, column: inverse(&self.transfer(place)) * all }
     }
 
-    /// Linear map from the start to the middle of an element, in the ring's axes.
+    /// Linear map from the start to the middle of an element, in the ring's axes; of a free straight to its entrance, where a thin field is.
     fn transfer_to_middle(&self, element: usize) -> (Place, Matrix6<f64>) {
-        let Element { length, misalignment, .. } = &self.ring.elements[element];
-        let place = Place { element, depth: 0.5 * length };
+        let Element { kind, length, misalignment, .. } = &self.ring.elements[element];
+        let is_thin = matches!(kind, Kind::Marker | Kind::Multipole { .. });
+        let place = Place { element, depth: if is_thin { 0.0 } else { 0.5 * length } };
         (place, misalignment.rotation().transpose() * self.transfer_into(place))
     }
 

@@ -245,18 +245,21 @@ fn one_line(text: &str) -> String {
     text.split(char::is_control).collect::<Vec<_>>().join(" ")
 }
 
-/// Monitors and correctors as thin elements with a drift behind them; markers likewise.
+/// Monitors and correctors as thin elements with a drift behind them; markers and thin multipoles likewise.
 fn pieces(element: Element, names: &mut Names) -> Vec<Element> {
-    if !matches!(element.kind, Kind::Marker | Kind::Monitor | Kind::Corrector { .. }) {
-        return vec![element];
-    }
+    let misalignment = match element.kind {
+        // free space has no orientation, a monitor's is passed over, and a corrector's is that of its kick
+        Kind::Marker | Kind::Monitor | Kind::Corrector { .. } => Misalignment::default(),
+        Kind::Multipole { .. } => element.misalignment,
+        _ => return vec![element],
+    };
     let (length, name) = (element.length, element.name.clone());
-    // free space has no orientation, a monitor's is passed over, and a corrector's is that of its kick
-    let thin = Element { length: 0.0, misalignment: Misalignment::default(), ..element };
+    let thin = Element { length: 0.0, misalignment, ..element };
     let behind = (length > 0.0).then(|| Element {
         name: names.take(&format!("{name}_drift")),
         kind: Kind::Drift,
         length,
+        misalignment: Misalignment::default(),
         ..thin.clone()
     });
     core::iter::once(thin).chain(behind).collect()

@@ -276,7 +276,7 @@ fn turn_edges(bend: &mut Bend, angle: f64) {
     bend.e2 += angle;
 }
 
-/// Add K1L, K1sL and K3L to the thin multipole that a free straight then is.
+/// Add K1L, K1sL and K3L to the thin multipole at its entrance that a free straight then is.
 fn stray(kind: &mut Kind, [normal, skew, octupole]: [f64; 3]) -> Option<()> {
     if *kind == Kind::Marker {
         *kind = Kind::Multipole { k1l: 0.0, k1sl: 0.0, k2l: 0.0, k3l: 0.0 };

@@ -470,6 +470,45 @@ mod tests {
         }
     }
 
+    /// A free straight of some length keeps it when a field is put there.
+    #[test]
+    fn an_effect_of_no_size_changes_nothing() {
+        let ring = testing::booster_with(|file| {
+            let elements = file["elements"].as_array_mut().unwrap();
+            let straights = elements.iter_mut().filter(|element| element["type"] == "marker");
+            straights.for_each(|element| element["length"] = 0.5.into());
+        });
+        let respond =
+            |effects: &[Effect]| Machine::new(ring.clone(), Rf::FixedMomentum, effects).unwrap().response().unwrap();
+        let plain = respond(&[]);
+        for &kind in EffectKind::ALL.iter().filter(|kind| !kind.is_switch()) {
+            for site in kind.sites(&ring).into_iter().step_by(7) {
+                let same = respond(&[Effect { kind, site, amplitude: 0.0 }]);
+                let off = (&same.x - &plain.x).amax().max((&same.y - &plain.y).amax());
+                assert!(off < 1e-9, "{kind} {site:?}: {off:e} m/rad");
+            }
+        }
+    }
+
+    /// A field in a free straight of some length is the same field in one without, and the drift behind it.
+    #[test]
+    fn a_stray_field_is_at_the_entrance_of_its_straight() {
+        let [thin, long] = [0.0, 0.5].map(|length| {
+            testing::booster_with(|file| {
+                let elements = file["elements"].as_array_mut().unwrap();
+                let straights = elements.iter_mut().filter(|element| element["type"] == "marker");
+                straights.for_each(|element| element["length"] = length.into());
+            })
+        });
+        for text in ["stray_gradient@SLOT_C3=0.02", "stray_skew_gradient@SLOT_D3=0.01"] {
+            let [one, other] = [&thin, &long].map(|ring| {
+                let effect = Effect::parse(text, ring).unwrap();
+                Machine::new(ring.clone(), Rf::FixedMomentum, &[effect]).unwrap().response().unwrap()
+            });
+            assert!((&one.x - &other.x).amax() < 1e-9 && (&one.y - &other.y).amax() < 1e-9, "{text}");
+        }
+    }
+
     #[test]
     fn phrases_are_those_of_a_control_room() {
         let ring = testing::dual();
