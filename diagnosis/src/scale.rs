@@ -4,7 +4,7 @@
 //! which the header knows to a prior width, with a scatter between monitors; both are taken over only where the evidence asks for them, so
 //! that monitors that agree with the header keep its noise exactly. A monitor far from all others has a scale of its own.
 //!
-//! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 5.4, the hierarchical normal model.
+//! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 5.4, the hierarchical normal model; E. B. Wilson and M. M. Hilferty, PNAS 17 (1931) 684.
 
 use twin::Measured;
 
@@ -64,7 +64,7 @@ fn is_alike(all: &[Measured], at: usize) -> bool {
     let mut others = all.to_vec();
     let one = others.remove(at);
     let scatter = scatter_among(&others).map_or(0.0, |scatter| scatter.value);
-    (one.value - centre_of(&others)).abs() < FAR * one.sigma.hypot(scatter)
+    !is_far(one, centre_of(&others), scatter)
 }
 
 /// The scatter of some scales, 0 with its root mean square where none is more likely; none without any scale.
@@ -102,11 +102,20 @@ fn common_of(near: &[Measured], scatter: f64) -> Measured {
 
 /// `ln` of the scale of one monitor.
 fn shrunk(one: Measured, common: f64, scatter: f64) -> f64 {
-    let off = one.value - common;
-    if off.abs() > FAR * one.sigma.hypot(scatter) {
+    if is_far(one, common, scatter) {
         return one.value;
     }
-    common + off * scatter.powi(2) / (scatter.powi(2) + one.sigma.powi(2))
+    common + (one.value - common) * scatter.powi(2) / (scatter.powi(2) + one.sigma.powi(2))
+}
+
+/// True for a scale far from the others. A variance of `n` differences is a chi-square, of which the cube root is nearly normal about `1 - v` with the variance
+/// `v = 2/(9 n)`, and not the logarithm, whose error is `s = 1/sqrt(2 n)`: half the noise in twenty differences would seem less likely than it is.
+fn is_far(one: Measured, centre: f64, scatter: f64) -> bool {
+    let off = one.value - centre;
+    let variance = 4.0 / 9.0 * one.sigma.powi(2);
+    let least = (1.0 - variance - FAR * variance.sqrt()).max(0.0);
+    let by_chance = if off < 0.0 { -1.5 * least.ln() } else { FAR * one.sigma };
+    off.abs() > by_chance.hypot(FAR * scatter)
 }
 
 /// Their median.
@@ -119,6 +128,18 @@ fn centre_of(all: &[Measured]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Of 22 differences half of the noise has a probability of 1.4e-4, among thirty monitors one in 250 campaigns; twice the noise 1e-9.
+    #[test]
+    fn few_quiet_differences_are_chance_and_few_loud_ones_are_not() {
+        let of = |scale: f64| {
+            let others = (0..29).map(|_| Some(Measured { value: 0.0, sigma: 0.15 }));
+            let own = Measured { value: f64::ln(scale), sigma: 44_f64.sqrt().recip() };
+            Scales::of(&others.chain([Some(own)]).collect::<Vec<_>>()).each[29]
+        };
+        assert_eq!(of(0.51), 1.0);
+        assert!((of(2.0) - 2.0).abs() < 1e-9 && (of(0.2) - 0.2).abs() < 1e-9, "{} {}", of(2.0), of(0.2));
+    }
 
     #[test]
     fn scales_far_apart_stay_numbers() {

@@ -155,6 +155,14 @@ impl Search {
             let Some(leader) = found.next.leader() else { break };
             // a trial without a stable machine is discarded
             let Ok(further) = self.further(&found, leader) else { break };
+            // judged by readings that are linearised about the machine with it, the only effect may not be needed
+            if let [only] = further.competitions.as_slice()
+                && !only.is_suspicious()
+                && !found.has_more()
+            {
+                found.next = only.clone();
+                break;
+            }
             // no progress: the new effect has only replaced another
             let gained = self.log_posterior(&further.best) - self.log_posterior(&found.best);
             if further.competitions.len() <= found.competitions.len() && gained < BETTER {
