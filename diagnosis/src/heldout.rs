@@ -35,9 +35,8 @@ pub type Block = Vec<usize>;
 
 /// Number of standard errors by which the prediction of held-out readings has to improve.
 pub const VALIDATED: f64 = 2.0;
-/// The same where chance gives as much as was found in at most [`CHANCE`] of the recordings that are drawn with nothing missing. Few runs show
-/// a step of the RF, and an instrument whose error is far beyond the ordinary scatter of its like is, from the first run that shows it, predicted by that
-/// scatter too: what is held out then tells little.
+/// The same where chance gives as much as was found in at most [`CHANCE`] of the recordings that are drawn with nothing missing: few runs show a step of the RF,
+/// so that what is held out tells little.
 pub const SUPPORTED: f64 = 1.0;
 /// That share.
 pub const CHANCE: f64 = 0.01;

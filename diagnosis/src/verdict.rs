@@ -118,6 +118,8 @@ pub struct Tested {
     pub of_choice: Option<f64>,
     /// Probability of as good a candidate were nothing there.
     pub chance: Option<f64>,
+    /// True for a member of a family whose scatter is in the fit: from the first readings that show it, that scatter predicts it too.
+    pub is_of_family: bool,
 }
 
 impl Tested {
@@ -125,8 +127,11 @@ impl Tested {
     pub fn is_passed(&self) -> bool {
         let (gain, error) = self.gain;
         let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
-        let is_chance = self.chance.is_none_or(|chance| chance > CHANCE);
-        of_choice > 0.0 && gain > error * if is_chance { VALIDATED } else { SUPPORTED }
+        match (self.chance.is_some_and(|chance| chance <= CHANCE), self.is_of_family) {
+            (true, true) => gain > 0.0,
+            (true, false) => of_choice > 0.0 && gain > SUPPORTED * error,
+            (false, _) => of_choice > 0.0 && gain > VALIDATED * error,
+        }
     }
 }
 
@@ -327,10 +332,13 @@ pub fn tests(
         let rival = if is_all { before } else { &Score::of(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
-            return Ok(Tested { gain, of_choice: None, chance: None });
+            return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
         }
+        let kind = found.best.hypothesis.terms[i].kind;
+        let is_of_family = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind);
         let choice = Choice::of(data, without, candidates, penalty)?;
-        Ok(Tested { gain, of_choice: Some(gain_of_choice(&choice)?), chance: Some(chance::of_search(&choice)?) })
+        let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
+        Ok(Tested { gain, of_choice, chance, is_of_family })
     };
     (0..found.competitions.len()).map(test).collect()
 }
@@ -351,7 +359,7 @@ pub fn test_of_element(
     }
     let without = || lessened(data, &found.best, found.best.hypothesis.without_element());
     let rival = if found.competitions.is_empty() { before } else { &Score::of(data, &without()?, blocks)? };
-    Ok(Some(Tested { gain: after.gain_over(rival), of_choice: None, chance: None }))
+    Ok(Some(Tested { gain: after.gain_over(rival), of_choice: None, chance: None, is_of_family: false }))
 }
 
 /// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of
@@ -612,11 +620,15 @@ mod tests {
     /// At 1.5 standard errors chance decides, and without a choice that predicts nothing does.
     #[test]
     fn what_chance_does_not_give_needs_less_of_what_is_held_out() {
-        let passed = |gain: f64, of_choice, chance| Tested { gain: (gain, 1.0), of_choice, chance }.is_passed();
+        let of = |gain: f64, of_choice, chance| Tested { gain: (gain, 1.0), of_choice, chance, is_of_family: false };
+        let passed = |gain: f64, of_choice, chance| of(gain, of_choice, chance).is_passed();
         assert!(passed(2.1, Some(0.1), Some(0.3)) && !passed(1.5, Some(0.1), Some(0.02)));
         assert!(passed(1.5, Some(0.1), Some(0.002)) && !passed(0.9, Some(0.1), Some(0.002)));
         assert!(!passed(5.0, Some(-0.1), Some(0.002)));
         assert!(passed(2.1, None, None) && !passed(1.5, None, Some(0.002)));
+        let outlier =
+            |gain: f64, chance| Tested { is_of_family: true, ..of(gain, Some(-3.0), Some(chance)) }.is_passed();
+        assert!(outlier(0.1, 0.002) && !outlier(-0.1, 0.002) && !outlier(5.0, 0.02));
     }
 
     /// What one monitor does that no effect describes, with a gain of that monitor in the model.

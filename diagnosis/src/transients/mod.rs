@@ -225,7 +225,8 @@ impl<'c> Within<'c> {
         }
         let leading = &alternatives.first()?.cause;
         let fit = fits.iter().find(|fit| leading.is(&Cause::Effect(fit.term)));
-        let tested = fit.map(|fit| Tested { gain: fit.gain, of_choice: None, chance: Some(chance) });
+        let tested =
+            fit.map(|fit| Tested { gain: fit.gain, of_choice: None, chance: Some(chance), is_of_family: false });
         let (shown, without) = match (fit, leading) {
             (Some(fit), _) => (self.shown(&(&fit.signal / fit.amplitude)), self.less(&fit.signal)),
             (None, Cause::Unmodelled(Discrepancy { at: Location::FirstFrames { from, to }, .. })) => {
