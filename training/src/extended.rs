@@ -136,7 +136,7 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
     instruments
 }
 
-/// Exact response [m/rad] of a machine, rows read monitors, columns correctors and the RF offset.
+/// Exact response [m/rad] of a machine about the orbit that it has by itself, rows read monitors, columns correctors and the RF offset.
 fn response(machine: &Machine) -> Result<DMatrix<f64>, TrainingError> {
     let (correctors, ring) = (machine.ring().correctors.len(), machine.ring());
     let drives = Drives {
@@ -144,7 +144,7 @@ fn response(machine: &Machine) -> Result<DMatrix<f64>, TrainingError> {
         rf_offset: DVector::from_fn(correctors + 1, |frame, _| f64::from(u8::from(frame == correctors))),
         time: DVector::zeros(correctors + 1),
         nominal_kick: 1.0,
-        orbit: vec![[0.0; 2]; ring.elements.len()],
+        orbit: machine.orbit()?,
     };
     Ok(machine.readings(&drives)?.0.transpose())
 }
