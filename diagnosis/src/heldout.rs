@@ -35,10 +35,9 @@ pub type Block = Vec<usize>;
 
 /// Number of standard errors by which the prediction of held-out readings has to improve.
 pub const VALIDATED: f64 = 2.0;
-/// The same where chance gives as much as was found in at most [`CHANCE`] of the recordings that are drawn with nothing missing: few runs show a step of the RF,
-/// so that what is held out tells little.
+/// The same where chance is excluded: a step of the RF is in few runs, and leaving one out takes much of what shows it.
 pub const SUPPORTED: f64 = 1.0;
-/// That share.
+/// Share of the recordings drawn with nothing missing in which the search finds as much, up to which chance is excluded.
 pub const CHANCE: f64 = 0.01;
 
 /// Every pool by itself.

@@ -68,7 +68,7 @@ const HIDDEN: f64 = 0.15;
 const STEPS: usize = 30;
 const SETTLED: f64 = 0.01;
 
-/// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles; a common
+/// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles;
 /// the planes of an instrument that reads or kicks in both are coupled by a per cent, each by itself: half of the sum of both couplings is one of these
 /// families, half of the difference a roll; a common
 /// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
@@ -384,24 +384,32 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
     hypothesis
 }
 
-/// The member of each learnt family that stands out most of it: it may have made the family as wide as it is, and then hide in it. An instrument
+/// The member of each learnt family that stands out most of it, of an instrument both planes: it may have made the family as wide as it is, and then hide in it. An instrument
 /// whose gain is nearer to none than to 1 may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     // the amplitude of each member in widths of its family, and in its unit
-    let members: Vec<(Term, f64, f64)> = (unknowns.iter())
+    let members: Vec<(&[Term], f64, f64)> = (unknowns.iter())
         .zip(fitted.u.iter().skip(fitted.params.len()))
         .filter_map(|(unknown, u)| match unknown {
-            Unknown::Ordinary(member, width) if member.terms.len() == 1 => Some((member.terms[0], u.abs(), u * width)),
+            Unknown::Ordinary(member, width) => Some((member.terms.as_slice(), u.abs(), u * width)),
             _ => None,
         })
         .collect();
     let most = |family: &Family| {
-        let own = members.iter().filter(|(term, u, _)| term.kind == family.kind && *u > STANDS_OUT);
+        let is_own = |terms: &[Term]| {
+            let size = if family.grouping == Grouping::Instrument { 2 } else { 1 };
+            terms.len() == size && terms[0].kind == family.kind
+        };
+        let own = members.iter().filter(|(terms, u, _)| is_own(terms) && *u > STANDS_OUT);
         own.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
-    stands_out.flat_map(|(term, _, amplitude)| iter::once(*term).chain(failures(*term, *amplitude))).collect()
+    let proposed = |(terms, _, amplitude): &(&[Term], f64, f64)| {
+        let failed = failures(terms[0], *amplitude);
+        terms.iter().copied().chain(failed).collect::<Vec<_>>()
+    };
+    stands_out.flat_map(proposed).collect()
 }
 
 /// The instrument of a gain dead, and reversed, where that is nearer than a sound one.

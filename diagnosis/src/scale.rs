@@ -52,10 +52,10 @@ impl Scales {
     }
 }
 
-/// The scale that is furthest from the others, in standard deviations.
+/// The scale that is furthest from the others, by what chance makes of it.
 fn furthest(all: &[Measured]) -> Option<usize> {
     let centre = centre_of(all);
-    let off = |one: &Measured| (one.value - centre).abs() / one.sigma;
+    let off = |one: &Measured| (one.value - centre).abs() / by_chance(one, one.value < centre);
     all.iter().enumerate().max_by(|a, b| off(a.1).total_cmp(&off(b.1))).map(|(i, _)| i)
 }
 
@@ -108,14 +108,19 @@ fn shrunk(one: Measured, common: f64, scatter: f64) -> f64 {
     common + (one.value - common) * scatter.powi(2) / (scatter.powi(2) + one.sigma.powi(2))
 }
 
-/// True for a scale far from the others. A variance of `n` differences is a chi-square, of which the cube root is nearly normal about `1 - v` with the variance
-/// `v = 2/(9 n)`, and not the logarithm, whose error is `s = 1/sqrt(2 n)`: half the noise in twenty differences would seem less likely than it is.
+/// True for a scale far from the others.
 fn is_far(one: Measured, centre: f64, scatter: f64) -> bool {
     let off = one.value - centre;
+    off.abs() > by_chance(&one, off < 0.0).hypot(FAR * scatter)
+}
+
+/// How far chance takes `ln` of a measured scale, down or up. A variance of `n` differences is a chi-square, of which the cube root is nearly normal about
+/// `1 - v` with the variance `v = 2/(9 n)`, and not the logarithm, whose error is `s = 1/sqrt(2 n)`: half the noise in twenty differences would seem less
+/// likely than it is.
+fn by_chance(one: &Measured, down: bool) -> f64 {
     let variance = 4.0 / 9.0 * one.sigma.powi(2);
     let least = (1.0 - variance - FAR * variance.sqrt()).max(0.0);
-    let by_chance = if off < 0.0 { -1.5 * least.ln() } else { FAR * one.sigma };
-    off.abs() > by_chance.hypot(FAR * scatter)
+    if down { -1.5 * least.ln() } else { FAR * one.sigma }
 }
 
 /// Their median.
@@ -132,13 +137,17 @@ mod tests {
     /// Of 22 differences half of the noise has a probability of 1.4e-4, among thirty monitors one in 250 campaigns; twice the noise 1e-9.
     #[test]
     fn few_quiet_differences_are_chance_and_few_loud_ones_are_not() {
-        let of = |scale: f64| {
+        let of = |scales: &[f64]| {
             let others = (0..29).map(|_| Some(Measured { value: 0.0, sigma: 0.15 }));
-            let own = Measured { value: f64::ln(scale), sigma: 44_f64.sqrt().recip() };
-            Scales::of(&others.chain([Some(own)]).collect::<Vec<_>>()).each[29]
+            let own = |scale: &f64| Some(Measured { value: scale.ln(), sigma: 44_f64.sqrt().recip() });
+            Scales::of(&others.chain(scales.iter().map(own)).collect::<Vec<_>>()).each.split_off(29)
         };
-        assert_eq!(of(0.51), 1.0);
-        assert!((of(2.0) - 2.0).abs() < 1e-9 && (of(0.2) - 0.2).abs() < 1e-9, "{} {}", of(2.0), of(0.2));
+        assert_eq!(of(&[0.51]), [1.0]);
+        let own = of(&[2.0, 0.2]);
+        assert!((own[0] - 2.0).abs() < 1e-9 && (own[1] - 0.2).abs() < 1e-9, "{own:?}");
+        // the quiet one, further in the logarithm, does not hide the loud one
+        let own = of(&[0.51, 1.88]);
+        assert!(own[0] == 1.0 && (own[1] - 1.88).abs() < 1e-9, "{own:?}");
     }
 
     #[test]

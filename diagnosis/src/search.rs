@@ -155,9 +155,11 @@ impl Search {
             let Some(leader) = found.next.leader() else { break };
             // a trial without a stable machine is discarded
             let Ok(further) = self.further(&found, leader) else { break };
-            // judged by readings that are linearised about the machine with it, the only effect may not be needed
+            // by readings that are linearised about the machine with it, the only effect is not needed, nor is another one: nothing is missing, and how
+            // likely that is those readings say
             if let [only] = further.competitions.as_slice()
                 && !only.is_suspicious()
+                && !further.next.is_suspicious()
                 && !found.has_more()
             {
                 found.next = only.clone();

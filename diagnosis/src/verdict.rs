@@ -118,12 +118,14 @@ pub struct Tested {
     pub of_choice: Option<f64>,
     /// Probability of as good a candidate were nothing there.
     pub chance: Option<f64>,
-    /// True for a member of a family whose scatter is in the fit: from the first readings that show it, that scatter predicts it too.
+    /// True of an instrument, if the fit without it has a learnt scatter of its kind: once one run shows it, that scatter predicts the other runs nearly as well, so
+    /// that held-out readings tell little.
     pub is_of_family: bool,
 }
 
 impl Tested {
-    /// True if held-out readings are predicted better by more than the standard errors asked for, by the choice too.
+    /// True if held-out readings are predicted better by more than the standard errors asked for, and by the choice too; of an instrument beside the scatter of
+    /// its like, if they are not predicted worse and chance is excluded.
     pub fn is_passed(&self) -> bool {
         let (gain, error) = self.gain;
         let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
@@ -335,8 +337,10 @@ pub fn tests(
             return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
         }
         let kind = found.best.hypothesis.terms[i].kind;
-        let is_of_family = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind);
+        let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
+        let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind);
         let choice = Choice::of(data, without, candidates, penalty)?;
+        let is_of_family = is_of_an_instrument && is_learnt;
         let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
         Ok(Tested { gain, of_choice, chance, is_of_family })
     };

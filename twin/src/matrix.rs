@@ -7,16 +7,27 @@
 
 use nalgebra::Matrix6;
 
-use crate::lattice::{Bend, Element, Kind};
+use crate::lattice::{Bend, Element, Kind, Misalignment};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, focus};
 
 impl Element {
-    /// The map of the axis from the entrance to `depth` [m] inside, and out at the end of the element; none if the axis is no orbit.
+    /// The map of the axis from the entrance to `depth` [m] inside, in the element's own axes, and out at the end of the element; none if the axis is no orbit.
     pub(crate) fn matrix(&self, z: &Phase<f64>, depth: f64, leaves: bool) -> Option<Matrix6<f64>> {
-        let is_on_axis = [X, PX, Y, PY, DELTA].iter().all(|&at| z[at] == 0.0) && self.misalignment.is_none();
+        let Misalignment { dx, dy, roll } = self.misalignment;
+        let is_on_axis = [X, PX, Y, PY, DELTA].iter().all(|&at| z[at] == 0.0) && dx == 0.0 && dy == 0.0;
         if !is_on_axis {
             return None;
         }
+        let own = self.own_matrix(depth, leaves)?;
+        if roll == 0.0 {
+            return Some(own);
+        }
+        let rotation = self.misalignment.rotation();
+        Some(if leaves { rotation.transpose() * own * rotation } else { own * rotation })
+    }
+
+    /// The same from its own axes.
+    fn own_matrix(&self, depth: f64, leaves: bool) -> Option<Matrix6<f64>> {
         match &self.kind {
             Kind::Drift | Kind::Marker | Kind::Monitor | Kind::Sextupole { .. } => Some(body(0.0, 0.0, depth)),
             Kind::Corrector { kick } => (*kick == [0.0; 2]).then(|| body(0.0, 0.0, depth)),
@@ -95,6 +106,13 @@ mod tests {
             (bend(0.072, -0.1, 0.0, 0.1, 0.0), 2e-6),
             (bend(0.0, 0.1, 0.0, 0.0, 0.0), 2e-6),
         ];
+        let rolled = |(element, tolerance): &(Element, f64)| {
+            (
+                Element { misalignment: Misalignment { roll: 0.3, ..Misalignment::default() }, ..element.clone() },
+                *tolerance,
+            )
+        };
+        let all = all.iter().cloned().chain(all.iter().map(rolled));
         for (element, tolerance) in all {
             let axis = Phase::<f64>::zeros();
             for depth in [0.4 * element.length, element.length] {

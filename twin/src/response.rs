@@ -197,10 +197,15 @@ impl<'r> Optics<'r> {
 
     /// Linear map from the start to the middle of an element, in the ring's axes; of a free straight to its entrance, where a thin field is.
     fn transfer_to_middle(&self, element: usize) -> (Place, Matrix6<f64>) {
-        let Element { kind, length, misalignment, .. } = &self.ring.elements[element];
+        let Element { kind, length, .. } = &self.ring.elements[element];
         let is_thin = matches!(kind, Kind::Marker | Kind::Multipole { .. });
         let place = Place { element, depth: if is_thin { 0.0 } else { 0.5 * length } };
-        (place, misalignment.rotation().transpose() * self.transfer_into(place))
+        (place, self.transfer_in_axes(place))
+    }
+
+    /// Linear map from the start to a place, in the ring's axes whatever the roll of its element.
+    fn transfer_in_axes(&self, place: Place) -> Matrix6<f64> {
+        self.ring.elements[place.element].misalignment.rotation().transpose() * self.transfer_into(place)
     }
 
     /// Observers of x and y in the middle of an element, in the ring's axes whatever its roll.
@@ -216,7 +221,7 @@ impl<'r> Optics<'r> {
         [PX, PY].map(|index| Source { place, column: back.column(index).into_owned() })
     }
 
-    /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one.
+    /// Derivative with respect to the gradient [1/m^2] of an element, or to the integrated gradient [1/m] of a thin one, in its own axes.
     pub fn gradient(&self, element: usize) -> Gradient {
         self.change(element, normal)
     }
@@ -227,29 +232,41 @@ impl<'r> Optics<'r> {
         self.change(element, skew)
     }
 
+    /// Derivatives with respect to the gradient and the skew gradient of an element, in the ring's axes whatever its roll; units as in [`Optics::gradient`].
+    pub(crate) fn gradients_in_axes(&self, element: usize) -> [Gradient; 2] {
+        let to_axes = self.ring.elements[element].misalignment.rotation().transpose();
+        let in_axes = |field: fn(&Matrix6<f64>, &Matrix6<f64>) -> Matrix6<f64>| {
+            self.change(element, |_, map| {
+                let map = to_axes * map;
+                field(&inverse(&map), &map)
+            })
+        };
+        [in_axes(normal), in_axes(skew)]
+    }
+
     /// Derivative with respect to an integrated gradient [1/m] in the middle of an element, in the ring's axes whatever its roll.
     pub(crate) fn gradient_middle(&self, element: usize) -> Gradient {
         let (place, map) = self.transfer_to_middle(element);
         Gradient { place, kernel: normal(&inverse(&map), &map) }
     }
 
-    /// Derivative with respect to an integrated gradient [1/m] at one place.
+    /// Derivative with respect to an integrated gradient [1/m] at one place, in the ring's axes.
     pub fn thin_gradient(&self, place: Place) -> Gradient {
-        let map = self.transfer_into(place);
+        let map = self.transfer_in_axes(place);
         Gradient { place, kernel: normal(&inverse(&map), &map) }
     }
 
-    /// Derivative with respect to an integrated skew gradient [1/m] at one place.
+    /// Derivative with respect to an integrated skew gradient [1/m] at one place, in the ring's axes.
     pub fn thin_skew_gradient(&self, place: Place) -> Gradient {
-        let map = self.transfer_into(place);
+        let map = self.transfer_in_axes(place);
         Gradient { place, kernel: skew(&inverse(&map), &map) }
     }
 
     /// Derivative with respect to the strength of a thin linear element of Hamiltonian `strength z_i z_j` at one place, z = (x, x', y, y'): a position
-    /// changes by the derivative of that with respect to its slope, a slope by minus the one with respect to its position. The unit of the strength is
+    /// changes by the derivative of that with respect to its slope, a slope by minus the one with respect to its position; in the ring's axes. The unit of the strength is
     /// 1/m of two positions, 1 of a position and a slope, m of two slopes.
     pub fn thin_linear(&self, place: Place, [i, j]: [usize; 2]) -> Gradient {
-        let map = self.transfer_into(place);
+        let map = self.transfer_in_axes(place);
         let back = inverse(&map);
         // x changes by dH/dx', x' by -dH/dx; taken away
         let part = |of: usize, by: usize| match of {

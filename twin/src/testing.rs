@@ -27,6 +27,11 @@ pub fn ring_of(elements: &[Value]) -> Ring {
 
 /// The Booster with a monitor, E4, that reads both planes, and a corrector, A4, that kicks in both.
 pub fn dual() -> Ring {
+    dual_with(|_| ())
+}
+
+/// The same, changed.
+pub fn dual_with(change: impl FnOnce(&mut Value)) -> Ring {
     booster_with(|file| {
         for element in file["elements"].as_array_mut().expect("a list") {
             if element["name"] == "PUH_E4" || element["name"] == "DCH_A4" {
@@ -34,6 +39,7 @@ pub fn dual() -> Ring {
             }
         }
         file["data"]["bpm_y"].as_array_mut().expect("a list").push("E4".into());
+        change(file);
     })
 }
 

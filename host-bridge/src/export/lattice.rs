@@ -278,3 +278,19 @@ fn name_knobs(correctors: &mut [Channel], elements: &[Element]) {
         channel.knob = format!("kick_{}{plane}", elements[channel.element].name);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_field_in_a_long_straight_is_thin_with_a_drift_behind_that_is_not_rolled() {
+        let misalignment = Misalignment { roll: 0.1, ..Misalignment::default() };
+        let kind = Kind::Multipole { k1l: 0.01, k1sl: 0.0, k2l: 0.0, k3l: 0.0 };
+        let straight = Element { kind: kind.clone(), misalignment, ..Element::drift(2.0, 0.5) };
+        let pieces = pieces(straight, &mut Names::new());
+        let [field, behind] = pieces.as_slice() else { panic!("{pieces:?}") };
+        assert_eq!((&field.kind, field.length, field.misalignment), (&kind, 0.0, misalignment));
+        assert_eq!((&behind.kind, behind.length, behind.misalignment), (&Kind::Drift, 0.5, Misalignment::default()));
+    }
+}

@@ -470,14 +470,19 @@ mod tests {
         }
     }
 
-    /// A free straight of some length keeps it when a field is put there.
-    #[test]
-    fn an_effect_of_no_size_changes_nothing() {
-        let ring = testing::booster_with(|file| {
+    /// The Booster with instruments of both planes and free straights of a length.
+    fn with_straights(length: f64) -> Ring {
+        testing::dual_with(|file| {
             let elements = file["elements"].as_array_mut().unwrap();
             let straights = elements.iter_mut().filter(|element| element["type"] == "marker");
-            straights.for_each(|element| element["length"] = 0.5.into());
-        });
+            straights.for_each(|element| element["length"] = length.into());
+        })
+    }
+
+    /// Nor does a free straight lose its length when a field is put there.
+    #[test]
+    fn an_effect_of_no_size_changes_no_response() {
+        let ring = with_straights(0.5);
         let respond =
             |effects: &[Effect]| Machine::new(ring.clone(), Rf::FixedMomentum, effects).unwrap().response().unwrap();
         let plain = respond(&[]);
@@ -493,13 +498,7 @@ mod tests {
     /// A field in a free straight of some length is the same field in one without, and the drift behind it.
     #[test]
     fn a_stray_field_is_at_the_entrance_of_its_straight() {
-        let [thin, long] = [0.0, 0.5].map(|length| {
-            testing::booster_with(|file| {
-                let elements = file["elements"].as_array_mut().unwrap();
-                let straights = elements.iter_mut().filter(|element| element["type"] == "marker");
-                straights.for_each(|element| element["length"] = length.into());
-            })
-        });
+        let [thin, long] = [0.0, 0.5].map(with_straights);
         for text in ["stray_gradient@SLOT_C3=0.02", "stray_skew_gradient@SLOT_D3=0.01"] {
             let [one, other] = [&thin, &long].map(|ring| {
                 let effect = Effect::parse(text, ring).unwrap();

@@ -93,7 +93,7 @@ impl MonitorEffect {
         }
     }
 
-    /// The factor on small changes in the own plane; those of a roll, a coupling and a cubic term are of second order.
+    /// The factor on small changes in the own plane; those of a roll and of a cubic term are of second order.
     fn factor(self, amplitude: f64) -> f64 {
         match self {
             Self::Gain => 1.0 + amplitude,
@@ -374,6 +374,14 @@ impl Reading {
     /// a gain's and a share's.
     pub fn of_signature(&self, about: &Signatures, readings: &mut DMatrix<f64>) {
         match self {
+            Self::Distorted { how: MonitorEffect::Coupling, monitors, amplitude } => {
+                for &monitor in monitors {
+                    let other = other_plane(&about.machine.ring, monitor).and_then(|other| about.read(other));
+                    if let (Some(i), Some(j)) = (about.read(monitor), other) {
+                        mix(readings, i, j, *amplitude);
+                    }
+                }
+            }
             Self::Distorted { how, monitors, amplitude } => {
                 let read = monitors.iter().filter_map(|&monitor| about.read(monitor));
                 read.for_each(|b| readings.column_mut(b).apply(|r| *r *= how.factor(*amplitude)));

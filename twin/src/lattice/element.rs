@@ -81,7 +81,7 @@ pub enum Kind {
         /// Second derivative of the field over the rigidity [1/m^3].
         k2: f64,
     },
-    /// Thin multipole at the entrance, then field-free: a stray field in a free straight.
+    /// Thin multipole at the entrance, then field-free, as where a stray field is in a free straight.
     Multipole {
         /// Integrated gradient [1/m].
         k1l: f64,
