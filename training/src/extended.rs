@@ -138,7 +138,7 @@ fn instruments(ring: &Ring, effects: &[Effect]) -> Instruments {
 
 /// Exact response [m/rad] of a machine about the orbit that it has by itself, rows read monitors, columns correctors and the RF offset.
 fn response(machine: &Machine) -> Result<DMatrix<f64>, TrainingError> {
-    let (correctors, ring) = (machine.ring().correctors.len(), machine.ring());
+    let correctors = machine.ring().correctors.len();
     let drives = Drives {
         kick: DMatrix::identity(correctors + 1, correctors),
         rf_offset: DVector::from_fn(correctors + 1, |frame, _| f64::from(u8::from(frame == correctors))),
