@@ -44,7 +44,9 @@ impl Scales {
     fn scatter_of(known: &[Measured]) -> (Vec<Measured>, Measured) {
         let mut near = known.to_vec();
         // the furthest one goes first: it widens the scatter of the others
-        while let Some(at) = furthest(&near).filter(|&at| near.len() > 2 && !is_alike(&near, at)) {
+        while near.len() > 2
+            && let Some(at) = furthest(&near)
+        {
             near.remove(at);
         }
         let scatter = scatter_among(&near).unwrap_or(Measured { value: 0.0, sigma: ALIKE });
@@ -52,11 +54,12 @@ impl Scales {
     }
 }
 
-/// The scale that is furthest from the others, by what chance makes of it.
+/// Of the scales that are far from the others the furthest, in standard deviations.
 fn furthest(all: &[Measured]) -> Option<usize> {
     let centre = centre_of(all);
-    let off = |one: &Measured| (one.value - centre).abs() / by_chance(one, one.value < centre);
-    all.iter().enumerate().max_by(|a, b| off(a.1).total_cmp(&off(b.1))).map(|(i, _)| i)
+    let off = |one: &Measured| (one.value - centre).abs() / one.sigma;
+    let far = (0..all.len()).filter(|&at| !is_alike(all, at));
+    far.max_by(|&a, &b| off(&all[a]).total_cmp(&off(&all[b])))
 }
 
 /// True if one of some scales lies near the others, by the scatter of these alone.
