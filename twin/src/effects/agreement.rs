@@ -1,12 +1,11 @@
 //! The three descriptions of every effect against each other: exact closed orbits ([`Tracked`]), linear optics about the
 //! orbit ([`Machine::readings`]) and derivatives ([`Signatures`]).
 
-use nalgebra::{DMatrix, DVector, Matrix6, MatrixXx2};
+use nalgebra::{DMatrix, DVector, MatrixXx2};
 
 use super::machine::MachineResponse;
 use super::{Class, Cycle, Drives, Effect, EffectKind, Machine, Rf, Signature, Signatures, Tracked};
-use crate::lattice::{Kind, Misalignment, Plane, Ring};
-use crate::map::{PX, PY, Phase, X, Y};
+use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
 use crate::site::Site;
 use crate::testing::{booster_with, dual};
@@ -310,49 +309,6 @@ fn with_sextupoles(k2: f64) -> Ring {
         let sextupoles = elements.iter_mut().filter(|element| element["type"] == "sextupole");
         sextupoles.for_each(|element| element["k2"] = k2.into());
     })
-}
-
-/// On an orbit in any direction a sextupole of the design is a quadrupole that is rolled; what is added to it is not.
-#[test]
-fn signatures_hold_where_sextupoles_of_the_design_are_on_an_orbit() {
-    let ring = with_sextupoles(-3.0);
-    let around: Vec<[f64; 2]> = (0..ring.elements.len())
-        .map(|i| [3e-3 * f64::sin(0.7 * i as f64 + 0.4), 2e-3 * f64::cos(1.1 * i as f64)])
-        .collect();
-    let drives = drives(&ring, around);
-    let machine = machine(&ring, &[]).on_orbit(&drives.orbit);
-    let signatures = Signatures::of(&machine, &drives).unwrap();
-    let linear = [EffectKind::StrayGradient, EffectKind::StraySkewGradient, EffectKind::QuadRoll, EffectKind::BpmRoll];
-    let kinds = [&linear[..], &[EffectKind::SextupoleError]].concat();
-    for effect in effects(&ring).iter().filter(|effect| kinds.contains(&effect.kind)) {
-        let signature = signatures.of_effect(effect.kind, effect.site).unwrap();
-        let known = difference(&ring, &[], effect, &drives);
-        let error = (&signature.readings - &known.readings).amax() / known.readings.amax();
-        assert!(error < 2e-4, "{effect:?}: {error:e}");
-    }
-}
-
-/// A sextupole and a thin multipole that are shifted and rolled, on an orbit: the map of small deviations from it.
-#[test]
-fn a_displaced_sextupole_on_an_orbit_is_the_quadrupole_that_deviations_see() {
-    let mut ring = with_sextupoles(-3.0);
-    let places = ["SXH_C2", "SLOT_F6"].map(|name| ring.element(name).unwrap());
-    ring.elements[places[1]].kind = Kind::Multipole { k1l: 0.01, k1sl: 0.02, k2l: 0.5, k3l: 0.0 };
-    for at in places {
-        ring.elements[at].misalignment = Misalignment { dx: 0.5e-3, dy: -0.2e-3, roll: 0.2 };
-    }
-    let (x, y) = (-2e-3, 1e-3);
-    let around = machine(&ring, &[]).on_orbit(&vec![[x, y]; ring.elements.len()]);
-    for at in places {
-        let exact = ring.elements[at].linearise(&mut Phase::new(x, 0.0, y, 0.0, 0.0, 0.0));
-        let mut axis = Phase::zeros();
-        let found = around.ring().elements[at].linearise(&mut axis);
-        let fields = |map: &Matrix6<f64>| [map[(PX, X)], map[(PX, Y)], map[(PY, X)], map[(PY, Y)]];
-        for (exact, found) in fields(&exact).into_iter().zip(fields(&found)) {
-            // what the magnet does to the orbit inside is left out, 1e-4 of the field
-            assert!((exact - found).abs() < 1e-6, "{exact:e} {found:e}");
-        }
-    }
 }
 
 /// Off momentum the beam passes the sextupoles of the design beside their axes, which focuses it: about that orbit the frames of a campaign are those of the

@@ -10,7 +10,7 @@ use super::drives::Drives;
 use super::hold::Held;
 use super::mechanism::{Measured, Mechanism, Unit};
 use super::{EffectError, EffectKind, Machine, Signature, Signatures};
-use crate::lattice::{Bend, Element, Kind, Misalignment, Plane, Ring};
+use crate::lattice::{Bend, Element, Kind, Plane, Ring};
 use crate::response::{Gradient, Optics, Place};
 use crate::site::Site;
 
@@ -380,41 +380,29 @@ fn across(orbit: &[[f64; 2]], at: usize) -> [f64; 2] {
 }
 
 impl Machine {
-    /// The same machine as small deviations from its orbit without kicks (x, y) see it: each sextupole is a gradient `k2 x`
-    /// and a skew gradient `k2 y`, which together are a rolled quadrupole; in a dipole it is the gradient, and the skew one of a stray sextupole belongs to what
-    /// crosses it, that of the design is left out. An octupole beyond the design is a gradient `K3L (x^2 - y^2)/2` and a skew gradient `K3L x y`. Their dipole parts are in the orbit already.
+    /// The same machine as small deviations from its orbit without kicks (x, y) see it: each stray sextupole is a gradient `k2 x`
+    /// and a skew gradient `k2 y`, which together are a rolled quadrupole; in a dipole it is the gradient, and the skew one belongs to what
+    /// crosses it. An octupole is a gradient `K3L (x^2 - y^2)/2` and a skew gradient `K3L x y`. Their dipole parts are in the orbit already.
     #[must_use]
     pub fn on_orbit(&self, orbit: &[[f64; 2]]) -> Self {
         let mut machine = self.clone();
-        for (at, (element, &[x, y])) in machine.ring.elements.iter_mut().zip(orbit).enumerate() {
-            let Misalignment { dx, dy, roll } = element.misalignment;
-            let (x, y) = (x - dx, y - dy);
+        for &Curved { element: at, k3l: own, .. } in &self.curved {
+            let ([x, y], element) = (orbit[at], &mut machine.ring.elements[at]);
             match &mut element.kind {
-                Kind::Sextupole { k2 } if *k2 != 0.0 => {
+                Kind::Sextupole { k2 } => {
                     element.kind = Kind::Quadrupole { k1: *k2 * x.hypot(y) };
-                    // it turns with half of the orbit's direction in the magnet's own axes
-                    element.misalignment =
-                        Misalignment { roll: 1.5 * roll - 0.5 * y.atan2(x), ..Misalignment::default() };
-                }
-                Kind::Multipole { k1l, k1sl, k2l, .. } if *k2l != 0.0 => {
-                    let (sin, cos) = roll.sin_cos();
-                    *k1l += *k2l * (x * cos + y * sin);
-                    *k1sl += *k2l * (y * cos - x * sin);
-                    *k2l = 0.0;
+                    element.misalignment.roll = -0.5 * y.atan2(x);
                 }
                 Kind::Bend(bend) => {
                     bend.k1 += bend.k2 * across(orbit, at)[0];
                     bend.k2 = 0.0;
                 }
+                Kind::Multipole { k1l, k1sl, k3l, .. } => {
+                    *k1l += 0.5 * own * (x * x - y * y);
+                    *k1sl += own * x * y;
+                    *k3l -= own;
+                }
                 _ => {}
-            }
-        }
-        for &Curved { element: at, k3l: own, .. } in &self.curved {
-            let [x, y] = orbit[at];
-            if let Kind::Multipole { k1l, k1sl, k3l, .. } = &mut machine.ring.elements[at].kind {
-                *k1l += 0.5 * own * (x * x - y * y);
-                *k1sl += own * x * y;
-                *k3l -= own;
             }
         }
         machine
