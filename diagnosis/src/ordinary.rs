@@ -149,7 +149,7 @@ impl Family {
                 return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
             }
             Grouping::Instrument => {
-                let element = |term: &Term| element_of(&data.ring, term.site);
+                let element = |term: &Term| term.site.elements(&data.ring);
                 let mut all: Vec<Term> = all.collect();
                 all.sort_by_key(element);
                 return all.chunk_by(|one, other| element(one) == element(other)).map(<[Term]>::to_vec).collect();
@@ -214,15 +214,6 @@ fn plane_of(ring: &Ring, site: Site) -> Option<Plane> {
     match site {
         Site::Monitor(at) => Some(ring.monitors[at].plane),
         Site::Corrector(at) => Some(ring.correctors[at].plane),
-        _ => None,
-    }
-}
-
-/// The element of an instrument.
-fn element_of(ring: &Ring, site: Site) -> Option<usize> {
-    match site {
-        Site::Monitor(at) => Some(ring.monitors[at].element),
-        Site::Corrector(at) => Some(ring.correctors[at].element),
         _ => None,
     }
 }
