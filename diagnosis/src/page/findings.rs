@@ -34,8 +34,8 @@ fn meaning(diagnosis: &Diagnosis) -> &'static str {
     match diagnosis.verdict {
         Verdict::Consistent => "Nothing was found at the noise level of the recording.",
         Verdict::Identified => {
-            "The effects below are decided (probability at least 95 %) and predict frames that they were not fitted to better by more than two \
-             standard errors."
+            "The effects below are decided: each has a probability of at least 95 %, and frames that it was not fitted to are predicted better with it, by more \
+             than two standard errors, or by less where chance is excluded."
         }
         Verdict::Ambiguous => {
             "Physics may be missing in the model; the data cannot separate the alternatives, or exclude chance."

@@ -74,7 +74,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         row(
             "verdict",
             format!(
-                "identified: P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors ({SUPPORTED:.0} where chance is at most {CHANCE}) and one of the choice above zero, of an instrument beside an ordinary scatter of its like a held-out gain above zero and chance of at most {CHANCE}, for every effect, and nothing further suspected; consistent: P(nothing) ≥ {:.1}; \
+                "identified: every effect has P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors ({SUPPORTED:.0} where chance is at most {CHANCE}) and one of the choice above zero, and nothing further is suspected; for an instrument beside an ordinary scatter of its like a held-out gain above zero will do where chance is at most {CHANCE}. Otherwise consistent: P(nothing) ≥ {:.1}; \
                  unexplained: an unmodelled discrepancy has P > {SUSPICIOUS:.1}; ambiguous: the rest.",
                 1.0 - SUSPICIOUS
             ),
