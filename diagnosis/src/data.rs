@@ -225,11 +225,16 @@ impl Data {
         drives.orbit = orbit;
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
-        let pools = Pools::of(&campaign.settings.of_frame, &noise.levels);
         for &b in &noise.sound {
             let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
+        let counting = |frame: usize, b: usize| screened.accepted[(frame, b)] && !recorded[(frame, b)].is_nan();
+        let has_same_monitors = |i: usize| (0..recorded.ncols()).all(|b| counting(i, b) == counting(i - 1, b));
+        let is_like_before = |i: usize| {
+            noise.levels.at(i) == noise.levels.at(i - 1) && (noise.modes.is_none() || has_same_monitors(i))
+        };
+        let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),

@@ -2,13 +2,12 @@
 //!
 //! Everything that the machine does in a setting is the same in all its frames, so that their mean tells of it what they tell together
 //! (for noise that remembers the frames before, all but a little); a campaign of 346 frames has 104. What differs within a pool, read-backs
-//! and supplies, is known and taken off before. A pool lasts a 32nd of the campaign at most, so that a slow change is not averaged out, and its frames have
-//! noise of one level.
+//! and supplies, is known and taken off before. A pool lasts a 32nd of the campaign at most, so that a slow change is not averaged out. Its frames have
+//! noise of one level, and, where monitors have noise in common within a frame, the same monitors: the means of others would be over other frames, and share
+//! it no longer.
 
 use nalgebra::{DMatrix, DVector};
 use twin::Drives;
-
-use super::levels::Levels;
 
 /// Pools of the frames of a campaign.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,12 +22,12 @@ pub struct Pools {
 const PARTS: usize = 32;
 
 impl Pools {
-    /// From the setting of each frame; a frame without one has a pool of its own.
-    pub fn of(settings: &[Option<usize>], levels: &Levels) -> Self {
+    /// From the setting of each frame, and whether its noise is like that of the frame before; a frame without a setting has a pool of its own.
+    pub fn of(settings: &[Option<usize>], is_like_before: impl Fn(usize) -> bool) -> Self {
         let longest = settings.len().div_ceil(PARTS);
         let (mut of_frame, mut count, mut first) = (Vec::with_capacity(settings.len()), 0, 0);
         for (i, setting) in settings.iter().enumerate() {
-            let is_same = i > 0 && setting.is_some() && settings[i - 1] == *setting && levels.at(i) == levels.at(i - 1);
+            let is_same = i > 0 && setting.is_some() && settings[i - 1] == *setting && is_like_before(i);
             if !is_same || i - first >= longest {
                 (first, count) = (i, count + 1);
             }
@@ -90,11 +89,11 @@ mod tests {
     fn a_pool_is_a_run_of_one_setting_and_no_longer_than_a_part_of_the_campaign() {
         let settings: Vec<Option<usize>> =
             [0, 0, 0, 1, 1, 0].map(Some).into_iter().chain([None, None]).chain([Some(2); 88]).collect();
-        let pools = Pools::of(&settings, &Levels::CONSTANT);
+        let pools = Pools::of(&settings, |_| true);
         assert_eq!(pools.of_frame[..12], [0, 0, 0, 1, 1, 2, 3, 4, 5, 5, 5, 6], "a 32nd of 96 frames is 3");
         assert_eq!(pools.count, 5 + 88_usize.div_ceil(3));
-        let pools = Pools::of(&settings, &Levels::some(2..4, 2.0));
-        assert_eq!(pools.of_frame[..6], [0, 0, 1, 2, 3, 4], "and where the level of the noise changes");
+        let pools = Pools::of(&settings, |frame| ![2, 4].contains(&frame));
+        assert_eq!(pools.of_frame[..6], [0, 0, 1, 2, 3, 4], "and where the noise is another");
     }
 
     #[test]
