@@ -18,7 +18,7 @@
 use core::ops::Range;
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, DVectorView, DVectorViewMut, MatrixXx2, RowVector2};
+use nalgebra::{DMatrix, DVector, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
     Drives, EffectError, Hold, Holding, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
 };
@@ -231,9 +231,8 @@ impl Data {
         }
         let counting = |frame: usize, b: usize| screened.accepted[(frame, b)] && !recorded[(frame, b)].is_nan();
         let has_same_monitors = |i: usize| (0..recorded.ncols()).all(|b| counting(i, b) == counting(i - 1, b));
-        let is_like_before = |i: usize| {
-            noise.levels.at(i) == noise.levels.at(i - 1) && (noise.modes.is_none() || has_same_monitors(i))
-        };
+        let is_like_before =
+            |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && (noise.modes.is_none() || has_same_monitors(i));
         let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
@@ -565,11 +564,16 @@ impl Data {
                 self.stack(&mut column, |c, pool| self.effect_on(&signature, c, pool));
             }
         }
+        self.whiten_stacked(&mut all);
+        Ok(all)
+    }
+
+    /// Whiten stacked columns.
+    fn whiten_stacked(&self, all: &mut DMatrix<f64>) {
         for (channel, rows) in self.channels.iter().zip(self.rows_of_channels()) {
             let mut part = all.rows_range_mut(rows);
             part.copy_from(&channel.whiten(part.clone_owned()));
         }
-        Ok(all)
     }
 
     /// Numbers of the channels, one for each pool, whitened: channel by channel.
@@ -726,9 +730,15 @@ impl Data {
         DMatrix::from_fn(all.nrows(), all.ncols(), |run, b| all[(run, b)] * self.channels[b].sigma / mixing.own(run, b))
     }
 
-    /// A signature that steps with time, whitened.
-    pub fn stepping(&self, signature: &Signature, step: &DVectorView<f64>) -> DVector<f64> {
-        self.whiten(|c, pool| self.effect_on(signature, c, pool) * step[pool])
+    /// Signatures that step with time, whitened: of each signature all steps, rows pools, one a column.
+    pub fn stepping(&self, signatures: &[Signature], steps: &DMatrix<f64>) -> DMatrix<f64> {
+        let each = signatures.iter().flat_map(|signature| steps.column_iter().map(move |step| (signature, step)));
+        let mut all = DMatrix::zeros(self.size(), signatures.len() * steps.ncols());
+        for (mut column, (signature, step)) in all.column_iter_mut().zip(each) {
+            self.stack(&mut column, |c, pool| self.effect_on(signature, c, pool) * step[pool]);
+        }
+        self.whiten_stacked(&mut all);
+        all
     }
 
     /// `E^T S^-1 E` of a monitor's readings for groups of pools, of which `group` names that of each pool, as if the noise were white:

@@ -23,13 +23,14 @@ use core::ops::Range;
 use estimator::MonitorState;
 use inference::Factor;
 use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
-use twin::{Plane, Signature, Signatures};
+use twin::{Plane, Ring, Signature, Signatures};
 
 use super::data::Data;
-use super::element::{Element, Linear};
+use super::element::{Element, Form, Linear};
 use super::error::FitError;
 use super::fit::Fitted;
-use super::location::Location;
+use super::location::{Location, SORTS};
+use super::search::{ODDS, UNMODELLED};
 use super::settings::Settings;
 use gradient::{Changing, Runs, Where};
 
@@ -176,12 +177,12 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         let of_stretches = weighted(data, &steps, &active, pattern);
         found.push(linearised.judge(Location::RingInTime(*quadrupole, *plane), &of_stretches, sites));
     }
-    let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
+    let sites = elements(&data.ring);
     for q in 0..data.ring.quadrupoles.len() {
         let forms = Element::signatures(&signatures, &data.ring, q);
-        let column =
-            |(_, one): &([usize; 2], Signature)| data.signature(&(at_monitors(one, &active) * one.rms().recip()));
-        let of_all = Sums::whole(&DMatrix::from_columns(&forms.iter().map(column).collect::<Vec<_>>()), &own);
+        let scaled = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
+        let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(scaled))?;
+        let of_all = Sums::whole(&columns, &own);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
             found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
@@ -195,6 +196,16 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
     found.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
     Ok(found)
+}
+
+/// Unknown elements that are tried.
+fn elements(ring: &Ring) -> usize {
+    Linear::ALL.len() * ring.quadrupoles.len()
+}
+
+/// `ln` prior of one of them and of its size, as the first of what is missing.
+pub fn log_prior_of_element(ring: &Ring) -> f64 {
+    (UNMODELLED * ODDS / (SORTS * elements(ring) * SIZES.len()) as f64).ln()
 }
 
 fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {
@@ -622,10 +633,10 @@ mod tests {
         let columns_of = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
             let readings = DMatrix::from_fn(data.pools.count, pattern.len(), |_, b| pattern[b]);
             let all = Signature { readings, tunes: [0.0; 2], tune_changes: MatrixXx2::zeros(data.pools.count) };
-            indicator.column_iter().map(|c| data.stepping(&all, &c)).collect::<Vec<_>>()
+            data.stepping(&[all], indicator)
         };
-        let of_columns = |columns: Vec<DVector<f64>>| Sums::whole(&DMatrix::from_columns(&columns), &own);
-        let whole = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| of_columns(columns_of(pattern, indicator));
+        let whole =
+            |pattern: &DVector<f64>, indicator: &DMatrix<f64>| Sums::whole(&columns_of(pattern, indicator), &own);
         let evidence = |sums: &Sums| linearised.judge(Location::Time, sums, 1).log_bayes;
         let (monitors, mut largest) = (data.active_monitors(), 0.0_f64);
         let stretches = stretches(&data);

@@ -4,7 +4,9 @@
 //!
 //! `h = sum of c_ij z_i z_j`, z = (x, x', y, y'),
 //!
-//! at any place there. Of the ten forms four couple the planes.
+//! at any place there. Of the ten products four couple the planes. A solenoid is one combination of two of these, `h = c (x y' - y x')`, which turns the planes
+//! by c and is the same at both ends of a straight: with free strengths of four forms it would have to make up for three that it has not, and two effects of the
+//! library beside each other seem to be the likelier cause.
 //!
 //! Source: A. J. Dragt, Lie Methods for Nonlinear Dynamics with Applications to Accelerator Physics, quadratic polynomials as generators of linear maps.
 
@@ -15,6 +17,35 @@ use super::hypothesis::Term;
 /// Share of the largest change of the readings by a form below which another one is not seen.
 const SHOWN: f64 = 1e-3;
 
+/// A form that the Hamiltonian of a thin linear element consists of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// `z_i z_j`, z = (x, x', y, y').
+    Product([usize; 2]),
+    /// `x y' - y x'`, which turns both planes.
+    Rotation,
+}
+
+impl Form {
+    /// All of them.
+    fn all() -> impl Iterator<Item = Self> {
+        (0..4).flat_map(|i| (i..4).map(move |j| Self::Product([i, j]))).chain([Self::Rotation])
+    }
+
+    /// Derivative with respect to its strength, at the entrance of a quadrupole.
+    pub fn signature(self, signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Signature {
+        let of = |product| signatures.of_thin_linear(ring.quadrupoles[quadrupole].element.into(), product);
+        match self {
+            Self::Product(product) => of(product),
+            Self::Rotation => {
+                let mut turned = of([0, 3]);
+                turned += of([1, 2]) * -1.0;
+                turned
+            }
+        }
+    }
+}
+
 /// What an unknown linear element does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Linear {
@@ -24,25 +55,20 @@ pub enum Linear {
     Couples,
     /// Both.
     FocusesAndCouples,
+    /// It turns the planes, and does nothing else.
+    Turns,
 }
 
 impl Linear {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Focuses, Self::Couples, Self::FocusesAndCouples];
+    pub const ALL: [Self; 4] = [Self::Focuses, Self::Couples, Self::FocusesAndCouples, Self::Turns];
 
-    /// The terms `z_i z_j` of its Hamiltonian, z = (x, x', y, y').
-    pub fn forms(self) -> impl Iterator<Item = [usize; 2]> {
-        let all = (0..4).flat_map(|i| (i..4).map(move |j| [i, j]));
-        all.filter(move |form| self.has(*form))
-    }
-
-    /// True if one of them is this.
-    pub fn has(self, [i, j]: [usize; 2]) -> bool {
-        let couples = (i < 2) != (j < 2);
-        match self {
-            Self::Focuses => !couples,
-            Self::Couples => couples,
-            Self::FocusesAndCouples => true,
+    /// True if its Hamiltonian has a form.
+    pub fn has(self, form: Form) -> bool {
+        match (self, form) {
+            (Self::Turns, Form::Rotation) | (Self::FocusesAndCouples, Form::Product(_)) => true,
+            (Self::Turns, Form::Product(_)) | (_, Form::Rotation) => false,
+            (_, Form::Product([i, j])) => ((i < 2) != (j < 2)) == (self == Self::Couples),
         }
     }
 
@@ -52,6 +78,7 @@ impl Linear {
             Self::Focuses => "focusing",
             Self::Couples => "coupling",
             Self::FocusesAndCouples => "focusing and coupling",
+            Self::Turns => "turning",
         }
     }
 
@@ -61,6 +88,7 @@ impl Linear {
             Self::Focuses => "focuses the beam",
             Self::Couples => "couples the planes",
             Self::FocusesAndCouples => "focuses the beam and couples the planes",
+            Self::Turns => "couples the planes by turning them, as a solenoid does",
         }
     }
 }
@@ -73,8 +101,8 @@ pub struct Element {
     pub quadrupole: usize,
     /// What it does.
     pub does: Linear,
-    /// Its forms `z_i z_j`, z = (x, x', y, y'), with the prior standard deviation of the strength of each.
-    pub forms: Vec<([usize; 2], f64)>,
+    /// Its forms, with the prior standard deviation of the strength of each.
+    pub forms: Vec<(Form, f64)>,
 }
 
 impl Element {
@@ -87,10 +115,8 @@ impl Element {
     }
 
     /// The forms at a quadrupole that a recording shows, with their signatures.
-    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<([usize; 2], Signature)> {
-        let at = ring.quadrupoles[quadrupole].element.into();
-        let all = Linear::FocusesAndCouples.forms().map(|form| (form, signatures.of_thin_linear(at, form)));
-        let mut all: Vec<_> = all.collect();
+    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<(Form, Signature)> {
+        let mut all: Vec<_> = Form::all().map(|form| (form, form.signature(signatures, ring, quadrupole))).collect();
         let largest = all.iter().map(|(_, signature)| signature.rms()).fold(0.0, f64::max);
         all.retain(|(_, signature)| signature.rms() > SHOWN * largest);
         all
@@ -104,7 +130,20 @@ impl Element {
     /// True for a thin linear field of the library that is nearer to it than two quadrupoles are to each other, on average.
     pub fn holds(&self, term: &Term, ring: &Ring) -> bool {
         let at = ring.elements[ring.quadrupoles[self.quadrupole].element].s;
-        let spacing = ring.circumference / ring.quadrupoles.len() as f64;
-        term.kind.thin().is_some() && term.position(ring).is_some_and(|s| ring.distance(s, at) < spacing)
+        thin_at(term, ring).is_some_and(|s| ring.distance(s, at) < spacing(ring))
     }
+}
+
+/// True for two thin linear fields of the library that are nearer to each other than two quadrupoles, on average.
+pub fn are_beside(one: &Term, other: &Term, ring: &Ring) -> bool {
+    let both = thin_at(one, ring).zip(thin_at(other, ring));
+    both.is_some_and(|(one, other)| ring.distance(one, other) < spacing(ring))
+}
+
+fn thin_at(term: &Term, ring: &Ring) -> Option<f64> {
+    term.kind.thin().and_then(|_| term.position(ring))
+}
+
+fn spacing(ring: &Ring) -> f64 {
+    ring.circumference / ring.quadrupoles.len() as f64
 }

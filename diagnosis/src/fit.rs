@@ -562,10 +562,9 @@ fn of_linear(
             Ok(Some(together(signatures, member, |kind| data.scale(campaign, kind))? * *width))
         }
         Unknown::Form(quadrupole, form, sigma) => {
-            let at = data.ring.quadrupoles[*quadrupole].element.into();
             // as a field that is no magnet of the ring
             let scale = data.scale(campaign, EffectKind::StrayGradient);
-            Ok(Some(signatures.of_thin_linear(at, *form) * (*sigma * scale)))
+            Ok(Some(form.signature(signatures, &data.ring, *quadrupole) * (*sigma * scale)))
         }
         _ => Ok(None),
     }

@@ -3,7 +3,7 @@
 use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
-use super::element::Element;
+use super::element::{Element, Form};
 use super::evidence::Units;
 use super::ordinary::{Family, is_absorbed};
 use super::scatter::Scatter;
@@ -47,7 +47,7 @@ pub enum Unknown {
     /// The orbit of a recording at an element, in x or y [m].
     Orbit(usize, usize, Plane, f64),
     /// The strength of a form of an unknown element near a quadrupole.
-    Form(usize, [usize; 2], f64),
+    Form(usize, Form, f64),
     /// One ordinary imperfection.
     Ordinary(Member, f64),
 }
@@ -76,7 +76,7 @@ pub enum Identity<'u> {
     /// The orbit of a recording at an element.
     Orbit(usize, usize, Plane),
     /// A form of an unknown element near a quadrupole.
-    Form(usize, [usize; 2]),
+    Form(usize, Form),
     /// An ordinary imperfection.
     Ordinary(&'u Member),
 }

@@ -237,7 +237,7 @@ impl Search {
     fn log_weight(&self, found: &Found) -> f64 {
         let first = usize::from(found.best.hypothesis.element.is_some());
         let of_each = (0..found.competitions.len()).map(|i| ((1.0 - UNMODELLED) * odds(first + i)).ln());
-        let odds: f64 = of_each.sum();
+        let odds: f64 = of_each.sum::<f64>() + first as f64 * discrepancy::log_prior_of_element(&found.data.ring);
         self.log_posterior(&found.best) - found.null.log_evidence + odds + softplus(found.next.log_odds)
     }
 

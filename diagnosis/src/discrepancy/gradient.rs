@@ -145,11 +145,8 @@ pub(super) struct Where<'d> {
 impl Where<'_> {
     /// Of patterns that step with time, by whole whitened frames.
     pub fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
-        let of = |pattern: &Signature| {
-            let pattern = at_monitors(pattern, self.monitors);
-            steps.column_iter().map(|step| self.data.stepping(&pattern, &step)).collect::<Vec<_>>()
-        };
-        Sums::whole(&DMatrix::from_columns(&patterns.iter().flat_map(of).collect::<Vec<_>>()), self.own)
+        let patterns: Vec<Signature> = patterns.iter().map(|one| at_monitors(one, self.monitors)).collect();
+        Sums::whole(&self.data.stepping(&patterns, steps), self.own)
     }
 }
 

@@ -2,17 +2,18 @@
 //!
 //! Where that is what the library lacks, it is put into the model, with its strengths as unknowns, and what else there is shows. The linear fields of the
 //! library beside it that were found are taken for parts of it: two independent causes at one place are rare, and what an element does beyond
-//! first order makes parts of it seem to be needed.
+//! first order makes parts of it seem to be needed. Two that were found beside each other are weighed against one such element in their place: by its
+//! evidence with all refitted, and the prior of its place and size.
 
 use twin::Signatures;
 
 use super::{Found, Search, relearnt};
 use crate::alternatives::{Cause, SUSPICIOUS};
-use crate::element::Element;
+use crate::element::{Element, are_beside};
 use crate::error::FitError;
 use crate::fit::Fitted;
 use crate::heldout::lessened;
-use crate::hypothesis::Hypothesis;
+use crate::hypothesis::{Hypothesis, Term};
 use crate::linearise;
 use crate::location::Location;
 
@@ -32,19 +33,42 @@ impl Found {
         let signatures = Signatures::of(&machine, &drives).map_err(FitError::from)?;
         Ok(Some(Element::of(&signatures, &self.data.ring, quadrupole, does, one.size)))
     }
+
+    /// Thin linear fields of the library that were found beside each other.
+    fn neighbours(&self) -> Vec<Term> {
+        let (terms, ring) = (&self.best.hypothesis.terms, &self.data.ring);
+        let is_beside = |one: &Term, other: &Term| one != other && are_beside(one, other, ring);
+        terms.iter().filter(|one| terms.iter().any(|other| is_beside(one, other))).copied().collect()
+    }
+
+    fn has_element(&self) -> bool {
+        self.best.hypothesis.element.is_some()
+    }
 }
 
 impl Search {
     /// The search beside an unknown element, where there is one. None where, beside what was then found, it is no longer the most likely of what is left:
     /// the first search is as good.
     pub(super) fn beside_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
-        let Some(element) = found.unknown_element()? else { return Ok(None) };
+        if let Some(element) = found.unknown_element()? {
+            return self.beside_it(found, |term| element.holds(term, &found.data.ring));
+        }
+        let neighbours = found.neighbours();
+        if neighbours.is_empty() {
+            return Ok(None);
+        }
+        let beside = self.beside_it(found, |term| neighbours.contains(term))?;
+        Ok(beside.filter(|beside| beside.has_element() && self.log_weight(beside) > self.log_weight(found)))
+    }
+
+    /// The same without some effects, of which the element takes the place.
+    fn beside_it(&self, found: &Found, is_part: impl Fn(&Term) -> bool) -> Result<Option<Found>, FitError> {
         self.held.set(0);
-        let whole = self.without_parts(found, &element)?;
+        let whole = self.without_parts(found, is_part)?;
         let Some(mut element) = whole.unknown_element()? else { return Ok(None) };
         for _ in 0..PLACES {
             let Some(beside) = self.beside(&whole, element.clone())? else { return Ok(None) };
-            if beside.best.hypothesis.element.is_none() {
+            if !beside.has_element() {
                 // a monitor wanders, and all was begun anew
                 return Ok(Some(self.beside_element(&beside)?.unwrap_or(beside)));
             }
@@ -77,9 +101,9 @@ impl Search {
     }
 
     /// The same without the effects that are parts of an unknown element.
-    fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
-        let (best, ring) = (&found.best, &found.data.ring);
-        let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
+    fn without_parts(&self, found: &Found, is_part: impl Fn(&Term) -> bool) -> Result<Found, FitError> {
+        let best = &found.best;
+        let hypothesis = best.hypothesis.without_terms(is_part);
         let mut data = found.data.clone();
         if hypothesis.terms.len() == best.hypothesis.terms.len() {
             return Ok(found.clone());
