@@ -358,6 +358,7 @@ impl Search {
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unmodelled(discrepancy), weight));
         }
+        beside::weigh_elements(data, fitted, &mut weights)?;
         Ok(Competition::of(weights, fitted.clone(), scanned))
     }
 
