@@ -89,6 +89,16 @@ impl Found {
     }
 }
 
+/// The competition of an effect that was added to those found, if it is not needed, and neither is a further one.
+fn idle<'f>(found: &Found, further: &'f Found) -> Option<&'f Competition> {
+    let is_new = |term: &Term| !found.best.hypothesis.terms.contains(term);
+    let all = || further.competitions.iter().zip(&further.best.hypothesis.terms);
+    let is_one_more =
+        all().filter(|(_, term)| is_new(term)).count() == 1 && all().count() == found.competitions.len() + 1;
+    let (idle, _) = all().find(|(one, term)| is_new(term) && !one.is_suspicious())?;
+    (is_one_more && !further.next.is_suspicious()).then_some(idle)
+}
+
 /// Prior odds of one more beside some effects.
 fn odds(effects: usize) -> f64 {
     if effects == 0 { ODDS } else { ODDS_FURTHER }
@@ -155,14 +165,10 @@ impl Search {
             let Some(leader) = found.next.leader() else { break };
             // a trial without a stable machine is discarded
             let Ok(further) = self.further(&found, leader) else { break };
-            // by readings that are linearised about the machine with it, the only effect is not needed, nor is another one: nothing is missing, and how
-            // likely that is those readings say
-            if let [only] = further.competitions.as_slice()
-                && !only.is_suspicious()
-                && !further.next.is_suspicious()
-                && !found.has_more()
-            {
-                found.next = only.clone();
+            // by readings that are linearised about the machine with it, it is not needed, nor is another one: nothing more is missing, and how likely that is
+            // those readings say
+            if let Some(idle) = idle(&found, &further) {
+                found.next = idle.clone();
                 break;
             }
             // no progress: the new effect has only replaced another
