@@ -614,6 +614,30 @@ mod tests {
         }
     }
 
+    /// Five times the noise, in frames of which some readings are missing: means over frames of other momenta were said to be a quadrupole that changes.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn a_momentum_that_jitters_beside_missing_readings_is_nothing_at_a_place() {
+        let (ring, recording) = template();
+        let white = Coloured::white(&ring, &recording, 9);
+        let momentum = 5.0 * white.noise / white.dispersion.amax();
+        let mut made = Coloured { momentum, ..white }.campaign(&ring, &recording, &[]);
+        let partial = || (1..recording.rows.len()).step_by(9);
+        for frame in partial() {
+            let horizontal = made.rows[frame].reading.iter_mut().take(ring.horizontal_monitors());
+            horizontal.step_by(2).for_each(|reading| *reading = None);
+        }
+        let campaign = Campaign::of(&ring, &made).unwrap();
+        let (settings, pools) = (&campaign.settings.of_frame, Data::of(&campaign).unwrap().pools.of_frame);
+        let within: Vec<usize> = partial().filter(|&frame| settings[frame] == settings[frame - 1]).collect();
+        assert!(within.len() > 10 && within.iter().all(|&frame| pools[frame] != pools[frame - 1]), "{within:?}");
+        let found = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+        assert!(found.findings.iter().all(|one| one.s.is_none()), "{}", found.sentence);
+        // a kick's pattern takes a part of it where the dispersion is not known well: measured 16 % with this seed, 10 and 2 % with two others
+        let learnt = found.found.data.noise.momentum.value;
+        assert!(learnt > 0.75 * momentum && learnt < 1.1 * momentum, "{learnt}, true {momentum}");
+    }
+
     /// Without its level the corrector that is in use then was said to act otherwise than by a single kick, at P 0.97 to 1, and up to 15 sound monitors
     /// to be faulty. A monitor that jumps or repeats one value then is still faulty, or said, and a frame without a beam no matter.
     #[test]
