@@ -185,6 +185,14 @@ impl Competition {
         Self { alternatives, nothing, log_odds, scanned, without }
     }
 
+    /// With fits that keep the data which they are to, for a place beside other data.
+    #[must_use]
+    pub(super) fn to(self, data: &Data) -> Self {
+        let keeping = |one: Alternative| Alternative { fitted: one.fitted.map(|fitted| fitted.to(data)), ..one };
+        let alternatives = self.alternatives.into_iter().map(keeping).collect();
+        Self { alternatives, without: self.without.to(data), ..self }
+    }
+
     /// True if an effect is likely to be needed.
     pub fn is_suspicious(&self) -> bool {
         1.0 - self.nothing > SUSPICIOUS

@@ -230,9 +230,9 @@ impl Data {
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
         let counting = |frame: usize, b: usize| screened.accepted[(frame, b)] && !recorded[(frame, b)].is_nan();
-        let has_same_monitors = |i: usize| (0..recorded.ncols()).all(|b| counting(i, b) == counting(i - 1, b));
-        let is_like_before =
-            |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && (noise.modes.is_none() || has_same_monitors(i));
+        let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
+        let has_same_monitors = |i: usize| sharing.iter().all(|&b| counting(i, b) == counting(i - 1, b));
+        let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
         let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {

@@ -23,14 +23,13 @@ use core::ops::Range;
 use estimator::MonitorState;
 use inference::Factor;
 use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
-use twin::{Plane, Ring, Signature, Signatures};
+use twin::{Plane, Signature, Signatures};
 
 use super::data::Data;
 use super::element::{Element, Form, Linear};
 use super::error::FitError;
 use super::fit::Fitted;
-use super::location::{Location, SORTS};
-use super::search::{ODDS, UNMODELLED};
+use super::location::Location;
 use super::settings::Settings;
 use gradient::{Changing, Runs, Where};
 
@@ -177,11 +176,11 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         let of_stretches = weighted(data, &steps, &active, pattern);
         found.push(linearised.judge(Location::RingInTime(*quadrupole, *plane), &of_stretches, sites));
     }
-    let sites = elements(&data.ring);
+    let sites = Linear::ALL.len() * data.ring.quadrupoles.len();
     for q in 0..data.ring.quadrupoles.len() {
         let forms = Element::signatures(&signatures, &data.ring, q);
-        let scaled = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
-        let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(scaled))?;
+        let of_rms_1 = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
+        let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(of_rms_1))?;
         let of_all = Sums::whole(&columns, &own);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
@@ -196,16 +195,6 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
     found.push(linearised.judge_held(Location::Everywhere, &some(&sums, &active)));
     Ok(found)
-}
-
-/// Unknown elements that are tried.
-fn elements(ring: &Ring) -> usize {
-    Linear::ALL.len() * ring.quadrupoles.len()
-}
-
-/// `ln` prior of one of them and of its size, as the first of what is missing.
-pub fn log_prior_of_element(ring: &Ring) -> f64 {
-    (UNMODELLED * ODDS / (SORTS * elements(ring) * SIZES.len()) as f64).ln()
 }
 
 fn some<'c>(sums: &'c [Sums], monitors: &[usize]) -> Vec<&'c Sums> {

@@ -3,8 +3,8 @@
 //! Everything that the machine does in a setting is the same in all its frames, so that their mean tells of it what they tell together
 //! (for noise that remembers the frames before, all but a little); a campaign of 346 frames has 104. What differs within a pool, read-backs
 //! and supplies, is known and taken off before. A pool lasts a 32nd of the campaign at most, so that a slow change is not averaged out. Its frames have
-//! noise of one level, and, where monitors have noise in common within a frame, the same monitors: the means of others would be over other frames, and share
-//! it no longer.
+//! noise of one level, and the same of the monitors that have noise in common within a frame: where one misses a frame, its mean is over other frames than its
+//! neighbours', and a jitter of the momentum no longer shifts all means together.
 
 use nalgebra::{DMatrix, DVector};
 use twin::Drives;

@@ -89,14 +89,15 @@ impl Found {
     }
 }
 
-/// The competition of an effect that was added to those found, if it is not needed, and neither is a further one.
-fn idle<'f>(found: &Found, further: &'f Found) -> Option<&'f Competition> {
-    let is_new = |term: &Term| !found.best.hypothesis.terms.contains(term);
-    let all = || further.competitions.iter().zip(&further.best.hypothesis.terms);
-    let is_one_more =
-        all().filter(|(_, term)| is_new(term)).count() == 1 && all().count() == found.competitions.len() + 1;
-    let (idle, _) = all().find(|(one, term)| is_new(term) && !one.is_suspicious())?;
-    (is_one_more && !further.next.is_suspicious()).then_some(idle)
+/// The competition of the one effect that was added to those found, if it is not needed, and neither is a further one.
+fn not_needed(found: &Found, further: &Found) -> Option<Competition> {
+    let is_new = |(_, term): &(&Competition, &Term)| !found.best.hypothesis.terms.contains(term);
+    let all = further.competitions.iter().zip(&further.best.hypothesis.terms);
+    let new: Vec<(&Competition, &Term)> = all.filter(is_new).collect();
+    let [(added, _)] = new[..] else { return None };
+    let is_one_more = further.competitions.len() == found.competitions.len() + 1;
+    let is_idle = is_one_more && !added.is_suspicious() && !further.next.is_suspicious();
+    is_idle.then(|| added.clone().to(&further.data))
 }
 
 /// Prior odds of one more beside some effects.
@@ -167,8 +168,8 @@ impl Search {
             let Ok(further) = self.further(&found, leader) else { break };
             // by readings that are linearised about the machine with it, it is not needed, nor is another one: nothing more is missing, and how likely that is
             // those readings say
-            if let Some(idle) = idle(&found, &further) {
-                found.next = idle.clone();
+            if let Some(added) = not_needed(&found, &further) {
+                found.next = added;
                 break;
             }
             // no progress: the new effect has only replaced another
@@ -243,7 +244,7 @@ impl Search {
     fn log_weight(&self, found: &Found) -> f64 {
         let first = usize::from(found.best.hypothesis.element.is_some());
         let of_each = (0..found.competitions.len()).map(|i| ((1.0 - UNMODELLED) * odds(first + i)).ln());
-        let odds: f64 = of_each.sum::<f64>() + first as f64 * discrepancy::log_prior_of_element(&found.data.ring);
+        let odds: f64 = of_each.sum();
         self.log_posterior(&found.best) - found.null.log_evidence + odds + softplus(found.next.log_odds)
     }
 

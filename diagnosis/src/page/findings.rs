@@ -35,7 +35,7 @@ fn meaning(diagnosis: &Diagnosis) -> &'static str {
         Verdict::Consistent => "Nothing was found at the noise level of the recording.",
         Verdict::Identified => {
             "The effects below are decided: each has a probability of at least 95 %, and frames that it was not fitted to are predicted better with it, by more \
-             than two standard errors, or by less where chance is excluded."
+             than two standard errors; where chance is excluded by more than one, or of an instrument at all."
         }
         Verdict::Ambiguous => {
             "Physics may be missing in the model; the data cannot separate the alternatives, or exclude chance."
