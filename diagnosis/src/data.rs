@@ -229,9 +229,9 @@ impl Data {
             let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
-        let counting = |frame: usize, b: usize| screened.accepted[(frame, b)] && !recorded[(frame, b)].is_nan();
         let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
-        let has_same_monitors = |i: usize| sharing.iter().all(|&b| counting(i, b) == counting(i - 1, b));
+        let accepted = &screened.accepted;
+        let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
         let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());

@@ -148,7 +148,7 @@ mod tests {
         assert_eq!(Linear::ALL.map(count), [6, 4, 10, 1]);
     }
 
-    /// The readings of a solenoid in the drift before a quadrupole: of 0.5 mrad, so that its focusing is 1e-3 of what it does.
+    /// The readings of a solenoid in the drift before a quadrupole, of 0.5 mrad with either sign: its focusing, the same for both, is not in the difference.
     #[test]
     fn a_rotation_is_a_solenoid_anywhere_in_the_straight() {
         let (ring, recording) = crate::testing::template();
