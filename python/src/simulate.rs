@@ -3,10 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use diagnosis::data::{Data, DataError};
-use diagnosis::hypothesis::Term;
-use diagnosis::scan::candidates;
-use diagnosis::validation::{self, Case, Class};
+use diagnosis::data::DataError;
+use diagnosis::validation::{self, Cases, Class};
 use host_bridge::command::response::by_name;
 use host_bridge::command::{self, CommandError};
 use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
@@ -17,9 +15,6 @@ use crate::error::{input, other, raised};
 use crate::recording::Recording;
 use crate::ring::Ring;
 use crate::task;
-
-/// Cases of a class are numbered from its place in the list of classes times this.
-const OF_CLASS: usize = 1_000_000;
 
 /// A campaign with settings, read-backs and gaps of a recording, and the vars that it was made with, in the ring's order. Without vars they are
 /// drawn from the ring's prior, rings with stable motion. Exact: every frame an exact orbit of misaligned magnets, monitors with offsets, noise and jumps, tunes;
@@ -78,7 +73,7 @@ pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult
 pub struct Validation {
     ring: twin::Ring,
     template: inference::Recording,
-    terms: Arc<[Term]>,
+    cases: Arc<Cases>,
 }
 
 #[pymethods]
@@ -89,10 +84,8 @@ impl Validation {
         let template = template.frames_of(&ring.ring)?;
         let (ring, template) = (ring.ring.clone(), (**template).clone());
         py.detach(|| {
-            let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
-            let data = Data::of(&campaign).map_err(refused)?;
-            let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
-            Ok(Self { ring, template, terms: terms.into() })
+            let cases = Arc::new(Cases::of(&ring, &template).map_err(refused)?);
+            Ok(Self { ring, template, cases })
         })
     }
 
@@ -107,7 +100,7 @@ impl Validation {
         };
         let this = self.clone();
         task::run(py, None, move |_| {
-            let case = Case::draw(&this.ring, &this.terms, class, class as usize * OF_CLASS + index, seed);
+            let case = this.cases.draw(class, class.number(index), seed);
             let outcome = validation::run(&this.ring, &this.template, &case)?;
             let text =
                 |outcome| serde_json::to_string(&outcome).map_err(|error| CommandError::Other(error.to_string()));

@@ -8,7 +8,7 @@ use diagnosis::hypothesis::{Hypothesis, Term};
 use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::scan::{candidates, scan};
 use diagnosis::score::{Grade, Truth};
-use diagnosis::validation::{Case, Class, Unmodelled, UnmodelledKind};
+use diagnosis::validation::{Cases, Class, Unmodelled, UnmodelledKind};
 use diagnosis::{Diagnosis, Verdict, data::Data, sample};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
@@ -279,11 +279,12 @@ fn unmodelled_physics_is_not_named() {
 #[test]
 fn cases_are_fixed_by_their_number() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
-    let data = whitened(&template);
-    let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
-    let draw = |index| Case::draw(&ring, &terms, Class::Pair, index, 1);
+    let cases = Cases::of(&ring, &template).unwrap();
+    let draw = |index| cases.draw(Class::Pair, index, 1);
     assert_eq!(draw(7).effects, draw(7).effects);
     assert_eq!(draw(7).vars, draw(7).vars);
+    let noise = |number: usize| draw(number).imperfections.map(|one| one.noise);
+    assert_eq!((0..9).map(noise).collect::<Vec<_>>(), (0..9).map(noise).collect::<Vec<_>>());
     assert_ne!(draw(7).seed, draw(8).seed);
 }
 

@@ -4,12 +4,17 @@ use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use serde::{Deserialize, Serialize};
-use twin::{Effect, EffectKind, Ring};
+use twin::{Effect, EffectError, EffectKind, Ring};
 
+use super::imperfect::{Families, Imperfections};
 use super::unmodelled::{Unmodelled, UnmodelledKind};
+use crate::data::{Data, DataError};
 use crate::hypothesis::Term;
+use crate::scan::candidates;
 use crate::score::{TrueCause, TrueEffect, Truth};
-use inference::simulate;
+use inference::Campaign;
+use inference::recording::Recording;
+use inference::simulate::{self, Beyond, Hardware};
 
 /// Class of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -38,20 +43,52 @@ pub struct Case {
     pub effects: Vec<Effect>,
     /// Physics that it does not hold.
     pub unmodelled: Vec<Unmodelled>,
+    /// Ordinary imperfections of its machine; none of one that is ideal but for its vars.
+    pub imperfections: Option<Imperfections>,
     /// Seed of the machine's hardware and noise.
     pub seed: u64,
+}
+
+/// What cases are drawn from.
+#[derive(Debug, Clone)]
+pub struct Cases {
+    ring: Ring,
+    /// All effects that could be seen.
+    terms: Vec<Term>,
+    families: Families,
 }
 
 /// Amplitudes in prior standard deviations, weak to strong; the logarithm is uniform in between.
 const SIZES: [f64; 2] = [0.2, 2.5];
 
-impl Case {
-    /// Case `index` of a class; `terms` are all effects that could be seen.
+/// Cases of a class.
+const OF_CLASS: usize = 1_000_000;
+
+impl Class {
+    /// The number of its `index`-th case.
+    pub fn number(self, index: usize) -> usize {
+        self as usize * OF_CLASS + index
+    }
+}
+
+impl Cases {
+    /// Campaigns of a ring with the settings of a recording.
+    ///
+    /// # Errors
+    /// [`DataError`] if that cannot be diagnosed.
+    pub fn of(ring: &Ring, template: &Recording) -> Result<Self, DataError> {
+        let data = Data::of(&Campaign::of(ring, template)?)?;
+        let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
+        Ok(Self { ring: ring.clone(), terms, families: Families::of(&data) })
+    }
+
+    /// Case `number` of a class; half of all machines have ordinary imperfections.
     ///
     /// # Panics
     /// If there is no effect to choose from.
-    pub fn draw(ring: &Ring, terms: &[Term], class: Class, index: usize, seed: u64) -> Self {
-        let mut streams = simulate::seeds(seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+    pub fn draw(&self, class: Class, number: usize, seed: u64) -> Case {
+        let Self { ring, terms, families } = self;
+        let mut streams = simulate::seeds(seed ^ (number as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let mut stream = || streams.next().expect("seeds do not end");
         let vars = simulate::vars(ring, true, stream()).expect("a design has tunes, and rings like it");
         let mut random = StdRng::seed_from_u64(stream());
@@ -68,13 +105,39 @@ impl Case {
         };
         let effects = match class {
             Class::Empty | Class::Unknown => Vec::new(),
-            Class::Single => vec![effect(index)],
-            Class::Pair => vec![effect(index), effect(7 * index + 3)],
+            Class::Single => vec![effect(number)],
+            Class::Pair => vec![effect(number), effect(7 * number + 3)],
         };
         let unknown = UnmodelledKind::in_ring(ring);
-        let kind = unknown[index % unknown.len()];
+        let kind = unknown[number % unknown.len()];
         let unmodelled = if class == Class::Unknown { vec![Unmodelled::of(kind, ring, stream())] } else { Vec::new() };
-        Self { index, class, vars, effects, unmodelled, seed: stream() }
+        let seed = stream();
+        let mut of_machine = StdRng::seed_from_u64(stream());
+        let imperfections = of_machine.random_bool(0.5).then(|| families.draw(&mut of_machine));
+        Case { index: number, class, vars, effects, unmodelled, imperfections, seed }
+    }
+}
+
+impl Case {
+    /// Its recording, by a machine with some imperfections.
+    ///
+    /// # Errors
+    /// [`EffectError`] if that keeps no beam.
+    pub fn recording(
+        &self,
+        ring: &Ring,
+        template: &Recording,
+        imperfections: Option<&Imperfections>,
+    ) -> Result<Recording, EffectError> {
+        let mut hardware = Hardware::shipped(ring, template);
+        let mut effects = self.effects.clone();
+        if let Some(Imperfections { effects: ordinary, noise }) = imperfections {
+            hardware.noise.iter_mut().for_each(|own| *own *= noise);
+            effects.extend(ordinary);
+        }
+        let beyond: Vec<&dyn Beyond> = self.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
+        let truth = simulate::Truth { vars: &self.vars, effects: &effects, beyond: &beyond };
+        simulate::campaign(template, ring, &truth, &hardware, self.seed)
     }
 
     /// The truth.

@@ -2,10 +2,14 @@
 //! effect of the library describes.
 //!
 //! A case is drawn ([`case`]), tracked exactly, diagnosed, and scored; [`tables`] counts. Beside each verdict stands the oracle:
-//! the gain in `ln` posterior when kind, place and size are given, over the best fit of vars and baselines without effects.
-//! For physics that the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
+//! the gain in `ln` posterior when kind, place and size are given, over the best fit of vars and baselines without effects, on a machine that is ideal
+//! otherwise. For physics that the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
+//!
+//! Half of the machines have ordinary imperfections ([`imperfect`]). Their vars tell whether error bars are right, since the base model allows for such; on
+//! ideal machines it allows for more than there is.
 
 pub mod case;
+pub mod imperfect;
 pub mod mixes;
 pub mod tables;
 pub mod unmodelled;
@@ -22,10 +26,9 @@ use crate::fit::Fitted;
 use crate::hypothesis::{Hypothesis, Term};
 use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
 use crate::{Diagnosis, Finding, Verdict};
-pub use case::{Case, Class};
+pub use case::{Case, Cases, Class};
 use inference::Campaign;
 use inference::recording::Recording;
-use inference::simulate::{self, Beyond, Hardware};
 use mixes::{Sort, Stated};
 pub use unmodelled::{Unmodelled, UnmodelledKind};
 
@@ -36,6 +39,8 @@ pub struct Outcome {
     pub index: usize,
     /// Its class.
     pub class: Class,
+    /// Whether its machine has ordinary imperfections.
+    pub is_imperfect: bool,
     /// The effects it was made with.
     pub truth: Vec<Made>,
     /// Gain in `ln` posterior when kind, place and size are given.
@@ -94,23 +99,17 @@ impl Made {
 /// # Errors
 /// [`DataError`] if the simulated campaign cannot be diagnosed.
 pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outcome>, DataError> {
-    let hardware = Hardware::shipped(ring, template);
-    let beyond: Vec<&dyn Beyond> = case.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
-    let truth = simulate::Truth { vars: &case.vars, effects: &case.effects, beyond: &beyond };
-    let plain = simulate::Truth { effects: &[], beyond: &[], ..truth };
-    let simulated = |truth| simulate::campaign(template, ring, &truth, &hardware, case.seed);
-    // what is not in the library is told by its signal
-    let without = case.unmodelled.first().map(|_| simulated(plain)).transpose();
-    let (Ok(recording), Ok(without)) = (simulated(truth), without) else { return Ok(None) };
+    let Ok(recording) = case.recording(ring, template, case.imperfections.as_ref()) else { return Ok(None) };
     let started = Instant::now();
     let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
     let key = case.key(ring);
     let names = ring.var_names();
-    let (oracle_gain, own) = oracle(ring, case, &recording, without.as_ref())?;
+    let Some((oracle_gain, own)) = oracle(ring, template, case)? else { return Ok(None) };
     Ok(Some(Outcome {
         index: case.index,
         class: case.class,
+        is_imperfect: case.imperfections.is_some(),
         oracle_gain,
         fates: own.into_iter().zip(key.fates(&diagnosis)).collect(),
         verdict: diagnosis.verdict,
@@ -203,27 +202,26 @@ fn is_near(ring: &Ring, diagnosis: &Diagnosis, one: &Unmodelled) -> bool {
 }
 
 /// Gain in `ln` posterior of vars and baselines when kind, place and size are given, of all effects and of each beside the
-/// others; for physics that the library does not hold, when its signal is subtracted.
-fn oracle(
-    ring: &Ring,
-    case: &Case,
-    recording: &Recording,
-    without: Option<&Recording>,
-) -> Result<(f64, Vec<f64>), DataError> {
+/// others; for physics that the library does not hold, when its signal is subtracted. On the ideal machine; `None` if that keeps no beam.
+fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64, Vec<f64>)>, DataError> {
     if case.class == Class::Empty {
-        return Ok((0.0, Vec::new()));
+        return Ok(Some((0.0, Vec::new())));
     }
-    let data = Data::of(&Campaign::of(ring, recording)?)?;
+    let Ok(recording) = case.recording(ring, template, None) else { return Ok(None) };
+    let data = Data::of(&Campaign::of(ring, &recording)?)?;
     let zero = DVector::zeros(data.units.len());
     let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
         let hypothesis = Hypothesis { given: given.to_vec(), ..Hypothesis::default() };
         Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
     };
     let nothing = best(&data, &[])?;
-    if let Some(without) = without {
-        let cleaned = data.less(&signal(recording, without), &tunes(recording, without));
+    if !case.unmodelled.is_empty() {
+        // what is not in the library is told by its signal
+        let plain = Case { unmodelled: Vec::new(), ..case.clone() };
+        let Ok(without) = plain.recording(ring, template, None) else { return Ok(None) };
+        let cleaned = data.less(&signal(&recording, &without), &tunes(&recording, &without));
         let gain = best(&cleaned, &[])? - nothing;
-        return Ok((gain, vec![gain]));
+        return Ok(Some((gain, vec![gain])));
     }
     let all = best(&data, &case.effects)?;
     let own = |i: usize| -> Result<f64, DataError> {
@@ -231,7 +229,7 @@ fn oracle(
         others.remove(i);
         Ok(all - if others.is_empty() { nothing } else { best(&data, &others)? })
     };
-    Ok((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?))
+    Ok(Some((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?)))
 }
 
 /// What the effect adds to each reading [m].

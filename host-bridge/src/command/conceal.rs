@@ -3,9 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use diagnosis::data::{Data, DataError};
-use diagnosis::scan::candidates;
-use diagnosis::validation::{Case, Class};
+use diagnosis::validation::{Cases, Class};
 use inference::{BatchFit, TuneUse, simulate};
 use measured::Folder;
 use serde_json::{Value, json};
@@ -44,11 +42,7 @@ fn into_recording(options: &Conceal) -> Result<Value, CommandError> {
     let ring = machine(options.common.machine.as_deref())?;
     let given = recording(&options.data, &ring)?;
     let campaign = campaign(&ring, &given)?;
-    let terms = candidates(
-        &Data::of(&campaign).map_err(|error: DataError| CommandError::Input(error.to_string()))?,
-        given.header.radial_loop_monitors.as_ref(),
-    );
-    let effects = Case::draw(&ring, &terms, Class::Single, options.seed as usize, options.seed).effects;
+    let effects = Cases::of(&ring, &given)?.draw(Class::Single, options.seed as usize, options.seed).effects;
     let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ())?;
     let vars: Vec<f64> = fit.map_params.iter().map(|theta| theta.exp()).collect();
     let concealed = simulate::conceal(&given, &ring, &vars, &effects).map_err(CommandError::other)?;

@@ -7,11 +7,10 @@ use std::io::Write;
 use std::path::Path;
 use std::sync::Mutex;
 
-use diagnosis::data::{Data, DataError};
-use diagnosis::scan::candidates;
+use diagnosis::data::DataError;
 use diagnosis::validation::tables::Tables;
-use diagnosis::validation::{self, Case, Class, Outcome, UnmodelledKind};
-use inference::{Campaign, Recording};
+use diagnosis::validation::{self, Case, Cases, Class, Outcome, UnmodelledKind};
+use inference::Recording;
 use twin::{EffectKind, Ring};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
@@ -59,8 +58,7 @@ pub fn run(options: &Validate) -> Result<(), CommandError> {
 
 /// Cases of all classes; the number of a case fixes it, so that a longer run begins with the shorter one's.
 fn cases(options: &Validate, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
-    let data = Data::of(&Campaign::of(ring, template).map_err(DataError::from)?)?;
-    let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
+    let all = Cases::of(ring, template)?;
     let classes = [
         (Class::Empty, options.empty),
         (Class::Single, options.single),
@@ -68,8 +66,8 @@ fn cases(options: &Validate, ring: &Ring, template: &Recording) -> Result<Vec<Ca
         (Class::Unknown, options.unknown),
     ];
     let of_class = |(class, count): (Class, usize)| {
-        let (terms, offset) = (&terms, class as usize * 1_000_000);
-        (0..count).map(move |i| Case::draw(ring, terms, class, offset + i, options.seed))
+        let all = &all;
+        (0..count).map(move |i| all.draw(class, class.number(i), options.seed))
     };
     Ok(classes.into_iter().flat_map(of_class).collect())
 }
