@@ -6,7 +6,7 @@
 //!
 //! `T = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T) A`, so that `T^T T = (C + U U^T)^-1`.
 
-use nalgebra::{DMatrix, DVector, DVectorViewMut};
+use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut};
 
 use super::levels::Levels;
 use super::memory::Memory;
@@ -68,7 +68,7 @@ impl Root {
         Some(Self::Remembers(covariance.cholesky()?.unpack()))
     }
 
-    fn whiten(&self, columns: &mut DMatrix<f64>) {
+    fn whiten(&self, mut columns: DMatrixViewMut<f64>) {
         match self {
             Self::White(roots) => columns.column_iter_mut().for_each(|mut column| column.component_mul_assign(roots)),
             Self::Remembers(lower) => solve_lower_mut(lower, columns),
@@ -95,7 +95,7 @@ impl Channel {
         let root =
             Root::of(memory, levels, frames).unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
         let mut common = common / sigma;
-        root.whiten(&mut common);
+        root.whiten(common.as_view_mut());
         let (basis, of_common) = match rows.is_empty() {
             true => (DMatrix::zeros(0, 0), DVector::zeros(0)),
             false => {
@@ -116,14 +116,19 @@ impl Channel {
 
     /// Whiten numbers in units of the noise of one reading, rows as [`Channel::rows`].
     pub fn whiten(&self, mut columns: DMatrix<f64>) -> DMatrix<f64> {
-        self.root.whiten(&mut columns);
-        let mut common = self.basis.transpose() * &columns;
-        common.row_iter_mut().zip(self.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
-        columns.gemm(-1.0, &self.basis, &common, 1.0);
+        self.whiten_mut(columns.as_view_mut());
         columns
     }
 
-    /// The same of one column in place.
+    /// The same in place.
+    pub fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
+        self.root.whiten(columns.as_view_mut());
+        let mut common = self.basis.transpose() * &columns;
+        common.row_iter_mut().zip(self.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
+        columns.gemm(-1.0, &self.basis, &common, 1.0);
+    }
+
+    /// The same of one column.
     pub fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
         match &self.root {
             Root::White(roots) => column.component_mul_assign(roots),

@@ -571,8 +571,7 @@ impl Data {
     /// Whiten stacked columns.
     fn whiten_stacked(&self, all: &mut DMatrix<f64>) {
         for (channel, rows) in self.channels.iter().zip(self.rows_of_channels()) {
-            let mut part = all.rows_range_mut(rows);
-            part.copy_from(&channel.whiten(part.clone_owned()));
+            channel.whiten_mut(all.rows_range_mut(rows));
         }
     }
 

@@ -6,12 +6,12 @@
 
 use core::convert::Infallible;
 
-use twin::{Drives, Machine, Place, Signatures, Thin};
+use twin::{Place, Thin};
 
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::scan::{BATCH, Projection, SignatureScore};
+use super::scan::{BATCH, Projection, SignatureScore, of_each};
 
 /// Longest segment [m], and longest where the gradient may be.
 const STEP: f64 = 0.5;
@@ -62,13 +62,8 @@ impl PlaceScan {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
         let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
-        let on_orbit = |campaign: usize| {
-            let (machine, drives) = fitted.machine_in(data, campaign)?;
-            Ok::<_, FitError>((machine.on_orbit(&drives.orbit), drives))
-        };
-        let machines: Vec<(Machine, Drives)> = (0..data.count()).map(on_orbit).collect::<Result<_, _>>()?;
-        let of_each = machines.iter().map(|(machine, drives)| Signatures::of(machine, drives));
-        let signatures: Vec<Signatures> = of_each.collect::<Result<_, _>>()?;
+        let machines = fitted.machines_on_orbit(data)?;
+        let signatures = of_each(&machines)?;
         let scale = kind.kind().prior_scale().unwrap_or(1.0);
         // a gradient of the magnets, where that is what the scan replaces
         let of_kind = left_out.map_or_else(|| kind.kind(), |term| fitted.hypothesis.terms[term].kind);

@@ -7,9 +7,11 @@
 //!
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
+use core::convert::Infallible;
+
 use inference::Factor;
 use nalgebra::{DMatrix, DVector, DVectorView};
-use twin::{EffectKind, Signatures, Site};
+use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
 use super::data::Data;
 use super::error::FitError;
@@ -101,6 +103,28 @@ impl Projection {
         columns.column_iter().map(of).collect()
     }
 
+    /// The candidates that some terms with such signatures are. Of an effect without an amplitude whose pull is below half of the power that stays at
+    /// least, which makes it less likely than nothing, the power is not worked out: the whole square stands for it.
+    fn candidates(&self, terms: &[Term], columns: &DMatrix<f64>) -> Vec<Candidate> {
+        let bounds = self.bounds(columns);
+        let is_hopeless = |i: usize| terms[i].kind.is_switch() && bounds[i].is_below_half_of_least();
+        let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
+        let Scored { scores, taken } = self.score(&columns.select_columns(&scored));
+        let mut candidates = vec![None; terms.len()];
+        let candidate = |i: usize, score: SignatureScore, adapting: DVector<f64>| {
+            let term = terms[i];
+            let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
+            Some(Candidate { term, amplitude, log_bayes, power: score.power, adapting })
+        };
+        for (at, (&i, &score)) in scored.iter().zip(&scores).enumerate() {
+            candidates[i] = candidate(i, score, -taken.column(at));
+        }
+        for i in hopeless {
+            candidates[i] = candidate(i, bounds[i], DVector::zeros(self.slope.len()));
+        }
+        candidates.into_iter().flatten().collect()
+    }
+
     /// `d_i P d_j` of whitened signatures, one a column.
     pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
@@ -162,50 +186,46 @@ pub fn candidates(data: &Data, radial_loop: Option<&[String; 2]>) -> Vec<Term> {
     lasting.flat_map(of_kind).chain(radial).filter(|term| !is_believed(term)).collect()
 }
 
+/// What the effects do on some machines.
+pub(super) fn of_each(machines: &[(Machine, Drives)]) -> Result<Vec<Signatures<'_>>, FitError> {
+    machines.iter().map(|(machine, drives)| Ok(Signatures::of(machine, drives)?)).collect()
+}
+
 /// Whitened signatures of some terms about a fit, one a column, per prior standard deviation.
 ///
 /// # Errors
 /// [`FitError`].
 pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatrix<f64>, FitError> {
     let data = fitted.data(data);
-    data.stacked_columns(terms.len(), |campaign, own| {
-        let (machine, drives) = fitted.machine_in(data, campaign)?;
-        let machine = machine.on_orbit(&drives.orbit);
-        let signatures = Signatures::of(&machine, &drives)?;
+    let machines = fitted.machines_on_orbit(data)?;
+    Ok(whitened(data, &of_each(&machines)?, terms))
+}
+
+/// The same by the signatures of the machine in each recording.
+fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64> {
+    let columns = data.stacked_columns(terms.len(), |campaign, own| {
         let of = |term: &Term| {
             let scale = term.kind.prior_scale().unwrap_or(1.0) * data.scale(campaign, term.kind);
             // none if there is no stable machine with it
-            Ok(signatures.of_effect(term.kind, term.site).ok().map(|one| one * scale))
+            Ok(of_each[campaign].of_effect(term.kind, term.site).ok().map(|one| one * scale))
         };
-        own.signatures(terms.len(), terms.iter().map(of))
-    })
+        own.signatures::<Infallible>(terms.len(), terms.iter().map(of))
+    });
+    let Ok(columns) = columns;
+    columns
 }
 
-/// Scan them. Of an effect without an amplitude whose pull is below half of the power that stays at least, which makes it less likely than
-/// nothing, the power is not worked out: the whole square stands for it.
+/// Scan them.
 ///
 /// # Errors
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
-    let projection = Projection::of(fitted);
-    let columns = signatures(data, fitted, terms)?;
-    let bounds = projection.bounds(&columns);
-    let is_hopeless = |i: usize| terms[i].kind.is_switch() && bounds[i].is_below_half_of_least();
-    let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
-    let Scored { scores, taken } = projection.score(&columns.select_columns(&scored));
-    let mut candidates = vec![None; terms.len()];
-    let candidate = |i: usize, score: SignatureScore, adapting: DVector<f64>| {
-        let term = terms[i];
-        let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
-        Some(Candidate { term, amplitude, log_bayes, power: score.power, adapting })
-    };
-    for (at, (&i, &score)) in scored.iter().zip(&scores).enumerate() {
-        candidates[i] = candidate(i, score, -taken.column(at));
-    }
-    for i in hopeless {
-        candidates[i] = candidate(i, bounds[i], DVector::zeros(fitted.u.len()));
-    }
-    Ok(candidates.into_iter().flatten().collect())
+    let (data, projection) = (fitted.data(data), Projection::of(fitted));
+    let machines = fitted.machines_on_orbit(data)?;
+    let of_each = of_each(&machines)?;
+    // all at once would be gigabytes for a ring of 150 monitors
+    let of_batch = |batch: &[Term]| projection.candidates(batch, &whitened(data, &of_each, batch));
+    Ok(terms.chunks(BATCH).flat_map(of_batch).collect())
 }
 
 /// A cause and its rival: norms of what a fit cannot absorb of both, per prior standard deviation.

@@ -85,8 +85,8 @@ impl Factor {
 }
 
 /// `L^-1 B` in place of `B`, with the lower triangle of a regular `lower`; what stands above its diagonal is not read.
-pub fn solve_lower_mut(lower: &DMatrix<f64>, right: &mut DMatrix<f64>) {
-    forward(lower.as_view(), right.as_view_mut());
+pub fn solve_lower_mut(lower: &DMatrix<f64>, right: DMatrixViewMut<f64>) {
+    forward(lower.as_view(), right);
 }
 
 /// `A^T A`: half of the products, as it is symmetric.

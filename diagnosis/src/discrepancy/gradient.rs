@@ -96,9 +96,13 @@ impl Runs {
             let leaves: Vec<DVector<f64>> = (0..patterns.len()).map(leaves).collect();
             for i in 0..patterns.len() {
                 for j in i..patterns.len() {
-                    let both = (&does[i] * leaves[j].transpose() + &leaves[i] * does[j].transpose()) * 0.5;
                     let mut block = all.gram.view_mut((i * runs, j * runs), (runs, runs));
-                    block += own.gram.component_mul(&both);
+                    for (run, (from, mut to)) in own.gram.column_iter().zip(block.column_iter_mut()).enumerate() {
+                        let [leaves_j, does_j] = [&leaves[j], &does[j]].map(|one| 0.5 * one[run]);
+                        let both =
+                            does[i].iter().zip(&leaves[i]).map(|(does, leaves)| does * leaves_j + leaves * does_j);
+                        to.iter_mut().zip(from.iter()).zip(both).for_each(|((to, gram), both)| *to += gram * both);
+                    }
                 }
                 let mut pull = all.pull.rows_mut(i * runs, runs);
                 pull += own.pull.component_mul(&does[i]);
