@@ -30,7 +30,7 @@ pub struct Choice<'d> {
 const BEYOND_CHANCE: f64 = 100.0;
 
 impl<'d> Choice<'d> {
-    /// Of some terms and their penalties. Exchanged and reversed instruments that neither the recording nor chance can choose are left out.
+    /// Of some terms and their penalties. Exchanged instruments that neither the recording nor chance can choose are left out.
     ///
     /// # Errors
     /// [`FitError`].
@@ -40,7 +40,7 @@ impl<'d> Choice<'d> {
         let bounds = projection.bounds(&columns);
         let is_open = |&i: &usize| {
             let bound = bounds[i];
-            !terms[i].kind.is_switch() || !bound.is_below_half_of_least() || bound.least() < BEYOND_CHANCE
+            !terms[i].is_exchange() || !bound.is_below_half_of_least() || bound.least() < BEYOND_CHANCE
         };
         let open: Vec<usize> = (0..terms.len()).filter(is_open).collect();
         let columns = columns.select_columns(&open);

@@ -122,6 +122,11 @@ impl Term {
         Effect { kind: self.kind, site: self.site, amplitude }
     }
 
+    /// True of two exchanged instruments.
+    pub fn is_exchange(self) -> bool {
+        self.kind.is_switch() && self.site.is_pair()
+    }
+
     /// `kind@place`.
     pub fn label(self, ring: &Ring) -> String {
         let place = self.site.name(ring);

@@ -57,8 +57,9 @@ pub struct Family {
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
 pub(super) const STANDS_OUT: f64 = 2.3;
-/// Gain error below which an instrument is nearer to one that is dead than to a sound one.
-const FAILS: f64 = -0.5;
+/// Gain error below which an instrument may be dead or reversed: twice the largest scatter that is quoted. A failed member makes its family wide, and stays
+/// short of -1 or -2 by as much as that is too narrow for it.
+const FAILS: f64 = -0.1;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
 /// Share of the full width that dipoles which hide something have beside straights that do. Beside one such dipole the NEES per var is 2.1 (`average.rs`); 0.4
@@ -376,7 +377,7 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
 }
 
 /// The member of each learnt family that stands out most of it, of an instrument both planes: it may have made the family as wide as it is, and then hide in it. An instrument
-/// whose gain is nearer to none than to 1 may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
+/// whose gain is far too small may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     // the amplitude of each member in widths of its family, and in its unit
@@ -403,7 +404,7 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     stands_out.flat_map(proposed).collect()
 }
 
-/// The instrument of a gain dead, and reversed, where that is nearer than a sound one.
+/// The instrument of a gain dead, and reversed, where it may be that.
 fn failures(gain: Term, amplitude: f64) -> impl Iterator<Item = Term> {
     let kinds: &[EffectKind] = match gain.kind {
         EffectKind::BpmGain if amplitude < FAILS => &[EffectKind::BpmDead, EffectKind::BpmPolarity],

@@ -33,8 +33,8 @@ pub struct Candidate {
     pub adapting: DVector<f64>,
 }
 
-/// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged or reversed
-/// instruments more than a half does.
+/// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged instruments more than a
+/// half does. Not of reversed and dead ones, which are ordinary gains as far as these are wide.
 const STAYS: f64 = 0.05;
 
 /// Signatures that are scored together.
@@ -103,11 +103,11 @@ impl Projection {
         columns.column_iter().map(of).collect()
     }
 
-    /// The candidates that some terms with such signatures are. Of an effect without an amplitude whose pull is below half of the power that stays at
-    /// least, which makes it less likely than nothing, the power is not worked out: the whole square stands for it.
+    /// The candidates that some terms with such signatures are. Of an exchange whose pull is below half of the power that stays at least, which makes it
+    /// less likely than nothing, the power is not worked out: the whole square stands for it.
     fn candidates(&self, terms: &[Term], columns: &DMatrix<f64>) -> Vec<Candidate> {
         let bounds = self.bounds(columns);
-        let is_hopeless = |i: usize| terms[i].kind.is_switch() && bounds[i].is_below_half_of_least();
+        let is_hopeless = |i: usize| terms[i].is_exchange() && bounds[i].is_below_half_of_least();
         let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
         let Scored { scores, taken } = self.score(&columns.select_columns(&scored));
         let mut candidates = vec![None; terms.len()];
@@ -150,7 +150,7 @@ impl SignatureScore {
         STAYS * self.power
     }
 
-    /// Of a bound: an effect without an amplitude is less likely than nothing.
+    /// Of a bound: an exchange is less likely than nothing.
     pub fn is_below_half_of_least(self) -> bool {
         self.pull < 0.5 * self.least()
     }

@@ -131,6 +131,12 @@ struct Window {
 }
 
 impl Window {
+    /// Of both planes.
+    fn of(ring: &Ring, tune_cut: bool) -> Result<[Self; 2], OrbitError> {
+        let design = tunes(ring)?;
+        Ok([design.x, design.y].map(|design| Self { design, tune_cut }))
+    }
+
     fn holds(&self, tune: f64) -> bool {
         let below = (2.0 * self.design).floor() / 2.0;
         let own = (self.design - below).min(below + 0.5 - self.design);
@@ -147,12 +153,20 @@ impl Window {
 /// [`VarsError`].
 pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsError> {
     let mut random = StdRng::seed_from_u64(seed);
-    let design = tunes(ring)?;
-    let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
+    let [x, y] = Window::of(ring, tune_cut)?;
     let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
     let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| x.holds(at.x) && y.holds(at.y));
     let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);
-    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [design.x, design.y] })
+    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [x.design, y.design] })
+}
+
+/// True for tunes that the tune cut lets pass.
+///
+/// # Errors
+/// [`OrbitError`] if the design has no tunes.
+pub fn are_near_design(ring: &Ring, tunes: Tunes) -> Result<bool, OrbitError> {
+    let [x, y] = Window::of(ring, true)?;
+    Ok(x.holds(tunes.x) && y.holds(tunes.y))
 }
 
 /// A factor from its truncated lognormal prior.

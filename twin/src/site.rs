@@ -23,6 +23,11 @@ pub enum Site {
 }
 
 impl Site {
+    /// True of two instruments.
+    pub fn is_pair(self) -> bool {
+        matches!(self, Self::MonitorPair(..) | Self::CorrectorPair(..))
+    }
+
     /// Two monitors in either order.
     pub fn pair(one: usize, other: usize) -> Self {
         Self::MonitorPair(one.min(other), one.max(other))

@@ -113,7 +113,8 @@ impl Cases {
         let unmodelled = if class == Class::Unknown { vec![Unmodelled::of(kind, ring, stream())] } else { Vec::new() };
         let seed = stream();
         let mut of_machine = StdRng::seed_from_u64(stream());
-        let imperfections = of_machine.random_bool(0.5).then(|| families.draw(&mut of_machine));
+        let is_imperfect = of_machine.random_bool(0.5);
+        let imperfections = is_imperfect.then(|| families.draw(ring, &vars, &mut of_machine)).flatten();
         Case { index: number, class, vars, effects, unmodelled, imperfections, seed }
     }
 }
@@ -130,11 +131,13 @@ impl Case {
         imperfections: Option<&Imperfections>,
     ) -> Result<Recording, EffectError> {
         let mut hardware = Hardware::shipped(ring, template);
-        let mut effects = self.effects.clone();
+        let mut effects = Vec::new();
         if let Some(Imperfections { effects: ordinary, noise }) = imperfections {
             hardware.noise.iter_mut().for_each(|own| *own *= noise);
-            effects.extend(ordinary);
+            effects.clone_from(ordinary);
         }
+        // the last: a dead corrector has no hysteresis
+        effects.extend(&self.effects);
         let beyond: Vec<&dyn Beyond> = self.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
         let truth = simulate::Truth { vars: &self.vars, effects: &effects, beyond: &beyond };
         simulate::campaign(template, ring, &truth, &hardware, self.seed)
