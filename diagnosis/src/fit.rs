@@ -11,9 +11,10 @@
 use core::ops::{Mul, Sub};
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine, Signature, Signatures};
+use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signatures};
 
 use super::data::Data;
+use super::element::Form;
 use super::error::FitError;
 use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Member, Term, Unknown};
@@ -213,11 +214,25 @@ impl Fitted {
 
     /// Amplitude and standard deviation of a term, the latter without the vars' range; (1, 0) for a switch, which has no amplitude.
     pub fn amplitude(&self, data: &Data, term: usize) -> (f64, f64) {
-        self.unknown(data, term).map_or((1.0, 0.0), |(at, scale)| {
-            let mut unit = DVector::zeros(self.u.len());
-            unit[at] = 1.0;
-            (self.u[at] * scale, self.factor.solve(&unit)[at].sqrt() * scale)
-        })
+        self.unknown(data, term).map_or((1.0, 0.0), |(at, scale)| self.sized(at, scale))
+    }
+
+    /// An unknown and its standard deviation, by its prior one.
+    fn sized(&self, at: usize, scale: f64) -> (f64, f64) {
+        let mut unit = DVector::zeros(self.u.len());
+        unit[at] = 1.0;
+        (self.u[at] * scale, self.factor.solve(&unit)[at].sqrt() * scale)
+    }
+
+    /// Angle by which its unknown element turns the planes [rad], if that is what it does.
+    pub fn turned(&self, data: &Data) -> Option<Measured> {
+        let turns = |(i, unknown): (usize, &Unknown)| match unknown {
+            Unknown::Form(_, Form::Rotation, sigma) => Some((self.params.len() + i, *sigma)),
+            _ => None,
+        };
+        let (at, scale) = self.hypothesis.unknowns(data).iter().enumerate().find_map(turns)?;
+        let (value, sigma) = self.sized(at, scale);
+        Some(Measured { value, sigma })
     }
 
     /// Index of the amplitude of a term among the unknowns, and its prior standard deviation.

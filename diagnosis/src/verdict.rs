@@ -279,6 +279,12 @@ impl Finding {
         matches!(&self.cause, Cause::Unmodelled(one) if is_within(&one.at))
     }
 
+    /// True for the unknown element in the model.
+    fn is_of_element(&self, found: &Found) -> bool {
+        let place = found.best.hypothesis.element.as_ref().map(|one| Location::Linear(one.quadrupole, one.does));
+        matches!(&self.cause, Cause::Unmodelled(one) if Some(&one.at) == place.as_ref())
+    }
+
     /// The word for its kind, or `unknown`.
     pub fn word(&self) -> &'static str {
         self.term().map_or("unknown", |term| term.kind.word())
@@ -406,6 +412,10 @@ pub fn findings(
     };
     if let Some(first) = open {
         let open = Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? };
+        let open = match found.best.turned(data).filter(|_| open.is_of_element(found)) {
+            Some(angle) => Finding { phrase: format!("{}, by {} mrad", open.phrase, angle.size(1e3)), ..open },
+            None => open,
+        };
         // what passes within settings was found without it
         let is_part = |finding: &Finding| {
             let in_model = finding.term().is_some_and(|term| found.best.hypothesis.terms.contains(term));

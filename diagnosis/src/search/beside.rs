@@ -245,6 +245,9 @@ mod tests {
             let [only] = found.findings.as_slice() else { panic!("{}", found.sentence) };
             assert!(only.term().is_none() && only.phrase.contains("turning them"), "{}", found.sentence);
             assert!(solenoid.is_near(&ring, only.s.unwrap()), "{}", found.sentence);
+            let angle = found.found.best.turned(&found.found.data).unwrap();
+            println!("{}", found.sentence);
+            assert!((angle.value.abs() - 0.01).abs() < 3.0 * angle.sigma, "{}", found.sentence);
         }
     }
 }
