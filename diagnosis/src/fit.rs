@@ -354,7 +354,7 @@ impl Fitted {
         for (i, unknown) in self.hypothesis.unknowns(data).iter().enumerate() {
             slopes.push(match unknown {
                 Unknown::Ordinary(..) | Unknown::Form(..) => {
-                    let own = of_linear(data, 0, &signatures, unknown)?;
+                    let own = of_linear(data, 0, &signatures, unknown, self.u[vars + i])?;
                     own.unwrap_or_else(|| slopes[0].clone() * 0.0)
                 }
                 _ => {
@@ -403,7 +403,8 @@ impl Fitted {
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
         let besides: Vec<Unknown> = beside.iter().flat_map(|family| family.unknowns(data)).collect();
         let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
-        let mut all = Ordinary::about(data, &besides, machine)?.beside(self.jacobian.clone());
+        let none = DVector::zeros(besides.len());
+        let mut all = Ordinary::about(data, &besides, &none, machine)?.beside(self.jacobian.clone());
         all.column_iter_mut().zip(&wider).for_each(|(mut column, wider)| column *= *wider);
         let left = &self.residual + &self.jacobian * &self.u;
         let identity = DMatrix::identity(all.ncols(), all.ncols());
@@ -425,9 +426,14 @@ impl<'d> Problem<'d> {
         let others = unknowns.iter().filter(|unknown| !unknown.is_of_first_order()).count();
         debug_assert!(unknowns[others..].iter().all(Unknown::is_of_first_order), "they are the last");
         let first = data.units.len() + others;
-        let machine = |campaign: usize| machine_at(data, hypothesis, campaign, start);
-        let ordinary = Ordinary::about(data, &unknowns[others..], machine)?;
-        Ok(Self { data, hypothesis, start: start.rows_range(first..).into_owned(), unknowns, ordinary })
+        let mut start = start.clone();
+        for (unknown, u) in unknowns.iter().zip(start.iter_mut().skip(data.units.len())) {
+            *u = u.max(unknown.least_start());
+        }
+        let machine = |campaign: usize| machine_at(data, hypothesis, campaign, &start);
+        let own = start.rows_range(first..).into_owned();
+        let ordinary = Ordinary::about(data, &unknowns[others..], &own, machine)?;
+        Ok(Self { data, hypothesis, start: own, unknowns, ordinary })
     }
 
     /// Number of the other unknowns, the first.
@@ -464,7 +470,8 @@ impl<'d> Problem<'d> {
             let of_vars = signatures.of_vars().into_iter().zip(&sigma);
             let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
             let of_others = self.unknowns[..self.others() - vars].iter();
-            let of_others = of_others.map(|unknown| of_linear(data, campaign, &signatures, unknown));
+            let of_others = of_others.zip(u.iter().skip(vars));
+            let of_others = of_others.map(|(unknown, u)| of_linear(data, campaign, &signatures, unknown, *u));
             own.signatures::<EffectError>(self.others(), of_vars.chain(of_others))
         })?;
         let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
@@ -485,14 +492,15 @@ impl Ordinary {
     fn about(
         data: &Data,
         unknowns: &[Unknown],
+        start: &DVector<f64>,
         machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
     ) -> Result<Self, EffectError> {
         let slopes = data.stacked_columns(unknowns.len(), |campaign, own| {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
             let signatures = Signatures::of(&machine, &drives)?;
-            let of = |unknown: &Unknown| of_linear(data, campaign, &signatures, unknown);
-            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().map(of))
+            let of = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
+            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(of))
         })?;
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })
@@ -557,7 +565,7 @@ pub(super) fn of_element(
     let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));
     let mut sum: Option<Signature> = None;
     for (unknown, u) in forms {
-        let Some(form) = of_linear(data, campaign, &signatures, unknown)? else { continue };
+        let Some(form) = of_linear(data, campaign, &signatures, unknown, *u)? else { continue };
         let form = form * *u;
         match &mut sum {
             None => sum = Some(form),
@@ -576,17 +584,20 @@ pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature,
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }
 
-/// The signature of an ordinary imperfection, or of a form of an unknown element, in a recording, per width; none of another unknown, or where it does
-/// not act.
+/// The derivative with respect to an ordinary imperfection, or a form of an unknown element, in a recording, per width, where the machine has it with `u`
+/// widths; none of another unknown, or where it does not act. A signature is that of one more effect: of one more gain on what an instrument with a gain error
+/// reads or kicks, `(1 + a)` times the derivative.
 fn of_linear(
     data: &Data,
     campaign: usize,
     signatures: &Signatures,
     unknown: &Unknown,
+    u: f64,
 ) -> Result<Option<Signature>, EffectError> {
     match unknown {
         Unknown::Ordinary(member, width) if member.is_in(campaign) => {
-            Ok(Some(together(signatures, member, |kind| data.scale(campaign, kind))? * *width))
+            let one_more = together(signatures, member, |kind| data.scale(campaign, kind))?;
+            Ok(Some(one_more * (width / member.factor(u * width))))
         }
         Unknown::Form(quadrupole, form, sigma) => {
             // as a field that is no magnet of the ring
@@ -656,5 +667,35 @@ fn difference<T: Sub<Output = T> + Mul<f64, Output = T>>(
         (Ok(above), Err(_)) => Ok((above - at(0.0)?) * DIFFERENCE.recip()),
         (Err(_), Ok(below)) => Ok((at(0.0)? - below) * DIFFERENCE.recip()),
         (Err(error), Err(_)) => Err(error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use inference::Campaign;
+
+    use super::*;
+    use crate::testing::template;
+
+    /// Readings and kicks are linear in a gain, so that differences are its derivative to rounding.
+    #[test]
+    fn the_derivative_of_a_gain_is_right_about_a_gain() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let mut fitted = Fitted::unfitted(&data, &Hypothesis::plain()).unwrap();
+        let (vars, unknowns) = (fitted.params.len(), fitted.hypothesis.unknowns(&data));
+        for kind in [EffectKind::BpmGain, EffectKind::CorrectorGain] {
+            let is_one = |unknown: &Unknown| matches!(unknown, Unknown::Ordinary(member, _) if member.terms[0].kind == kind && member.terms.len() == 1);
+            let at = vars + unknowns.iter().position(is_one).unwrap();
+            fitted.u[at] = -0.3 / unknowns[at - vars].sigma();
+            let moved = |step: f64| {
+                let mut u = fitted.u.clone();
+                u[at] += step;
+                fitted.predicted_at(&data, 0, &u)
+            };
+            let (exact, found) = (difference(moved).unwrap(), &fitted.slopes(&data).unwrap()[at]);
+            let off = (&exact.readings - &found.readings).amax() / exact.readings.amax();
+            assert!(off < 1e-9, "{kind:?}: {off}");
+        }
     }
 }

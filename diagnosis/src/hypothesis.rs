@@ -61,7 +61,20 @@ pub struct Member {
     pub campaign: Option<usize>,
 }
 
+/// Gain error of an instrument down to which its machine is linearised.
+const LEAST_GAIN: f64 = -0.5;
+
 impl Member {
+    /// True for a gain of monitors or correctors.
+    fn is_gain(&self) -> bool {
+        self.terms.iter().all(|term| matches!(term.kind, EffectKind::BpmGain | EffectKind::CorrectorGain))
+    }
+
+    /// What its amplitude multiplies readings or kicks by, if it is a gain; 1 of another.
+    pub(super) fn factor(&self, amplitude: f64) -> f64 {
+        if self.is_gain() { 1.0 + amplitude.max(LEAST_GAIN) } else { 1.0 }
+    }
+
     /// True if it acts in a recording.
     pub fn is_in(&self, campaign: usize) -> bool {
         self.campaign.is_none_or(|own| own == campaign)
@@ -86,6 +99,14 @@ impl Unknown {
     /// evaluated for the same machine.
     pub fn is_of_first_order(&self) -> bool {
         matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
+    }
+
+    /// The least that it is where others are linearised about it, in prior standard deviations: at a gain error of -1 nothing shows how a gain changes.
+    pub fn least_start(&self) -> f64 {
+        match self {
+            Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,
+            _ => f64::NEG_INFINITY,
+        }
     }
 
     /// Its prior standard deviation.

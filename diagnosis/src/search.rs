@@ -596,20 +596,21 @@ fn relearn(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)], ou
 }
 
 /// The same fit with the ordinary widths that the recording then shows, if it is the better and keeps a beam: as wide as that, imperfections
-/// that are of first order in the fit may leave none. A poor one stays as it is; one that was poor before
-/// gets the ordinary imperfections that it lacks. One that has readings of its own keeps them.
+/// that are of first order in the fit may leave none. One without any ordinary imperfections gets them, where it is then not poor; another poor one
+/// stays as it is. One that has readings of its own keeps them.
 fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
-    if fitted.is_poor() {
+    let lacks_all = fitted.hypothesis.ordinary.is_empty();
+    if fitted.is_poor() && !lacks_all {
         return fitted;
     }
     let own = fitted.has_own().then(|| fitted.data(data).clone());
     let data = own.as_ref().unwrap_or(data);
     let again = |hypothesis: Hypothesis, from: &Fitted| Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis));
-    let lacks_all = fitted.hypothesis.ordinary.is_empty();
     let with_all = || Hypothesis { ordinary: Family::all(), ..fitted.hypothesis.clone() };
     let begun = if lacks_all { again(with_all(), &fitted) } else { Ok(fitted.clone()) };
-    let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun));
+    let begun = begun.ok().filter(|begun| !begun.is_poor());
+    let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun).ok());
     let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
-    let best = learnt.ok().filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
+    let best = learnt.filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
     if own.is_some() { best.to(data) } else { best }
 }
