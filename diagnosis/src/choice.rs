@@ -26,7 +26,7 @@ pub struct Choice<'d> {
     pub scores: Vec<SignatureScore>,
 }
 
-/// Power from which on chance cannot choose an effect without an amplitude: that needs a pull of half the power, five standard deviations.
+/// Power from which on chance cannot choose an exchange: that needs a pull of half the power, five standard deviations.
 const BEYOND_CHANCE: f64 = 100.0;
 
 impl<'d> Choice<'d> {

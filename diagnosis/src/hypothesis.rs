@@ -61,7 +61,7 @@ pub struct Member {
     pub campaign: Option<usize>,
 }
 
-/// Gain error of an instrument down to which its machine is linearised.
+/// Least gain error that a fit is linearised about: the derivative is the signature over `1 + a`, and both vanish at -1.
 const LEAST_GAIN: f64 = -0.5;
 
 impl Member {
@@ -72,7 +72,7 @@ impl Member {
 
     /// What its amplitude multiplies readings or kicks by, if it is a gain; 1 of another.
     pub(super) fn factor(&self, amplitude: f64) -> f64 {
-        if self.is_gain() { 1.0 + amplitude.max(LEAST_GAIN) } else { 1.0 }
+        if self.is_gain() { 1.0 + amplitude } else { 1.0 }
     }
 
     /// True if it acts in a recording.
@@ -101,7 +101,7 @@ impl Unknown {
         matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
     }
 
-    /// The least that it is where others are linearised about it, in prior standard deviations: at a gain error of -1 nothing shows how a gain changes.
+    /// The least that it is where a fit is linearised about it, in prior standard deviations.
     pub fn least_start(&self) -> f64 {
         match self {
             Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,

@@ -57,8 +57,8 @@ pub struct Family {
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
 pub(super) const STANDS_OUT: f64 = 2.3;
-/// Gain error below which an instrument may be dead or reversed: twice the largest scatter that is quoted. A failed member makes its family wide, and stays
-/// short of -1 or -2 by as much as that is too narrow for it.
+/// Gain error below which an instrument may be dead or reversed: twice the largest scatter that is quoted. Such a one widens its family, whose prior still
+/// pulls its gain from -1 or -2 towards 0.
 const FAILS: f64 = -0.1;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
@@ -377,7 +377,7 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
 }
 
 /// The member of each learnt family that stands out most of it, of an instrument both planes: it may have made the family as wide as it is, and then hide in it. An instrument
-/// whose gain is far too small may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
+/// whose gain is more than 10 % too small may be dead or reversed, which a gain of -1 or -2 in a wide family hides as well.
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     // the amplitude of each member in widths of its family, and in its unit

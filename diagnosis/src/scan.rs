@@ -34,7 +34,7 @@ pub struct Candidate {
 }
 
 /// Share of the square of a whitened signature that is taken to stay when a fit's unknowns absorb what they can: of exchanged instruments more than a
-/// half does. Not of reversed and dead ones, which are ordinary gains as far as these are wide.
+/// half does. Not so of reversed and dead ones: where gains scatter widely, ordinary gains absorb nearly all of their signature.
 const STAYS: f64 = 0.05;
 
 /// Signatures that are scored together.
@@ -103,9 +103,9 @@ impl Projection {
         columns.column_iter().map(of).collect()
     }
 
-    /// The candidates that some terms with such signatures are. Of an exchange whose pull is below half of the power that stays at least, which makes it
+    /// Score some terms by their whitened signatures, one a column. Of an exchange whose pull is below half of the power that stays at least, which makes it
     /// less likely than nothing, the power is not worked out: the whole square stands for it.
-    fn candidates(&self, terms: &[Term], columns: &DMatrix<f64>) -> Vec<Candidate> {
+    fn scan(&self, terms: &[Term], columns: &DMatrix<f64>) -> Vec<Candidate> {
         let bounds = self.bounds(columns);
         let is_hopeless = |i: usize| terms[i].is_exchange() && bounds[i].is_below_half_of_least();
         let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
@@ -131,7 +131,7 @@ impl Projection {
         columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
     }
 
-    /// SignatureScore whitened signatures, one a column, in units of their prior standard deviations.
+    /// Score whitened signatures, one a column, in units of their prior standard deviations.
     pub fn score(&self, columns: &DMatrix<f64>) -> Scored {
         let shared = &self.back * columns;
         let taken = self.factor.solve(&shared);
@@ -224,7 +224,7 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     let machines = fitted.machines_on_orbit(data)?;
     let of_each = of_each(&machines)?;
     // all at once would be gigabytes for a ring of 150 monitors
-    let of_batch = |batch: &[Term]| projection.candidates(batch, &whitened(data, &of_each, batch));
+    let of_batch = |batch: &[Term]| projection.scan(batch, &whitened(data, &of_each, batch));
     Ok(terms.chunks(BATCH).flat_map(of_batch).collect())
 }
 

@@ -197,7 +197,7 @@ impl Search {
     }
 
     /// The fit of the vars and of what is ordinary. What makes a fit poor is not: ordinary imperfections, small by their nature, are then left out
-    /// until the effects are in the model that explain it.
+    /// until a fit with them is good.
     fn without_effects(&self, mut data: Data) -> Result<Found, FitError> {
         data.is_about_effects = false;
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
@@ -217,7 +217,9 @@ impl Search {
         let mut data = found.data.clone();
         // what is ordinary is no longer as wide as the effect had made it
         let again = settled(&data, leader.clone());
-        let won = (again.log_evidence < leader.log_evidence + BETTER).then_some(&found.next);
+        // nor does a competition stand in which only the leaders had what is ordinary
+        let is_alike = leader.hypothesis.ordinary.is_empty() == found.next.without.hypothesis.ordinary.is_empty();
+        let won = (is_alike && again.log_evidence < leader.log_evidence + BETTER).then_some(&found.next);
         let (mut best, competitions) = self.settle(&data, won.map_or(again, |_| leader), won)?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
@@ -610,7 +612,7 @@ fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let begun = if lacks_all { again(with_all(), &fitted) } else { Ok(fitted.clone()) };
     let begun = begun.ok().filter(|begun| !begun.is_poor());
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun).ok());
-    let is_better = |learnt: &Fitted| lacks_all || learnt.log_evidence > fitted.log_evidence;
+    let is_better = |learnt: &Fitted| !learnt.is_poor() && (lacks_all || learnt.log_evidence > fitted.log_evidence);
     let best = learnt.filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
     if own.is_some() { best.to(data) } else { best }
 }

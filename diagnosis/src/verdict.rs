@@ -412,7 +412,7 @@ pub fn findings(
     };
     if let Some(first) = open {
         let open = Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? };
-        let open = match found.best.turned(data).filter(|_| open.is_of_element(found)) {
+        let open = match found.best.turned(data).filter(|_| open.is_of_element(found) && !data.is_joint()) {
             Some(angle) => Finding { phrase: format!("{}, by {} mrad", open.phrase, angle.size(1e3)), ..open },
             None => open,
         };

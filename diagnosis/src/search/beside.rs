@@ -246,7 +246,8 @@ mod tests {
             assert!(only.term().is_none() && only.phrase.contains("turning them"), "{}", found.sentence);
             assert!(solenoid.is_near(&ring, only.s.unwrap()), "{}", found.sentence);
             let angle = found.found.best.turned(&found.found.data).unwrap();
-            println!("{}", found.sentence);
+            let is_told = only.phrase.ends_with(&format!("by {} mrad", angle.size(1e3)));
+            assert!(is_told && angle.sigma < 2e-3, "{}", found.sentence);
             assert!((angle.value.abs() - 0.01).abs() < 3.0 * angle.sigma, "{}", found.sentence);
         }
     }

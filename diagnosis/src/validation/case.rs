@@ -61,7 +61,7 @@ pub struct Cases {
 /// Amplitudes in prior standard deviations, weak to strong; the logarithm is uniform in between.
 const SIZES: [f64; 2] = [0.2, 2.5];
 
-/// Cases of a class.
+/// Cases of a class are numbered from its place in the list of classes times this.
 const OF_CLASS: usize = 1_000_000;
 
 impl Class {
@@ -120,24 +120,20 @@ impl Cases {
 }
 
 impl Case {
-    /// Its recording, by a machine with some imperfections.
+    /// Its recording.
     ///
     /// # Errors
-    /// [`EffectError`] if that keeps no beam.
-    pub fn recording(
-        &self,
-        ring: &Ring,
-        template: &Recording,
-        imperfections: Option<&Imperfections>,
-    ) -> Result<Recording, EffectError> {
+    /// [`EffectError`] if its machine keeps no beam.
+    pub fn recording(&self, ring: &Ring, template: &Recording) -> Result<Recording, EffectError> {
         let mut hardware = Hardware::shipped(ring, template);
-        let mut effects = Vec::new();
-        if let Some(Imperfections { effects: ordinary, noise }) = imperfections {
+        // the current of a dead corrector is none before its coils couple, and what a dead monitor reads is none after its electronics' gain
+        let (mut effects, others): (Vec<Effect>, Vec<Effect>) =
+            self.effects.iter().partition(|effect| effect.kind.is_of_a_corrector());
+        if let Some(Imperfections { effects: ordinary, noise }) = &self.imperfections {
             hardware.noise.iter_mut().for_each(|own| *own *= noise);
-            effects.clone_from(ordinary);
+            effects.extend(ordinary);
         }
-        // the last: a dead corrector has no hysteresis
-        effects.extend(&self.effects);
+        effects.extend(others);
         let beyond: Vec<&dyn Beyond> = self.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
         let truth = simulate::Truth { vars: &self.vars, effects: &effects, beyond: &beyond };
         simulate::campaign(template, ring, &truth, &hardware, self.seed)

@@ -5,8 +5,8 @@
 //! the gain in `ln` posterior when kind, place and size are given, over the best fit of vars and baselines without effects, on a machine that is ideal
 //! otherwise. For physics that the library does not hold the exact signal is given: the same seed makes the same machine and noise without it.
 //!
-//! Half of the machines have ordinary imperfections ([`imperfect`]). Their vars tell whether error bars are right, since the base model allows for such; on
-//! ideal machines it allows for more than there is.
+//! Half of the machines have ordinary imperfections ([`imperfect`]). The base model allows for such, so that the vars of ideal machines are closer to the
+//! truth than their error bars say.
 
 pub mod case;
 pub mod imperfect;
@@ -43,7 +43,7 @@ pub struct Outcome {
     pub is_imperfect: bool,
     /// The effects it was made with.
     pub truth: Vec<Made>,
-    /// Gain in `ln` posterior when kind, place and size are given.
+    /// Gain in `ln` posterior when kind, place and size are given, on the ideal machine.
     pub oracle_gain: f64,
     /// Of each effect, the same beside the others, and its fate.
     pub fates: Vec<(f64, Fate)>,
@@ -94,18 +94,18 @@ impl Made {
     }
 }
 
-/// Simulate, diagnose and score one case; `None` if its machine keeps no beam.
+/// Simulate, diagnose and score one case; `None` if its machine, or the ideal one, keeps no beam.
 ///
 /// # Errors
 /// [`DataError`] if the simulated campaign cannot be diagnosed.
 pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outcome>, DataError> {
-    let Ok(recording) = case.recording(ring, template, case.imperfections.as_ref()) else { return Ok(None) };
+    let Some((oracle_gain, own)) = oracle(ring, template, case)? else { return Ok(None) };
+    let Ok(recording) = case.recording(ring, template) else { return Ok(None) };
     let started = Instant::now();
     let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
     let key = case.key(ring);
     let names = ring.var_names();
-    let Some((oracle_gain, own)) = oracle(ring, template, case)? else { return Ok(None) };
     Ok(Some(Outcome {
         index: case.index,
         class: case.class,
@@ -207,7 +207,8 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
     if case.class == Class::Empty {
         return Ok(Some((0.0, Vec::new())));
     }
-    let Ok(recording) = case.recording(ring, template, None) else { return Ok(None) };
+    let case = &Case { imperfections: None, ..case.clone() };
+    let Ok(recording) = case.recording(ring, template) else { return Ok(None) };
     let data = Data::of(&Campaign::of(ring, &recording)?)?;
     let zero = DVector::zeros(data.units.len());
     let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
@@ -218,7 +219,7 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
     if !case.unmodelled.is_empty() {
         // what is not in the library is told by its signal
         let plain = Case { unmodelled: Vec::new(), ..case.clone() };
-        let Ok(without) = plain.recording(ring, template, None) else { return Ok(None) };
+        let Ok(without) = plain.recording(ring, template) else { return Ok(None) };
         let cleaned = data.less(&signal(&recording, &without), &tunes(&recording, &without));
         let gain = best(&cleaned, &[])? - nothing;
         return Ok(Some((gain, vec![gain])));
