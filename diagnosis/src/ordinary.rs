@@ -404,14 +404,19 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     stands_out.flat_map(proposed).collect()
 }
 
+/// The kind of the family that an effect of an instrument is a member of: a dead instrument has a gain error of -1, a reversed one of -2.
+pub fn family_of(kind: EffectKind) -> EffectKind {
+    match kind {
+        EffectKind::BpmDead | EffectKind::BpmPolarity => EffectKind::BpmGain,
+        EffectKind::CorrectorDead | EffectKind::CorrectorPolarity => EffectKind::CorrectorGain,
+        other => other,
+    }
+}
+
 /// The instrument of a gain dead, and reversed, where it may be that.
 fn failures(gain: Term, amplitude: f64) -> impl Iterator<Item = Term> {
-    let kinds: &[EffectKind] = match gain.kind {
-        EffectKind::BpmGain if amplitude < FAILS => &[EffectKind::BpmDead, EffectKind::BpmPolarity],
-        EffectKind::CorrectorGain if amplitude < FAILS => &[EffectKind::CorrectorDead, EffectKind::CorrectorPolarity],
-        _ => &[],
-    };
-    kinds.iter().map(move |&kind| Term { kind, ..gain })
+    let fails = move |kind: &EffectKind| amplitude < FAILS && *kind != gain.kind && family_of(*kind) == gain.kind;
+    EffectKind::ALL.iter().copied().filter(fails).map(move |kind| Term { kind, ..gain })
 }
 
 /// The scatter of the vars and the sizes of the ordinary imperfections in a fit, of several recordings those of the first where each has its own. The Fisher information of `ln w` is `2 sum of (1 - c)^2`, `c` the share of a member's

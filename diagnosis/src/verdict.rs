@@ -344,7 +344,8 @@ pub fn tests(
         }
         let kind = found.best.hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
-        let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind);
+        let own = ordinary::family_of(kind);
+        let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == own);
         let choice = Choice::of(data, without, candidates, penalty)?;
         let is_of_family = is_of_an_instrument && is_learnt;
         let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
