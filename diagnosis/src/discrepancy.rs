@@ -142,9 +142,8 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     if active.is_empty() {
         return Ok(Vec::new());
     }
-    let (machine, drives) = fitted.machine_in(all, campaign)?;
+    let (machine, drives) = fitted.machine_on_orbit(all, campaign)?;
     let predicted = fitted.predicted_in(all, campaign)?;
-    let machine = machine.on_orbit(&drives.orbit);
     let signatures = Signatures::of(&machine, &drives)?;
     let mut found = Vec::new();
     for &b in &active {

@@ -274,16 +274,21 @@ impl Fitted {
         self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
-    /// The same in each recording, on its orbit.
+    /// The same on its orbit.
+    ///
+    /// # Errors
+    /// [`EffectError`].
+    pub fn machine_on_orbit(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+        let (machine, drives) = self.machine_in(data, campaign)?;
+        Ok((machine.on_orbit(&drives.orbit), drives))
+    }
+
+    /// That in each recording.
     ///
     /// # Errors
     /// [`EffectError`].
     pub fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
-        let on_orbit = |campaign: usize| {
-            let (machine, drives) = self.machine_in(data, campaign)?;
-            Ok((machine.on_orbit(&drives.orbit), drives))
-        };
-        (0..data.count()).map(on_orbit).collect()
+        (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
     /// The machine in each recording.

@@ -101,8 +101,7 @@ impl Standard {
             data.linearise_about(&fitted.machine(&data).unwrap().0).unwrap();
             fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
         }
-        let (machine, drives) = fitted.machine(&data).unwrap();
-        let machine = machine.on_orbit(&drives.orbit);
+        let (machine, drives) = fitted.machine_on_orbit(&data, 0).unwrap();
         let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
         let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
         let score = Projection::of(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];

@@ -130,13 +130,30 @@ struct Window {
     tune_cut: bool,
 }
 
-impl Window {
-    /// Of both planes.
-    fn of(ring: &Ring, tune_cut: bool) -> Result<[Self; 2], OrbitError> {
+/// Which tunes the machines of a ring may have.
+pub struct TuneWindow {
+    x: Window,
+    y: Window,
+}
+
+impl TuneWindow {
+    /// With the tune cut, tunes within [`TUNE_CUT`] of the design's; without it, those between the same half integers, and not on one.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the design has no tunes.
+    pub fn of(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
         let design = tunes(ring)?;
-        Ok([design.x, design.y].map(|design| Self { design, tune_cut }))
+        let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
+        Ok(Self { x, y })
     }
 
+    /// True for tunes that a machine may have.
+    pub fn holds(&self, tunes: Tunes) -> bool {
+        self.x.holds(tunes.x) && self.y.holds(tunes.y)
+    }
+}
+
+impl Window {
     fn holds(&self, tune: f64) -> bool {
         let below = (2.0 * self.design).floor() / 2.0;
         let own = (self.design - below).min(below + 0.5 - self.design);
@@ -153,20 +170,11 @@ impl Window {
 /// [`VarsError`].
 pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsError> {
     let mut random = StdRng::seed_from_u64(seed);
-    let [x, y] = Window::of(ring, tune_cut)?;
+    let window = TuneWindow::of(ring, tune_cut)?;
     let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
-    let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| x.holds(at.x) && y.holds(at.y));
+    let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| window.holds(at));
     let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);
-    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [x.design, y.design] })
-}
-
-/// True for tunes that the tune cut lets pass.
-///
-/// # Errors
-/// [`OrbitError`] if the design has no tunes.
-pub fn are_near_design(ring: &Ring, tunes: Tunes) -> Result<bool, OrbitError> {
-    let [x, y] = Window::of(ring, true)?;
-    Ok(x.holds(tunes.x) && y.holds(tunes.y))
+    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [window.x.design, window.y.design] })
 }
 
 /// A factor from its truncated lognormal prior.

@@ -84,7 +84,8 @@ impl Validation {
         let template = template.frames_of(&ring.ring)?;
         let (ring, template) = (ring.ring.clone(), (**template).clone());
         py.detach(|| {
-            let cases = Arc::new(Cases::of(&ring, &template).map_err(refused)?);
+            let campaign = inference::Campaign::of(&ring, &template).map_err(other)?;
+            let cases = Arc::new(Cases::of(&campaign).map_err(refused)?);
             Ok(Self { ring, template, cases })
         })
     }

@@ -279,7 +279,7 @@ fn unmodelled_physics_is_not_named() {
 #[test]
 fn cases_are_fixed_by_their_number() {
     let (ring, template) = (Ring::booster(), read("paper-vars"));
-    let cases = Cases::of(&ring, &template).unwrap();
+    let cases = Cases::of(&Campaign::of(&ring, &template).unwrap()).unwrap();
     let draw = |index| cases.draw(Class::Pair, index, 1);
     assert_eq!(draw(7).effects, draw(7).effects);
     assert_eq!(draw(7).vars, draw(7).vars);

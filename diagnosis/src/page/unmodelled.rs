@@ -241,8 +241,7 @@ impl Left<'_> {
     /// The change of a quadrupole's gradient that the residuals of each setting, and of each run of frames, would give.
     fn gradient(&self, q: usize) -> Result<Vec<(String, Figure)>, FitError> {
         let (data, fitted) = (self.partial.data, self.partial.fitted);
-        let (machine, drives) = fitted.machine(data)?;
-        let machine = machine.on_orbit(&drives.orbit);
+        let (machine, drives) = fitted.machine_on_orbit(data, 0)?;
         let signatures = Signatures::of(&machine, &drives)?;
         // of one per cent
         let does = steering(&signatures, machine.ring(), &drives.orbit).swap_remove(q) * 0.01;

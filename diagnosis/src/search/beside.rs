@@ -37,8 +37,7 @@ impl Found {
 /// The unknown linear element that a discrepancy is, if it is one.
 fn element_of(data: &Data, without: &Fitted, one: &Discrepancy) -> Result<Option<Element>, FitError> {
     let Location::Linear(quadrupole, does) = one.at else { return Ok(None) };
-    let (machine, drives) = without.machine_in(without.data(data), one.campaign)?;
-    let machine = machine.on_orbit(&drives.orbit);
+    let (machine, drives) = without.machine_on_orbit(without.data(data), one.campaign)?;
     let signatures = Signatures::of(&machine, &drives)?;
     Ok(Some(Element::of(&signatures, &data.ring, quadrupole, does, one.size)))
 }

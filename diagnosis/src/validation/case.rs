@@ -72,14 +72,14 @@ impl Class {
 }
 
 impl Cases {
-    /// Campaigns of a ring with the settings of a recording.
+    /// Campaigns with the ring and the settings of one.
     ///
     /// # Errors
     /// [`DataError`] if that cannot be diagnosed.
-    pub fn of(ring: &Ring, template: &Recording) -> Result<Self, DataError> {
-        let data = Data::of(&Campaign::of(ring, template)?)?;
-        let terms = candidates(&data, template.header.radial_loop_monitors.as_ref());
-        Ok(Self { ring: ring.clone(), terms, families: Families::of(&data) })
+    pub fn of(template: &Campaign) -> Result<Self, DataError> {
+        let data = Data::of(template)?;
+        let terms = candidates(&data, template.recording.header.radial_loop_monitors.as_ref());
+        Ok(Self { ring: template.ring.clone(), terms, families: Families::of(&data) })
     }
 
     /// Case `number` of a class; half of all machines have ordinary imperfections.

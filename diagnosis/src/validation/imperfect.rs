@@ -7,7 +7,7 @@
 
 use core::iter;
 
-use inference::simulate::are_near_design;
+use inference::simulate::TuneWindow;
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use twin::{Effect, Machine, Rf, Ring};
@@ -52,11 +52,11 @@ impl Families {
 
     /// Draw those of a machine of a ring with some vars; `None` if hardly any has tunes near the design's.
     pub fn draw(&self, ring: &Ring, vars: &[f64], random: &mut impl Rng) -> Option<Imperfections> {
-        let made = ring.with_vars(vars);
+        let (made, window) = (ring.with_vars(vars), TuneWindow::of(ring, true).ok()?);
         let is_near_design = |drawn: &Imperfections| {
             let machine = Machine::new(made.clone(), Rf::FixedMomentum, &drawn.effects);
             let tunes = machine.ok().and_then(|machine| machine.optics().ok()?.tunes().ok());
-            tunes.is_some_and(|tunes| are_near_design(ring, tunes).is_ok_and(|are_near| are_near))
+            tunes.is_some_and(|tunes| window.holds(tunes))
         };
         iter::repeat_with(|| self.draw_any(random)).take(TRIES).find(is_near_design)
     }
@@ -95,12 +95,12 @@ mod tests {
         let data = Data::of(&Campaign::of(&ring, &template).unwrap()).unwrap();
         let families = Families::of(&data);
         let mut random = StdRng::seed_from_u64(3);
-        let vars = vec![1.0; ring.parameters.len()];
+        let (vars, window) = (vec![1.0; ring.parameters.len()], TuneWindow::of(&ring, true).unwrap());
         let (mut widths, mut rejected) = (Vec::new(), 0);
         for _ in 0..DRAWS {
             let drawn = families.draw(&ring, &vars, &mut random).unwrap();
             let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &drawn.effects).unwrap();
-            assert!(are_near_design(&ring, machine.optics().unwrap().tunes().unwrap()).unwrap());
+            assert!(window.holds(machine.optics().unwrap().tunes().unwrap()));
             let of_rolls = drawn.effects.iter().filter(|effect| effect.kind == EffectKind::BpmRoll);
             let rolls: Vec<f64> = of_rolls.map(|effect| effect.amplitude).collect();
             let width = (rolls.iter().map(|roll| roll * roll).sum::<f64>() / rolls.len() as f64).sqrt();
@@ -108,7 +108,7 @@ mod tests {
             let any = families.draw_any(&mut random);
             let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &any.effects).unwrap();
             let tunes = machine.optics().and_then(|optics| optics.tunes());
-            rejected += usize::from(!tunes.is_ok_and(|tunes| are_near_design(&ring, tunes).unwrap()));
+            rejected += usize::from(!tunes.is_ok_and(|tunes| window.holds(tunes)));
         }
         // the mean of a half-normal width is 0.8 of its scale, 10 mrad, and scatters by 0.6 of that: four standard errors
         let mean = widths.iter().sum::<f64>() / DRAWS as f64;
@@ -127,7 +127,7 @@ mod tests {
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn dead_and_reversed_instruments_among_ordinary_imperfections_are_named() {
         let (ring, template) = template();
-        let cases = Cases::of(&ring, &template).unwrap();
+        let cases = Cases::of(&Campaign::of(&ring, &template).unwrap()).unwrap();
         for kind in [EffectKind::CorrectorDead, EffectKind::CorrectorPolarity, EffectKind::BpmPolarity] {
             let drawn = (0..2000).map(|i| cases.draw(Class::Single, Class::Single.number(i), 1));
             let is_one = |case: &Case| case.imperfections.is_some() && case.effects[0].kind == kind;

@@ -157,6 +157,11 @@ impl Fates {
         all
     }
 
+    /// Named, or undecided among inseparable causes.
+    fn found(&self) -> Share {
+        Share::new(self.named + self.together, self.total())
+    }
+
     fn total(&self) -> usize {
         self.named + self.together + self.listed + self.absent
     }
@@ -167,19 +172,15 @@ impl OfMachines {
         let all: Vec<&Outcome> = outcomes.iter().filter(|outcome| outcome.is_imperfect == is_imperfect).collect();
         let some = |is: fn(&Outcome) -> bool| all.iter().copied().filter(move |outcome| is(outcome));
         let library = || some(|outcome| outcome.class != Class::Unknown);
-        let visible: Vec<Fate> = library()
-            .flat_map(|outcome| &outcome.fates)
-            .filter(|(gain, _)| *gain > VISIBLE)
-            .map(|(_, fate)| *fate)
-            .collect();
-        let named = visible.iter().filter(|fate| matches!(fate, Fate::Named | Fate::Together)).count();
+        let visible = library().flat_map(|outcome| &outcome.fates).filter(|(gain, _)| *gain > VISIBLE);
+        let fates = Fates::of(visible.map(|(_, fate)| fate));
         let unknown = some(|outcome| outcome.class == Class::Unknown && outcome.oracle_gain > VISIBLE);
         let pulls: Vec<f64> = all.iter().flat_map(|outcome| outcome.pulls.iter().copied()).collect();
         Self {
             campaigns: all.len(),
             consistent: Share::of(some(|outcome| outcome.class == Class::Empty), |o| o.verdict == Verdict::Consistent),
             wrong: Share::of(library(), |outcome| outcome.grade == Grade::Wrong),
-            named: Share::new(named, visible.len()),
+            named: fates.found(),
             open: Share::of(unknown, |outcome| outcome.grade == Grade::Open),
             amplitudes: (pulls.len(), mean(pulls.iter().map(|pull| pull * pull))),
             nees: mean(library().map(|outcome| outcome.nees[1])),
@@ -246,7 +247,7 @@ impl Tables {
         writeln!(text, "|---|---|---|---|---|---|---|")?;
         for (bin, fates) in &self.by_gain {
             let Fates { named, together, listed, absent } = fates;
-            let found = Share::new(named + together, fates.total());
+            let found = fates.found();
             let counts = format!("{} | {named} | {together} | {listed} | {absent}", fates.total());
             writeln!(text, "| {} | {counts} | {} |", range(bin), found.text())?;
         }

@@ -10,7 +10,7 @@ use std::sync::Mutex;
 use diagnosis::data::DataError;
 use diagnosis::validation::tables::Tables;
 use diagnosis::validation::{self, Case, Cases, Class, Outcome, UnmodelledKind};
-use inference::Recording;
+use inference::{Campaign, Recording};
 use twin::{EffectKind, Ring};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
@@ -58,7 +58,7 @@ pub fn run(options: &Validate) -> Result<(), CommandError> {
 
 /// Cases of all classes; the number of a case fixes it, so that a longer run begins with the shorter one's.
 fn cases(options: &Validate, ring: &Ring, template: &Recording) -> Result<Vec<Case>, CommandError> {
-    let all = Cases::of(ring, template)?;
+    let all = Cases::of(&Campaign::of(ring, template).map_err(DataError::from)?)?;
     let classes = [
         (Class::Empty, options.empty),
         (Class::Single, options.single),
