@@ -123,19 +123,17 @@ impl Channel {
     /// The same in place.
     pub fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
         self.root.whiten(columns.as_view_mut());
-        let mut common = self.basis.transpose() * &columns;
-        common.row_iter_mut().zip(self.shrink.iter()).for_each(|(mut row, shrink)| row *= *shrink);
-        columns.gemm(-1.0, &self.basis, &common, 1.0);
+        // column by column, since there are few factors
+        for mut column in columns.column_iter_mut() {
+            let common = self.basis.tr_mul(&column).component_mul(&self.shrink);
+            column.gemv(-1.0, &self.basis, &common, 1.0);
+        }
     }
 
     /// The same of one column.
     pub fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
-        match &self.root {
-            Root::White(roots) => column.component_mul_assign(roots),
-            Root::Remembers(lower) => lower.solve_lower_triangular_unchecked_mut(column),
-        }
-        let common = self.basis.tr_mul(column).component_mul(&self.shrink);
-        column.gemv(-1.0, &self.basis, &common, 1.0);
+        let rows = column.len();
+        self.whiten_mut(DMatrixViewMut::from_slice(column.as_mut_slice(), rows, 1));
     }
 
     /// The part of `T^T T` that common terms take, `common common^T` [rows][factors], for white noise: `T^T T = diag(n) - common common^T`.

@@ -298,7 +298,7 @@ impl<'f> Linearised<'f> {
 }
 
 impl Discrepancy {
-    fn of(at: Location, logs: [f64; SIZES.len()], sites: usize) -> Self {
+    pub(super) fn of(at: Location, logs: [f64; SIZES.len()], sites: usize) -> Self {
         let (best, largest) = logs
             .iter()
             .enumerate()

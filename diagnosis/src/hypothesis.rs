@@ -286,6 +286,7 @@ impl Hypothesis {
         let scaled = |term: &Term, amplitude: f64| term.effect(amplitude * data.scale(campaign, term.kind));
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
         effects.extend(&self.given);
+        let mut ordinary = Vec::new();
         let mut drives = own.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
@@ -294,11 +295,12 @@ impl Hypothesis {
                     drives.orbit[*element][plane.index()] += u * sigma;
                 }
                 Unknown::Ordinary(member, sigma) if member.is_in(campaign) => {
-                    effects.extend(member.terms.iter().map(|term| scaled(term, u * sigma)));
+                    ordinary.extend(member.terms.iter().map(|term| scaled(term, u * sigma)));
                 }
                 Unknown::Orbit(..) | Unknown::Form(..) | Unknown::Ordinary(..) => {}
             }
         }
+        let effects = in_order(effects, ordinary);
         effects.iter().for_each(|effect| correct_orbit(own, &mut drives, effect));
         let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
         Ok((Machine::new(ring, own.believed, &effects)?, drives))
@@ -309,6 +311,14 @@ impl Hypothesis {
         let terms: Vec<String> = self.terms.iter().map(|term| term.label(ring)).collect();
         if terms.is_empty() { "nothing".into() } else { terms.join(" + ") }
     }
+}
+
+/// Effects beside ordinary imperfections, in the order in which a signal passes them. The current of a dead corrector is none before its coils couple,
+/// and exchanged cables lead it to other coils; what a dead monitor reads is none after its electronics' gain, and exchanged names are given to readings.
+pub fn in_order(effects: Vec<Effect>, ordinary: impl IntoIterator<Item = Effect>) -> Vec<Effect> {
+    let (of_correctors, others): (Vec<Effect>, Vec<Effect>) =
+        effects.into_iter().partition(|effect| effect.kind.is_of_a_corrector());
+    of_correctors.into_iter().chain(ordinary).chain(others).collect()
 }
 
 /// The orbit at a monitor was estimated as if it read what is there: not so where it misreads large positions.

@@ -23,6 +23,8 @@ pub enum Location {
     Corrector(usize),
     /// A corrector that kicks the beam at a second location as well.
     CorrectorElsewhere(usize),
+    /// A corrector whose kick differs from frame to frame of a setting; it competes with what else passes within them.
+    UnsteadyCorrector(usize),
     /// A place in the ring (a quadrupole's entrance) where the beam is kicked in a plane.
     Ring(usize, Plane),
     /// The same, in time.
@@ -63,7 +65,9 @@ impl Location {
             | Self::GainInTime(b)
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitor_names()[b].clone(),
-            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.corrector_names()[c].clone(),
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) | Self::UnsteadyCorrector(c) => {
+                ring.corrector_names()[c].clone()
+            }
             Self::Ring(q, _)
             | Self::RingInTime(q, _)
             | Self::Linear(q, _)
@@ -88,6 +92,7 @@ impl Location {
             Self::MonitorCurve(_) => format!("curve of {name}"),
             Self::Corrector(_) => format!("corrector {name}"),
             Self::CorrectorElsewhere(_) => format!("corrector {name}, other location"),
+            Self::UnsteadyCorrector(_) => format!("corrector {name}, from frame to frame"),
             Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
             Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
             Self::RingInTime(_, Plane::X) => format!("kicks near {name} in time, x"),
@@ -114,6 +119,9 @@ impl Location {
             Self::MonitorCurve(_) => format!("monitor {name} reads a nonlinear function of the position"),
             Self::Corrector(_) => format!("corrector {name} acts otherwise than by a single kick"),
             Self::CorrectorElsewhere(_) => format!("corrector {name} kicks the beam at another location too"),
+            Self::UnsteadyCorrector(_) => {
+                format!("the kick of corrector {name} differs from frame to frame of a setting")
+            }
             Self::Ring(_, Plane::X) => format!("the beam is kicked horizontally near {name}"),
             Self::Ring(_, Plane::Y) => format!("the beam is kicked vertically near {name}"),
             Self::RingInTime(_, Plane::X) => format!("a horizontal kick near {name} changes during the campaign"),
@@ -142,7 +150,7 @@ impl Location {
             Self::Monitor(b) | Self::GainInTime(b) | Self::MonitorElsewhere(b) | Self::MonitorCurve(b) => {
                 term.kind.is_of_a_monitor() && term.site == Site::Monitor(ring.read_monitors[b])
             }
-            Self::Corrector(c) | Self::CorrectorElsewhere(c) => {
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) | Self::UnsteadyCorrector(c) => {
                 term.kind.is_of_a_corrector() && term.site == Site::Corrector(c)
             }
             _ => false,
@@ -158,7 +166,7 @@ impl Location {
             | Self::GainInTime(b)
             | Self::MonitorElsewhere(b)
             | Self::MonitorCurve(b) => ring.monitors[ring.read_monitors[b]].element,
-            Self::Corrector(c) | Self::CorrectorElsewhere(c) => ring.correctors[c].element,
+            Self::Corrector(c) | Self::CorrectorElsewhere(c) | Self::UnsteadyCorrector(c) => ring.correctors[c].element,
             Self::Ring(q, _)
             | Self::RingInTime(q, _)
             | Self::Linear(q, _)

@@ -70,13 +70,24 @@ impl Coloured {
 
     /// A campaign with this noise, with the faulty monitors of the shipped recordings.
     pub fn campaign(&self, ring: &Ring, recording: &Recording, effects: &[Effect]) -> Recording {
+        self.campaign_with(ring, recording, effects, &[])
+    }
+
+    /// The same with more physics.
+    pub fn campaign_with(
+        &self,
+        ring: &Ring,
+        recording: &Recording,
+        effects: &[Effect],
+        more: &[&dyn Beyond],
+    ) -> Recording {
         let mut hardware = Hardware::shipped(ring, recording);
         for (b, noise) in hardware.noise.iter_mut().enumerate() {
             let shared = if CRATE.contains(&b) { self.crate_share } else { 0.0 };
             *noise *= (1.0 - self.slow.0 - shared).sqrt() * self.noise / recording.header.noise[b];
         }
-        let beyond: &[&dyn Beyond] = &[self];
-        let truth = Truth { vars: &self.vars, effects, beyond };
+        let beyond: Vec<&dyn Beyond> = more.iter().copied().chain([self as &dyn Beyond]).collect();
+        let truth = Truth { vars: &self.vars, effects, beyond: &beyond };
         inference::simulate::campaign(recording, ring, &truth, &hardware, self.seed).unwrap()
     }
 }

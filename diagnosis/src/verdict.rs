@@ -275,7 +275,9 @@ impl Finding {
 
     /// True for something unknown that the means of settings do not show: what passes within them, and what varies from frame to frame.
     pub fn is_within_settings(&self) -> bool {
-        let is_within = |at: &Location| matches!(at, Location::FrameToFrame | Location::FirstFrames { .. });
+        let is_within = |at: &Location| {
+            matches!(at, Location::FrameToFrame | Location::FirstFrames { .. } | Location::UnsteadyCorrector(_))
+        };
         matches!(&self.cause, Cause::Unmodelled(one) if is_within(&one.at))
     }
 

@@ -80,7 +80,9 @@ impl Factor {
     /// `L^-1`.
     fn inverse_lower(&self) -> DMatrix<f64> {
         let n = self.lower.nrows();
-        self.whiten(&DMatrix::identity(n, n))
+        let mut inverse = DMatrix::identity(n, n);
+        invert(self.lower.as_view(), inverse.as_view_mut());
+        inverse
     }
 }
 
@@ -138,6 +140,22 @@ fn factorise(mut matrix: DMatrixViewMut<f64>) -> Option<()> {
     matrix.view_mut((half, half), (n - half, n - half)).gemm(-1.0, &below, &across, 1.0);
     matrix.view_mut((half, 0), (n - half, half)).copy_from(&below);
     factorise(matrix.view_mut((half, half), (n - half, n - half)))
+}
+
+/// `L^-1` in place of 1: with `L` in four blocks, `L11^-1`, `-L22^-1 L21 L11^-1`, `L22^-1`.
+fn invert(lower: DMatrixView<f64>, mut inverse: DMatrixViewMut<f64>) {
+    let n = lower.nrows();
+    if n <= ROWS {
+        lower.solve_lower_triangular_unchecked_mut(&mut inverse);
+        return;
+    }
+    let half = n / 2;
+    invert(lower.view((0, 0), (half, half)), inverse.view_mut((0, 0), (half, half)));
+    let below = lower.view((half, 0), (n - half, half)) * -inverse.view((0, 0), (half, half));
+    inverse.view_mut((half, 0), (n - half, half)).copy_from(&below);
+    let of_rest = lower.view((half, half), (n - half, n - half));
+    forward(of_rest, inverse.view_mut((half, 0), (n - half, half)));
+    invert(of_rest, inverse.view_mut((half, half), (n - half, n - half)));
 }
 
 fn forward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {

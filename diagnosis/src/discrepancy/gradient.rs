@@ -97,11 +97,13 @@ impl Runs {
             for i in 0..patterns.len() {
                 for j in i..patterns.len() {
                     let mut block = all.gram.view_mut((i * runs, j * runs), (runs, runs));
+                    // by slices, which takes a tenth of the time of matrix iterators
+                    let (does_i, leaves_i) = (does[i].as_slice(), leaves[i].as_slice());
                     for (run, (from, mut to)) in own.gram.column_iter().zip(block.column_iter_mut()).enumerate() {
                         let [leaves_j, does_j] = [&leaves[j], &does[j]].map(|one| 0.5 * one[run]);
-                        let both =
-                            does[i].iter().zip(&leaves[i]).map(|(does, leaves)| does * leaves_j + leaves * does_j);
-                        to.iter_mut().zip(from.iter()).zip(both).for_each(|((to, gram), both)| *to += gram * both);
+                        let both = does_i.iter().zip(leaves_i).map(|(does, leaves)| does * leaves_j + leaves * does_j);
+                        let gram = from.as_slice().iter().zip(both);
+                        to.as_mut_slice().iter_mut().zip(gram).for_each(|(to, (gram, both))| *to += gram * both);
                     }
                 }
                 let mut pull = all.pull.rows_mut(i * runs, runs);

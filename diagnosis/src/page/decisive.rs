@@ -6,6 +6,7 @@ use crate::alternatives::Cause;
 use crate::error::FitError;
 use crate::fit::Fitted;
 use crate::hypothesis::Term;
+use crate::location::Location;
 use crate::{Diagnosis, Finding};
 use report::Figure;
 
@@ -24,7 +25,10 @@ pub fn figures(diagnosis: &Diagnosis) -> Result<Vec<(String, Figure)>, FitError>
     let mut all = Vec::new();
     for finding in &diagnosis.findings {
         if let Some(passing) = diagnosis.transients.iter().find(|one| one.is_of(finding)) {
-            all.push(slope::of_first_frames(finding, &passing.shown));
+            let is_unsteady =
+                matches!(&finding.cause, Cause::Unmodelled(one) if matches!(one.at, Location::UnsteadyCorrector(_)));
+            let figure = if is_unsteady { slope::of_each_frame } else { slope::of_first_frames };
+            all.push(figure(finding, &passing.shown));
             continue;
         }
         all.extend(match &finding.cause {

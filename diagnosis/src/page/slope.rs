@@ -136,6 +136,22 @@ pub fn of_element(what: &str, partial: &Partial) -> (String, Figure) {
     (caption.into(), Figure::lines(&axes, &[measured, line]))
 }
 
+/// The figure of a corrector that is unsteady: each frame against what the kick that suits it best should make of the readings.
+pub fn of_each_frame(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
+    let point = |one: &Shown| {
+        let weight = (one.sigma * 1e6).powi(-2);
+        Point { signature: 1e6 * one.predicted * weight, residual: 1e6 * one.measured * weight, weight }
+    };
+    let points: Vec<Point> = shown.iter().map(point).collect();
+    let (measured, [from, to]) = means(&points, "measured ± 1 σ: the mean of many readings");
+    let line = Series::line("slope 1", vec![from, to], vec![from, to]);
+    let (x_label, y_label) =
+        ("change by the best kick of each frame [µm]", "reading less the mean of its setting [µm]");
+    let caption = "Readings in which the corrector is on, less the mean of the frames of the same setting, against what one more kick of this corrector, fitted \
+                   to each frame, should make of them by its measured response. Were the corrector steady, no change would be larger than the noise makes it.";
+    (caption.into(), Figure::lines(&Axes::new(&capitalised(&finding.phrase), x_label, y_label), &[measured, line]))
+}
+
 /// The figure of what passes within settings: first frames against the frames before the change.
 pub fn of_first_frames(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
     // in um, the signature per percent of the share

@@ -95,7 +95,8 @@ pub fn figures(diagnosis: &Diagnosis, one: &Discrepancy) -> Result<Vec<(String, 
         Location::Tunes => tunes::of_model(&found.data, &found.best, &left.title())?,
         Location::Time => vec![left.map_in_time()],
         // what passes within settings has a picture of its own; what noise has in common is in the table of imperfections
-        Location::Everywhere | Location::FirstFrames { .. } | Location::FrameToFrame => Vec::new(),
+        Location::FirstFrames { .. } | Location::UnsteadyCorrector(_) => Vec::new(),
+        Location::Everywhere | Location::FrameToFrame => Vec::new(),
     })
 }
 

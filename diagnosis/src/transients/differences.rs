@@ -27,6 +27,9 @@ const FEWEST: usize = 20;
 const NORMAL: f64 = 1.4826;
 /// Distance from its run, in standard deviations, at which a reading jumps.
 const JUMPS: f64 = 4.5;
+/// Share of the monitors, and number of them at least, that do not jump at once by themselves.
+const MANY: f64 = 0.2;
+const SEVERAL: usize = 3;
 /// Median distance of all readings of a frame from their run, in standard deviations, at which there was no beam, or one from elsewhere: 0.7 is
 /// usual.
 const LOST: f64 = 4.0;
@@ -47,15 +50,24 @@ impl Differences {
             counts.row_mut(frame).fill(false);
         }
         let mut sigma = noise.to_vec();
+        let mut jumping = vec![Vec::new(); sigma.len()];
         for (b, sigma) in sigma.iter_mut().enumerate() {
             let reading = |frame: usize| if counts[(frame, b)] { readings[(frame, b)] } else { f64::NAN };
             let column: Vec<f64> = (0..readings.nrows()).map(reading).collect();
             let [typical, rms] = repeated(&column, &runs).unwrap_or([*sigma; 2]);
-            // one that jumps in later frames does so in first ones too, as if it were late
-            if typical == 0.0 || jumps(&column, &runs, typical) {
+            if typical == 0.0 {
                 counts.column_mut(b).fill(false);
             }
+            jumping[b] = jumps(&column, &runs, typical);
             *sigma = rms;
+        }
+        // one that jumps by itself in later frames does so in first ones too, as if it were late
+        let at_once = |frame: usize| jumping.iter().filter(|one| one.contains(&frame)).count();
+        let many = SEVERAL.max((MANY * sigma.len() as f64) as usize + 1);
+        let by_itself = |frame: &usize| at_once(*frame) < many;
+        let jumps = jumping.iter().map(|one| one.iter().any(by_itself));
+        for (mut counts, _) in counts.column_iter_mut().zip(jumps).filter(|(_, jumps)| *jumps) {
+            counts.fill(false);
         }
         let dispersion = dispersion.iter().zip(&sigma).map(|(d, sigma)| d / sigma.max(f64::MIN_POSITIVE)).collect();
         let mut differences = Self { runs, counts, sigma, dispersion, ripple: Vec::new() };
@@ -107,6 +119,13 @@ impl Differences {
         if square > 0.0 {
             counting.iter().for_each(|&b| white[(frame, b)] -= self.dispersion[b] * along / square);
         }
+    }
+
+    /// An orbit [m] that is added to every frame, over the noise and without the direction of the dispersion, rows frames; 0 where nothing counts.
+    pub fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
+        let mut all = self.counts.map_with_location(|_, b, counts| if counts { orbit[b] / self.sigma[b] } else { 0.0 });
+        self.runs.iter().flat_map(Clone::clone).for_each(|frame| self.without_momentum(&mut all, frame));
+        all
     }
 
     /// Noise of a monitor [m].
@@ -188,13 +207,14 @@ fn repeated(column: &[f64], runs: &[Range<usize>]) -> Option<[f64; 2]> {
     (sizes.len() >= FEWEST).then(|| [NORMAL * median(&mut sizes), rms].map(|d| d * core::f64::consts::FRAC_1_SQRT_2))
 }
 
-/// True if any frame after the first of its run is far from the median of these.
-fn jumps(column: &[f64], runs: &[Range<usize>], sigma: f64) -> bool {
-    runs.iter().any(|run| {
-        let later = || column[run.start + 1..run.end].iter().copied().filter(|x| x.is_finite());
-        let middle = median(&mut later().collect::<Vec<_>>());
-        later().any(|x| (x - middle).abs() > JUMPS * sigma)
-    })
+/// Frames after the first of their run that are far from the median of these.
+fn jumps(column: &[f64], runs: &[Range<usize>], sigma: f64) -> Vec<usize> {
+    let of_run = |run: &Range<usize>| {
+        let later = (run.start + 1..run.end).filter(|&frame| column[frame].is_finite());
+        let middle = median(&mut later.clone().map(|frame| column[frame]).collect::<Vec<_>>());
+        later.filter(move |&frame| (column[frame] - middle).abs() > JUMPS * sigma)
+    };
+    runs.iter().flat_map(of_run).collect()
 }
 
 /// Median, 0 of none.

@@ -1,4 +1,5 @@
-//! What passes within a setting: a monitor that is late, a corrector that settles, a machine that keeps a share of its former orbit.
+//! What passes within a setting: a monitor that is late, a corrector that settles, a machine that keeps a share of its former orbit, a corrector that is
+//! unsteady ([`unsteady`]).
 //!
 //! All other physics is the same in every frame of a setting, and these show in the frames after a change, so that the two are found apart:
 //! here from the differences within the runs of frames of one setting (`differences.rs`), by signals made of measured orbits
@@ -14,6 +15,7 @@
 
 mod differences;
 mod signals;
+mod unsteady;
 
 use core::ops::Range;
 
@@ -35,6 +37,7 @@ use differences::{Differences, median, run_means};
 use inference::Campaign;
 use inference::recording::Recording;
 use signals::Signals;
+use unsteady::Unsteady;
 
 /// What passes within the settings of a recording.
 #[derive(Debug, Clone)]
@@ -111,10 +114,13 @@ impl Transients {
             && let Some((transient, without)) = Within::of(&campaign, &dispersion).strongest()
         {
             campaign = Campaign::of(ring, &without)?;
-            let is_known = transient.alternatives[0].is_of_library();
+            let is_of_first_frames = matches!(
+                &transient.alternatives[0].cause,
+                Cause::Unmodelled(Discrepancy { at: Location::FirstFrames { .. }, .. })
+            );
             found.push(transient);
-            // the frames that showed what is not known are gone
-            if !is_known {
+            // first frames, which show what passes, are gone
+            if is_of_first_frames {
                 break;
             }
         }
@@ -206,17 +212,19 @@ impl<'c> Within<'c> {
         let slopes: Vec<DMatrix<f64>> = self.terms.iter().map(|&term| self.slope(&signals, term, 0.0)).collect();
         let first_order = self.weights(&slopes, &self.white);
         let (of_former, of_terms) = first_order.split_last()?;
-        let (fits, unmodelled) = (self.leaders(of_terms), self.former_orbit(&signals));
-        let of_former = unmodelled.as_ref().map_or(f64::NEG_INFINITY, |_| *of_former);
+        let (mut fits, mut former) = (self.leaders(of_terms), self.former_orbit(&signals));
+        let of_former = former.as_ref().map_or(f64::NEG_INFINITY, |_| *of_former);
         let best = fits.iter().map(|fit| of_terms[fit.at]).fold(of_former, f64::max);
         let chance = if best > 0.0 { self.by_chance(&slopes, best) } else { 1.0 };
         if chance > RARE {
-            return None;
+            fits.clear();
+            former = None;
         }
         let mut weights: Vec<(Alternative, f64)> =
             fits.iter().map(|fit| (fit.alternative(), fit.log_bayes + self.log_prior(fit.term))).collect();
-        weights.extend(unmodelled.map(|one| {
-            let weight = one.log_bayes + log_prior_unmodelled();
+        // of a corrector that is unsteady no frame is the first
+        weights.extend(former.into_iter().chain(self.unsteady(&signals)).map(|one| {
+            let weight = one.log_bayes + log_prior_unmodelled() - (one.sites as f64).ln();
             (Alternative::unmodelled(one), weight)
         }));
         let Weighed { alternatives, nothing, .. } = Weighed::of(weights);
@@ -231,6 +239,10 @@ impl<'c> Within<'c> {
             (Some(fit), _) => (self.shown(&(&fit.signal / fit.amplitude)), self.less(&fit.signal)),
             (None, Cause::Unmodelled(Discrepancy { at: Location::FirstFrames { from, to }, .. })) => {
                 (self.shown(&signals.of_former_orbit()), self.without_first_frames(*from, *to))
+            }
+            (None, Cause::Unmodelled(Discrepancy { at: Location::UnsteadyCorrector(c), .. })) => {
+                let unsteady = Unsteady::of(&self.differences, &self.white, signals.of_corrector(*c))?;
+                (unsteady.shown(&self.readings, |frame| self.is_on(*c, frame)), self.without_corrector(*c))
             }
             (None, _) => return None,
         };
@@ -296,6 +308,23 @@ impl<'c> Within<'c> {
         let rms = (some.iter().map(|x| x * x).sum::<f64>() / some.len().max(1) as f64).sqrt();
         let at = Location::FirstFrames { from, to };
         Some(Discrepancy { at, campaign: 0, log_bayes, size: share * rms, sites: 1, adapted: None })
+    }
+
+    /// Each corrector as one that is unsteady.
+    fn unsteady(&self, signals: &Signals) -> Vec<Discrepancy> {
+        let frames = self.campaign.drives.len();
+        let driven = |&c: &usize| (0..frames).any(|frame| self.is_on(c, frame));
+        let correctors: Vec<usize> = (0..self.campaign.ring.correctors.len()).filter(driven).collect();
+        let of = |&c: &usize| {
+            let one = Unsteady::of(&self.differences, &self.white, signals.of_corrector(c))?;
+            one.judge(c, |frame| self.is_on(c, frame), correctors.len())
+        };
+        correctors.iter().filter_map(of).collect()
+    }
+
+    /// True of a frame in which a corrector kicks the beam.
+    fn is_on(&self, corrector: usize, frame: usize) -> bool {
+        self.campaign.drives[frame].kick[corrector].abs() > DRIVEN * self.campaign.recording.nominal_kick()
     }
 
     /// Variance of the readings along the signal of an effect.
@@ -380,6 +409,14 @@ impl<'c> Within<'c> {
         for (row, values) in recording.rows.iter_mut().zip(signal.row_iter()) {
             row.reading.iter_mut().zip(values.iter()).for_each(|(to, signal)| *to = to.map(|reading| reading - signal));
         }
+        recording
+    }
+
+    /// The recording without the readings in which a corrector kicks the beam.
+    fn without_corrector(&self, corrector: usize) -> Recording {
+        let mut recording = self.campaign.recording.clone();
+        let rows = recording.rows.iter_mut().enumerate().filter(|(frame, _)| self.is_on(corrector, *frame));
+        rows.for_each(|(_, row)| row.reading.fill(None));
         recording
     }
 

@@ -61,6 +61,11 @@ impl<'c> Signals<'c> {
         DMatrix::from_columns(&columns)
     }
 
+    /// Measured response of the monitors to a corrector [m/rad].
+    pub fn of_corrector(&self, corrector: usize) -> DVector<f64> {
+        self.response.row(corrector).transpose()
+    }
+
     /// What the orbit of the cycle before has beyond that of each frame, at a monitor [m]; 0 where that cycle is not recorded.
     fn coming(&self, b: usize) -> DVector<f64> {
         let change = |frame: usize| match self.elapsed[frame] {

@@ -9,7 +9,7 @@ use twin::{Effect, EffectError, EffectKind, Ring};
 use super::imperfect::{Families, Imperfections};
 use super::unmodelled::{Unmodelled, UnmodelledKind};
 use crate::data::{Data, DataError};
-use crate::hypothesis::Term;
+use crate::hypothesis::{Term, in_order};
 use crate::scan::candidates;
 use crate::score::{TrueCause, TrueEffect, Truth};
 use inference::Campaign;
@@ -126,14 +126,11 @@ impl Case {
     /// [`EffectError`] if its machine keeps no beam.
     pub fn recording(&self, ring: &Ring, template: &Recording) -> Result<Recording, EffectError> {
         let mut hardware = Hardware::shipped(ring, template);
-        // the current of a dead corrector is none before its coils couple, and what a dead monitor reads is none after its electronics' gain
-        let (mut effects, others): (Vec<Effect>, Vec<Effect>) =
-            self.effects.iter().partition(|effect| effect.kind.is_of_a_corrector());
-        if let Some(Imperfections { effects: ordinary, noise }) = &self.imperfections {
+        let ordinary = self.imperfections.iter().flat_map(|one| one.effects.iter().copied());
+        let effects = in_order(self.effects.clone(), ordinary);
+        if let Some(Imperfections { noise, .. }) = &self.imperfections {
             hardware.noise.iter_mut().for_each(|own| *own *= noise);
-            effects.extend(ordinary);
         }
-        effects.extend(others);
         let beyond: Vec<&dyn Beyond> = self.unmodelled.iter().map(|one| one as &dyn Beyond).collect();
         let truth = simulate::Truth { vars: &self.vars, effects: &effects, beyond: &beyond };
         simulate::campaign(template, ring, &truth, &hardware, self.seed)

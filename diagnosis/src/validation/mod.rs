@@ -25,6 +25,7 @@ use crate::data::{Data, DataError};
 use crate::fit::Fitted;
 use crate::hypothesis::{Hypothesis, Term};
 use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
+use crate::search::Found;
 use crate::{Diagnosis, Finding, Verdict};
 pub use case::{Case, Cases, Class};
 use inference::Campaign;
@@ -65,6 +66,8 @@ pub struct Outcome {
     pub covered: Vec<bool>,
     /// Whether a finding is within the distance of two quadrupoles of the place of physics that the library does not hold.
     pub near: bool,
+    /// Of such physics that is named as something else: gain in `ln` posterior of its exact signal over that name.
+    pub beyond_name: Option<f64>,
     /// NEES per var before and after.
     pub nees: [f64; 2],
     /// Time of the diagnosis [s].
@@ -104,6 +107,8 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     let started = Instant::now();
     let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
+    let is_named = !case.unmodelled.is_empty() && diagnosis.verdict == Verdict::Identified;
+    let beyond_name = if is_named { beyond_name(ring, template, case, &recording, &diagnosis.found)? } else { None };
     let key = case.key(ring);
     let names = ring.var_names();
     Ok(Some(Outcome {
@@ -123,6 +128,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
         near: case.unmodelled.iter().any(|one| is_near(ring, &diagnosis, one))
             || key.effects.iter().any(|effect| effect.is_told(&diagnosis)),
         nees: [key.nees(&names, &diagnosis.vars_before), key.nees(&names, &diagnosis.vars_after)],
+        beyond_name,
         truth: key.effects.iter().map(|effect| Made::of(effect, ring)).collect(),
         seconds,
     }))
@@ -217,10 +223,7 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
     };
     let nothing = best(&data, &[])?;
     if !case.unmodelled.is_empty() {
-        // what is not in the library is told by its signal
-        let plain = Case { unmodelled: Vec::new(), ..case.clone() };
-        let Ok(without) = plain.recording(ring, template) else { return Ok(None) };
-        let cleaned = data.less(&signal(&recording, &without), &tunes(&recording, &without));
+        let Some(cleaned) = without_signal(ring, template, case, &recording, &data) else { return Ok(None) };
         let gain = best(&cleaned, &[])? - nothing;
         return Ok(Some((gain, vec![gain])));
     }
@@ -231,6 +234,29 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
         Ok(all - if others.is_empty() { nothing } else { best(&data, &others)? })
     };
     Ok(Some((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?)))
+}
+
+/// What the readings say of physics that the library does not hold and that is named as something else: how much more likely they are with its exact
+/// signal than with that name, all that is ordinary fitted beside both; in `ln` posterior.
+fn beyond_name(
+    ring: &Ring,
+    template: &Recording,
+    case: &Case,
+    recording: &Recording,
+    found: &Found,
+) -> Result<Option<f64>, DataError> {
+    let Found { data, best, .. } = found;
+    let Some(cleaned) = without_signal(ring, template, case, recording, data) else { return Ok(None) };
+    let nothing = best.hypothesis.without_terms(|_| true);
+    let fitted = Fitted::of(&cleaned, &nothing, &best.guess(data, &nothing))?;
+    Ok(Some(fitted.log_posterior(&cleaned) - best.log_posterior(data)))
+}
+
+/// The readings of a case less what its physics outside the library adds; none if the machine keeps no beam without that.
+fn without_signal(ring: &Ring, template: &Recording, case: &Case, recording: &Recording, data: &Data) -> Option<Data> {
+    let plain = Case { unmodelled: Vec::new(), ..case.clone() };
+    let without = plain.recording(ring, template).ok()?;
+    Some(data.less(&signal(recording, &without), &tunes(recording, &without)))
 }
 
 /// What the effect adds to each reading [m].

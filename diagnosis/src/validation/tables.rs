@@ -43,6 +43,8 @@ pub struct Unknown {
     pub near: Share,
     /// Named as something else.
     pub named: usize,
+    /// Of these, names that the readings refute: they are more likely by over 25 nat with the true signal than with the name.
+    pub refuted: usize,
 }
 
 /// What became of campaigns on ideal machines, or on machines with ordinary imperfections.
@@ -253,7 +255,11 @@ impl Tables {
         }
         writeln!(text, "\nCampaigns with a false identification: {}.", self.wrong.text())?;
         self.write_unknown(text)?;
-        writeln!(text, "\nA place is right within the mean distance of two quadrupoles.")?;
+        writeln!(
+            text,
+            "\nA place is right within the mean distance of two quadrupoles. A name is refuted where the readings are more likely with the \
+             exact signal than with that name by over 25 nat, in ln posterior; by less the name describes them nearly as well as the truth."
+        )?;
         writeln!(
             text,
             "\nPower: single effects named right, by size (in prior standard deviations; kinds without one: all):\n"
@@ -320,11 +326,12 @@ impl Tables {
             writeln!(text, "\nPhysics outside the library, {group}:\n")?;
             writeln!(
                 text,
-                "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else |"
+                "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else | \
+                 of these, refuted by the readings |"
             )?;
-            writeln!(text, "|---|---|---|---|")?;
-            for (bin, Unknown { undecided, near, named }) in rows {
-                writeln!(text, "| {} | {} | {} | {named} |", range(bin), undecided.text(), near.text())?;
+            writeln!(text, "|---|---|---|---|---|")?;
+            for (bin, Unknown { undecided, near, named, refuted }) in rows {
+                writeln!(text, "| {} | {} | {} | {named} | {refuted} |", range(bin), undecided.text(), near.text())?;
             }
         }
         Ok(())
@@ -372,7 +379,9 @@ fn unknown(outcomes: &[Outcome], is_frozen: bool) -> Vec<([f64; 2], Unknown)> {
         let all: Vec<&Outcome> = outcomes.iter().filter(is_one).filter(within).collect();
         let share = |is: fn(&Outcome) -> bool| Share::of(all.iter().copied(), is);
         let undecided = share(|outcome| outcome.grade == Grade::Open);
-        (bin, Unknown { undecided, near: share(|outcome| outcome.near), named: share(is_named).of })
+        let is_refuted = |outcome: &Outcome| outcome.beyond_name.is_some_and(|gain| gain > VISIBLE);
+        let (named, refuted) = (share(is_named).of, share(is_refuted).of);
+        (bin, Unknown { undecided, near: share(|outcome| outcome.near), named, refuted })
     };
     GAINS.map(of).into()
 }
@@ -393,7 +402,9 @@ fn power<'o>(outcomes: impl Iterator<Item = &'o Outcome>) -> BTreeMap<String, [S
 fn confusion(outcome: &Outcome) -> (String, String) {
     let truth: Vec<&str> = outcome.truth.iter().map(|made| made.label.as_str()).collect();
     let truth = if truth.is_empty() { "nothing".into() } else { truth.join(" + ") };
-    (format!("{truth} (oracle gain {:.1})", outcome.oracle_gain), outcome.found.join(" + "))
+    let said = outcome.found.join(" + ");
+    let beyond = outcome.beyond_name.map_or(String::new(), |gain| format!("; {gain:.1} nat tell it from that"));
+    (format!("{truth} (oracle gain {:.1})", outcome.oracle_gain), said + &beyond)
 }
 
 fn range([from, to]: &[f64; 2]) -> String {

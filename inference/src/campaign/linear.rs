@@ -1,6 +1,6 @@
 //! The exact ring at given params and mean supplies, and to first order about them: what predictions of frames are made of.
 
-use nalgebra::{DMatrix, DVector, DVectorView};
+use nalgebra::{DMatrix, DVector};
 use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
 use super::Campaign;
@@ -13,7 +13,7 @@ pub(crate) struct Linearised {
     response: DMatrix<f64>,
     /// Its derivative with respect to each param, of each monitor [N][C].
     slopes: Vec<DMatrix<f64>>,
-    /// The same with respect to `ln` of each supply's strength [F][C].
+    /// The same with respect to `ln` of each supply's strength, of each supply [B][C].
     supply_slopes: Vec<DMatrix<f64>>,
     rf: Vec<RfOrbit>,
     /// Tunes.
@@ -82,7 +82,7 @@ struct RfOrbit {
     offset: f64,
     /// [B] [m].
     orbit: DVector<f64>,
-    /// [N][B] and [F][B].
+    /// [N][B] and [B][F].
     slopes: DMatrix<f64>,
     supply_slopes: DMatrix<f64>,
 }
@@ -106,16 +106,18 @@ impl Linearised {
         let (params, supply_count) = (ring.parameters.len(), ring.supplies.len());
         let (monitors, correctors) = (observers.len(), sources.len());
         let mut slopes = vec![DMatrix::zeros(params, correctors); monitors];
-        let mut supply_slopes = vec![DMatrix::zeros(supply_count, correctors); monitors];
+        let mut supply_slopes = vec![DMatrix::zeros(monitors, correctors); supply_count];
         // d/d ln k = k1 d/dk1
         for (m, gradient) in gradients.iter().enumerate() {
-            let slope = held.jacobian(&optics, &observers, &sources, gradient);
-            for (to, index) in [(&mut slopes, by_param(m)), (&mut supply_slopes, by_supply(m))] {
-                let Some(index) = index else { continue };
-                for (b, to) in to.iter_mut().enumerate() {
-                    let mut row = to.row_mut(index);
-                    row += slope.row(b) * k1[m];
+            let slope = held.jacobian(&optics, &observers, &sources, gradient) * k1[m];
+            if let Some(param) = by_param(m) {
+                for (of_monitor, slope) in slopes.iter_mut().zip(slope.row_iter()) {
+                    let mut row = of_monitor.row_mut(param);
+                    row += slope;
                 }
+            }
+            if let Some(supply) = by_supply(m) {
+                supply_slopes[supply] += slope;
             }
         }
         let rf_slope = optics.rf_jacobian(&observers, &gradients);
@@ -134,12 +136,7 @@ impl Linearised {
             (summed(&rf_slope, params, &by_param), summed(&rf_slope, supply_count, &by_supply));
         let rf = |offset: f64| {
             let orbit = rf_orbit(ring, offset)?;
-            Ok(RfOrbit {
-                offset,
-                orbit,
-                slopes: rf_params.transpose() * offset,
-                supply_slopes: rf_supplies.transpose() * offset,
-            })
+            Ok(RfOrbit { offset, orbit, slopes: rf_params.transpose() * offset, supply_slopes: &rf_supplies * offset })
         };
         Ok(Self {
             response: held.response(&optics, &observers, &sources),
@@ -157,36 +154,32 @@ impl Linearised {
     pub fn orbits(&self, drives: &[Drive]) -> DMatrix<f64> {
         let kicks = self.kicks(drives);
         let off = columns(self.supplies.len(), drives, |drive| &drive.strength - &self.supplies);
-        let mut orbits = (&self.response * &kicks).transpose();
-        for (b, mut orbit) in orbits.column_iter_mut().enumerate() {
-            let by_supply = self.along(&self.supply_slopes[b], &kicks, drives, |rf| rf.supply_slopes.column(b));
-            for (i, (orbit, drive)) in orbit.iter_mut().zip(drives).enumerate() {
-                *orbit += self.rf(drive).map_or(0.0, |rf| rf.orbit[b]) + by_supply.column(i).dot(&off.column(i));
+        let mut orbits = &self.response * &kicks;
+        for (slope, off) in self.supply_slopes.iter().zip(off.row_iter()) {
+            let moved = slope * &kicks;
+            for ((mut orbit, moved), off) in orbits.column_iter_mut().zip(moved.column_iter()).zip(off.iter()) {
+                orbit.axpy(*off, &moved, 1.0);
             }
         }
-        orbits
+        for (i, mut orbit) in orbits.column_iter_mut().enumerate() {
+            let Some(rf) = self.rf(&drives[i]) else { continue };
+            orbit += &rf.orbit + &rf.supply_slopes * off.column(i);
+        }
+        orbits.transpose()
     }
 
     /// Derivative of the orbits with respect to the params, of each monitor: rows params, columns frames.
     pub fn slopes(&self, drives: &[Drive]) -> Vec<DMatrix<f64>> {
         let kicks = self.kicks(drives);
         let slopes = self.slopes.iter().enumerate();
-        slopes.map(|(b, slope)| self.along(slope, &kicks, drives, |rf| rf.slopes.column(b))).collect()
-    }
-
-    /// A derivative of one monitor's response, times the drives of all frames.
-    fn along<'l>(
-        &'l self,
-        slope: &DMatrix<f64>,
-        kicks: &DMatrix<f64>,
-        drives: &[Drive],
-        of_rf: impl Fn(&'l RfOrbit) -> DVectorView<'l, f64>,
-    ) -> DMatrix<f64> {
-        let mut along = slope * kicks;
-        for (mut column, drive) in along.column_iter_mut().zip(drives) {
-            self.rf(drive).into_iter().for_each(|rf| column += of_rf(rf));
-        }
-        along
+        let along = |(b, slope): (usize, &DMatrix<f64>)| {
+            let mut along = slope * &kicks;
+            for (mut column, drive) in along.column_iter_mut().zip(drives) {
+                self.rf(drive).into_iter().for_each(|rf| column += rf.slopes.column(b));
+            }
+            along
+        };
+        slopes.map(along).collect()
     }
 
     fn rf(&self, drive: &Drive) -> Option<&RfOrbit> {

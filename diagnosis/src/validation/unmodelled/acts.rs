@@ -14,6 +14,8 @@ const FULL_KICK: f64 = 2e-4;
 const CRATE: usize = 8;
 /// Change of position over which the ripple of a logarithmic amplifier repeats [m].
 const RIPPLE: f64 = 1.5e-3;
+/// Share of the charge of a spark that a ceramic break collects in a cycle without kicks.
+const CATCH: f64 = 0.04;
 
 impl Beyond for Unmodelled {
     fn alter_ring(&self, ring: &mut Ring) {
@@ -132,6 +134,13 @@ impl Unmodelled {
                 let before = past.others.replace(others).unwrap_or(others);
                 self.size * (others - before) / FULL_KICK
             }
+            UnmodelledKind::ChargedCeramic => {
+                let charge = past.charge;
+                let halo = 1.0 + kicks.iter().map(|kick| kick.abs()).sum::<f64>() / FULL_KICK;
+                let caught = CATCH * halo * (1.0 + 0.5 * past.draw);
+                past.charge = if charge > 1.0 { 0.0 } else { charge + caught };
+                self.size * charge
+            }
             _ => 0.0,
         };
         kicks[self.index] += change;
@@ -191,6 +200,8 @@ struct Past {
     rest: f64,
     /// How unevenly a current is shared, -1 to 1.
     creep: f64,
+    /// Of a ceramic break, in units of that at which it sparks.
+    charge: f64,
 }
 
 impl Past {
@@ -207,6 +218,8 @@ impl Past {
             trim: 0.0,
             rest: 0.0,
             creep: 0.0,
+            // somewhere between two sparks
+            charge: seed + 0.5,
         }
     }
 

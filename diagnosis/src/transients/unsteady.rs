@@ -1,0 +1,202 @@
+//! A corrector whose kick differs from frame to frame of a setting, as where its supply hunts.
+//!
+//! In the runs in which it is on, each frame has a kick of its own, of standard deviation `omega`, which moves the monitors along the measured response
+//! `p` (over their noise). With `w` the whitened differences of a run of `n` frames, less its mean,
+//!
+//! `z = p.w/sqrt(v p.p)`, `ln Bayes factor = sum of z^2 q/(1 + q)/2 - (n - 1) ln(1 + q)/2`, `q = omega^2 p.p/v`,
+//!
+//! averaged over omega. The variance `v` along `p` is that in the runs in which the corrector is off: what moves the monitors in every setting is
+//! no corrector's; where the noise across `p` is larger in its own runs, so is `v`. One trip is no unsteady supply: the other runs have to confirm what
+//! the most telling one shows.
+
+use core::ops::Range;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::Shown;
+use super::differences::Differences;
+use crate::discrepancy::{Discrepancy, SIZES};
+use crate::location::Location;
+
+/// `ln` odds, 95 %, at which the runs but the most telling one confirm it.
+const CONFIRMED: f64 = 2.94;
+
+/// What the runs of frames say of one corrector.
+pub struct Unsteady<'d> {
+    differences: &'d Differences,
+    /// Whitened differences, rows frames.
+    white: &'d DMatrix<f64>,
+    /// The corrector's response, of rms 1.
+    response: DVector<f64>,
+    /// What that does to whitened readings per metre, rows frames.
+    pattern: DMatrix<f64>,
+}
+
+/// Sums over one run, or over several.
+#[derive(Default)]
+struct Sums {
+    /// Differences: frames less runs.
+    count: f64,
+    /// Sum of `(p.w)^2/p.p`.
+    along: f64,
+    /// Sum of `w.w` without that, and how many numbers that is of.
+    across: f64,
+    numbers: f64,
+    /// Sum of `p.p` over the frames, and their number.
+    power: f64,
+    frames: f64,
+}
+
+impl<'d> Unsteady<'d> {
+    /// `response`: what the corrector does to each monitor, in any unit; none if it does nothing.
+    pub fn of(differences: &'d Differences, white: &'d DMatrix<f64>, response: DVector<f64>) -> Option<Self> {
+        let rms = response.norm() / (response.len() as f64).sqrt();
+        let response = response / rms;
+        (rms > 0.0).then(|| Self { differences, white, pattern: differences.of_orbit(&response), response })
+    }
+
+    /// The discrepancy, if there are two runs or more in which the corrector is on; one of some `sites`.
+    pub fn judge(&self, corrector: usize, is_on: impl Fn(usize) -> bool, sites: usize) -> Option<Discrepancy> {
+        let (own, others): (Vec<Range<usize>>, Vec<Range<usize>>) =
+            self.differences.runs.iter().cloned().partition(|run| is_on(run.start));
+        let each: Vec<Sums> = own.iter().map(|run| self.sums([run])).collect();
+        let (all, of_others) = (self.sums(&own), self.sums(&others));
+        if each.len() < 2 || all.power == 0.0 || of_others.count == 0.0 {
+            return None;
+        }
+        let louder = (all.across / all.numbers) / (of_others.across / of_others.numbers).max(f64::MIN_POSITIVE);
+        let variance = (of_others.along / of_others.count).max(1.0) * louder.max(1.0);
+        let logs = SIZES.map(|size| each.iter().map(|run| run.log_bayes(size, variance)).collect::<Vec<f64>>());
+        let of = |logs: [f64; SIZES.len()]| Discrepancy::of(Location::UnsteadyCorrector(corrector), logs, sites);
+        let sum = |of_runs: &Vec<f64>| of_runs.iter().sum::<f64>();
+        let most = |of_runs: &Vec<f64>| of_runs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let of_others = of(logs.each_ref().map(|one| sum(one) - most(one)));
+        (of_others.log_bayes > CONFIRMED).then(|| of(logs.each_ref().map(sum)))
+    }
+
+    /// In each frame in which it is on the readings less the mean of their run, against what the kick that suits the frame best should make of them.
+    pub fn shown(&self, readings: &DMatrix<f64>, is_on: impl Fn(usize) -> bool) -> Vec<Shown> {
+        let mut shown = Vec::new();
+        for run in self.differences.runs.iter().filter(|run| is_on(run.start)) {
+            for b in (0..readings.ncols()).filter(|&b| self.differences.sees(b)) {
+                let mean = readings.view((run.start, b), (run.len(), 1)).mean();
+                let sigma = self.differences.noise(b) * (1.0 - (run.len() as f64).recip()).sqrt();
+                for frame in run.clone() {
+                    let (p, w) = (self.pattern.row(frame), self.white.row(frame));
+                    let (power, measured) = (p.norm_squared(), readings[(frame, b)] - mean);
+                    if power > 0.0 && measured.is_finite() {
+                        let predicted = self.response[b] * p.dot(&w) / power;
+                        shown.push(Shown { predicted, measured, sigma });
+                    }
+                }
+            }
+        }
+        shown
+    }
+
+    fn sums<'r>(&self, runs: impl IntoIterator<Item = &'r Range<usize>>) -> Sums {
+        let mut sums = Sums::default();
+        for run in runs {
+            sums.count += (run.len() - 1) as f64;
+            for frame in run.clone() {
+                let (p, w) = (self.pattern.row(frame), self.white.row(frame));
+                let (power, square) = (p.norm_squared(), w.norm_squared());
+                let along = if power > 0.0 { p.dot(&w).powi(2) / power } else { 0.0 };
+                // of n numbers less their mean, n - 1 are free
+                let free = 1.0 - (run.len() as f64).recip();
+                sums.along += along;
+                sums.across += square - along;
+                sums.numbers += free * (w.iter().filter(|x| **x != 0.0).count() as f64 - 1.0).max(0.0);
+                sums.power += power;
+                sums.frames += 1.0;
+            }
+        }
+        sums
+    }
+}
+
+impl Sums {
+    /// Of kicks that move the monitors by `size` [m] rms; `variance` along the pattern without them.
+    fn log_bayes(&self, size: f64, variance: f64) -> f64 {
+        let q = size * size * self.power / (self.frames * variance);
+        0.5 * (self.along / variance * q / (1.0 + q) - self.count * q.ln_1p())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use inference::Recording;
+    use inference::simulate::Beyond;
+    use rand::SeedableRng;
+    use rand::rngs::StdRng;
+    use rand_distr::{Distribution, StandardNormal};
+    use twin::{Cycle, Ring};
+
+    use super::*;
+    use crate::alternatives::Cause;
+    use crate::testing::{Coloured, template};
+    use crate::transients::Transients;
+
+    /// A corrector whose kick is off by shares that repeat after four frames, or in one frame only.
+    struct Hunting {
+        corrector: usize,
+        share: f64,
+        only: Option<usize>,
+    }
+
+    impl Beyond for Hunting {
+        fn alter_cycles(&self, cycles: &mut [Cycle]) {
+            for (frame, cycle) in cycles.iter_mut().enumerate().filter(|(i, _)| self.only.is_none_or(|one| one == *i)) {
+                cycle.kick[self.corrector] *= 1.0 + self.share * [1.0, -0.6, 0.3, -0.9][frame % 4];
+            }
+        }
+    }
+
+    fn found(hunting: &Hunting, noise: impl Fn(&mut Coloured)) -> (Ring, Recording, Vec<Location>) {
+        let (ring, recording) = template();
+        let mut made = Coloured::white(&ring, &recording, 7);
+        noise(&mut made);
+        let made = made.campaign_with(&ring, &recording, &[], &[hunting]);
+        let found = Transients::of(&ring, &made).unwrap();
+        let at = found.found.iter().filter_map(|one| match &one.alternatives[0].cause {
+            Cause::Unmodelled(one) => Some(one.at.clone()),
+            Cause::Effect(_) => None,
+        });
+        (ring, found.campaign.recording.clone(), at.collect())
+    }
+
+    /// By 19 to 75 % rms of its kick; its frames are left out.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn a_corrector_that_hunts_is_found_and_left_out() {
+        for (corrector, share) in [(4, 0.25), (9, 0.3), (15, 0.6), (20, 1.0)] {
+            let (_, recording, found) = found(&Hunting { corrector, share, only: None }, |_| ());
+            assert_eq!(found, [Location::UnsteadyCorrector(corrector)], "{share}");
+            let kicked = recording.rows.iter().filter(|row| row.reading.iter().all(Option::is_none)).count();
+            assert!((5..12).contains(&kicked), "two runs of three or four frames: {kicked}");
+        }
+    }
+
+    /// Off in one frame; and noise that is larger in its frames, which all monitors have.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn neither_a_trip_nor_noise_is_an_unsteady_supply() {
+        let (_, recording) = template();
+        let on = |i: usize| recording.rows[i].correctors.iter().find(|(_, current)| current.abs() > 1.0);
+        let frame = (100..recording.rows.len()).find(|&i| on(i).is_some()).unwrap();
+        let corrector = on(frame).unwrap().0;
+        assert_eq!(found(&Hunting { corrector, share: -1.0, only: Some(frame + 1) }, |_| ()).2, []);
+        let frames: Vec<usize> =
+            (0..recording.rows.len()).filter(|&i| on(i).is_some_and(|(c, _)| *c == corrector)).collect();
+        let steady = Hunting { corrector, share: 0.0, only: None };
+        let louder = |made: &mut Coloured| {
+            let mut random = StdRng::seed_from_u64(3);
+            let monitors = made.dispersion.len();
+            made.common = DMatrix::from_fn(recording.rows.len(), monitors, |i, _| {
+                let draw: f64 = StandardNormal.sample(&mut random);
+                if frames.contains(&i) { 3.0 * made.noise * draw } else { 0.0 }
+            });
+        };
+        assert_eq!(found(&steady, louder).2, []);
+    }
+}
