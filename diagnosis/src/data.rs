@@ -1,7 +1,8 @@
 //! A recording whitened: one vector of independent numbers of variance 1.
 //!
 //! The readings of a monitor have unknown terms in common: its baseline (orbit and offset), the change of that with the supplies and
-//! with the RF frequency (caused by misalignments), and, where all quadrupoles drift, with the time. Each is a vector `u` over the
+//! with the RF frequency (caused by misalignments, which also lengthen the orbit and with it move the momentum that a frequency sets), and, where all
+//! quadrupoles drift, with the time. Each is a vector `u` over the
 //! frames with an unknown factor of known standard deviation, so that the readings' covariance is
 //!
 //! `S = sigma^2 (1 + U U^T)`, and with the thin decomposition `U = Q D V^T`,
@@ -459,7 +460,13 @@ impl Data {
         let rf = DVector::from_iterator(rows.len(), rows.iter().map(|&i| drives.rf_offset[i]));
         let at = shared.ncols();
         let mut shared = shared.insert_column(at, 0.0);
-        shared.set_column(at, &(rf * self.baseline.spurious[plane]));
+        shared.set_column(at, &(&rf * self.baseline.spurious[plane]));
+        let lengthened = rf.map(|offset| if offset == 0.0 { 0.0 } else { self.baseline.lengthened[b] });
+        if lengthened.amax() > 0.0 {
+            let at = shared.ncols();
+            shared = shared.insert_column(at, 0.0);
+            shared.set_column(at, &lengthened);
+        }
         if drift == 0.0 {
             return shared;
         }
