@@ -27,8 +27,7 @@ const FEWEST: usize = 20;
 const NORMAL: f64 = 1.4826;
 /// Distance from its run, in standard deviations, at which a reading jumps.
 const JUMPS: f64 = 4.5;
-/// Share of the monitors, and number of them at least, that do not jump at once by themselves.
-const MANY: f64 = 0.2;
+/// Monitors that do not jump at once by themselves: the beam does.
 const SEVERAL: usize = 3;
 /// Median distance of all readings of a frame from their run, in standard deviations, at which there was no beam, or one from elsewhere: 0.7 is
 /// usual.
@@ -63,8 +62,7 @@ impl Differences {
         }
         // one that jumps by itself in later frames does so in first ones too, as if it were late
         let at_once = |frame: usize| jumping.iter().filter(|one| one.contains(&frame)).count();
-        let many = SEVERAL.max((MANY * sigma.len() as f64) as usize + 1);
-        let by_itself = |frame: &usize| at_once(*frame) < many;
+        let by_itself = |frame: &usize| at_once(*frame) < SEVERAL;
         let jumps = jumping.iter().map(|one| one.iter().any(by_itself));
         for (mut counts, _) in counts.column_iter_mut().zip(jumps).filter(|(_, jumps)| *jumps) {
             counts.fill(false);

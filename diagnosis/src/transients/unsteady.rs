@@ -6,8 +6,8 @@
 //! `z = p.w/sqrt(v p.p)`, `ln Bayes factor = sum of z^2 q/(1 + q)/2 - (n - 1) ln(1 + q)/2`, `q = omega^2 p.p/v`,
 //!
 //! averaged over omega. The variance `v` along `p` is that in the runs in which the corrector is off: what moves the monitors in every setting is
-//! no corrector's; where the noise across `p` is larger in its own runs, so is `v`. One trip is no unsteady supply: the other runs have to confirm what
-//! the most telling one shows.
+//! no corrector's; where the noise across `p` is larger in its own runs, so is `v`. One trip is no unsteady supply: all frames but the most
+//! telling one have to confirm it. Without a frame `k` of a run `sum of (p.w)^2` is less by `(p.w_k)^2 n/(n - 1)`.
 
 use core::ops::Range;
 
@@ -18,7 +18,7 @@ use super::differences::Differences;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
-/// `ln` odds, 95 %, at which the runs but the most telling one confirm it.
+/// `ln` odds, 95 %, at which all frames but the most telling one confirm it.
 const CONFIRMED: f64 = 2.94;
 
 /// What the runs of frames say of one corrector.
@@ -37,8 +37,9 @@ pub struct Unsteady<'d> {
 struct Sums {
     /// Differences: frames less runs.
     count: f64,
-    /// Sum of `(p.w)^2/p.p`.
+    /// Sum of `(p.w)^2/p.p`, and by how much it would be less without the frame that tells most.
     along: f64,
+    most: f64,
     /// Sum of `w.w` without that, and how many numbers that is of.
     across: f64,
     numbers: f64,
@@ -59,19 +60,21 @@ impl<'d> Unsteady<'d> {
     pub fn judge(&self, corrector: usize, is_on: impl Fn(usize) -> bool, sites: usize) -> Option<Discrepancy> {
         let (own, others): (Vec<Range<usize>>, Vec<Range<usize>>) =
             self.differences.runs.iter().cloned().partition(|run| is_on(run.start));
-        let each: Vec<Sums> = own.iter().map(|run| self.sums([run])).collect();
+        let mut each: Vec<Sums> = own.iter().map(|run| self.sums([run])).collect();
         let (all, of_others) = (self.sums(&own), self.sums(&others));
         if each.len() < 2 || all.power == 0.0 || of_others.count == 0.0 {
             return None;
         }
         let louder = (all.across / all.numbers) / (of_others.across / of_others.numbers).max(f64::MIN_POSITIVE);
         let variance = (of_others.along / of_others.count).max(1.0) * louder.max(1.0);
-        let logs = SIZES.map(|size| each.iter().map(|run| run.log_bayes(size, variance)).collect::<Vec<f64>>());
-        let of = |logs: [f64; SIZES.len()]| Discrepancy::of(Location::UnsteadyCorrector(corrector), logs, sites);
-        let sum = |of_runs: &Vec<f64>| of_runs.iter().sum::<f64>();
-        let most = |of_runs: &Vec<f64>| of_runs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let of_others = of(logs.each_ref().map(|one| sum(one) - most(one)));
-        (of_others.log_bayes > CONFIRMED).then(|| of(logs.each_ref().map(sum)))
+        let of = |runs: &[Sums]| {
+            let logs = SIZES.map(|size| runs.iter().map(|run| run.log_bayes(size, variance)).sum());
+            Discrepancy::of(Location::UnsteadyCorrector(corrector), logs, sites)
+        };
+        let found = of(&each);
+        let telling = each.iter_mut().max_by(|one, other| one.most.total_cmp(&other.most))?;
+        (telling.along, telling.count) = (telling.along - telling.most, telling.count - 1.0);
+        (of(&each).log_bayes > CONFIRMED).then_some(found)
     }
 
     /// In each frame in which it is on the readings less the mean of their run, against what the kick that suits the frame best should make of them.
@@ -105,6 +108,7 @@ impl<'d> Unsteady<'d> {
                 // of n numbers less their mean, n - 1 are free
                 let free = 1.0 - (run.len() as f64).recip();
                 sums.along += along;
+                sums.most = sums.most.max(along / free);
                 sums.across += square - along;
                 sums.numbers += free * (w.iter().filter(|x| **x != 0.0).count() as f64 - 1.0).max(0.0);
                 sums.power += power;
