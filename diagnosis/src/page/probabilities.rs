@@ -27,11 +27,13 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             figures.push((caption, figure(&found.data, competition, &title, nothing)));
         }
     }
-    let (next, more) = (&found.next, if found.competitions.is_empty() { "" } else { " more" });
+    // what passes within settings is found before, and not in the data of the search
+    let is_first = found.competitions.is_empty() && diagnosis.transients.is_empty();
+    let (next, more) = (&found.next, if is_first { "" } else { " more" });
     let title = format!("Nothing{more} is missing with probability {}", percent(next.nothing));
-    let caption = match found.competitions.is_empty() {
+    let caption = match is_first {
         true => "What is missing in the model without any effect.",
-        false => "What is missing beside the effects found.",
+        false => "What is missing beside what was found.",
     };
     figures.push((caption.into(), figure(&found.data, next, &title, &format!("nothing{more}"))));
     Section {

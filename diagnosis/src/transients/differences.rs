@@ -56,8 +56,9 @@ impl Differences {
             let [typical, rms] = repeated(&column, &runs).unwrap_or([*sigma; 2]);
             if typical == 0.0 {
                 counts.column_mut(b).fill(false);
+            } else {
+                jumping[b] = jumps(&column, &runs, typical);
             }
-            jumping[b] = jumps(&column, &runs, typical);
             *sigma = rms;
         }
         // one that jumps by itself in later frames does so in first ones too, as if it were late
