@@ -223,7 +223,16 @@ impl<'c> Within<'c> {
         let mut weights: Vec<(Alternative, f64)> =
             fits.iter().map(|fit| (fit.alternative(), fit.log_bayes + self.log_prior(fit.term))).collect();
         // of a corrector that is unsteady no frame is the first
-        weights.extend(former.into_iter().chain(self.unsteady(&signals)).map(|one| {
+        let mut unsteady = self.unsteady(&signals, &self.white);
+        // and what settles is not unsteady
+        if let Some((best, _)) =
+            weights.iter().enumerate().max_by(|(_, (_, one)), (_, (_, other))| one.total_cmp(other))
+        {
+            let left = &self.white - self.differences.whiten(&fits[best].signal);
+            let still = self.unsteady(&signals, &left);
+            unsteady.retain(|one| still.iter().any(|other| other.at == one.at));
+        }
+        weights.extend(former.into_iter().chain(unsteady).map(|one| {
             let weight = one.log_bayes + log_prior_unmodelled() - (one.sites as f64).ln();
             (Alternative::unmodelled(one), weight)
         }));
@@ -310,13 +319,13 @@ impl<'c> Within<'c> {
         Some(Discrepancy { at, campaign: 0, log_bayes, size: share * rms, sites: 1, adapted: None })
     }
 
-    /// Each corrector as one that is unsteady.
-    fn unsteady(&self, signals: &Signals) -> Vec<Discrepancy> {
+    /// Each corrector as one that is unsteady, by whitened readings, where these confirm it.
+    fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
         let frames = self.campaign.drives.len();
         let driven = |&c: &usize| (0..frames).any(|frame| self.is_on(c, frame));
         let correctors: Vec<usize> = (0..self.campaign.ring.correctors.len()).filter(driven).collect();
         let of = |&c: &usize| {
-            let one = Unsteady::of(&self.differences, &self.white, signals.of_corrector(c))?;
+            let one = Unsteady::of(&self.differences, white, signals.of_corrector(c))?;
             one.judge(c, |frame| self.is_on(c, frame), correctors.len())
         };
         correctors.iter().filter_map(of).collect()
