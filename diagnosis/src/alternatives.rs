@@ -17,7 +17,7 @@ pub const DECISIVE: f64 = 0.95;
 /// missing physics ambiguous.
 pub const SUSPICIOUS: f64 = 0.6;
 
-/// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in two validations 11 of 180
+/// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in two validations 11 of 171
 /// that could be seen.
 const ALIKE: f64 = 0.06;
 /// Probability of such a cause over that of it or the effect that it looks like: both explain the readings as well, so that it is the ratio of the priors.

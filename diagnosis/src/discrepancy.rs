@@ -12,7 +12,7 @@
 //! Sums are taken monitor by monitor. Where monitors have noise in common within a frame, a pattern that only one of them reads leaves
 //! something in the others when the frame is whitened; it is counted as if their readings and memory were the same, and what the
 //! free amplitudes of different monitors then share is left out. For slow noise of a fifth, jitter that adds as much as the noise and a crate of a
-//! fifth that changes `ln` Bayes factors by 0.02 at most.
+//! fifth that changes `ln` Bayes factors by 0.03 at most.
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 

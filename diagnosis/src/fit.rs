@@ -652,8 +652,8 @@ mod tests {
     use super::*;
     use crate::testing::template;
 
-    /// Readings and kicks are linear in a gain, so that differences are its derivative to rounding; also beside instruments that are exchanged or reversed. (Of first order
-    /// are the gains of exchanged monitors as those of others: once they were of the names, and a fit that was begun where it ended ended elsewhere.)
+    /// Readings and kicks are linear in a gain, so that differences are its derivative to rounding; also beside instruments that are exchanged or reversed. Once the fit's machine
+    /// had ordinary gains after the exchange and the derivative before it, so that a fit that was begun at its own end moved.
     #[test]
     fn the_derivative_of_a_gain_is_right_about_a_gain() {
         let (ring, recording) = template();

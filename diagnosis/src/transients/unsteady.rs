@@ -18,7 +18,7 @@ use super::differences::Differences;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
-/// `ln` odds, 95 %, at which all frames but the most telling one confirm it.
+/// `ln` Bayes factor, of 19, at which all frames but the most telling one confirm it.
 const CONFIRMED: f64 = 2.94;
 
 /// What the runs of frames say of one corrector.

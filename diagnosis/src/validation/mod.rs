@@ -66,7 +66,7 @@ pub struct Outcome {
     pub covered: Vec<bool>,
     /// Whether a finding is within the distance of two quadrupoles of the place of physics that the library does not hold.
     pub near: bool,
-    /// Of such physics that is named as something else: gain in `ln` posterior of its exact signal over that name.
+    /// Of such physics that is named as something else: gain in `ln` posterior of its exact signal over that name, by the means of settings.
     pub beyond_name: Option<f64>,
     /// NEES per var before and after.
     pub nees: [f64; 2],
@@ -107,7 +107,9 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     let started = Instant::now();
     let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
-    let is_named = !case.unmodelled.is_empty() && diagnosis.verdict == Verdict::Identified;
+    // what passes within settings is not in the means, which are compared
+    let of_means = diagnosis.transients.is_empty() && diagnosis.verdict == Verdict::Identified;
+    let is_named = !case.unmodelled.is_empty() && of_means;
     let beyond_name = if is_named { beyond_name(ring, template, case, &recording, &diagnosis.found)? } else { None };
     let key = case.key(ring);
     let names = ring.var_names();
@@ -236,7 +238,7 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
     Ok(Some((all - nothing, (0..case.effects.len()).map(own).collect::<Result<_, _>>()?)))
 }
 
-/// What the readings say of physics that the library does not hold and that is named as something else: how much more likely they are with its exact
+/// What the means of settings say of physics that the library does not hold and that is named as something else: how much more likely they are with its exact
 /// signal than with that name, all that is ordinary fitted beside both; in `ln` posterior.
 fn beyond_name(
     ring: &Ring,

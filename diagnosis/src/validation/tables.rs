@@ -43,7 +43,7 @@ pub struct Unknown {
     pub near: Share,
     /// Named as something else.
     pub named: usize,
-    /// Of these, names that the readings refute: they are more likely by over 25 nat with the true signal than with the name.
+    /// Of these, names that the means of settings refute: they are more likely by over 25 nat with the true signal than with the name.
     pub refuted: usize,
 }
 
@@ -257,7 +257,7 @@ impl Tables {
         self.write_unknown(text)?;
         writeln!(
             text,
-            "\nA place is right within the mean distance of two quadrupoles. A name is refuted where the readings are more likely with the \
+            "\nA place is right within the mean distance of two quadrupoles. A name is refuted where the means of settings are more likely with the \
              exact signal than with that name by over 25 nat, in ln posterior; by less the name describes them nearly as well as the truth."
         )?;
         writeln!(
@@ -327,7 +327,7 @@ impl Tables {
             writeln!(
                 text,
                 "| oracle gain | called unexplained or ambiguous, or a monitor said to wander | its place is | named as something else | \
-                 of these, refuted by the readings |"
+                 of these, refuted by the means of settings |"
             )?;
             writeln!(text, "|---|---|---|---|---|")?;
             for (bin, Unknown { undecided, near, named, refuted }) in rows {

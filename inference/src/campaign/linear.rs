@@ -13,7 +13,7 @@ pub(crate) struct Linearised {
     response: DMatrix<f64>,
     /// Its derivative with respect to each param, of each monitor [N][C].
     slopes: Vec<DMatrix<f64>>,
-    /// The same with respect to `ln` of each supply's strength, of each supply [B][C].
+    /// The same with respect to `ln` of each supply's strength, a matrix [B][C] for each supply.
     supply_slopes: Vec<DMatrix<f64>>,
     rf: Vec<RfOrbit>,
     /// Tunes.
