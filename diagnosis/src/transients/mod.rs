@@ -1,5 +1,5 @@
 //! What passes within a setting: a monitor that is late, a corrector that settles, a machine that keeps a share of its former orbit, a corrector that is
-//! unsteady ([`unsteady`]).
+//! unsteady (`unsteady.rs`).
 //!
 //! All other physics is the same in every frame of a setting, and these show in the frames after a change, so that the two are found apart:
 //! here from the differences within the runs of frames of one setting (`differences.rs`), by signals made of measured orbits
