@@ -136,14 +136,18 @@ pub fn of_element(what: &str, partial: &Partial) -> (String, Figure) {
     (caption.into(), Figure::lines(&axes, &[measured, line]))
 }
 
-/// The figure of a corrector that is unsteady: each frame against what the kick that suits it best should make of the readings.
-pub fn of_each_frame(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
+/// Readings in um, weighted by their noise, against signatures in a unit that is `factor` to the metre.
+fn points_of(shown: &[Shown], factor: f64) -> Vec<Point> {
     let point = |one: &Shown| {
         let weight = (one.sigma * 1e6).powi(-2);
-        Point { signature: 1e6 * one.predicted * weight, residual: 1e6 * one.measured * weight, weight }
+        Point { signature: factor * one.predicted * weight, residual: 1e6 * one.measured * weight, weight }
     };
-    let points: Vec<Point> = shown.iter().map(point).collect();
-    let (measured, [from, to]) = means(&points, "measured ± 1 σ: the mean of many readings");
+    shown.iter().map(point).collect()
+}
+
+/// The figure of a corrector that is unsteady: each frame against what the kick that suits it best should make of the readings.
+pub fn of_each_frame(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
+    let (measured, [from, to]) = means(&points_of(shown, 1e6), "measured ± 1 σ: the mean of many readings");
     let line = Series::line("slope 1", vec![from, to], vec![from, to]);
     let (x_label, y_label) =
         ("change by the best kick of each frame [µm]", "reading less the mean of its setting [µm]");
@@ -154,12 +158,8 @@ pub fn of_each_frame(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
 
 /// The figure of what passes within settings: first frames against the frames before the change.
 pub fn of_first_frames(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
-    // in um, the signature per percent of the share
-    let point = |one: &Shown| {
-        let weight = (one.sigma * 1e6).powi(-2);
-        Point { signature: 1e4 * one.predicted * weight, residual: 1e6 * one.measured * weight, weight }
-    };
-    let points: Vec<Point> = shown.iter().map(point).collect();
+    // the signature per percent of the share
+    let points = points_of(shown, 1e4);
     let (measured, [from, to]) = means(&points, "measured ± 1 σ: the mean of many readings");
     let (slope, sigma) = match finding.term() {
         Some(_) => (100.0 * finding.amplitude.0, 100.0 * finding.amplitude.1),

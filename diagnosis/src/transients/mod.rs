@@ -193,10 +193,9 @@ impl<'c> Within<'c> {
         let monitors = (0..campaign.monitors()).filter(|&b| differences.sees(b));
         let late =
             monitors.map(|b| Term { kind: EffectKind::BpmTiming, site: Site::Monitor(campaign.ring.read_monitors[b]) });
-        let nominal = campaign.recording.nominal_kick();
-        let driven = |&c: &usize| campaign.drives.iter().any(|drive| drive.kick[c].abs() > DRIVEN * nominal);
-        let correctors = (0..campaign.ring.correctors.len()).filter(driven);
-        let settling = correctors.map(|c| Term { kind: EffectKind::CorrectorSettling, site: Site::Corrector(c) });
+        let settling = driven(campaign)
+            .into_iter()
+            .map(|c| Term { kind: EffectKind::CorrectorSettling, site: Site::Corrector(c) });
         let terms = late.chain(settling).collect();
         let former = differences.whiten(&Signals::of(campaign, &readings).of_former_orbit());
         let spread = spread(&differences, &former, &white);
@@ -251,7 +250,7 @@ impl<'c> Within<'c> {
             }
             (None, Cause::Unmodelled(Discrepancy { at: Location::UnsteadyCorrector(c), .. })) => {
                 let unsteady = Unsteady::of(&self.differences, &self.white, signals.of_corrector(*c))?;
-                (unsteady.shown(&self.readings, |frame| self.is_on(*c, frame)), self.without_corrector(*c))
+                (unsteady.shown(&self.readings, |frame| is_on(self.campaign, *c, frame)), self.without_corrector(*c))
             }
             (None, _) => return None,
         };
@@ -321,19 +320,12 @@ impl<'c> Within<'c> {
 
     /// Each corrector as one that is unsteady, by whitened readings, where these confirm it.
     fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
-        let frames = self.campaign.drives.len();
-        let driven = |&c: &usize| (0..frames).any(|frame| self.is_on(c, frame));
-        let correctors: Vec<usize> = (0..self.campaign.ring.correctors.len()).filter(driven).collect();
+        let correctors = driven(self.campaign);
         let of = |&c: &usize| {
             let one = Unsteady::of(&self.differences, white, signals.of_corrector(c))?;
-            one.judge(c, |frame| self.is_on(c, frame), correctors.len())
+            one.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
         };
         correctors.iter().filter_map(of).collect()
-    }
-
-    /// True of a frame in which a corrector kicks the beam.
-    fn is_on(&self, corrector: usize, frame: usize) -> bool {
-        self.campaign.drives[frame].kick[corrector].abs() > DRIVEN * self.campaign.recording.nominal_kick()
     }
 
     /// Variance of the readings along the signal of an effect.
@@ -424,7 +416,7 @@ impl<'c> Within<'c> {
     /// The recording without the readings in which a corrector kicks the beam.
     fn without_corrector(&self, corrector: usize) -> Recording {
         let mut recording = self.campaign.recording.clone();
-        let rows = recording.rows.iter_mut().enumerate().filter(|(frame, _)| self.is_on(corrector, *frame));
+        let rows = recording.rows.iter_mut().enumerate().filter(|(frame, _)| is_on(self.campaign, corrector, *frame));
         rows.for_each(|(_, row)| row.reading.fill(None));
         recording
     }
@@ -450,6 +442,17 @@ impl Fit {
     fn alternative(&self) -> Alternative {
         Alternative::unfitted(Cause::Effect(self.term), self.log_bayes, (self.amplitude, self.sigma))
     }
+}
+
+/// True of a frame in which a corrector kicks the beam.
+fn is_on(campaign: &Campaign, corrector: usize, frame: usize) -> bool {
+    campaign.drives[frame].kick[corrector].abs() > DRIVEN * campaign.recording.nominal_kick()
+}
+
+/// Correctors that kick the beam in some frame.
+fn driven(campaign: &Campaign) -> Vec<usize> {
+    let kicks = |corrector: &usize| (0..campaign.drives.len()).any(|frame| is_on(campaign, *corrector, frame));
+    (0..campaign.ring.correctors.len()).filter(kicks).collect()
 }
 
 /// Readings at the mean supply currents and kicks of each run, by the machine that the screening ends with: next to an integer tune every ripple
