@@ -675,6 +675,46 @@ mod tests {
         }
     }
 
+    /// What is scored as one more effect is what the fit has with it, whatever was found before.
+    #[test]
+    fn one_more_effect_is_scored_as_it_is_fitted() {
+        let (ring, recording) = template();
+        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let term = |text: &str| Term::from(twin::Effect::parse(&format!("{text}=1"), &ring).unwrap());
+        let (monitors, correctors) = ("bpm_swap@y_C5,y_D5", "corrector_swap@V_D3,V_D7");
+        let after = [
+            (monitors, ["bpm_gain@y_C5", "bpm_roll@y_D5", "bpm_swap@y_D5,y_E5"]),
+            ("bpm_polarity@y_C5", ["bpm_roll@y_C5", "bpm_crosstalk@y_C3", "bpm_swap@y_D5,y_E5"]),
+            (correctors, ["corrector_gain@V_D3", "corrector_crosstalk@V_D3", "corrector_swap@V_D7,V_E3"]),
+            ("corrector_polarity@V_D3", ["corrector_gain@V_D3", "corrector_even@V_D3", "corrector_swap@V_D7,V_E3"]),
+        ];
+        for (first, others) in after {
+            let before = Hypothesis::default().with(term(first));
+            for other in others {
+                let one = term(other);
+                let off = off_by_one_more(&data, &before, one);
+                assert!(off < 1e-6, "{other} after {first}: {off}");
+            }
+        }
+    }
+
+    /// Largest error of what one more effect does, per unit of its amplitude if it has one, over its largest element.
+    fn off_by_one_more(data: &Data, before: &Hypothesis, one: Term) -> f64 {
+        let predicted = |hypothesis: &Hypothesis, amplitude: f64| {
+            let mut u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
+            if let Some(last) = one.kind.prior_scale().filter(|_| amplitude != 0.0) {
+                *u.as_mut_slice().last_mut().unwrap() = amplitude / last;
+            }
+            predicted_by(data, hypothesis, 0, &u).unwrap()
+        };
+        let step = if one.kind.is_switch() { 1.0 } else { 1e-6 };
+        let exact = (predicted(&before.with(one), step) - predicted(before, 0.0)) * (1.0 / step);
+        let (machine, drives) = machine_at(data, before, 0, &DVector::zeros(data.units.len())).unwrap();
+        let machine = machine.on_orbit(&drives.orbit);
+        let scored = Signatures::of(&machine, &drives).unwrap().of_effect(one.kind, one.site).unwrap();
+        (&exact.readings - &scored.readings).amax() / exact.readings.amax()
+    }
+
     /// Largest error of the derivative with respect to an ordinary gain, about one of -30 %, over its largest element.
     fn off_by_differences(data: &Data, hypothesis: &Hypothesis, gain: Term) -> f64 {
         let (vars, unknowns) = (data.units.len(), hypothesis.unknowns(data));

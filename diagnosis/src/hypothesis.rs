@@ -1,5 +1,7 @@
 //! A hypothesis about a machine: some effects, and the unknowns that they add to the vars.
 
+use core::cmp::Reverse;
+
 use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
@@ -313,12 +315,25 @@ impl Hypothesis {
     }
 }
 
-/// Effects beside ordinary imperfections, in the order in which a signal passes them. The current of a dead corrector is none before its coils couple,
-/// and exchanged cables lead it to other coils; what a dead monitor reads is none after its electronics' gain, and exchanged names are given to readings.
+/// Effects beside ordinary imperfections, in the order in which a signal passes them: correctors, ordinary imperfections, fields, monitors.
+///
+/// Of correctors and monitors what has an amplitude is next to the beam, then what is reversed or dead, then what is exchanged: the current of a dead corrector
+/// is none before its coils couple, and exchanged names are given to what monitors read. Of the same sort the later one is nearer. An effect is scored as if it
+/// were next to the beam, so that a fit with one more has what was scored, but for an exchange of instruments of which one is known to be reversed or dead.
 pub fn in_order(effects: Vec<Effect>, ordinary: impl IntoIterator<Item = Effect>) -> Vec<Effect> {
-    let (of_correctors, others): (Vec<Effect>, Vec<Effect>) =
+    let from_beam = |effect: &Effect| match effect.kind.is_switch() {
+        false => 0,
+        true if effect.site.is_pair() => 2,
+        true => 1,
+    };
+    let (mut of_correctors, others): (Vec<Effect>, Vec<Effect>) =
         effects.into_iter().partition(|effect| effect.kind.is_of_a_corrector());
-    of_correctors.into_iter().chain(ordinary).chain(others).collect()
+    let (mut of_monitors, of_the_ring): (Vec<Effect>, Vec<Effect>) =
+        others.into_iter().partition(|effect| effect.kind.is_of_a_monitor());
+    of_correctors.sort_by_key(|effect| Reverse(from_beam(effect)));
+    of_monitors.reverse();
+    of_monitors.sort_by_key(from_beam);
+    of_correctors.into_iter().chain(ordinary).chain(of_the_ring).chain(of_monitors).collect()
 }
 
 /// The orbit at a monitor was estimated as if it read what is there: not so where it misreads large positions.

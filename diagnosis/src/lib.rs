@@ -75,7 +75,7 @@ use average::Vars;
 use beyond::Beyond;
 use data::{Data, DataError};
 use heldout::Score;
-use hypothesis::Term;
+use hypothesis::{Term, in_order};
 use imperfection::Imperfection;
 use inference::recording::{Recording, at_energy};
 use readback::Contradiction;
@@ -200,15 +200,19 @@ impl Diagnosis {
         })
     }
 
-    /// The effects in the fitted model, at their most likely amplitudes.
+    /// The effects in the fitted model, at their most likely amplitudes, in the order in which a signal passes them. What passes within a setting was found by the
+    /// names of correctors and monitors in the recording, so that it is farthest from the beam.
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
+        let lasting = in_order(best.hypothesis.terms.iter().enumerate().map(of).collect(), []);
         let passing = self.transients.iter().filter_map(|one| {
             let leading = &one.alternatives[0];
             Some(leading.term()?.effect(leading.amplitude.0))
         });
-        passing.chain(best.hypothesis.terms.iter().enumerate().map(of)).collect()
+        let (of_correctors, of_monitors): (Vec<Effect>, Vec<Effect>) =
+            passing.partition(|effect| effect.kind.is_of_a_corrector());
+        of_correctors.into_iter().chain(lasting).chain(of_monitors).collect()
     }
 
     /// The possible measurements for an ambiguous verdict, best first; none for another.

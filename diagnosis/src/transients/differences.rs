@@ -273,4 +273,19 @@ mod tests {
         assert_eq!([0, 1].map(|b| differences.sees(b)), [false, true]);
         assert!(differences.whiten(&readings)[(8, 1)] > 10.0, "the first of a run is what is looked at");
     }
+
+    /// Two monitors in one frame jump by themselves, three show the beam.
+    #[test]
+    fn monitors_that_jump_together_count() {
+        let settings: Vec<Option<usize>> = (0..120).map(|frame| Some(frame / 4)).collect();
+        for (jumping, count) in [(2, false), (3, true)] {
+            let readings = DMatrix::from_fn(120, 8, |frame, b| {
+                let jump = if frame == 10 && b < jumping { 1.0 } else { 0.0 };
+                0.1 * (1.7 * (frame * frame + b) as f64).sin() + jump
+            });
+            let none = DMatrix::zeros(120, 0);
+            let differences = Differences::of(&readings, &settings, &[0.1; 8], &DVector::zeros(8), &none);
+            assert!((0..8).all(|b| differences.sees(b) == (b >= jumping || count)), "{jumping}");
+        }
+    }
 }

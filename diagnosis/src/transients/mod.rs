@@ -56,14 +56,14 @@ pub struct Transient {
     /// How an effect stood its tests.
     pub tested: Option<Tested>,
     /// Readings of the frames after a change less the later ones of their run, against what the leading cause should make of them, per unit of its
-    /// amplitude [m]; of each pair the noise of the first.
+    /// amplitude [m]; of an unsteady corrector those of every frame less the mean of their run.
     pub shown: Vec<Shown>,
 }
 
-/// One reading of a frame after a change.
+/// One reading of a frame, after a change or of a corrector that is unsteady.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shown {
-    /// Predicted difference per unit of the amplitude [m].
+    /// Predicted difference [m], per unit of the amplitude of a cause that has one.
     pub predicted: f64,
     /// The difference [m].
     pub measured: f64,
