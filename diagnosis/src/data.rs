@@ -26,6 +26,7 @@ use twin::{
 
 use super::baseline::Baseline;
 use super::channel::Channel;
+use super::close_tunes::CloseTunes;
 use super::error::FitError;
 use super::evidence::Units;
 use super::exact::Exact;
@@ -60,6 +61,8 @@ pub struct Data {
     pub drives: Drives,
     /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
+    /// Tunes that are left out.
+    pub close_tunes: Option<CloseTunes>,
     /// Which readings count, and the state of the monitors.
     pub screened: Screened,
     /// `ln` of each supply's mean factor [F].
@@ -94,15 +97,12 @@ pub struct Data {
 #[derive(Debug, Clone)]
 struct Frames {
     drives: Drives,
-    /// As recorded, columns monitors [m] and the two tunes, these less what the kicks do to them; NaN for what is missing.
+    /// As recorded, columns monitors [m] and the two tunes; NaN for what is missing.
     recorded: DMatrix<f64>,
-    /// The same at the mean supply currents, at the drives of the pool and without the terms above first order, the tunes without what kicks do to
-    /// them where the machine holds something else than the header says.
+    /// The same at the mean supply currents, at the drives of the pool and without the terms above first order.
     readings: DMatrix<f64>,
     /// `ln` of each supply's factor off its mean, columns supplies.
     fluctuation: DMatrix<f64>,
-    /// What kicks do to the tunes where what the header states is held, already taken off `recorded`.
-    tune_shift: MatrixXx2<f64>,
     /// Noise of one frame's tune, of a tune that was read.
     tune_noise: [Option<f64>; 2],
 }
@@ -130,6 +130,18 @@ impl Displaced {
         let means = Drives { orbit: self.orbit.clone(), ..exact.means.clone() };
         let higher = &exact.readings - self.machine.readings(&means)?.0;
         Ok(higher.select_rows(&exact.settings.of_frame))
+    }
+
+    /// What exact tunes have beyond [`Machine::readings`], rows frames: kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not
+    /// held; the orbit without kicks is off the axis of sextupole fields, and couples the planes.
+    fn tunes_beyond(&self, drives: &Drives, exact: MatrixXx2<f64>) -> Result<MatrixXx2<f64>, EffectError> {
+        // a drift is no effect of the kicks
+        let time = DVector::zeros(drives.time.len());
+        let frames = Drives { time, orbit: self.orbit.clone(), ..drives.clone() };
+        let (_, tunes, changes) = self.machine.readings(&frames)?;
+        let mut beyond = exact - changes;
+        beyond.column_iter_mut().zip([tunes.x, tunes.y]).for_each(|(mut column, tune)| column.add_scalar_mut(-tune));
+        Ok(beyond)
     }
 }
 
@@ -189,9 +201,6 @@ pub enum DataError {
 /// Prior standard deviations of a var up to which its range reaches here, where it ends before: at two, unless the machine file says something else. A
 /// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
 const REACH: f64 = 5.0;
-/// Change of a tune by the orbit that crosses sextupole fields up to which first order will do: its error, some tenth, is that of a tune meter over ten
-/// campaigns.
-const FIRST_ORDER: f64 = 2e-5;
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
 /// Whitened residual above which a reading of a faulty monitor is dropped.
@@ -217,13 +226,16 @@ impl Data {
         let at_supplies = ring.with_strengths(&ring.strengths(&[], supplies));
         let design = Machine::new(at_supplies, believed, &[])?;
         let of_momentum = |i: usize, plane: usize| drives.rf_offset[i] == 0.0 && !campaign.tunes[(i, plane)].is_nan();
-        let shift = Exact::of(&design.without_memory(), &drives)?.tune_shift();
-        let recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
-            if of_momentum(i, plane) { campaign.tunes[(i, plane)] - shift[(i, plane)] } else { f64::NAN }
+        let mut recorded_tunes = DMatrix::from_fn(driven.len(), 2, |i, plane| {
+            if of_momentum(i, plane) { campaign.tunes[(i, plane)] } else { f64::NAN }
         });
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
+        let close_tunes = CloseTunes::of(&Displaced::of(&design, &baseline)?.displaced, &recorded_tunes)?;
+        if close_tunes.is_some() {
+            recorded_tunes.fill(f64::NAN);
+        }
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         for &b in &noise.sound {
@@ -247,6 +259,7 @@ impl Data {
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
+            close_tunes,
             expected_noise: recording.header.noise.clone(),
             centre: DVector::zeros(recorded.ncols() + 2),
             noise,
@@ -262,7 +275,6 @@ impl Data {
                 recorded: beside(recorded, &recorded_tunes),
                 readings: beside(recorded, &recorded_tunes),
                 fluctuation: campaign.fluctuation.clone(),
-                tune_shift: shift,
                 tune_noise: [None; 2],
             },
         };
@@ -274,8 +286,7 @@ impl Data {
 
     /// Linearise the recorded readings and tunes about a machine: subtract the effect of the supplies' fluctuations on the kicked orbit,
     /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
-    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. From the tunes what kicks do to
-    /// them besides, where the machine holds something else than the header says. Returns the chi-square of the change of all.
+    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. From the tunes what moves them beyond first order. Returns the chi-square of the change of all.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
@@ -291,28 +302,11 @@ impl Data {
         let mut of_monitors = readings.columns_mut(0, monitors);
         of_monitors -= off_first_order;
         let mut of_tunes = readings.columns_mut(monitors, 2);
-        of_tunes -= self.tune_shift_beside(&displaced, &exact)?;
+        of_tunes -= displaced.tunes_beyond(&self.frames.drives, exact.tunes())?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();
         Ok(self.whiten(|c, pool| self.readings[(pool, c)] - before[(pool, c)]).norm_squared())
-    }
-
-    /// What kicks do to the tunes besides, where a machine does not hold what the header states, so that the momentum moves with them, and the tunes by
-    /// the chromaticity; and beyond first order where it has strong sextupole fields. Rows frames.
-    fn tune_shift_beside(
-        &self,
-        Displaced { machine, orbit, .. }: &Displaced,
-        exact: &Exact,
-    ) -> Result<MatrixXx2<f64>, EffectError> {
-        // a drift is no effect of the kicks
-        let time = DVector::zeros(self.frames.drives.time.len());
-        let frames = Drives { time, orbit: orbit.clone(), ..self.frames.drives.clone() };
-        let first_order = machine.readings(&frames)?.2;
-        if machine.holding().is_like(&self.believed) && first_order.amax() < FIRST_ORDER {
-            return Ok(MatrixXx2::zeros(self.frames.drives.kick.nrows()));
-        }
-        Ok(exact.tune_shift() - first_order - &self.frames.tune_shift)
     }
 
     /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if

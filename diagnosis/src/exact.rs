@@ -16,8 +16,8 @@ pub struct Exact {
     pub means: Drives,
     /// Readings less those of the orbit without kicks, rows settings, columns read monitors [m].
     pub readings: DMatrix<f64>,
-    /// Tunes less those on the orbit without kicks, rows settings; 0 where kicks leave no stable motion, and of an RF offset.
-    shift: MatrixXx2<f64>,
+    /// Tunes, rows settings.
+    tunes: MatrixXx2<f64>,
 }
 
 impl Exact {
@@ -33,13 +33,13 @@ impl Exact {
         let cycle = |kick: Vec<f64>, rf_offset: f64| Cycle { kick, strength: strength.clone(), rf_offset, time: 0.0 };
         let (without, plain) = tracked.cycle(&cycle(vec![0.0; drives.kick.ncols()], 0.0))?;
         let mut readings = DMatrix::zeros(settings.count(), without.len());
-        let mut shift = MatrixXx2::zeros(settings.count());
+        let mut tunes = MatrixXx2::from_fn(settings.count(), |_, plane| [plain.x, plain.y][plane]);
         for (i, kick) in means.kick.row_iter().enumerate() {
             let cycle = cycle(kick.iter().copied().collect(), means.rf_offset[i]);
             let read = match tracked.cycle(&cycle) {
                 Ok((read, kicked)) => {
                     if cycle.rf_offset == 0.0 {
-                        shift.row_mut(i).copy_from_slice(&[kicked.x - plain.x, kicked.y - plain.y]);
+                        tunes.row_mut(i).copy_from_slice(&[kicked.x, kicked.y]);
                     }
                     read
                 }
@@ -49,12 +49,12 @@ impl Exact {
                 *to = read - none;
             });
         }
-        Ok(Self { settings, means, readings, shift })
+        Ok(Self { settings, means, readings, tunes })
     }
 
-    /// What kicks do to the tunes, rows frames.
-    pub fn tune_shift(&self) -> MatrixXx2<f64> {
-        self.shift.select_rows(&self.settings.of_frame)
+    /// The tunes, rows frames; of frames with an RF offset, and where kicks leave no stable motion, those without kicks.
+    pub fn tunes(&self) -> MatrixXx2<f64> {
+        self.tunes.select_rows(&self.settings.of_frame)
     }
 }
 
@@ -71,10 +71,11 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let machine = Machine::new(ring, Rf::FixedMomentum, &[]).unwrap();
-        let by = |scale: f64| {
+        let at = |scale: f64| {
             let drives = Drives { kick: &data.drives.kick * scale, ..data.drives.clone() };
-            Exact::of(&machine, &drives).unwrap().tune_shift()
+            Exact::of(&machine, &drives).unwrap().tunes()
         };
+        let by = |scale: f64| at(scale) - at(0.0);
         let (full, turned) = (by(1.0), by(-1.0));
         // a tenth of the tune meter's noise of one frame at most, 5e-4
         assert!(full.amax() > 1e-6 && full.amax() < 5e-5, "{:e}", full.amax());

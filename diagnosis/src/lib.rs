@@ -17,6 +17,7 @@ pub mod beyond;
 pub mod chance;
 mod channel;
 pub mod choice;
+pub mod close_tunes;
 pub mod data;
 pub mod discrepancy;
 pub mod element;

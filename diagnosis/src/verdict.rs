@@ -485,6 +485,7 @@ fn remarks(data: &Data, found: &Found) -> Vec<String> {
         remarks.push(format!("larger than ordinary: {}", large.join(", ")));
     }
     for own in data.campaigns() {
+        remarks.extend(own.close_tunes.iter().map(|one| within(data, &own.name, one.to_string())));
         remarks.extend(own.noise.remarks().into_iter().map(|said| within(data, &own.name, said)));
         remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
     }

@@ -87,11 +87,6 @@ impl Holding {
         frequency.or(self.radial_loop.map(|_| EffectKind::RadialLoop))
     }
 
-    /// True if the same is held, at whatever momentum on average.
-    pub fn is_like(&self, other: &Self) -> bool {
-        Self { delta: other.delta, ..*self } == *other
-    }
-
     /// Share of a step of the RF frequency that reaches the beam.
     fn share_of_rf_steps(&self) -> f64 {
         (1.0 + self.more_of_steps) * (1.0 - self.radial_loop.map_or(0.0, |one| one.of_rf_steps))

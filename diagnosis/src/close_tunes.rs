@@ -1,0 +1,60 @@
+//! Tunes that are so close that coupling mixes the planes: both modes are then of both planes, and neither tune tells the focusing of one.
+//!
+//! With `D` the distance of the tunes without coupling, that of the modes is `sqrt(D^2 + C^2)`, and a change of `D` shows in it by the share
+//! `D/sqrt(D^2 + C^2)`, 0.94 where the modes are `3 C` apart. `C` is the closest approach: that of the orbit in the fields of the design, with what rolls of the
+//! quadrupoles that are ordinary add to it, `C^2 = sum of (2 roll K1L sqrt(beta_x beta_y)/(2 pi))^2`.
+//!
+//! Source: G. Guignard, CERN 76-06 (1976).
+
+use core::f64::consts::TAU;
+use core::fmt;
+
+use nalgebra::DMatrix;
+use twin::{EffectKind, Machine, OrbitError, Plane};
+
+use super::ordinary::Family;
+
+/// The tunes of a recording that are too close.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CloseTunes {
+    /// Mean distance of their fractional parts.
+    pub distance: f64,
+    /// Closest approach that is expected.
+    pub approach: f64,
+}
+
+/// Closest approaches that tunes have to be apart.
+const APART: f64 = 3.0;
+
+impl CloseTunes {
+    /// Of a machine on its orbit, and tunes as recorded, rows frames; none where they are far enough apart, or not recorded.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the machine keeps no beam.
+    pub fn of(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
+        let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
+        let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
+        let (distance, optics) = (distances.iter().sum::<f64>() / distances.len() as f64, machine.optics()?);
+        let ring = machine.ring();
+        let roll =
+            Family::all().iter().find(|family| family.kind == EffectKind::QuadRoll).map_or(0.0, |one| one.tolerance);
+        let by_roll = ring.quadrupoles.iter().zip(ring.gradients()).map(|(quadrupole, k1)| {
+            let [x, y] = [Plane::X, Plane::Y].map(|plane| optics.beta(quadrupole.element, plane));
+            2.0 * roll * k1 * ring.elements[quadrupole.element].length * (x * y).sqrt() / TAU
+        });
+        let approach = by_roll.map(|one| one * one).sum::<f64>().sqrt().hypot(optics.closest_tune_approach()?);
+        // not a number without tunes
+        Ok((distance < APART * approach).then_some(Self { distance, approach }))
+    }
+}
+
+impl fmt::Display for CloseTunes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { distance, approach } = self;
+        write!(
+            f,
+            "the tunes are {distance:.3} apart, coupling mixes those less than {:.3} apart, and they are left out",
+            APART * approach
+        )
+    }
+}
