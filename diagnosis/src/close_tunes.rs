@@ -36,8 +36,10 @@ impl CloseTunes {
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
         let (distance, optics) = (distances.iter().sum::<f64>() / distances.len() as f64, machine.optics()?);
         let ring = machine.ring();
-        let roll =
-            Family::all().iter().find(|family| family.kind == EffectKind::QuadRoll).map_or(0.0, |one| one.tolerance);
+        let roll = Family::of_machine()
+            .iter()
+            .find(|family| family.kind == EffectKind::QuadRoll)
+            .map_or(0.0, |one| one.tolerance);
         let by_roll = ring.quadrupoles.iter().zip(ring.gradients()).map(|(quadrupole, k1)| {
             let [x, y] = [Plane::X, Plane::Y].map(|plane| optics.beta(quadrupole.element, plane));
             2.0 * roll * k1 * ring.elements[quadrupole.element].length * (x * y).sqrt() / TAU
@@ -56,5 +58,47 @@ impl fmt::Display for CloseTunes {
             "the tunes are {distance:.3} apart, coupling mixes those less than {:.3} apart, and they are left out",
             APART * approach
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use inference::Campaign;
+    use twin::{Effect, Rf};
+
+    use super::*;
+    use crate::data::Data;
+    use crate::testing::template;
+
+    #[test]
+    fn tunes_that_coupling_mixes_are_left_out_and_told() {
+        let (ring, mut recording) = template();
+        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let apart = data(&recording);
+        assert!(apart.close_tunes.is_none() && apart.tune_noise(0).is_some());
+        // as a meter reads two modes next to each other
+        recording.rows.iter_mut().for_each(|row| row.tune[1] = row.tune[0].map(|tune| tune + 0.004));
+        let close = data(&recording);
+        let told = close.close_tunes.unwrap();
+        assert!((told.distance - 0.004).abs() < 1e-9 && close.tune_noise(0).is_none());
+        let said = told.to_string();
+        assert!(said.starts_with("the tunes are 0.004 apart, coupling mixes those less than 0.0"), "{said}");
+    }
+
+    /// A skew gradient that keeps tunes apart by more than rolls do.
+    #[test]
+    fn the_closest_approach_is_that_of_the_machine_and_of_rolls() {
+        let ring = template().0;
+        let of = |effects: &[&str]| {
+            let effects: Vec<Effect> = effects.iter().map(|text| Effect::parse(text, &ring).unwrap()).collect();
+            let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &effects).unwrap();
+            let own = machine.optics().unwrap().closest_tune_approach().unwrap();
+            let tunes = DMatrix::from_row_slice(2, 2, &[0.7, 0.699, f64::NAN, 0.7]);
+            (CloseTunes::of(&machine, &tunes).unwrap().unwrap(), own)
+        };
+        let ((plain, none), (coupled, own)) = (of(&[]), of(&["stray_skew_gradient@SLOT_F6=0.02"]));
+        println!("{} {own}", plain.approach);
+        assert!(none < 1e-6 && (plain.distance - 1e-3).abs() < 1e-12);
+        assert!((coupled.approach - own.hypot(plain.approach)).abs() < 0.05 * coupled.approach && own > plain.approach);
     }
 }

@@ -57,6 +57,8 @@ pub enum Unknown {
 /// Effects that share an amplitude.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Member {
+    /// The family's name: two may hold the same effect.
+    pub family: &'static str,
     /// The effects.
     pub terms: Vec<Term>,
     /// The recording in which they have it; none if they have it in all.

@@ -26,6 +26,7 @@ pub mod evidence;
 mod exact;
 pub mod experiment;
 mod factors;
+pub mod feed_down;
 pub mod fit;
 pub mod frame_to_frame;
 mod half_normal;

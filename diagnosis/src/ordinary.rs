@@ -22,6 +22,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Measured, Plane, Ring, Site, Unit};
 
 use super::data::Data;
+use super::feed_down;
 use super::fit::Fitted;
 use super::hypothesis::{Hypothesis, Member, Term, Unknown, members};
 use super::imperfection::{Imperfection, Measure};
@@ -38,6 +39,8 @@ pub enum Grouping {
     Plane(Plane),
     /// All.
     All,
+    /// None, each of its own width: that of the orbit in sextupole fields ([`super::feed_down`]).
+    OfOrbit,
 }
 
 /// One property of all instruments or magnets of a sort.
@@ -49,9 +52,9 @@ pub struct Family {
     pub kind: EffectKind,
     /// Which members share an amplitude.
     pub grouping: Grouping,
-    /// Standard deviation that is ordinary, in the unit of the kind.
+    /// Standard deviation that is ordinary, in the unit of the kind; of one whose members have their own, 1.
     pub tolerance: f64,
-    /// Standard deviation of the amplitudes, in the unit of the kind.
+    /// Standard deviation of the amplitudes, in the same unit.
     pub width: f64,
 }
 
@@ -109,8 +112,20 @@ pub fn is_absorbed(kind: EffectKind) -> bool {
 }
 
 impl Family {
-    /// All of them, as wide as their tolerances.
+    /// All of them, and what the orbit adds that nobody knows.
     pub fn all() -> Vec<Self> {
+        let of_orbit = Self {
+            name: "orbit in sextupoles",
+            kind: EffectKind::QuadRoll,
+            grouping: Grouping::OfOrbit,
+            tolerance: 1.0,
+            width: 1.0,
+        };
+        Self::of_machine().into_iter().chain([of_orbit]).collect()
+    }
+
+    /// Those of magnets and instruments, as wide as their tolerances.
+    pub fn of_machine() -> Vec<Self> {
         let of = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
             name,
             kind,
@@ -127,14 +142,23 @@ impl Family {
         let of_each = |terms: Vec<Term>| {
             let campaigns: Vec<Option<usize>> =
                 if self.is_of_a_moment() { (0..data.count()).map(Some).collect() } else { vec![None] };
-            campaigns.into_iter().map(move |campaign| Member { terms: terms.clone(), campaign })
+            campaigns.into_iter().map(move |campaign| Member { family: self.name, terms: terms.clone(), campaign })
         };
         terms.flat_map(of_each).collect()
     }
 
     /// Its members as unknowns of a fit.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        self.members(data).into_iter().map(|member| Unknown::Ordinary(member, self.width)).collect()
+        let rolls = feed_down::rolls(&data.ring, &data.baseline);
+        let width = |member: &Member| match (self.grouping, member.terms[0].site) {
+            (Grouping::OfOrbit, Site::Quadrupole(q)) => self.width * rolls[q],
+            _ => self.width,
+        };
+        self.members(data)
+            .into_iter()
+            .map(|member| (width(&member), member))
+            .map(|(w, one)| Unknown::Ordinary(one, w))
+            .collect()
     }
 
     /// True for what may differ between two times in the cycle: the momentum, and fields of eddy currents.
@@ -148,6 +172,11 @@ impl Family {
         let some: Vec<Vec<Term>> = match self.grouping {
             Grouping::Each => {
                 return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
+            }
+            Grouping::OfOrbit => {
+                let rolls = feed_down::rolls(&data.ring, &data.baseline);
+                let is_one = |term: &Term| matches!(term.site, Site::Quadrupole(q) if rolls[q] > 0.0);
+                return all.filter(is_one).map(|term| vec![term]).collect();
             }
             Grouping::Instrument => {
                 let element = |term: &Term| term.site.elements(&data.ring);
@@ -196,7 +225,7 @@ impl Family {
             (Grouping::Plane(Plane::Y), EffectKind::CorrectorGain) => "V",
             (Grouping::Plane(Plane::X), _) => "x",
             (Grouping::Plane(Plane::Y), _) => "y",
-            (Grouping::Each | Grouping::Instrument | Grouping::All, _) => "all",
+            (Grouping::Each | Grouping::Instrument | Grouping::All | Grouping::OfOrbit, _) => "all",
         }
     }
 
@@ -446,7 +475,7 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
             Grouping::Each | Grouping::Instrument if family.is_learnt() => {
                 (width, width / information(&covariance, own).sqrt())
             }
-            Grouping::Each | Grouping::Instrument => continue,
+            Grouping::Each | Grouping::Instrument | Grouping::OfOrbit => continue,
             Grouping::Plane(_) | Grouping::All => {
                 (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
             }

@@ -413,6 +413,12 @@ pub fn findings(
         }
         _ => None,
     };
+    if all.is_empty() && open.is_none() {
+        // what explains the effects in the model better than these do
+        for competition in found.competitions.iter().filter(|one| !one.alternatives.is_empty()) {
+            all.push(Finding::of_competition(data, competition, 0)?);
+        }
+    }
     if let Some(first) = open {
         let open = Finding { tested: of_element, ..Finding::of_competition(data, &found.next, first)? };
         let open = match found.best.turned(data).filter(|_| open.is_of_element(found) && !data.is_joint()) {

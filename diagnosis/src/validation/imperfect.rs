@@ -45,7 +45,7 @@ impl Families {
     /// Those of a machine with such recordings.
     pub fn of(data: &Data) -> Self {
         let drawn = |family: Family, scatters| Drawn { members: family.members(data), width: family.width, scatters };
-        let ordinary = Family::all().into_iter().map(|family| drawn(family, family.is_learnt()));
+        let ordinary = Family::of_machine().into_iter().map(|family| drawn(family, family.is_learnt()));
         let hidden = Family::hidden(data).into_iter().map(|family| drawn(family, false));
         Self(ordinary.chain(hidden).collect())
     }
