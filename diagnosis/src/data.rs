@@ -61,6 +61,8 @@ pub struct Data {
     pub drives: Drives,
     /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
+    /// What the tunes on the orbit without kicks are above those of [`Machine::readings`], of the machine that the readings are linearised about.
+    pub tunes_of_orbit: [f64; 2],
     /// Tunes that are left out.
     pub close_tunes: Option<CloseTunes>,
     /// Which readings count, and the state of the monitors.
@@ -130,6 +132,13 @@ impl Displaced {
         let means = Drives { orbit: self.orbit.clone(), ..exact.means.clone() };
         let higher = &exact.readings - self.machine.readings(&means)?.0;
         Ok(higher.select_rows(&exact.settings.of_frame))
+    }
+
+    /// What the orbit without kicks does to the tunes: it is off the axis of sextupole fields, and couples the planes.
+    fn tunes_of_orbit(&self) -> Result<[f64; 2], OrbitError> {
+        let [with, without] =
+            [self.displaced.optics()?.tunes()?, self.machine.on_orbit(&self.orbit).optics()?.tunes()?];
+        Ok([with.x - without.x, with.y - without.y])
     }
 
     /// What exact tunes have beyond [`Machine::readings`], rows frames: kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not
@@ -259,6 +268,7 @@ impl Data {
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
+            tunes_of_orbit: [0.0; 2],
             close_tunes,
             expected_noise: recording.header.noise.clone(),
             centre: DVector::zeros(recorded.ncols() + 2),
@@ -303,6 +313,7 @@ impl Data {
         of_monitors -= off_first_order;
         let mut of_tunes = readings.columns_mut(monitors, 2);
         of_tunes -= displaced.tunes_beyond(&self.frames.drives, exact.tunes())?;
+        self.tunes_of_orbit = displaced.tunes_of_orbit()?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();

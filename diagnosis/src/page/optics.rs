@@ -94,7 +94,7 @@ impl Fit {
             s: ring.elements.iter().map(|element| element.s).chain([ring.circumference]).collect(),
             beat: [of(0), of(1)],
             dispersion: [of(2), of(3)],
-            tunes: [pair(last), pair(last + 1)],
+            tunes: [0, 1].map(|plane| (best[last + plane] + data.tunes_of_orbit[plane], sigma[last + plane])),
             approach: pair(last + 2),
             design,
         }

@@ -64,12 +64,12 @@ fn figure(
     what: &str,
 ) -> Result<Option<(String, Figure)>, FitError> {
     let Some(noise) = data.tune_noise(plane) else { return Ok(None) };
-    let symbol = ["Qx", "Qy"][plane];
+    let (symbol, of_orbit) = (["Qx", "Qy"][plane], data.tunes_of_orbit[plane]);
     let [x, mean, sigma] = measured(data, fitted, plane, noise)?;
     let bars = mean.iter().zip(&sigma).map(|(tune, sigma)| (tune - sigma, tune + sigma)).collect();
     let mut series = vec![Series::points("measured ± 1 σ", x, mean).within(bars)];
     for Predicted(label, range) in models {
-        series.push(Series::line(label, vec![-1.0, 1.0], vec![*range.start(), *range.end()]));
+        series.push(Series::line(label, vec![-1.0, 1.0], vec![range.start() + of_orbit, range.end() + of_orbit]));
     }
     let title = format!("{what}: {symbol} measured and predicted");
     let axes = Axes::new(&title, "time, −1 at the start to 1 at the end [1]", &format!("{symbol} [1]"));
@@ -112,7 +112,7 @@ fn readings(data: &Data, fitted: &Fitted, plane: usize) -> Result<Vec<Reading>, 
     let (column, miss) = (data.monitors() + plane, data.miss(&predicted));
     let of = |(pool, readings): (usize, f64)| Reading {
         time: data.drives.time[pool],
-        tune: predicted[(pool, column)] + miss[(pool, column)],
+        tune: predicted[(pool, column)] + miss[(pool, column)] + data.tunes_of_orbit[plane],
         readings,
     };
     Ok(data.tune_pools(plane).into_iter().map(of).collect())
