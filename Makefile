@@ -149,7 +149,7 @@ gateway: .venv-control ## published estimates as EPICS records and an NTTable, a
 	.venv-control/bin/orbitcal-gateway config/gateway.toml
 
 validate: build ## how often the diagnosis is right: 868 blind campaigns, twenty minutes on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
-	$(ORBITCAL) validate recordings/paper-vars --seed 3 --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
+	$(ORBITCAL) validate recordings/paper-vars --seed 5 --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
 
 adversary: build .venv ## 220 blind campaigns by pyAT of machines with ordinary imperfections, simulated by a program written without sight of the diagnosis, and their scores; an hour
 	.venv/bin/python tests/peers/adversary.py --machine machines/booster.json --out target/adversary

@@ -21,7 +21,7 @@ use core::ops::Range;
 use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
-    Drives, EffectError, Hold, Holding, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
+    Drives, EffectError, Hold, Holding, Kind, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
 };
 
 use super::baseline::Baseline;
@@ -118,11 +118,21 @@ struct Displaced {
 }
 
 impl Displaced {
-    fn of(machine: &Machine, baseline: &Baseline) -> Result<Self, OrbitError> {
+    /// `off`: by how much the orbit at each element is off the estimated one, in a fit to which sextupole and octupole fields tell it (x, y) [m]. Such a field is
+    /// displaced against the orbit instead.
+    fn of(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
         let machine = machine.without_memory();
         let mut displaced = machine.clone();
         baseline.displace(&mut displaced)?;
-        let orbit = displaced.orbit()?;
+        // what a monitor misreads depends on the orbit there too, and that is the exact one
+        let fields: Vec<usize> =
+            (0..off.len()).filter(|&at| !matches!(machine.ring().elements[at].kind, Kind::Monitor)).collect();
+        for &at in &fields {
+            let misalignment = &mut displaced.ring_mut().elements[at].misalignment;
+            (misalignment.dx, misalignment.dy) = (misalignment.dx - off[at][0], misalignment.dy - off[at][1]);
+        }
+        let mut orbit = displaced.orbit()?;
+        fields.iter().for_each(|&at| (0..2).for_each(|plane| orbit[at][plane] += off[at][plane]));
         Ok(Self { machine, displaced, orbit })
     }
 
@@ -241,7 +251,7 @@ impl Data {
         let kicked_off = recorded - design.readings(&drives)?.0;
         let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
-        let close_tunes = CloseTunes::of(&Displaced::of(&design, &baseline)?.displaced, &recorded_tunes)?;
+        let close_tunes = CloseTunes::of(&Displaced::of(&design, &baseline, &[])?.displaced, &recorded_tunes)?;
         if close_tunes.is_some() {
             recorded_tunes.fill(f64::NAN);
         }
@@ -290,20 +300,24 @@ impl Data {
         };
         data.prepare();
         data.check(recording)?;
-        data.linearise_about(&design)?;
+        let orbit = data.drives.orbit.clone();
+        data.linearise_about(&design, &orbit)?;
         Ok(data)
     }
 
-    /// Linearise the recorded readings and tunes about a machine: subtract the effect of the supplies' fluctuations on the kicked orbit,
+    /// Linearise the recorded readings and tunes about a machine and the orbit without kicks that it has in the fit, (x, y) at every element [m]: subtract the effect of the supplies' fluctuations on the kicked orbit,
     /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
     /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. From the tunes what moves them beyond first order. Returns the chi-square of the change of all.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn linearise_about(&mut self, machine: &Machine) -> Result<f64, EffectError> {
-        let frames = Drives { orbit: self.drives.orbit.clone(), ..self.frames.drives.clone() };
-        let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&self.drives)?.0);
-        let displaced = Displaced::of(machine, &self.baseline)?;
+    pub fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
+        let frames = Drives { orbit: orbit.to_vec(), ..self.frames.drives.clone() };
+        let means = Drives { orbit: orbit.to_vec(), ..self.drives.clone() };
+        let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&means)?.0);
+        let off: Vec<[f64; 2]> =
+            orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
+        let displaced = Displaced::of(machine, &self.baseline, &off)?;
         let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
         let off_first_order = within + displaced.higher_orders(&exact)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();

@@ -291,12 +291,12 @@ impl Fitted {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
-    /// The machine in each recording.
+    /// The machine in each recording, and its drives.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machines(&self, data: &Data) -> Result<Vec<Machine>, EffectError> {
-        (0..data.count()).map(|campaign| Ok(self.machine_in(data, campaign)?.0)).collect()
+    pub fn machines(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
+        (0..data.count()).map(|campaign| self.machine_in(data, campaign)).collect()
     }
 
     /// Change of the tunes by the unknown element, which is not in the machine; 0 without one.

@@ -98,7 +98,8 @@ impl Standard {
         let hypothesis = Hypothesis { given: vec![effect], ..Hypothesis::default() };
         let mut fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
         for _ in 0..PASSES {
-            data.linearise_about(&fitted.machine(&data).unwrap().0).unwrap();
+            let (machine, drives) = fitted.machine(&data).unwrap();
+            data.linearise_about(&machine, &drives.orbit).unwrap();
             fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
         }
         let (machine, drives) = fitted.machine_on_orbit(&data, 0).unwrap();

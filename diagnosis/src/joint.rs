@@ -11,7 +11,7 @@ use core::ops::Range;
 
 use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector};
-use twin::{EffectError, EffectKind, Machine};
+use twin::{Drives, EffectError, EffectKind, Machine};
 
 use super::data::{Data, DataError};
 
@@ -147,17 +147,18 @@ impl Data {
         self.campaigns().map(Self::log_det).sum()
     }
 
-    /// [`Data::linearise_about`] of each recording about its machine; chi-square of the change of all readings.
+    /// [`Data::linearise_about`] of each recording about its machine and orbit; chi-square of the change of all readings.
     ///
     /// # Errors
     /// [`EffectError`]; all are then as they were.
-    pub fn linearise_each(&mut self, machines: &[Machine]) -> Result<f64, EffectError> {
+    pub fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
         let mut others = self.others.clone();
         let mut moved = 0.0;
-        for (other, machine) in others.iter_mut().zip(&machines[1..]) {
-            moved += other.linearise_about(machine)?;
+        for (other, (machine, drives)) in others.iter_mut().zip(&machines[1..]) {
+            moved += other.linearise_about(machine, &drives.orbit)?;
         }
-        moved += self.linearise_about(&machines[0])?;
+        let (machine, drives) = &machines[0];
+        moved += self.linearise_about(machine, &drives.orbit)?;
         self.others = others;
         Ok(moved)
     }

@@ -58,3 +58,32 @@ pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
     }
     fitted
 }
+
+#[cfg(test)]
+mod tests {
+    use inference::Campaign;
+    use twin::EffectKind;
+
+    use super::*;
+    use crate::testing::template;
+    use crate::validation::{Cases, Class};
+
+    /// A sextupole next to an integer tune, which the orbit passes some tenths of a millimetre off the estimated place: linearised on the estimated orbit, each pass
+    /// went further away, and two effects were named that are not there.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn readings_beside_a_sextupole_are_linearised_on_the_orbit_of_the_fit() {
+        let (ring, recording) = template();
+        let case = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap().draw(Class::Pair, 2_000_002, 4);
+        let sextupole = case.effects.iter().find(|effect| effect.kind == EffectKind::SextupoleError).unwrap();
+        let made = case.recording(&ring, &recording).unwrap();
+        let mut data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let hypothesis = Hypothesis::plain().with((*sextupole).into());
+        let unknowns = data.units.len() + hypothesis.unknowns(&data).len();
+        let fitted = fit(&mut data, &hypothesis, &DVector::zeros(unknowns)).unwrap();
+        let (value, sigma) = fitted.amplitude(&data, 0);
+        assert!(((value - sextupole.amplitude) / sigma).abs() < 3.0, "{value} ± {sigma}");
+        let again = data.linearise_each(&fitted.machines(&data).unwrap()).unwrap();
+        assert!(again < CURVED && fitted.chi2_per_number() < 0.9, "{again} {}", fitted.chi2_per_number());
+    }
+}

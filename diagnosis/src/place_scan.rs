@@ -200,8 +200,8 @@ mod tests {
             let mut data = Data::of(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
-            let machine = hypothesis.machine(&data, &fitted.params, &fitted.u.as_slice()[48..]).unwrap().0;
-            data.linearise_about(&machine).unwrap();
+            let (machine, drives) = fitted.machine(&data).unwrap();
+            data.linearise_about(&machine, &drives.orbit).unwrap();
             let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
             let scan = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
