@@ -34,6 +34,9 @@ impl CloseTunes {
     pub fn of(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
         let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
+        if distances.is_empty() {
+            return Ok(None);
+        }
         let (distance, optics) = (distances.iter().sum::<f64>() / distances.len() as f64, machine.optics()?);
         let ring = machine.ring();
         let roll = Family::of_machine()
@@ -45,7 +48,6 @@ impl CloseTunes {
             2.0 * roll * k1 * ring.elements[quadrupole.element].length * (x * y).sqrt() / TAU
         });
         let approach = by_roll.map(|one| one * one).sum::<f64>().sqrt().hypot(optics.closest_tune_approach()?);
-        // not a number without tunes
         Ok((distance < APART * approach).then_some(Self { distance, approach }))
     }
 }
@@ -55,8 +57,7 @@ impl fmt::Display for CloseTunes {
         let Self { distance, approach } = self;
         write!(
             f,
-            "the tunes are {distance:.3} apart, coupling mixes those less than {:.3} apart, and they are left out",
-            APART * approach
+            "the tunes are {distance:.3} apart, less than three times the closest approach of {approach:.3} that coupling leaves, and are not used"
         )
     }
 }
@@ -82,7 +83,10 @@ mod tests {
         let told = close.close_tunes.unwrap();
         assert!((told.distance - 0.004).abs() < 1e-9 && close.tune_noise(0).is_none());
         let said = told.to_string();
-        assert!(said.starts_with("the tunes are 0.004 apart, coupling mixes those less than 0.0"), "{said}");
+        assert!(
+            said.starts_with("the tunes are 0.004 apart, less than three times the closest approach of 0.00"),
+            "{said}"
+        );
     }
 
     /// A skew gradient that keeps tunes apart by more than rolls do.
@@ -97,7 +101,6 @@ mod tests {
             (CloseTunes::of(&machine, &tunes).unwrap().unwrap(), own)
         };
         let ((plain, none), (coupled, own)) = (of(&[]), of(&["stray_skew_gradient@SLOT_F6=0.02"]));
-        println!("{} {own}", plain.approach);
         assert!(none < 1e-6 && (plain.distance - 1e-3).abs() < 1e-12);
         assert!((coupled.approach - own.hypot(plain.approach)).abs() < 0.05 * coupled.approach && own > plain.approach);
     }

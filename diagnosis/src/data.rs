@@ -61,8 +61,8 @@ pub struct Data {
     pub drives: Drives,
     /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
-    /// What the tunes on the orbit without kicks are above those of [`Machine::readings`], of the machine that the readings are linearised about.
-    pub tunes_of_orbit: [f64; 2],
+    /// Shift of the tunes by the orbit without kicks, which [`Machine::readings`] leaves out, in the machine that the readings are linearised about.
+    pub tune_shift_of_orbit: [f64; 2],
     /// Tunes that are left out.
     pub close_tunes: Option<CloseTunes>,
     /// Which readings count, and the state of the monitors.
@@ -118,8 +118,8 @@ struct Displaced {
 }
 
 impl Displaced {
-    /// `off`: by how much the orbit at each element is off the estimated one, in a fit to which sextupole and octupole fields tell it (x, y) [m]. Such a field is
-    /// displaced against the orbit instead.
+    /// `off`: by how much the orbit at each element is off the estimated one (x, y) [m], where a fit moves it at a sextupole or an octupole. The field is displaced
+    /// against the orbit instead.
     fn of(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
         let machine = machine.without_memory();
         let mut displaced = machine.clone();
@@ -145,7 +145,7 @@ impl Displaced {
     }
 
     /// What the orbit without kicks does to the tunes: it is off the axis of sextupole fields, and couples the planes.
-    fn tunes_of_orbit(&self) -> Result<[f64; 2], OrbitError> {
+    fn tune_shift_of_orbit(&self) -> Result<[f64; 2], OrbitError> {
         let [with, without] =
             [self.displaced.optics()?.tunes()?, self.machine.on_orbit(&self.orbit).optics()?.tunes()?];
         Ok([with.x - without.x, with.y - without.y])
@@ -278,7 +278,7 @@ impl Data {
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
             shared: (0..recorded.ncols()).map(shared).collect(),
             baseline,
-            tunes_of_orbit: [0.0; 2],
+            tune_shift_of_orbit: [0.0; 2],
             close_tunes,
             expected_noise: recording.header.noise.clone(),
             centre: DVector::zeros(recorded.ncols() + 2),
@@ -307,7 +307,7 @@ impl Data {
 
     /// Linearise the recorded readings and tunes about a machine and the orbit without kicks that it has in the fit, (x, y) at every element [m]: subtract the effect of the supplies' fluctuations on the kicked orbit,
     /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
-    /// 10 um for kicks of 0.2 mrad, more near an integer tune. Both depend little on the details of the model. From the tunes what moves them beyond first order. Returns the chi-square of the change of all.
+    /// 10 um for kicks of 0.2 mrad, more near an integer tune. What moves the tunes beyond first order is subtracted too. Returns the chi-square of the change of all.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
@@ -327,7 +327,7 @@ impl Data {
         of_monitors -= off_first_order;
         let mut of_tunes = readings.columns_mut(monitors, 2);
         of_tunes -= displaced.tunes_beyond(&self.frames.drives, exact.tunes())?;
-        self.tunes_of_orbit = displaced.tunes_of_orbit()?;
+        self.tune_shift_of_orbit = displaced.tune_shift_of_orbit()?;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();

@@ -106,7 +106,7 @@ mod tests {
                 let off = off.iter().sum::<f64>() / off.len() as f64;
                 let beta = optics.beta(at, [Plane::X, Plane::Y][plane]);
                 let sigma = 2.0 * data.baseline.sigma[at][0] * beta / (4.0 * core::f64::consts::PI);
-                let found = data.tunes_of_orbit[plane];
+                let found = data.tune_shift_of_orbit[plane];
                 // and the ripple of the supplies
                 assert!((off - found).abs() < 3.0 * sigma + 3e-4, "{off} {found} ± {sigma}");
                 assert!(seed != 1 || found.abs() > 3.0 * sigma, "{found} ± {sigma}");

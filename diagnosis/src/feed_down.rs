@@ -2,7 +2,8 @@
 //!
 //! The readings are linearised about that orbit ([`super::data`]), so that what it is off by remains: in a field `K2L` an orbit that is `y` higher is a skew
 //! gradient `K2L y`. It acts on the beam as a roll `K2L y/(2 K1L)` of the nearest quadrupole; of a sextupole in the Booster 16 % of it are no such roll, by the phase
-//! between the two. The normal gradient `K2L x` is part of the quadrupole's var, of whose scatter it is a small share.
+//! between the two. The normal gradient `K2L x` is part of the quadrupole's var, of whose scatter it is a small share. Errors at different places are taken to be independent,
+//! though one orbit makes them, so that those of neighbouring sextupoles resemble each other.
 
 use twin::{Kind, Ring};
 
@@ -79,7 +80,6 @@ mod tests {
         let flat = |one: &nalgebra::DMatrix<f64>| DVector::from_column_slice(one.as_slice());
         let (rolled, skew) = (flat(&rolled) * (rolls[quadrupole] * k1l.signum()), flat(&skew) * 2e-3);
         let left = (&skew - &rolled * (skew.dot(&rolled) / rolled.norm_squared())).norm() / skew.norm();
-        println!("{left} {}", skew.dot(&rolled) / rolled.norm_squared());
         assert!(left < 0.2, "{left}");
     }
 }

@@ -212,9 +212,9 @@ impl Diagnosis {
             let leading = &one.alternatives[0];
             Some(leading.term()?.effect(leading.amplitude.0))
         });
-        let (of_correctors, of_monitors): (Vec<Effect>, Vec<Effect>) =
+        let (of_correctors, others): (Vec<Effect>, Vec<Effect>) =
             passing.partition(|effect| effect.kind.is_of_a_corrector());
-        of_correctors.into_iter().chain(lasting).chain(of_monitors).collect()
+        of_correctors.into_iter().chain(lasting).chain(others).collect()
     }
 
     /// The possible measurements for an ambiguous verdict, best first; none for another.

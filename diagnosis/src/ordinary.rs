@@ -39,7 +39,7 @@ pub enum Grouping {
     Plane(Plane),
     /// All.
     All,
-    /// None, each of its own width: that of the orbit in sextupole fields ([`super::feed_down`]).
+    /// None, and each has a width of its own: that of the orbit in sextupole fields ([`super::feed_down`]), which each recording has for itself.
     OfOrbit,
 }
 
@@ -138,6 +138,9 @@ impl Family {
 
     /// Its members; of a family that belongs to a moment in the cycle those of each recording.
     pub fn members(&self, data: &Data) -> Vec<Member> {
+        if self.grouping == Grouping::OfOrbit {
+            return self.of_orbit(data).map(|(member, _)| member).collect();
+        }
         let terms = self.terms(data).into_iter();
         let of_each = |terms: Vec<Term>| {
             let campaigns: Vec<Option<usize>> =
@@ -149,16 +152,22 @@ impl Family {
 
     /// Its members as unknowns of a fit.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        let rolls = feed_down::rolls(&data.ring, &data.baseline);
-        let width = |member: &Member| match (self.grouping, member.terms[0].site) {
-            (Grouping::OfOrbit, Site::Quadrupole(q)) => self.width * rolls[q],
-            _ => self.width,
-        };
-        self.members(data)
-            .into_iter()
-            .map(|member| (width(&member), member))
-            .map(|(w, one)| Unknown::Ordinary(one, w))
-            .collect()
+        if self.grouping == Grouping::OfOrbit {
+            let own = self.of_orbit(data);
+            return own.map(|(member, roll)| Unknown::Ordinary(member, roll * self.width)).collect();
+        }
+        self.members(data).into_iter().map(|member| Unknown::Ordinary(member, self.width)).collect()
+    }
+
+    /// Members that are each recording's own, with their widths [rad].
+    fn of_orbit(&self, data: &Data) -> impl Iterator<Item = (Member, f64)> {
+        data.campaigns().enumerate().flat_map(move |(campaign, own)| {
+            let rolls = feed_down::rolls(&own.ring, &own.baseline).into_iter().enumerate();
+            rolls.filter(|(_, roll)| *roll > 0.0).map(move |(quadrupole, roll)| {
+                let term = Term { kind: self.kind, site: Site::Quadrupole(quadrupole) };
+                (Member { family: self.name, terms: vec![term], campaign: Some(campaign) }, roll)
+            })
+        })
     }
 
     /// True for what may differ between two times in the cycle: the momentum, and fields of eddy currents.
@@ -170,13 +179,8 @@ impl Family {
     fn terms(&self, data: &Data) -> Vec<Vec<Term>> {
         let all = members(self.kind, data).into_iter();
         let some: Vec<Vec<Term>> = match self.grouping {
-            Grouping::Each => {
+            Grouping::Each | Grouping::OfOrbit => {
                 return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
-            }
-            Grouping::OfOrbit => {
-                let rolls = feed_down::rolls(&data.ring, &data.baseline);
-                let is_one = |term: &Term| matches!(term.site, Site::Quadrupole(q) if rolls[q] > 0.0);
-                return all.filter(is_one).map(|term| vec![term]).collect();
             }
             Grouping::Instrument => {
                 let element = |term: &Term| term.site.elements(&data.ring);
@@ -410,25 +414,21 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
 pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     let unknowns = fitted.hypothesis.unknowns(data);
     // the amplitude of each member in widths of its family, and in its unit
-    let members: Vec<(&[Term], f64, f64)> = (unknowns.iter())
+    let members: Vec<(&Member, f64, f64)> = (unknowns.iter())
         .zip(fitted.u.iter().skip(fitted.params.len()))
         .filter_map(|(unknown, u)| match unknown {
-            Unknown::Ordinary(member, width) => Some((member.terms.as_slice(), u.abs(), u * width)),
+            Unknown::Ordinary(member, width) => Some((member, u.abs(), u * width)),
             _ => None,
         })
         .collect();
     let most = |family: &Family| {
-        let is_own = |terms: &[Term]| {
-            let size = if family.grouping == Grouping::Instrument { 2 } else { 1 };
-            terms.len() == size && terms[0].kind == family.kind
-        };
-        let own = members.iter().filter(|(terms, u, _)| is_own(terms) && *u > STANDS_OUT);
+        let own = members.iter().filter(|(member, u, _)| member.family == family.name && *u > STANDS_OUT);
         own.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
-    let proposed = |(terms, _, amplitude): &(&[Term], f64, f64)| {
-        let failed = failures(terms[0], *amplitude);
-        terms.iter().copied().chain(failed).collect::<Vec<_>>()
+    let proposed = |(member, _, amplitude): &(&Member, f64, f64)| {
+        let failed = failures(member.terms[0], *amplitude);
+        member.terms.iter().copied().chain(failed).collect::<Vec<_>>()
     };
     stands_out.flat_map(proposed).collect()
 }

@@ -390,7 +390,7 @@ pub fn findings(
 ) -> Result<Vec<Finding>, FitError> {
     let (named, unmodelled): (Vec<Finding>, Vec<Finding>) =
         transients.iter().map(|one| Finding::of_transient(data, one)).partition(|one| one.term().is_some());
-    let mut all = named;
+    let mut own = Vec::new();
     for (index, ((competition, term), &tested)) in
         found.competitions.iter().zip(&found.best.hypothesis.terms).zip(tests).enumerate()
     {
@@ -402,9 +402,11 @@ pub fn findings(
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
-        all.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
+        own.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
-    all.retain(|finding| finding.probability > STATED);
+    own.retain(|finding: &Finding| finding.probability > STATED);
+    let is_explained_better = own.is_empty();
+    let mut all: Vec<Finding> = named.into_iter().filter(|finding| finding.probability > STATED).chain(own).collect();
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
@@ -413,10 +415,13 @@ pub fn findings(
         }
         _ => None,
     };
-    if all.is_empty() && open.is_none() {
+    if is_explained_better && open.is_none() {
         // what explains the effects in the model better than these do
-        for competition in found.competitions.iter().filter(|one| !one.alternatives.is_empty()) {
-            all.push(Finding::of_competition(data, competition, 0)?);
+        for competition in &found.competitions {
+            let Some(leading) = competition.alternatives.first() else { continue };
+            if !all.iter().any(|finding| finding.cause.is(&leading.cause)) {
+                all.push(Finding::of_competition(data, competition, 0)?);
+            }
         }
     }
     if let Some(first) = open {

@@ -185,10 +185,10 @@ mod tests {
         let first: f64 = numbers(&shares.figures[0].1)[0][2].parse().unwrap();
         assert!((first - 100.0 * finding.probability).abs() < 1e-9);
         // tunes are those that the fit predicts
-        let data = &diagnosis.found.data;
+        let data = diagnosis.found.best.data(&diagnosis.found.data);
         let (machine, drives) = diagnosis.found.best.machine(data).unwrap();
         let (_, tunes, _) = machine.readings(&drives).unwrap();
-        let [x, y] = data.tunes_of_orbit;
+        let [x, y] = data.tune_shift_of_orbit;
         let rows = &section(&page, "Optics of the fitted machine").tables[0].rows;
         for (row, tune) in rows.iter().zip([tunes.x + x, tunes.y + y]) {
             assert!(row[2].starts_with(&format!("{tune:.5} ±")), "{row:?}");

@@ -94,7 +94,7 @@ impl Fit {
             s: ring.elements.iter().map(|element| element.s).chain([ring.circumference]).collect(),
             beat: [of(0), of(1)],
             dispersion: [of(2), of(3)],
-            tunes: [0, 1].map(|plane| (best[last + plane] + data.tunes_of_orbit[plane], sigma[last + plane])),
+            tunes: [0, 1].map(|plane| (best[last + plane] + data.tune_shift_of_orbit[plane], sigma[last + plane])),
             approach: pair(last + 2),
             design,
         }
@@ -164,7 +164,8 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
 fn numbers(data: &Data, fitted: &Fitted, fit: &Fit) -> Result<report::Table, FitError> {
     let measured = |plane: usize| -> Result<String, FitError> {
         let mean = tunes::mean(data, fitted, plane)?;
-        Ok(mean.map_or("not measured".to_owned(), |(mean, sigma)| format!("{mean:.5} ± {sigma:.5}")))
+        let without = if data.close_tunes.is_some() { "too close, not used" } else { "not measured" };
+        Ok(mean.map_or(without.to_owned(), |(mean, sigma)| format!("{mean:.5} ± {sigma:.5}")))
     };
     let measured = [measured(0)?, measured(1)?];
     let design = [fit.design.tunes.x, fit.design.tunes.y];
@@ -192,6 +193,6 @@ fn numbers(data: &Data, fitted: &Fitted, fit: &Fit) -> Result<report::Table, Fit
         [format!("largest beta-beat in {} [%]", ["x", "y"][plane]), "0".into(), value, "not measured".into()]
     };
     let caption = "Optics of the design (at the recording's supply currents), of the fitted machine, and as measured by the tune meter. The closest approach is \
-                   what skew gradients and rolls leave between the tunes, were these brought together.";
+                   what skew gradients and rolls leave between the tunes, were these brought together. The orbit in sextupole fields of the design is in the tunes, not in the other rows.";
     Ok(table(caption, ["", "design", "fitted", "measured"], vec![tune(0), tune(1), coupling, beat(0), beat(1)]))
 }

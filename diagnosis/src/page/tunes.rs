@@ -64,7 +64,7 @@ fn figure(
     what: &str,
 ) -> Result<Option<(String, Figure)>, FitError> {
     let Some(noise) = data.tune_noise(plane) else { return Ok(None) };
-    let (symbol, of_orbit) = (["Qx", "Qy"][plane], data.tunes_of_orbit[plane]);
+    let (symbol, of_orbit) = (["Qx", "Qy"][plane], data.tune_shift_of_orbit[plane]);
     let [x, mean, sigma] = measured(data, fitted, plane, noise)?;
     let bars = mean.iter().zip(&sigma).map(|(tune, sigma)| (tune - sigma, tune + sigma)).collect();
     let mut series = vec![Series::points("measured ± 1 σ", x, mean).within(bars)];
@@ -112,7 +112,7 @@ fn readings(data: &Data, fitted: &Fitted, plane: usize) -> Result<Vec<Reading>, 
     let (column, miss) = (data.monitors() + plane, data.miss(&predicted));
     let of = |(pool, readings): (usize, f64)| Reading {
         time: data.drives.time[pool],
-        tune: predicted[(pool, column)] + miss[(pool, column)] + data.tunes_of_orbit[plane],
+        tune: predicted[(pool, column)] + miss[(pool, column)] + data.tune_shift_of_orbit[plane],
         readings,
     };
     Ok(data.tune_pools(plane).into_iter().map(of).collect())

@@ -132,6 +132,11 @@ impl Differences {
         self.sigma[b]
     }
 
+    /// True for a reading that counts.
+    pub fn counts(&self, frame: usize, b: usize) -> bool {
+        self.counts[(frame, b)]
+    }
+
     /// True for a monitor with readings that count.
     pub fn sees(&self, b: usize) -> bool {
         self.counts.column(b).iter().any(|counts| *counts)

@@ -62,8 +62,9 @@ impl<'d> Unsteady<'d> {
         let (own, others): (Vec<Range<usize>>, Vec<Range<usize>>) =
             self.differences.runs.iter().cloned().partition(|run| is_on(run.start));
         let mut each: Vec<Sums> = own.iter().map(|run| self.sums([run])).collect();
+        each.retain(|run| run.frames > 0.0);
         let (all, of_others) = (self.sums(&own), self.sums(&others));
-        if each.len() < 2 || all.count == 0.0 || of_others.frames < all.frames {
+        if each.len() < 2 || of_others.frames < all.frames {
             return None;
         }
         let louder = all.variance_across() / of_others.variance_across().max(f64::MIN_POSITIVE);
@@ -83,21 +84,18 @@ impl<'d> Unsteady<'d> {
     pub fn shown(&self, readings: &DMatrix<f64>, is_on: impl Fn(usize) -> bool) -> Vec<Shown> {
         let mut shown = Vec::new();
         for run in self.differences.runs.iter().filter(|run| is_on(run.start)) {
-            for b in (0..readings.ncols()).filter(|&b| self.differences.sees(b)) {
-                let known: Vec<f64> =
-                    run.clone().map(|frame| readings[(frame, b)]).filter(|reading| reading.is_finite()).collect();
-                let (n, mean) = (known.len() as f64, known.iter().sum::<f64>() / known.len() as f64);
+            for b in 0..readings.ncols() {
+                let frames: Vec<usize> = run.clone().filter(|&frame| self.differences.counts(frame, b)).collect();
+                let n = frames.len() as f64;
+                let mean = frames.iter().map(|&frame| readings[(frame, b)]).sum::<f64>() / n;
                 let sigma = self.differences.noise(b) * (1.0 - n.recip()).sqrt();
-                for frame in run.clone().filter(|&frame| readings[(frame, b)].is_finite()) {
+                for frame in frames {
                     let (p, w) = (self.pattern.row(frame), self.white.row(frame));
                     let power = p.norm_squared() - p[b] * p[b];
                     if power > 0.0 && sigma > 0.0 {
                         let kick = (p.dot(&w) - p[b] * w[b]) / power;
-                        shown.push(Shown {
-                            predicted: self.response[b] * kick,
-                            measured: readings[(frame, b)] - mean,
-                            sigma,
-                        });
+                        let (predicted, measured) = (self.response[b] * kick, readings[(frame, b)] - mean);
+                        shown.push(Shown { predicted, measured, sigma });
                     }
                 }
             }
@@ -141,9 +139,6 @@ impl Sums {
 
     /// Of kicks that move the monitors by `size` [m] rms; `variance` along the pattern without them.
     fn log_bayes(&self, size: f64, variance: f64) -> f64 {
-        if self.frames == 0.0 {
-            return 0.0;
-        }
         let q = size * size * self.power / (self.frames * variance);
         0.5 * (self.along / variance * q / (1.0 + q) - self.count * q.ln_1p())
     }

@@ -460,7 +460,7 @@ fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
     // on its orbit, where sextupoles focus
     let tunes = machine.on_orbit(&drives.orbit).optics().and_then(|optics| optics.tunes()).ok()?;
     let [x, y] = best.tunes_of_element(data).ok()?;
-    let [of_x, of_y] = data.tunes_of_orbit;
+    let [of_x, of_y] = best.data(data).tune_shift_of_orbit;
     Some(Tunes { x: tunes.x + x + of_x, y: tunes.y + y + of_y })
 }
 
