@@ -98,12 +98,12 @@ impl Baseline {
         };
         let read: Vec<Option<f64>> = self.read.iter().zip(ring.monitors_read()).map(less).collect();
         let kicks = Kriged::of(ring, &read, self.rms)?.kicks;
-        for ((quadrupole, k1), [x, y]) in ring.quadrupoles.iter().zip(ring.gradients()).zip(kicks) {
-            let element = &mut ring.elements[quadrupole.element];
-            let strength = k1 * element.length;
+        let strengths = ring.integrated_gradients();
+        for ((quadrupole, strength), [x, y]) in ring.quadrupoles.iter().zip(strengths).zip(kicks) {
             if strength != 0.0 {
-                element.misalignment.dx += x / strength;
-                element.misalignment.dy -= y / strength;
+                let misalignment = &mut ring.elements[quadrupole.element].misalignment;
+                misalignment.dx += x / strength;
+                misalignment.dy -= y / strength;
             }
         }
         Ok(())
@@ -261,10 +261,9 @@ mod tests {
         for seed in 0..RINGS {
             let (mut displaced, mut random) = (ring.clone(), StdRng::seed_from_u64(seed));
             let mut longer = 0.0;
-            for (quadrupole, k1) in ring.quadrupoles.iter().zip(ring.gradients()) {
+            for (quadrupole, k1l) in ring.quadrupoles.iter().zip(ring.integrated_gradients()) {
                 let draw: f64 = StandardNormal.sample(&mut random);
-                let element = &mut displaced.elements[quadrupole.element];
-                element.misalignment.dx = kick * draw / (k1 * element.length);
+                displaced.elements[quadrupole.element].misalignment.dx = kick * draw / k1l;
                 longer += kick * draw * optics.dispersion(&optics.observe(quadrupole.element, Plane::X));
             }
             let mut off = moved(&displaced) - &straight;

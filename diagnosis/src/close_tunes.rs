@@ -43,9 +43,9 @@ impl CloseTunes {
             .iter()
             .find(|family| family.kind == EffectKind::QuadRoll)
             .map_or(0.0, |one| one.tolerance);
-        let by_roll = ring.quadrupoles.iter().zip(ring.gradients()).map(|(quadrupole, k1)| {
+        let by_roll = ring.quadrupoles.iter().zip(ring.integrated_gradients()).map(|(quadrupole, k1l)| {
             let [x, y] = [Plane::X, Plane::Y].map(|plane| optics.beta(quadrupole.element, plane));
-            2.0 * roll * k1 * ring.elements[quadrupole.element].length * (x * y).sqrt() / TAU
+            2.0 * roll * k1l * (x * y).sqrt() / TAU
         });
         let approach = by_roll.map(|one| one * one).sum::<f64>().sqrt().hypot(optics.closest_tune_approach()?);
         Ok((distance < APART * approach).then_some(Self { distance, approach }))

@@ -118,8 +118,8 @@ struct Displaced {
 }
 
 impl Displaced {
-    /// `off`: by how much the orbit at each element is off the estimated one (x, y) [m], where a fit moves it at a sextupole or an octupole. The field is displaced
-    /// against the orbit instead.
+    /// `off`: by how much the orbit at each element is off the estimated one (x, y) [m], where a fit moves it at a sextupole or an octupole. The field is
+    /// displaced against the orbit instead.
     fn of(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
         let machine = machine.without_memory();
         let mut displaced = machine.clone();
@@ -136,32 +136,31 @@ impl Displaced {
         Ok(Self { machine, displaced, orbit })
     }
 
-    /// What the exact orbits have beyond [`Machine::readings`], rows frames, the same for all repeats [m]: terms above first order in kicks and RF
-    /// offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes.
-    fn higher_orders(&self, exact: &Exact) -> Result<DMatrix<f64>, EffectError> {
+    /// What exact orbits have beyond [`Machine::readings`].
+    fn higher_orders(&self, exact: &Exact) -> Result<HigherOrders, EffectError> {
         let means = Drives { orbit: self.orbit.clone(), ..exact.means.clone() };
-        let higher = &exact.readings - self.machine.readings(&means)?.0;
-        Ok(higher.select_rows(&exact.settings.of_frame))
+        let (readings, tunes, tune_changes) = self.machine.readings(&means)?;
+        let of_orbit = [exact.without_kicks.x - tunes.x, exact.without_kicks.y - tunes.y];
+        let by_frame = &exact.settings.of_frame;
+        let mut of_tunes = &exact.tunes - tune_changes;
+        of_tunes.column_iter_mut().zip([tunes.x, tunes.y]).for_each(|(mut column, tune)| column.add_scalar_mut(-tune));
+        Ok(HigherOrders {
+            readings: (&exact.readings - readings).select_rows(by_frame),
+            tunes: of_tunes.select_rows(by_frame),
+            tune_shift_of_orbit: of_orbit,
+        })
     }
+}
 
-    /// What the orbit without kicks does to the tunes: it is off the axis of sextupole fields, and couples the planes.
-    fn tune_shift_of_orbit(&self) -> Result<[f64; 2], OrbitError> {
-        let [with, without] =
-            [self.displaced.optics()?.tunes()?, self.machine.on_orbit(&self.orbit).optics()?.tunes()?];
-        Ok([with.x - without.x, with.y - without.y])
-    }
-
-    /// What exact tunes have beyond [`Machine::readings`], rows frames: kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not
-    /// held; the orbit without kicks is off the axis of sextupole fields, and couples the planes.
-    fn tunes_beyond(&self, drives: &Drives, exact: MatrixXx2<f64>) -> Result<MatrixXx2<f64>, EffectError> {
-        // a drift is no effect of the kicks
-        let time = DVector::zeros(drives.time.len());
-        let frames = Drives { time, orbit: self.orbit.clone(), ..drives.clone() };
-        let (_, tunes, changes) = self.machine.readings(&frames)?;
-        let mut beyond = exact - changes;
-        beyond.column_iter_mut().zip([tunes.x, tunes.y]).for_each(|(mut column, tune)| column.add_scalar_mut(-tune));
-        Ok(beyond)
-    }
+/// What exact orbits have beyond first order, the same for all repeats.
+struct HigherOrders {
+    /// Terms above first order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes; rows frames [m].
+    readings: DMatrix<f64>,
+    /// Kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not held; the orbit without kicks is off the axis of sextupole
+    /// fields, and couples the planes; rows frames. A drift is no effect of the kicks, so that the time is that in mid-campaign.
+    tunes: MatrixXx2<f64>,
+    /// The part of these that the orbit without kicks makes.
+    tune_shift_of_orbit: [f64; 2],
 }
 
 /// Why a recording cannot be diagnosed.
@@ -305,9 +304,10 @@ impl Data {
         Ok(data)
     }
 
-    /// Linearise the recorded readings and tunes about a machine and the orbit without kicks that it has in the fit, (x, y) at every element [m]: subtract the effect of the supplies' fluctuations on the kicked orbit,
-    /// to first order, and the terms of the exact orbits above first order. The curvature of the bends makes the latter up to some
-    /// 10 um for kicks of 0.2 mrad, more near an integer tune. What moves the tunes beyond first order is subtracted too. Returns the chi-square of the change of all.
+    /// Linearise the recorded readings and tunes about a machine and the orbit without kicks that it has in the fit, (x, y) at every element [m]: subtract the
+    /// effect of the supplies' fluctuations on the kicked orbit, to first order, and what exact orbits have above first order. The curvature of the bends makes the
+    /// latter up to some 10 um for kicks of 0.2 mrad, more near an integer tune. What moves the tunes beyond first order is subtracted too. Returns the
+    /// chi-square of the change of all.
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
@@ -319,15 +319,15 @@ impl Data {
             orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
         let displaced = Displaced::of(machine, &self.baseline, &off)?;
         let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
-        let off_first_order = within + displaced.higher_orders(&exact)?;
+        let higher = displaced.higher_orders(&exact)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
         let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);
         let mut of_monitors = readings.columns_mut(0, monitors);
-        of_monitors -= off_first_order;
+        of_monitors -= within + higher.readings;
         let mut of_tunes = readings.columns_mut(monitors, 2);
-        of_tunes -= displaced.tunes_beyond(&self.frames.drives, exact.tunes())?;
-        self.tune_shift_of_orbit = displaced.tune_shift_of_orbit()?;
+        of_tunes -= higher.tunes;
+        self.tune_shift_of_orbit = higher.tune_shift_of_orbit;
         self.frames.readings = readings;
         let before = core::mem::replace(&mut self.readings, DMatrix::zeros(0, 0));
         self.prepare();

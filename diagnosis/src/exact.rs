@@ -4,7 +4,7 @@
 //! that in the mean of many frames, so that tunes of a campaign in which correctors and signs take turns seem to drift.
 
 use nalgebra::{DMatrix, MatrixXx2};
-use twin::{Cycle, Drives, EffectError, Machine, Tracked};
+use twin::{Cycle, Drives, EffectError, Machine, Tracked, Tunes};
 
 use super::settings::Settings;
 
@@ -16,8 +16,10 @@ pub struct Exact {
     pub means: Drives,
     /// Readings less those of the orbit without kicks, rows settings, columns read monitors [m].
     pub readings: DMatrix<f64>,
-    /// Tunes, rows settings.
-    tunes: MatrixXx2<f64>,
+    /// Tunes, rows settings; with an RF offset, and where kicks leave no stable motion, those without kicks.
+    pub tunes: MatrixXx2<f64>,
+    /// Tunes on the orbit without kicks.
+    pub without_kicks: Tunes,
 }
 
 impl Exact {
@@ -49,12 +51,7 @@ impl Exact {
                 *to = read - none;
             });
         }
-        Ok(Self { settings, means, readings, tunes })
-    }
-
-    /// The tunes, rows frames; of frames with an RF offset, and where kicks leave no stable motion, those without kicks.
-    pub fn tunes(&self) -> MatrixXx2<f64> {
-        self.tunes.select_rows(&self.settings.of_frame)
+        Ok(Self { settings, means, readings, tunes, without_kicks: plain })
     }
 }
 
@@ -72,11 +69,11 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let machine = Machine::new(ring, Rf::FixedMomentum, &[]).unwrap();
-        let at = |scale: f64| {
+        let by = |scale: f64| {
             let drives = Drives { kick: &data.drives.kick * scale, ..data.drives.clone() };
-            Exact::of(&machine, &drives).unwrap().tunes()
+            let Exact { settings, tunes, without_kicks: Tunes { x, y }, .. } = Exact::of(&machine, &drives).unwrap();
+            tunes.map_with_location(|_, plane, tune| tune - [x, y][plane]).select_rows(&settings.of_frame)
         };
-        let by = |scale: f64| at(scale) - at(0.0);
         let (full, turned) = (by(1.0), by(-1.0));
         // a tenth of the tune meter's noise of one frame at most, 5e-4
         assert!(full.amax() > 1e-6 && full.amax() < 5e-5, "{:e}", full.amax());

@@ -1,9 +1,9 @@
 //! Skew gradients of an orbit in the sextupole fields of the design that is not the one that the monitors' baselines tell.
 //!
 //! The readings are linearised about that orbit ([`super::data`]), so that what it is off by remains: in a field `K2L` an orbit that is `y` higher is a skew
-//! gradient `K2L y`. It acts on the beam as a roll `K2L y/(2 K1L)` of the nearest quadrupole; of a sextupole in the Booster 16 % of it are no such roll, by the phase
-//! between the two. The normal gradient `K2L x` is part of the quadrupole's var, of whose scatter it is a small share. Errors at different places are taken to be independent,
-//! though one orbit makes them, so that those of neighbouring sextupoles resemble each other.
+//! gradient `K2L y`. It acts on the beam as a roll `K2L y/(2 K1L)` of the nearest quadrupole; of a sextupole in the Booster 16 % of it are no such roll, by
+//! the phase between the two. The normal gradient `K2L x` is part of the quadrupole's var, of whose scatter it is a small share. Errors at different places
+//! are taken to be independent, though one orbit makes them, so that those of neighbouring sextupoles resemble each other.
 
 use twin::{Kind, Ring};
 
@@ -12,8 +12,7 @@ use super::baseline::Baseline;
 /// Standard deviation of the roll of each quadrupole `[M]` that stands for the fields nearest to it [rad]; 0 where there is none.
 pub fn rolls(ring: &Ring, baseline: &Baseline) -> Vec<f64> {
     let middle = |element: usize| ring.elements[element].s + 0.5 * ring.elements[element].length;
-    let strength: Vec<f64> =
-        ring.quadrupoles.iter().zip(ring.gradients()).map(|(one, k1)| k1 * ring.elements[one.element].length).collect();
+    let strength = ring.integrated_gradients();
     let mut squares = vec![0.0; strength.len()];
     for (element, k2l) in sextupoles(ring) {
         let apart = |q: &usize| ring.distance(middle(ring.quadrupoles[*q].element), middle(element));
@@ -69,7 +68,7 @@ mod tests {
         let rolls = rolls(&ring, &baseline(1e-3));
         let quadrupole = rolls.iter().position(|roll| *roll > 0.0).unwrap();
         assert_eq!(rolls.iter().filter(|roll| **roll > 0.0).count(), 1);
-        let k1l = ring.gradients()[quadrupole] * ring.elements[ring.quadrupoles[quadrupole].element].length;
+        let k1l = ring.integrated_gradients()[quadrupole];
         assert!((rolls[quadrupole] - 1e-3 / k1l.abs()).abs() < 1e-12);
         let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &[]).unwrap();
         let signatures = Signatures::of(&machine, &data.drives).unwrap();

@@ -320,8 +320,9 @@ impl Hypothesis {
 /// Effects beside ordinary imperfections, in the order in which a signal passes them: correctors, ordinary imperfections, fields, monitors.
 ///
 /// Of correctors and monitors what has an amplitude is next to the beam, then what is reversed or dead, then what is exchanged: the current of a dead corrector
-/// is none before its coils couple, and exchanged names are given to what monitors read. Of the same sort the later one is nearer. An effect is scored as if it
-/// were next to the beam, so that a fit with one more has what was scored, to first order in what is ordinary; but for an exchange of instruments of which one is known to be reversed or dead.
+/// is none before its coils couple, and exchanged names are given to what monitors read. Of the same sort the later one is nearer. An effect is scored as if
+/// it were next to the beam, so that a fit with one more has what was scored, to first order in what is ordinary; but for an exchange of instruments of
+/// which one is known to be reversed or dead.
 pub fn in_order(effects: Vec<Effect>, ordinary: impl IntoIterator<Item = Effect>) -> Vec<Effect> {
     let from_beam = |effect: &Effect| match effect.kind.is_switch() {
         false => 0,

@@ -202,8 +202,8 @@ impl Diagnosis {
         })
     }
 
-    /// The effects in the fitted model, at their most likely amplitudes, in the order in which a signal passes them. What passes within a setting was found by the
-    /// names of correctors and monitors in the recording, so that it is farthest from the beam.
+    /// The effects in the fitted model, at their most likely amplitudes, in the order in which a signal passes them. What passes within a setting was found by
+    /// the names of correctors and monitors in the recording, so that it is farthest from the beam.
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
         let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);

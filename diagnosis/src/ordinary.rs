@@ -136,43 +136,42 @@ impl Family {
         FAMILIES.iter().map(of).collect()
     }
 
-    /// Its members; of a family that belongs to a moment in the cycle those of each recording.
+    /// Its members; of a family that each recording has for itself those of each.
     pub fn members(&self, data: &Data) -> Vec<Member> {
-        if self.grouping == Grouping::OfOrbit {
-            return self.of_orbit(data).map(|(member, _)| member).collect();
-        }
-        let terms = self.terms(data).into_iter();
-        let of_each = |terms: Vec<Term>| {
-            let campaigns: Vec<Option<usize>> =
-                if self.is_of_a_moment() { (0..data.count()).map(Some).collect() } else { vec![None] };
-            campaigns.into_iter().map(move |campaign| Member { family: self.name, terms: terms.clone(), campaign })
-        };
-        terms.flat_map(of_each).collect()
+        self.members_with_widths(data).map(|(member, _)| member).collect()
     }
 
     /// Its members as unknowns of a fit.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        if self.grouping == Grouping::OfOrbit {
-            let own = self.of_orbit(data);
-            return own.map(|(member, roll)| Unknown::Ordinary(member, roll * self.width)).collect();
-        }
-        self.members(data).into_iter().map(|member| Unknown::Ordinary(member, self.width)).collect()
+        self.members_with_widths(data).map(|(member, width)| Unknown::Ordinary(member, width)).collect()
     }
 
-    /// Members that are each recording's own, with their widths [rad].
-    fn of_orbit(&self, data: &Data) -> impl Iterator<Item = (Member, f64)> {
-        data.campaigns().enumerate().flat_map(move |(campaign, own)| {
-            let rolls = feed_down::rolls(&own.ring, &own.baseline).into_iter().enumerate();
-            rolls.filter(|(_, roll)| *roll > 0.0).map(move |(quadrupole, roll)| {
-                let term = Term { kind: self.kind, site: Site::Quadrupole(quadrupole) };
-                (Member { family: self.name, terms: vec![term], campaign: Some(campaign) }, roll)
-            })
-        })
+    fn members_with_widths(&self, data: &Data) -> impl Iterator<Item = (Member, f64)> {
+        let rolls: Vec<Vec<f64>> = match self.grouping {
+            Grouping::OfOrbit => data.campaigns().map(|own| feed_down::rolls(&own.ring, &own.baseline)).collect(),
+            _ => Vec::new(),
+        };
+        let width = move |member: &Member| match (member.campaign, member.terms[0].site) {
+            (Some(own), Site::Quadrupole(at)) => self.width * rolls[own][at],
+            _ => self.width,
+        };
+        let campaigns: Vec<Option<usize>> =
+            if self.is_of_each() { (0..data.count()).map(Some).collect() } else { vec![None] };
+        let of_each = move |terms: Vec<Term>| {
+            let member = move |campaign| Member { family: self.name, terms: terms.clone(), campaign };
+            campaigns.clone().into_iter().map(member)
+        };
+        let with_width = move |member: Member| {
+            let width = width(&member);
+            (width > 0.0).then_some((member, width))
+        };
+        self.terms(data).into_iter().flat_map(of_each).filter_map(with_width)
     }
 
-    /// True for what may differ between two times in the cycle: the momentum, and fields of eddy currents.
-    fn is_of_a_moment(&self) -> bool {
-        matches!(self.kind, EffectKind::MomentumOffset | EffectKind::DipoleSextupole)
+    /// True for what each recording has for itself: the momentum and fields of eddy currents, which differ between two times in the cycle, and the orbit.
+    fn is_of_each(&self) -> bool {
+        self.grouping == Grouping::OfOrbit
+            || matches!(self.kind, EffectKind::MomentumOffset | EffectKind::DipoleSextupole)
     }
 
     /// Its effects, those that share an amplitude together.

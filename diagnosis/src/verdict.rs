@@ -404,9 +404,9 @@ pub fn findings(
         };
         own.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
-    own.retain(|finding: &Finding| finding.probability > STATED);
-    let is_explained_better = own.is_empty();
-    let mut all: Vec<Finding> = named.into_iter().filter(|finding| finding.probability > STATED).chain(own).collect();
+    let is_stated = |finding: &Finding| finding.probability > STATED;
+    let is_explained_better = !own.iter().any(is_stated);
+    let mut all: Vec<Finding> = named.into_iter().chain(own).filter(is_stated).collect();
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),

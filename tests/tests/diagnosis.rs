@@ -164,10 +164,13 @@ fn a_reversed_corrector_is_named_where_no_setting_is_repeated() {
     assert_eq!(truth.grade(&diagnosis), Grade::Right, "{}", diagnosis.sentence);
 }
 
-/// A campaign in which the columns of some monitors went round.
+/// A campaign in which the columns of some monitors went round, and a faulty one reads tenfold.
 fn gone_round(monitors: usize) -> Diagnosis {
     let mut recording = simulated(&[], 79);
-    recording.rows.iter_mut().for_each(|row| row.reading[8..8 + monitors].rotate_left(1));
+    for row in &mut recording.rows {
+        row.reading[8..8 + monitors].rotate_left(1);
+        row.reading[20] = row.reading[20].map(|position| 10.0 * position);
+    }
     Diagnosis::of(&Ring::booster(), &recording, |_| ()).unwrap()
 }
 

@@ -168,10 +168,8 @@ fn stated_error(ring: &Ring, instruments: &Instruments, tables: &Tables) -> [f32
 /// What each quadrupole has: its strength, its param, its supply; and the prior of each param.
 fn wiring(ring: &Ring, tables: &mut Tables) -> Result<(), TrainingError> {
     let index = |i: Option<usize>| i.map_or(NONE, |i| i as i16);
-    let strengths = ring.gradients().into_iter().zip(&ring.quadrupoles);
-    for (to, (k1, q)) in tables.list_mut(List::Weight).iter_mut().zip(strengths) {
-        *to = (0.5 * k1 * ring.elements[q.element].length) as f32;
-    }
+    let strengths = ring.integrated_gradients();
+    tables.list_mut(List::Weight).iter_mut().zip(strengths).for_each(|(to, k1l)| *to = (0.5 * k1l) as f32);
     let params = ring.quadrupoles.iter().map(|q| index(q.parameter));
     tables.line_mut(Table::Param).iter_mut().zip(params).for_each(|(to, param)| *to = param);
     let supplies = ring.quadrupoles.iter().map(|q| index(q.supply));

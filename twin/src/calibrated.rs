@@ -103,7 +103,7 @@ mod tests {
         let mut covariance = DMatrix::zeros(48, 48);
         covariance[(parameter, parameter)] = 1e-4;
         let (sigma, tune_sigma) = calibrated.sigma(&covariance);
-        let k1l = ring.gradients()[parameter] * ring.elements[q].length;
+        let k1l = ring.integrated_gradients()[parameter];
         let middle = |plane: usize| {
             let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
             let depth = 0.5 * ring.elements[q].length;

@@ -32,11 +32,9 @@ fn of_plane(ring: &Ring, optics: &Optics, plane: Plane) -> Vec<f64> {
     let observers: Vec<_> = read.map(|monitor| optics.observe(monitor.element, plane)).collect();
     let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
     let k1 = ring.gradients();
-    let shifted = ring.quadrupoles.iter().zip(&k1).map(|(quadrupole, k1)| {
-        let kick = k1 * ring.elements[quadrupole.element].length;
-        optics.kick(quadrupole.element, direction).times(kick)
-    });
-    let sources: Vec<_> = shifted.collect();
+    let shifted = ring.quadrupoles.iter().zip(ring.integrated_gradients());
+    let sources: Vec<_> =
+        shifted.map(|(quadrupole, kick)| optics.kick(quadrupole.element, direction).times(kick)).collect();
     let orbit = optics.response(&observers, &sources);
     let mut change = vec![DMatrix::zeros(orbit.nrows(), orbit.ncols()); ring.supplies.len()];
     for (m, quadrupole) in ring.quadrupoles.iter().enumerate() {

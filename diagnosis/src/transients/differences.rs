@@ -98,8 +98,8 @@ impl Differences {
         white
     }
 
-    /// Less the mean of the run, over the noise.
-    fn within(&self, values: &DMatrix<f64>) -> DMatrix<f64> {
+    /// Less the mean of the run, over the noise; 0 where nothing counts.
+    pub fn within(&self, values: &DMatrix<f64>) -> DMatrix<f64> {
         let mut white = DMatrix::zeros(values.nrows(), values.ncols());
         for run in &self.runs {
             for (b, sigma) in self.sigma.iter().enumerate() {

@@ -156,6 +156,11 @@ impl Ring {
         self.quadrupoles.iter().map(|q| self.k1(q.element)).collect()
     }
 
+    /// Integrated gradient K1L of each quadrupole `[M]` [1/m].
+    pub fn integrated_gradients(&self) -> Vec<f64> {
+        self.quadrupoles.iter().map(|q| self.k1(q.element) * self.elements[q.element].length).collect()
+    }
+
     /// The params of horizontally focusing quadrupoles, by their first, and the others.
     pub fn params_by_focusing(&self) -> [Vec<usize>; 2] {
         let gradients = self.gradients();
