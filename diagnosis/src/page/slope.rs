@@ -151,8 +151,8 @@ pub fn of_each_frame(finding: &Finding, shown: &[Shown]) -> (String, Figure) {
     let line = Series::line("slope 1", vec![from, to], vec![from, to]);
     let (x_label, y_label) =
         ("change by the best kick of each frame [µm]", "reading less the mean of its setting [µm]");
-    let caption = "Readings in which the corrector is on, less the mean of the frames of the same setting, against what one more kick of this corrector, fitted \
-                   to each frame, should make of them by its measured response. Were the corrector steady, no change would be larger than the noise makes it.";
+    let caption = "Readings in which the corrector is on, less the mean of the frames of the same setting, against what one more kick of this corrector should \
+                   make of them by its measured response; of each reading it is fitted to the other monitors of the frame. Were the corrector steady, no change would be larger than the noise makes it.";
     (caption.into(), Figure::lines(&Axes::new(&capitalised(&finding.phrase), x_label, y_label), &[measured, line]))
 }
 
