@@ -56,7 +56,9 @@ pub struct Competition {
     pub alternatives: Vec<Alternative>,
     /// Probability that none of them is needed.
     pub nothing: f64,
-    /// `ln` posterior odds of any of them over none.
+    /// Probability of physics that the library does not hold and that is too small to be seen.
+    pub too_small: f64,
+    /// `ln` posterior odds of any of the alternatives over none.
     pub log_odds: f64,
     /// All candidates of the library, to first order.
     pub scanned: Vec<Candidate>,
@@ -154,19 +156,22 @@ pub(super) struct Weighed {
     pub alternatives: Vec<Alternative>,
     /// Probability that none of them is needed.
     pub nothing: f64,
-    /// `ln` posterior odds of any of them over none.
+    /// Probability of what is too small to be seen.
+    pub too_small: f64,
+    /// `ln` posterior odds of any of the alternatives over none.
     pub log_odds: f64,
 }
 
 impl Weighed {
-    /// Normalise posterior weights (`ln`; that of no effect is 0); a share [`IMITATED`] of an effect's is that of what only looks like it.
-    pub fn of(mut weights: Vec<(Alternative, f64)>) -> Self {
+    /// Normalise posterior weights (`ln`; that of no effect is 0); a share [`IMITATED`] of an effect's is that of what only looks like it. What is too
+    /// small to be seen explains the readings as no effect does, so that its odds over none, `too_small`, are those of the prior.
+    pub fn of(mut weights: Vec<(Alternative, f64)>, too_small: f64) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
         weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
         let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
         let nothing = (-largest).exp();
         let something: f64 = weights.iter().map(|(_, weight)| (weight - largest).exp()).sum();
-        let sum = nothing + something;
+        let sum = nothing * (1.0 + too_small) + something;
         let normalised = |(alternative, weight): (Alternative, f64)| {
             let itself = if alternative.is_of_library() { 1.0 - IMITATED } else { 1.0 };
             let probability = itself * (weight - largest).exp() / sum;
@@ -174,15 +179,21 @@ impl Weighed {
         };
         let listed = |one: &Alternative| one.probability > LISTED || one.fitted.is_some();
         let alternatives = weights.into_iter().map(normalised).filter(listed).collect();
-        Self { alternatives, nothing: nothing / sum, log_odds: largest + something.ln() }
+        let nothing = nothing / sum;
+        Self { alternatives, nothing, too_small: nothing * too_small, log_odds: largest + something.ln() }
     }
 }
 
 impl Competition {
-    /// Of posterior weights (`ln`; that of no effect is 0).
-    pub(super) fn of(weights: Vec<(Alternative, f64)>, without: Fitted, scanned: Vec<Candidate>) -> Self {
-        let Weighed { alternatives, nothing, log_odds } = Weighed::of(weights);
-        Self { alternatives, nothing, log_odds, scanned, without }
+    /// Of posterior weights (`ln`; that of no effect is 0), and the odds of what is too small to be seen.
+    pub(super) fn of(
+        weights: Vec<(Alternative, f64)>,
+        too_small: f64,
+        without: Fitted,
+        scanned: Vec<Candidate>,
+    ) -> Self {
+        let Weighed { alternatives, nothing, too_small, log_odds } = Weighed::of(weights, too_small);
+        Self { alternatives, nothing, too_small, log_odds, scanned, without }
     }
 
     /// With fits that keep the data which they are to, for a place beside other data.
@@ -195,7 +206,7 @@ impl Competition {
 
     /// True if an effect is likely to be needed.
     pub fn is_suspicious(&self) -> bool {
-        1.0 - self.nothing > SUSPICIOUS
+        1.0 - self.nothing - self.too_small > SUSPICIOUS
     }
 
     /// Probability of an effect of the library.
@@ -211,7 +222,7 @@ impl Competition {
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
-        self.imitating() + listed.map(|a| a.probability).sum::<f64>()
+        self.imitating() + self.too_small + listed.map(|a| a.probability).sum::<f64>()
     }
 
     /// The exact fit with the most likely effect of the library.
@@ -226,7 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// All probabilities add up to 1, and no effect is more certain than that nothing looks like it.
+    /// All probabilities add up to 1, no effect is more certain than that nothing looks like it, and what is too small to be seen keeps its odds over nothing.
     #[test]
     fn an_effect_is_at_most_as_likely_as_that_nothing_unknown_looks_like_it() {
         let of = |log_gain: f64, corrector: usize| {
@@ -234,9 +245,10 @@ mod tests {
             (Alternative::unfitted(Cause::Effect(term), log_gain, (0.1, 0.01)), log_gain)
         };
         for (first, least) in [(40.0, 0.985), (2.0, 0.6)] {
-            let all = Weighed::of(vec![of(first, 0), of(0.0, 1)]);
+            let all = Weighed::of(vec![of(first, 0), of(0.0, 1)], 0.06);
             let library: f64 = all.alternatives.iter().map(|one| one.probability).sum();
-            assert!((all.nothing + library + imitating(library) - 1.0).abs() < 1e-12);
+            assert!((all.nothing + all.too_small + library + imitating(library) - 1.0).abs() < 1e-12);
+            assert!((all.too_small - 0.06 * all.nothing).abs() < 1e-12);
             let leading = all.alternatives[0].probability;
             assert!(leading > least && leading <= 1.0 - IMITATED, "{leading}");
         }

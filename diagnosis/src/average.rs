@@ -59,7 +59,7 @@ impl Vars {
     fn over(competition: &Competition) -> Self {
         let plain = Self::of(&competition.without);
         let (vars, units) = (plain.mean.len(), &competition.without.units);
-        let mut parts = vec![(competition.nothing, plain.clone())];
+        let mut parts = vec![(competition.nothing + competition.too_small, plain.clone())];
         for alternative in &competition.alternatives {
             let part = match (&alternative.fitted, &alternative.cause) {
                 (Some(fitted), _) => Self::of(fitted),

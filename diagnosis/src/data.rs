@@ -136,19 +136,40 @@ impl Displaced {
         Ok(Self { machine, displaced, orbit })
     }
 
-    /// What exact orbits have beyond [`Machine::readings`].
-    fn higher_orders(&self, exact: &Exact) -> Result<HigherOrders, EffectError> {
+    /// What exact orbits have beyond [`Machine::readings`] in frames at some times.
+    fn higher_orders(&self, exact: &Exact, time: &DVector<f64>) -> Result<HigherOrders, EffectError> {
         let means = Drives { orbit: self.orbit.clone(), ..exact.means.clone() };
         let (readings, tunes, tune_changes) = self.machine.readings(&means)?;
         let of_orbit = [exact.without_kicks.x - tunes.x, exact.without_kicks.y - tunes.y];
         let by_frame = &exact.settings.of_frame;
         let mut of_tunes = &exact.tunes - tune_changes;
         of_tunes.column_iter_mut().zip([tunes.x, tunes.y]).for_each(|(mut column, tune)| column.add_scalar_mut(-tune));
+        let drifted = self.drifted(exact, of_orbit, time)?;
         Ok(HigherOrders {
             readings: (&exact.readings - readings).select_rows(by_frame),
-            tunes: of_tunes.select_rows(by_frame),
+            tunes: of_tunes.select_rows(by_frame) + drifted,
             tune_shift_of_orbit: of_orbit,
         })
+    }
+
+    /// The orbit without kicks drifts with the gradients, by a tenth where these do by 4 per mille, and with it what it does to the tunes: the change of that
+    /// from mid-campaign, rows frames, by exact tunes at both ends.
+    fn drifted(&self, exact: &Exact, of_orbit: [f64; 2], time: &DVector<f64>) -> Result<MatrixXx2<f64>, EffectError> {
+        let Some(ends) = &exact.ends else { return Ok(MatrixXx2::zeros(time.len())) };
+        let still = Drives {
+            kick: DMatrix::zeros(2, exact.means.kick.ncols()),
+            rf_offset: DVector::zeros(2),
+            time: DVector::from_vec(vec![-1.0, 1.0]),
+            nominal_kick: exact.means.nominal_kick,
+            orbit: self.orbit.clone(),
+        };
+        let (_, tunes, changes) = self.machine.readings(&still)?;
+        let at = |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
+        let [start, end] = [at(0), at(1)];
+        Ok(MatrixXx2::from_fn(time.len(), |i, plane| {
+            let (odd, even) = (0.5 * (end[plane] - start[plane]), 0.5 * (end[plane] + start[plane]) - of_orbit[plane]);
+            (odd + even * time[i]) * time[i]
+        }))
     }
 }
 
@@ -157,7 +178,7 @@ struct HigherOrders {
     /// Terms above first order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes; rows frames [m].
     readings: DMatrix<f64>,
     /// Kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not held; the orbit without kicks is off the axis of sextupole
-    /// fields, and couples the planes; rows frames. A drift is no effect of the kicks, so that the time is that in mid-campaign.
+    /// fields, and couples the planes; rows frames. What the kicks do is that of mid-campaign.
     tunes: MatrixXx2<f64>,
     /// The part of these that the orbit without kicks makes.
     tune_shift_of_orbit: [f64; 2],
@@ -319,7 +340,7 @@ impl Data {
             orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
         let displaced = Displaced::of(machine, &self.baseline, &off)?;
         let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
-        let higher = displaced.higher_orders(&exact)?;
+        let higher = displaced.higher_orders(&exact, &self.frames.drives.time)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
         let mut readings = &self.frames.recorded - rippled(&self.ring, &slopes, &self.frames.fluctuation);

@@ -18,8 +18,10 @@ pub struct Exact {
     pub readings: DMatrix<f64>,
     /// Tunes, rows settings; with an RF offset, and where kicks leave no stable motion, those without kicks.
     pub tunes: MatrixXx2<f64>,
-    /// Tunes on the orbit without kicks.
+    /// Tunes on the orbit without kicks, in mid-campaign.
     pub without_kicks: Tunes,
+    /// The same at the start and at the end, where the machine drifts.
+    pub ends: Option<[Tunes; 2]>,
 }
 
 impl Exact {
@@ -33,7 +35,10 @@ impl Exact {
         let tracked = Tracked::of(machine.clone(), drives.nominal_kick)?;
         let strength = vec![0.0; machine.ring().quadrupoles.len()];
         let cycle = |kick: Vec<f64>, rf_offset: f64| Cycle { kick, strength: strength.clone(), rf_offset, time: 0.0 };
-        let (without, plain) = tracked.cycle(&cycle(vec![0.0; drives.kick.ncols()], 0.0))?;
+        let still = cycle(vec![0.0; drives.kick.ncols()], 0.0);
+        let (without, plain) = tracked.cycle(&still)?;
+        let at = |time: f64| Ok::<_, EffectError>(tracked.cycle(&Cycle { time, ..still.clone() })?.1);
+        let ends = if machine.drift() == 0.0 { None } else { Some([at(-1.0)?, at(1.0)?]) };
         let mut readings = DMatrix::zeros(settings.count(), without.len());
         let mut tunes = MatrixXx2::from_fn(settings.count(), |_, plane| [plain.x, plain.y][plane]);
         for (i, kick) in means.kick.row_iter().enumerate() {
@@ -51,7 +56,7 @@ impl Exact {
                 *to = read - none;
             });
         }
-        Ok(Self { settings, means, readings, tunes, without_kicks: plain })
+        Ok(Self { settings, means, readings, tunes, without_kicks: plain, ends })
     }
 }
 

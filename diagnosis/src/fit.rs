@@ -441,7 +441,8 @@ impl<'d> Problem<'d> {
         let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
             let (machine, drives) = machine_at(data, self.hypothesis, campaign, &held)?;
             let machine = machine.on_orbit(&drives.orbit);
-            let signatures = Signatures::of(&machine, &drives)?;
+            let ends = machine.ends();
+            let signatures = Signatures::of(&machine, &drives)?.between(ends.as_ref())?;
             let of_vars = signatures.of_vars().into_iter().zip(&sigma);
             let of_vars = of_vars.map(|(signature, sigma)| Ok(Some(signature * *sigma)));
             let of_others = self.unknowns[..self.others() - vars].iter();
@@ -473,7 +474,8 @@ impl Ordinary {
         let slopes = data.stacked_columns(unknowns.len(), |campaign, own| {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
-            let signatures = Signatures::of(&machine, &drives)?;
+            let ends = machine.ends();
+            let signatures = Signatures::of(&machine, &drives)?.between(ends.as_ref())?;
             let of = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
             own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(of))
         })?;

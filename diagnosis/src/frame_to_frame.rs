@@ -517,7 +517,7 @@ mod tests {
 
     #[test]
     fn unordinary_sizes_begin_at_nearly_four_widths() {
-        assert!(beyond_ordinary(3.75) < correction_of_sort() && beyond_ordinary(3.85) > correction_of_sort());
+        assert!(beyond_ordinary(3.9) < correction_of_sort() && beyond_ordinary(4.0) > correction_of_sort());
         // a period that chance gives once in a hundred recordings is no evidence, of one in a million it is
         assert!(
             beyond_chance(0.01_f64.ln()) < correction_of_sort() && beyond_chance(1e-6_f64.ln()) > correction_of_sort()

@@ -1,7 +1,8 @@
 //! The search for the effects that the data support, corrected for the number of candidates tried.
 //!
 //! Prior: in half of all campaigns the model is complete. Otherwise one effect is missing, and each further one with odds of 1 to 4. With
-//! 15 % it is physics that the library does not hold; else all kinds are equally likely, and all places of a kind.
+//! 15 % it is physics that the library does not hold, two in five of which are too small to be seen; else all kinds are equally likely, and all places of
+//! a kind.
 //! The posterior weight of a candidate is its prior times its evidence: exact twin, everything refitted, for the leaders; first
 //! order for the rest.
 //!
@@ -38,6 +39,11 @@ pub(super) const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Prior probability of physics that the library does not hold.
 pub(super) const UNMODELLED: f64 = 0.15;
+/// Share of it that is too small to be seen, as nothing is known of its size taken to be that of the library's effects: where nothing is found, these are
+/// 0.43 times as likely as before.
+const TOO_SMALL: f64 = 0.4;
+/// Prior probability of what can be seen of it.
+pub(super) const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
 /// Rounds over all competitions, and the gain of `ln` posterior that calls for another round.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;
@@ -120,12 +126,12 @@ pub fn corrections(terms: &[Term]) -> Vec<f64> {
 
 /// The same for an unmodelled discrepancy.
 pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
-    -(UNMODELLED * ODDS / (SORTS * discrepancy.sites) as f64).ln()
+    -(UNMODELLED_SEEN * ODDS / (SORTS * discrepancy.sites) as f64).ln()
 }
 
 /// The same for one sort of it that has no sites.
 pub fn correction_of_sort() -> f64 {
-    -(UNMODELLED * ODDS / SORTS as f64).ln()
+    -(UNMODELLED_SEEN * ODDS / SORTS as f64).ln()
 }
 
 /// The candidates of a recording, with their prior.
@@ -363,12 +369,12 @@ impl Search {
         }
         relearn(data, fitted, &mut weights, &outstanding);
         for discrepancy in discrepancy::scan(data, fitted)? {
-            let prior = (UNMODELLED * odds / (SORTS * discrepancy.sites) as f64).ln();
+            let prior = (UNMODELLED_SEEN * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unmodelled(discrepancy), weight));
         }
         beside::weigh_elements(data, fitted, &mut weights)?;
-        Ok(Competition::of(weights, fitted.clone(), scanned))
+        Ok(Competition::of(weights, TOO_SMALL * UNMODELLED * odds, fitted.clone(), scanned))
     }
 
     /// The candidates for an exact fit. Where the fit is poor its vars are strongly biased, and so is a scan about them: the leaders of a

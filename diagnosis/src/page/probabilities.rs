@@ -39,8 +39,8 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
     Section {
         heading: "How probable each cause is".into(),
         text: vec![
-            "The bars of a figure add up to 100 %: every effect of the library at every place, every unmodelled discrepancy, causes that no effect describes and that look like one, \
-             and nothing. They are posterior probabilities, corrected for the number of candidates tried."
+            "The bars of a figure add up to 100 %: every effect of the library at every place, every unmodelled discrepancy, causes that no effect describes and that look like one or are \
+             too small to be seen, and nothing. They are posterior probabilities, corrected for the number of candidates tried."
                 .into(),
         ],
         figures,
@@ -69,6 +69,9 @@ fn bars(data: &Data, competition: &Competition, nothing: &str) -> Vec<Ranked> {
         shown.map(|one| bar(label(data, one), usize::from(!one.is_of_library()), one.probability)).collect();
     if competition.imitating() > LEAST {
         bars.push(bar("unknown, and looks like an effect".into(), 1, competition.imitating()));
+    }
+    if competition.too_small > LEAST {
+        bars.push(bar("unknown, and too small to be seen".into(), 1, competition.too_small));
     }
     let sum: f64 = bars.iter().map(|bar| bar.value).sum::<f64>() / 100.0;
     bars.push(bar("all others together, of both".into(), 0, (1.0 - sum - competition.nothing).max(0.0)));

@@ -31,7 +31,7 @@ use super::discrepancy::Discrepancy;
 use super::heldout::VALIDATED;
 use super::hypothesis::Term;
 use super::location::{Location, SORTS};
-use super::search::{ODDS, UNMODELLED};
+use super::search::{ODDS, UNMODELLED, UNMODELLED_SEEN};
 use super::verdict::{Finding, Tested};
 use differences::{Differences, median, run_means};
 use inference::Campaign;
@@ -235,7 +235,8 @@ impl<'c> Within<'c> {
             let weight = one.log_bayes + log_prior_unmodelled() - (one.sites as f64).ln();
             (Alternative::unmodelled(one), weight)
         }));
-        let Weighed { alternatives, nothing, .. } = Weighed::of(weights);
+        // what is too small to be seen is weighed with the search
+        let Weighed { alternatives, nothing, .. } = Weighed::of(weights, 0.0);
         if 1.0 - nothing < SUSPICIOUS {
             return None;
         }
@@ -524,7 +525,7 @@ fn log_bayes(pull: f64, power: f64, width: f64) -> f64 {
 }
 
 fn log_prior_unmodelled() -> f64 {
-    (UNMODELLED * ODDS / SORTS as f64).ln()
+    (UNMODELLED_SEEN * ODDS / SORTS as f64).ln()
 }
 
 fn width(term: Term) -> f64 {

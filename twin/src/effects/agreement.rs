@@ -9,6 +9,7 @@ use crate::lattice::{Plane, Ring};
 use crate::orbit::{ClosedOrbit, Hold};
 use crate::site::Site;
 use crate::testing::{booster_with, dual};
+use crate::tune::Tunes;
 
 const NOMINAL: f64 = 2e-4;
 
@@ -106,7 +107,8 @@ fn difference(ring: &Ring, about: &[Effect], effect: &Effect, drives: &Drives) -
 fn assert_derivatives(ring: &Ring, about: &[Effect], which: &[Effect], tolerance: f64) {
     let drives = drives(ring, orbit(&displaced(), 0.0));
     let about_machine = machine(ring, about);
-    let signatures = Signatures::of(&about_machine, &drives).unwrap();
+    let ends = about_machine.ends();
+    let signatures = Signatures::of(&about_machine, &drives).unwrap().between(ends.as_ref()).unwrap();
     for effect in which {
         let signature = signatures.of_effect(effect.kind, effect.site).unwrap();
         let known = difference(ring, about, effect, &drives);
@@ -151,6 +153,37 @@ fn signatures_hold_about_a_machine_with_effects() {
     let linear = |kind: EffectKind| !kind.is_switch() && !holds(kind) && !is_curved(kind);
     assert(&about("radial_loop@x_D8,x_E6"), &linear, 2e-4);
     assert(&about("fixed_rf_frequency"), &linear, 2e-4);
+    // a drift as wide as its prior, whose own derivative differs by the drift and by what is of third order; what remembers the frame before meets another drift
+    assert(&about("quad_drift=0.002"), &|kind| linear(kind) && !kind.is_transient(), 1e-2);
+}
+
+/// In every frame of a large drift, where those of mid-campaign are off by more than a tenth.
+#[test]
+fn derivatives_by_gradients_are_those_of_every_frame_of_a_drift() {
+    let ring = Ring::booster();
+    let drifting = machine(&ring, &[Effect { kind: EffectKind::QuadDrift, site: Site::Ring, amplitude: 5e-3 }]);
+    let drives = drives(&ring, orbit(&ring, 0.0));
+    let ends = drifting.ends();
+    let of_quadrupoles = Signatures::of(&drifting, &drives).unwrap().between(ends.as_ref()).unwrap().of_quadrupoles();
+    let still = machine(&ring, &[]);
+    let of_middle = Signatures::of(&still, &drives).unwrap().of_quadrupoles();
+    let count = ring.quadrupoles.len();
+    for at in [0, 17, 30] {
+        let with = |step: f64| {
+            let factors: Vec<f64> = (0..count).map(|q| if q == at { step.exp() } else { 1.0 }).collect();
+            let (readings, Tunes { x, y, .. }, changes) = drifting.with_strengths(&factors).readings(&drives).unwrap();
+            (readings, changes.map_with_location(|_, plane, change| change + [x, y][plane]))
+        };
+        let (up, down) = (with(1e-5), with(-1e-5));
+        let (readings, tunes) = ((up.0 - down.0) / 2e-5, (up.1 - down.1) / 2e-5);
+        let own = &of_quadrupoles[at];
+        let error = (&own.readings - &readings).amax() / readings.amax();
+        assert!(error < 1e-4, "{at}: {error:e}");
+        let error = tunes.map_with_location(|i, plane, known| own.tune(plane, i) - known).amax();
+        assert!(error < 1e-6, "{at}: {error:e}");
+        let error = (&of_middle[at].readings - &readings).amax() / readings.amax();
+        assert!(error > 0.1, "{at}: {error:e}");
+    }
 }
 
 /// Largest error of the linear change against the exact one, in frames with kicks and in those with an RF offset, the
@@ -250,6 +283,34 @@ fn what_crosses_curved_fields_moves_the_tunes() {
         // second order in the kicks and the field
         assert!(error.amax() < 0.1 * change.amax(), "{text}: {:e} of {:e}", error.amax(), change.amax());
     }
+}
+
+/// The largest that is thought possible, 5 per mille of all gradients from mid-campaign to its end: what is of second order in it moves the tunes too.
+#[test]
+fn a_drift_moves_the_tunes_of_every_frame() {
+    let ring = Ring::booster();
+    let drives = drives(&ring, orbit(&ring, 0.0)).still();
+    for amplitude in [5e-3, -5e-3] {
+        let drifting = machine(&ring, &[Effect { kind: EffectKind::QuadDrift, site: Site::Ring, amplitude }]);
+        let exact = tracked_tunes(&drifting, &drives);
+        let (_, tunes, changes) = drifting.readings(&drives).unwrap();
+        let errors = (0..drives.time.len()).flat_map(|i| {
+            let of_frame = [tunes.x + changes[(i, 0)] - exact[i].x, tunes.y + changes[(i, 1)] - exact[i].y];
+            of_frame.map(f64::abs)
+        });
+        // of third order; what is of second order is 4e-5
+        let largest = errors.fold(0.0, f64::max);
+        assert!(largest < 2e-7, "{largest:e}");
+    }
+}
+
+/// Exact tunes of a machine without kicks at the times of some frames.
+fn tracked_tunes(machine: &Machine, drives: &Drives) -> Vec<Tunes> {
+    let (correctors, quadrupoles) = (machine.ring().correctors.len(), machine.ring().quadrupoles.len());
+    let tracked = Tracked::of(machine.clone(), NOMINAL).unwrap();
+    let at =
+        |&time: &f64| Cycle { kick: vec![0.0; correctors], strength: vec![0.0; quadrupoles], rf_offset: 0.0, time };
+    drives.time.iter().map(|time| tracked.cycle(&at(time)).unwrap().1).collect()
 }
 
 #[test]

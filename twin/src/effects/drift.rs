@@ -1,16 +1,18 @@
 //! Unrecorded drifts during a campaign.
 //!
 //! Every gradient is `k1 (1 + a t)` in a cycle at time t, from -1 to 1; per frame that is the parabola in t through the machines at the start, in
-//! the middle and at the end, and its derivative at none is `t (dR/dln k1) k`. A response, which is the machine in mid-campaign, does not move.
+//! the middle and at the end, of derivatives too: what is known of the vars after a large drift depends on what that does in every frame, not on
+//! mid-campaign. A response, which is the machine in mid-campaign, does not move.
 
-use nalgebra::{DMatrix, RowVector2};
+use nalgebra::{DMatrix, DVector, MatrixXx2};
 
-use super::drives::{Drives, Seen};
+use super::drives::Drives;
 use super::mechanism::{Measured, Mechanism, Unit};
 use super::{EffectError, Machine, Signature, Signatures};
 use crate::lattice::Ring;
 use crate::orbit::OrbitError;
 use crate::site::Site;
+use crate::tune::Tunes;
 
 /// What drifts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -80,36 +82,72 @@ pub(super) fn factor(drift: f64, time: f64) -> f64 {
     1.0 + drift * time
 }
 
-/// Change of the positions by a drift of all quadrupoles, rows frames [m], from those without, and of the tunes from mid-campaign to its end.
+/// Change of the positions by a drift of all quadrupoles, rows frames [m], from those without, and of the tunes from those in mid-campaign.
 pub(super) fn of_frames(
     machine: &Machine,
     ring: &Ring,
     drives: &Drives,
     kick: &DMatrix<f64>,
     without: &[DMatrix<f64>; 2],
-) -> Result<([DMatrix<f64>; 2], [f64; 2]), OrbitError> {
-    let scaled = |factor: f64| machine.seen(&ring.with_strengths(&vec![factor; ring.quadrupoles.len()]));
-    let (end, start) = (scaled(factor(machine.drift, 1.0))?, scaled(factor(machine.drift, -1.0))?);
-    let tunes = [end.tunes.x - start.tunes.x, end.tunes.y - start.tunes.y].map(|change| 0.5 * change);
-    let positions = |seen: &Seen| drives.positions(seen, kick);
-    let (end, start) = (positions(&end), positions(&start));
-    let of_plane = |plane: usize| {
-        let (odd, even) = ((&end[plane] - &start[plane]) * 0.5, (&end[plane] + &start[plane]) * 0.5 - &without[plane]);
-        in_time(odd + in_time(even, drives), drives)
-    };
-    Ok(([of_plane(0), of_plane(1)], tunes))
+    tunes: &Tunes,
+) -> Result<([DMatrix<f64>; 2], MatrixXx2<f64>), OrbitError> {
+    let at = |time: f64| machine.seen(&drifted(ring, machine.drift, time));
+    let ends = [at(-1.0)?, at(1.0)?];
+    let [start, end] = ends.each_ref().map(|seen| [seen.tunes.x, seen.tunes.y]);
+    let of_tunes = MatrixXx2::from_fn(drives.time.len(), |i, plane| {
+        let middle = [tunes.x, tunes.y][plane];
+        let (odd, even) = (0.5 * (end[plane] - start[plane]), 0.5 * (end[plane] + start[plane]) - middle);
+        (odd + even * drives.time[i]) * drives.time[i]
+    });
+    let [[start_x, start_y], [end_x, end_y]] = ends.map(|seen| drives.positions(&seen, kick));
+    let positions = [changes([start_x, end_x], &without[0], drives), changes([start_y, end_y], &without[1], drives)];
+    Ok((positions, of_tunes))
+}
+
+impl Machine {
+    /// The machines at the start and at the end of a drift, without one; none of one that does not drift.
+    pub fn ends(&self) -> Option<[Self; 2]> {
+        let at = |time: f64| Self { ring: drifted(&self.ring, self.drift, time), drift: 0.0, ..self.clone() };
+        (self.drift != 0.0).then(|| [-1.0, 1.0].map(at))
+    }
+}
+
+/// The signature in every frame, from those in mid-campaign, at the start and at the end.
+pub(super) fn signature([start, end]: [Signature; 2], mut middle: Signature, drives: &Drives) -> Signature {
+    let (mut change, mut even) = ((end.clone() - start.clone()) * 0.5, end);
+    even += start;
+    change += in_time(even * 0.5 - middle.clone(), drives);
+    middle += in_time(change, drives);
+    middle
 }
 
 /// All gradients in proportion to the time.
 fn of_gradients(about: &Signatures) -> Signature {
     let mut sum = about.nothing();
     (0..about.machine.ring.quadrupoles.len()).for_each(|at| sum += about.of_quadrupole(at));
-    let tune_changes = &about.drives.time * RowVector2::from(sum.tunes);
-    Signature { readings: in_time(sum.readings, about.drives), tunes: [0.0; 2], tune_changes }
+    in_time(sum, about.drives)
 }
 
-/// Rows times the time of their frame.
-fn in_time(mut change: DMatrix<f64>, drives: &Drives) -> DMatrix<f64> {
-    change.row_iter_mut().zip(drives.time.iter()).for_each(|(mut row, time)| row *= *time);
+/// A signature that grows in proportion to the time of the frame.
+fn in_time(one: Signature, drives: &Drives) -> Signature {
+    let time = &drives.time;
+    let tune_changes = MatrixXx2::from_fn(time.len(), |i, plane| time[i] * one.tune(plane, i));
+    Signature { readings: in_proportion(one.readings, time), tunes: [0.0; 2], tune_changes }
+}
+
+/// A ring at a time of a drift.
+fn drifted(ring: &Ring, drift: f64, time: f64) -> Ring {
+    ring.with_strengths(&vec![factor(drift, time); ring.quadrupoles.len()])
+}
+
+/// What the frames, which are rows, differ by from mid-campaign: by the parabola through it, the start and the end.
+fn changes([start, end]: [DMatrix<f64>; 2], middle: &DMatrix<f64>, drives: &Drives) -> DMatrix<f64> {
+    let (odd, even) = ((&end - &start) * 0.5, (end + start) * 0.5 - middle);
+    in_proportion(odd + in_proportion(even, &drives.time), &drives.time)
+}
+
+/// Rows times a number of each.
+fn in_proportion(mut change: DMatrix<f64>, to: &DVector<f64>) -> DMatrix<f64> {
+    change.row_iter_mut().zip(to.iter()).for_each(|(mut row, to)| row *= *to);
     change
 }

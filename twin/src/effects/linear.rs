@@ -9,7 +9,7 @@
 //! against the orbit without kicks, whose own reading is unknown and constant. Sextupole and octupole fields and a cubic term depend on
 //! that orbit: it is part of [`Drives`].
 
-use nalgebra::{DMatrix, MatrixXx2, RowVector2};
+use nalgebra::{DMatrix, MatrixXx2};
 
 use super::drift;
 use super::drives::Drives;
@@ -33,9 +33,9 @@ impl Machine {
         let mut positions = drives.positions(&seen, &kick);
         let mut tune_changes = MatrixXx2::zeros(kick.nrows());
         if self.drift != 0.0 {
-            let (change, of_tunes) = drift::of_frames(self, &ring, drives, &kick, &positions)?;
+            let (change, of_tunes) = drift::of_frames(self, &ring, drives, &kick, &positions, &seen.tunes)?;
             add(&mut positions, change);
-            tune_changes += &drives.time * RowVector2::from(of_tunes);
+            tune_changes += of_tunes;
         }
         if !self.curved.is_empty() {
             let held = self.held_of(&ring, &optics)?;

@@ -3,8 +3,11 @@
 //! Each class has its formula for it in its own file; one without a formula is a difference of two machines. An effect without an
 //! amplitude (a reversed corrector, exchanged monitors, a held frequency) has its whole change instead.
 
+use core::convert::Infallible;
+
 use nalgebra::{DMatrix, DVector, MatrixXx2};
 
+use super::drift;
 use super::drives::{Drives, Seen};
 use super::field::{self, Thin};
 use super::hold::Held;
@@ -32,6 +35,8 @@ pub struct Signatures<'m> {
     pub(super) positions: [DMatrix<f64>; 2],
     /// Response of the read monitors, the RF frequency last.
     pub(super) response: DMatrix<f64>,
+    /// The same at the start and at the end of a drift.
+    ends: Option<Box<[Self; 2]>>,
 }
 
 /// What a small effect does per unit of its amplitude.
@@ -120,7 +125,18 @@ impl<'m> Signatures<'m> {
             let at = ring.read_monitors[b];
             seen.response[ring.monitors[at].plane.index()][(at, c)]
         });
-        Ok(Self { machine, drives, optics, held, observers, sources, kick, positions, response })
+        Ok(Self { machine, drives, optics, held, observers, sources, kick, positions, response, ends: None })
+    }
+
+    /// With what effects and vars do at the [ends](Machine::ends) of a drift, so that their signatures are those of every frame; without, they are those of
+    /// mid-campaign. A drift of 4 per mille tells the vars more than the orbits do, and wrongly where derivatives are those of mid-campaign.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the machine is unstable at one of them.
+    pub fn between(self, ends: Option<&'m [Machine; 2]>) -> Result<Self, OrbitError> {
+        let Some([start, end]) = ends else { return Ok(self) };
+        let ends = [Self::of(start, self.drives)?, Self::of(end, self.drives)?];
+        Ok(Self { ends: Some(Box::new(ends)), ..self })
     }
 
     /// The signature of an effect of a kind at a site.
@@ -136,7 +152,7 @@ impl<'m> Signatures<'m> {
     /// # Errors
     /// [`EffectError`].
     pub fn of_mechanism(&self, mechanism: &dyn Mechanism, site: Site) -> Result<Signature, EffectError> {
-        mechanism.signature(self, site).map(|signature| self.as_read(signature))
+        self.in_frames(|about| mechanism.signature(about, site)).map(|signature| self.as_read(signature))
     }
 
     /// Derivative of readings and tunes with respect to each param, the `ln` of a factor.
@@ -152,10 +168,14 @@ impl<'m> Signatures<'m> {
 
     /// The same with respect to `ln` of each quadrupole's gradient `[M]`.
     pub fn of_quadrupoles(&self) -> Vec<Signature> {
-        (0..self.machine.ring.quadrupoles.len()).map(|at| self.as_read(self.of_quadrupole(at))).collect()
+        let of = |at: usize| {
+            let Ok(signature) = self.in_frames(|about| Ok::<_, Infallible>(about.of_quadrupole(at)));
+            self.as_read(signature)
+        };
+        (0..self.machine.ring.quadrupoles.len()).map(of).collect()
     }
 
-    /// The same of the orbit itself, for one quadrupole.
+    /// The same of the orbit itself in mid-campaign, for one quadrupole.
     pub(super) fn of_quadrupole(&self, at: usize) -> Signature {
         let ring = &self.machine.ring;
         self.of_gradient(&self.optics.gradient(ring.quadrupoles[at].element), ring.gradients()[at])
@@ -202,6 +222,13 @@ impl<'m> Signatures<'m> {
         let at = self.machine.ring.correctors[corrector].element;
         let step = |i: usize| self.optics.step(at, core::array::from_fn(|j| f64::from(u8::from(i == j))));
         self.held.response(&self.optics, &self.observers, &[0, 1, 2, 3].map(step))
+    }
+
+    /// A signature in every frame, from those about machines that do not drift.
+    fn in_frames<E>(&self, of: impl Fn(&Self) -> Result<Signature, E>) -> Result<Signature, E> {
+        let middle = of(self)?;
+        let Some(ends) = self.ends.as_deref() else { return Ok(middle) };
+        Ok(drift::signature([of(&ends[0])?, of(&ends[1])?], middle, self.drives))
     }
 
     /// What monitors with effects that are in the machine already make of a change of the orbit.
