@@ -18,8 +18,13 @@ pub(super) const CURVED: f64 = 4.0;
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    if !fitted.is_poor() && data.trim_each(&fitted.residual) {
-        fitted = Fitted::of(data, hypothesis, &fitted.u)?;
+    let mut trimmed = data.clone();
+    if trimmed.trim_each(&fitted.residual) {
+        let again = Fitted::of(&trimmed, hypothesis, &fitted.u)?;
+        // one jump of 9 mm makes a fit poor; one that stays poor is a wrong model, and says nothing of the readings
+        if !fitted.is_poor() || !again.is_poor() {
+            (*data, fitted) = (trimmed, again);
+        }
     }
     for _ in 0..PASSES {
         let mut linearised = data.clone();
@@ -86,6 +91,23 @@ mod tests {
         assert!(((value - sextupole.amplitude) / sigma).abs() < 3.0, "{value} ± {sigma}");
         let again = data.linearise_each(&fitted.machines(&data).unwrap()).unwrap();
         assert!(again < CURVED && fitted.chi2_per_number() < 0.9, "{again} {}", fitted.chi2_per_number());
+    }
+
+    /// One reading of y_B5 that jumps by some mm and is the first of its setting made the fit poor, and a poor fit kept it: this machine was `unexplained`, with two
+    /// exchanged correctors and without.
+    #[test]
+    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
+    fn a_jump_that_alone_makes_a_fit_poor_is_trimmed() {
+        let (ring, recording) = template();
+        let cases = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let mut case = cases.draw(Class::Single, 1_000_199, 5);
+        case.effects.clear();
+        let made = case.recording(&ring, &recording).unwrap();
+        let mut data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let start = DVector::zeros(data.units.len());
+        assert!(Fitted::of(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
+        let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
+        assert!(fitted.chi2_per_number() < 1.0, "{}", fitted.chi2_per_number());
     }
 
     /// Drifts of 4 per mille, one of them of a machine with ordinary imperfections: the tunes then tell the vars more than the orbits do. With derivatives of
