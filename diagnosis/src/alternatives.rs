@@ -13,7 +13,7 @@ use super::search::UNMODELLED;
 
 /// Probability at which a cause counts as decided.
 pub const DECISIVE: f64 = 0.95;
-/// Probability of missing physics above which a recording is not consistent. A lower limit would call too many recordings without
+/// Probability of missing physics that can be seen above which a recording is not consistent. A lower limit would call too many recordings without
 /// missing physics ambiguous.
 pub const SUSPICIOUS: f64 = 0.6;
 
@@ -221,8 +221,13 @@ impl Competition {
 
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
+        self.unknown_seen() + self.too_small
+    }
+
+    /// The same without what is too small to be seen, which is no evidence of anything.
+    pub fn unknown_seen(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
-        self.imitating() + self.too_small + listed.map(|a| a.probability).sum::<f64>()
+        self.imitating() + listed.map(|a| a.probability).sum::<f64>()
     }
 
     /// The exact fit with the most likely effect of the library.

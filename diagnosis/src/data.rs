@@ -22,6 +22,7 @@ use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
     Drives, EffectError, Hold, Holding, Kind, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
+    change_at,
 };
 
 use super::baseline::Baseline;
@@ -166,10 +167,8 @@ impl Displaced {
         let (_, tunes, changes) = self.machine.readings(&still)?;
         let at = |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
         let [start, end] = [at(0), at(1)];
-        Ok(MatrixXx2::from_fn(time.len(), |i, plane| {
-            let (odd, even) = (0.5 * (end[plane] - start[plane]), 0.5 * (end[plane] + start[plane]) - of_orbit[plane]);
-            (odd + even * time[i]) * time[i]
-        }))
+        let change = |i: usize, plane: usize| change_at(time[i], [start[plane], of_orbit[plane], end[plane]]);
+        Ok(MatrixXx2::from_fn(time.len(), change))
     }
 }
 
@@ -178,7 +177,8 @@ struct HigherOrders {
     /// Terms above first order in kicks and RF offset, and those of the orbit without kicks, in which the dipoles' ends couple the planes; rows frames [m].
     readings: DMatrix<f64>,
     /// Kicks move the orbit in dipoles and sextupole fields, and the momentum where that is not held; the orbit without kicks is off the axis of sextupole
-    /// fields, and couples the planes; rows frames. What the kicks do is that of mid-campaign.
+    /// fields, and couples the planes; rows frames. What kicks do above first order is that of mid-campaign, some 10 um that change by a tenth in a drift of 4 per
+    /// mille.
     tunes: MatrixXx2<f64>,
     /// The part of these that the orbit without kicks makes.
     tune_shift_of_orbit: [f64; 2],

@@ -39,8 +39,8 @@ pub(super) const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Prior probability of physics that the library does not hold.
 pub(super) const UNMODELLED: f64 = 0.15;
-/// Share of it that is too small to be seen, as nothing is known of its size taken to be that of the library's effects: where nothing is found, these are
-/// 0.43 times as likely as before.
+/// Share of it that is too small to be seen. Nothing is known of its size, so that it is taken to hide as often as the library's effects do: these are 0.43 times
+/// as likely as before where nothing is found, on average of 1186 simulated empty campaigns.
 const TOO_SMALL: f64 = 0.4;
 /// Prior probability of what can be seen of it.
 pub(super) const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
@@ -184,7 +184,8 @@ impl Search {
                 break;
             }
             // an unmodelled discrepancy may be better than one more effect, but worse than two that show only together
-            if found.next.library() <= found.next.unknown() && self.log_weight(&further) < self.log_weight(&found) {
+            if found.next.library() <= found.next.unknown_seen() && self.log_weight(&further) < self.log_weight(&found)
+            {
                 break;
             }
             found = self.with_noise(further)?;

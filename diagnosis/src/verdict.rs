@@ -84,11 +84,11 @@ impl Verdict {
     /// From the competition of each effect, and how it stood its tests.
     pub fn of(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
-        if next.unknown() > SUSPICIOUS || found.best.is_poor() {
+        if next.unknown_seen() > SUSPICIOUS || found.best.is_poor() {
             return Self::Unexplained;
         }
         if found.competitions.is_empty() {
-            return match (next.is_suspicious(), next.unknown() > next.library()) {
+            return match (next.is_suspicious(), next.unknown_seen() > next.library()) {
                 (false, _) => Self::Consistent,
                 (true, true) => Self::Unexplained,
                 (true, false) => Self::Ambiguous,

@@ -33,7 +33,7 @@ pub use calibrated::CalibratedOptics;
 pub use effects::{
     Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect, Held,
     HoldEffect, Holding, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin,
-    Tracked, Unit,
+    Tracked, Unit, change_at,
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,

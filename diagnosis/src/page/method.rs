@@ -74,9 +74,8 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         row(
             "verdict",
             format!(
-                "identified: every effect has P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors ({SUPPORTED:.0} where chance is at most {CHANCE}) and one of the choice above zero, and nothing further is suspected; for an instrument beside an ordinary scatter of its like a held-out gain above zero will do where chance is at most {CHANCE}. Otherwise consistent: P(nothing) ≥ {:.1}; \
-                 unexplained: an unmodelled discrepancy has P > {SUSPICIOUS:.1}; ambiguous: the rest.",
-                1.0 - SUSPICIOUS
+                "identified: every effect has P ≥ {DECISIVE}, a held-out gain above {VALIDATED:.0} standard errors ({SUPPORTED:.0} where chance is at most {CHANCE}) and one of the choice above zero, and nothing further is suspected; for an instrument beside an ordinary scatter of its like a held-out gain above zero will do where chance is at most {CHANCE}. Otherwise consistent: all that can be seen has P ≤ {SUSPICIOUS:.1}; \
+                 unexplained: what can be seen of other physics than the library's has P > {SUSPICIOUS:.1}; ambiguous: the rest."
             ),
         ),
         row(

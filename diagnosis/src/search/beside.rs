@@ -28,7 +28,7 @@ impl Found {
     /// An unknown linear element, where what is left is physics that the library does not hold, and such an element its most likely form.
     fn unknown_element(&self) -> Result<Option<Element>, FitError> {
         let leader = self.next.alternatives.iter().find(|one| !one.is_of_library());
-        let leader = leader.filter(|_| self.next.unknown() > SUSPICIOUS);
+        let leader = leader.filter(|_| self.next.unknown_seen() > SUSPICIOUS);
         let Some(Cause::Unmodelled(one)) = leader.map(|one| &one.cause) else { return Ok(None) };
         element_of(&self.data, &self.next.without, one)
     }

@@ -3,7 +3,7 @@
 //! With `k` the kicks that a frame really had (gains, polarities and even parts applied), `f` its RF offset, `t` its time from
 //! -1 to 1 and `R` the response of the ring with all its effects,
 //!
-//! `position = R k - (D/eta) f + t a (dR/dln k1) k + t^2 a^2 (d^2R/d(ln k1)^2) k/2 + kicks of stray sextupole and octupole fields`,
+//! `position = R k - (D/eta) f + t a (dR/dln k1) k + t^2 a^2 (k1^2 d^2R/dk1^2) k/2 + kicks of stray sextupole and octupole fields`,
 //!
 //! and the monitors' errors (gain, roll, coupling, cubic term, exchanged names) are applied last. Everything is the change
 //! against the orbit without kicks, whose own reading is unknown and constant. Sextupole and octupole fields and a cubic term depend on

@@ -26,7 +26,7 @@ use crate::orbit::OrbitError;
 use crate::site::Site;
 
 pub use corrector::CorrectorEffect;
-pub use drift::DriftEffect;
+pub use drift::{DriftEffect, change_at};
 pub use drives::Drives;
 pub use field::{FieldEffect, Thin};
 pub use hold::{Held, HoldEffect, Holding, Rf};

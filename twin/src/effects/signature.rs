@@ -35,7 +35,7 @@ pub struct Signatures<'m> {
     pub(super) positions: [DMatrix<f64>; 2],
     /// Response of the read monitors, the RF frequency last.
     pub(super) response: DMatrix<f64>,
-    /// The same at the start and at the end of a drift.
+    /// Signatures about the machines at the start and at the end of a drift.
     ends: Option<Box<[Self; 2]>>,
 }
 
@@ -129,7 +129,7 @@ impl<'m> Signatures<'m> {
     }
 
     /// With what effects and vars do at the [ends](Machine::ends) of a drift, so that their signatures are those of every frame; without, they are those of
-    /// mid-campaign. A drift of 4 per mille tells the vars more than the orbits do, and wrongly where derivatives are those of mid-campaign.
+    /// mid-campaign, as those of kicks and of single fields at any place remain.
     ///
     /// # Errors
     /// [`OrbitError`] if the machine is unstable at one of them.
@@ -175,7 +175,7 @@ impl<'m> Signatures<'m> {
         (0..self.machine.ring.quadrupoles.len()).map(of).collect()
     }
 
-    /// The same of the orbit itself in mid-campaign, for one quadrupole.
+    /// The same of the orbit itself, for one quadrupole, about this machine alone.
     pub(super) fn of_quadrupole(&self, at: usize) -> Signature {
         let ring = &self.machine.ring;
         self.of_gradient(&self.optics.gradient(ring.quadrupoles[at].element), ring.gradients()[at])
