@@ -21,14 +21,8 @@ const FEW: f64 = 0.01;
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
     let mut fitted = Fitted::of(data, hypothesis, guess)?;
-    let mut trimmed = data.clone();
-    if trimmed.trim_each(&fitted.residual)
-        && (!fitted.is_poor() || trimmed.whole_size() as f64 > (1.0 - FEW) * data.whole_size() as f64)
-        && let Ok(again) = Fitted::of(&trimmed, hypothesis, &fitted.u)
-        // one that stays poor is a wrong model, and says nothing of the readings
-        && (!fitted.is_poor() || !again.is_poor())
-    {
-        (*data, fitted) = (trimmed, again);
+    if let Some((without_jumps, again)) = trimmed(data, &fitted) {
+        (*data, fitted) = (without_jumps, again);
     }
     for _ in 0..PASSES {
         let mut linearised = data.clone();
@@ -45,6 +39,19 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
         }
     }
     Ok(fitted)
+}
+
+/// The data without the readings of faulty monitors that lie far from a fit, and the fit to them. None where there are no such readings, and of a poor fit where
+/// they are many or it stays poor: the model is then wrong, and says nothing of the readings.
+fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
+    let mut trimmed = data.clone();
+    let has_some = trimmed.trim_each(&fitted.residual);
+    let are_few = trimmed.whole_size() as f64 > (1.0 - FEW) * data.whole_size() as f64;
+    if !has_some || fitted.is_poor() && !are_few {
+        return None;
+    }
+    let again = Fitted::of(&trimmed, &fitted.hypothesis, &fitted.u).ok()?;
+    (!fitted.is_poor() || !again.is_poor()).then_some((trimmed, again))
 }
 
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
