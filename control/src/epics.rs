@@ -13,7 +13,6 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::channel::{Channel, Control, ControlError, Sample};
-use crate::file::why;
 
 /// A connection to EPICS.
 pub struct Epics {
@@ -58,7 +57,11 @@ impl Epics {
         // in a group of its own: a Ctrl-C at the terminal must not end it before the machine is back
         command.process_group(0).stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut process = command.spawn().map_err(|error| {
-            ControlError::Process(format!("{}: {}; `make control-env` installs it", program.display(), why(&error)))
+            ControlError::Process(format!(
+                "{}: {}; `make control-env` installs it",
+                program.display(),
+                twin::unreadable(&error)
+            ))
         })?;
         let (requests, replies) = (process.stdin.take(), process.stdout.take().expect("it is piped"));
         let (send, receive) = channel();

@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::file::why;
 use crate::frame::Frame;
 use crate::plan::{Channels, Plan};
 use crate::step::Step;
@@ -40,7 +39,7 @@ enum Entry {
 #[non_exhaustive]
 pub enum JournalError {
     /// The system does not let it be used.
-    #[error("{}: {}", .0.display(), why(.1))]
+    #[error("{}: {}", .0.display(), twin::unreadable(.1))]
     File(PathBuf, io::Error),
     /// Another process is at it.
     #[error("{}: in use by another measurement", .0.display())]

@@ -10,7 +10,6 @@
 
 mod channel;
 mod epics;
-mod file;
 mod frame;
 mod gathering;
 mod journal;

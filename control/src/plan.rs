@@ -9,7 +9,6 @@ use inference::recording::{Format, Header, Names};
 use serde::{Deserialize, Serialize};
 use twin::Ring;
 
-use crate::file::why;
 use crate::step::Step;
 
 /// A plan whose names are those of the machine and whose numbers are in their ranges.
@@ -189,7 +188,8 @@ impl Plan {
     /// # Errors
     /// [`PlanError`]; values that cannot be are all told at once.
     pub fn read(file: &Path, ring: &Ring) -> Result<Self, PlanError> {
-        let unreadable = |path: &Path, error: std::io::Error| PlanError::Unreadable(path.into(), why(&error));
+        let unreadable =
+            |path: &Path, error: std::io::Error| PlanError::Unreadable(path.into(), twin::unreadable(&error));
         let text = fs::read_to_string(file).map_err(|error| unreadable(file, error))?;
         let plan: PlanFile = toml::from_str(&text).map_err(|error| written(file, &text, &error))?;
         let header_file = file.parent().unwrap_or(Path::new("")).join(&plan.header);

@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diagnosis::validation::UnmodelledKind;
 use inference::nuts::NutsSettings;
-use measured::import::{self, Pattern};
+use lattices::export;
+use lattices::import::{self, Pattern};
 use twin::EffectText;
 
 use crate::sink::shared_memory::{PUBLISHER, SERVICE};
@@ -475,8 +476,7 @@ pub struct Export {
 }
 
 /// Lattice formats.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
     /// A sequence for MAD-X
     Madx,
@@ -488,6 +488,18 @@ pub enum Format {
     Xsuite,
     /// JSON in the Particle Accelerator Lattice Standard
     Pals,
+}
+
+impl From<Format> for export::Format {
+    fn from(format: Format) -> Self {
+        match format {
+            Format::Madx => Self::Madx,
+            Format::Bmad => Self::Bmad,
+            Format::At => Self::At,
+            Format::Xsuite => Self::Xsuite,
+            Format::Pals => Self::Pals,
+        }
+    }
 }
 
 /// `orbitcal import`.

@@ -3,7 +3,7 @@
 use core::fmt;
 use std::collections::BTreeMap;
 
-use measured::import::{Agreement, Format, Instruments, Lattice};
+use lattices::import::{Agreement, Format, Instruments, Lattice};
 use serde::Serialize;
 use twin::Plane;
 

@@ -6,7 +6,6 @@ pub mod cli;
 pub mod command;
 pub mod config;
 pub mod daemon;
-pub mod export;
 pub mod fit_page;
 pub mod frames_result;
 pub mod health;

@@ -19,7 +19,7 @@ use crate::output::{self, OutputError};
 #[non_exhaustive]
 pub enum ModelFileError {
     /// The system cannot read it.
-    #[error("{path}: {}", output::unreadable(.source))]
+    #[error("{path}: {}", twin::unreadable(.source))]
     Read {
         /// The file.
         path: String,

@@ -147,15 +147,6 @@ pub fn temporary(path: &Path) -> Result<NamedTempFile, OutputError> {
     })
 }
 
-/// What the system says of a file that was to be read.
-pub fn unreadable(error: &io::Error) -> String {
-    match error.kind() {
-        ErrorKind::NotFound => "file not found".into(),
-        ErrorKind::InvalidData => "expected UTF-8 text".into(),
-        kind => kind.to_string(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -37,7 +37,7 @@ pub use effects::{
 };
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
-    Quadrupole, RampPoint, Ring, Supply,
+    Quadrupole, RampPoint, Ring, Supply, unreadable,
 };
 pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};

@@ -103,7 +103,7 @@ fn folders(root: &Path) -> Result<Vec<PathBuf>, CommandError> {
 
 fn descend(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), CommandError> {
     let wrong =
-        |error: std::io::Error| CommandError::Input(format!("{}: {}", folder.display(), output::unreadable(&error)));
+        |error: std::io::Error| CommandError::Input(format!("{}: {}", folder.display(), twin::unreadable(&error)));
     if folder.join("frames.csv").is_file() && folder.join("truth.json").is_file() {
         found.push(folder.to_owned());
     }

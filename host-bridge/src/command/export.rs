@@ -3,11 +3,11 @@
 use core::fmt;
 use std::path::{Path, PathBuf};
 
+use lattices::export::{self, Calibration, ExportError, Format, Lattice};
 use serde::Serialize;
 
 use super::{CommandError, check_outputs, deliver, machine};
-use crate::cli::{Export, Format};
-use crate::export::{self, Calibration, ExportError, Lattice};
+use crate::cli::Export;
 use crate::output;
 use crate::result::Tunes;
 
@@ -38,7 +38,7 @@ pub fn run(options: &Export) -> Result<(), CommandError> {
     let input = |error: ExportError| CommandError::Input(error.to_string());
     let calibration = Calibration::read(&options.result).map_err(|error| input(error.into()))?;
     let lattice = Lattice::of(&ring, &calibration, &options.result).map_err(input)?;
-    let (text, result) = (export::text(&lattice, options.format), ExportResult::of(&lattice, options));
+    let (text, result) = (export::text(&lattice, options.format.into()), ExportResult::of(&lattice, options));
     if to_stdout {
         output::say(text.trim_end())?;
         return Ok(json.map_or(Ok(()), |path| output::json(path, &result))?);
@@ -51,7 +51,7 @@ impl<'l> ExportResult<'l> {
     fn of(lattice: &'l Lattice, options: &Export) -> Self {
         Self {
             file: options.out.clone(),
-            format: options.format,
+            format: options.format.into(),
             machine: &lattice.machine,
             elements: lattice.elements.len(),
             tunes: lattice.tunes.map(|[x, y]| Tunes { x, y }),

@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use measured::Folder;
-use measured::import::{
+use lattices::import::{
     Conventions, Input, Instruments, Lacking, Lattice, Loco, Measurement, Missing, PerInstrument, Table, agreement,
     assemble, bare, write,
 };
+use measured::Folder;
 use measured::lattice::ring;
 use twin::{Hold, Optics, Rf};
 

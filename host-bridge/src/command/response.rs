@@ -51,7 +51,7 @@ pub fn run(options: &Response) -> Result<(), CommandError> {
 /// Factor of every quadrupole: those in the file, 1 for the others.
 pub(super) fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|e| wrong(output::unreadable(&e)))?;
+    let text = std::fs::read_to_string(path).map_err(|e| wrong(twin::unreadable(&e)))?;
     let file: BTreeMap<String, f64> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
     by_name(&file, ring).map_err(wrong)
 }

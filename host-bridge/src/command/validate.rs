@@ -143,7 +143,7 @@ const MARKS: [&str; 2] = ["<!-- tables of make validate -->", "<!-- end of table
 /// Replace what is between the marks of a page.
 fn write_between_marks(path: &Path, tables: &str) -> Result<(), CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let page = fs::read_to_string(path).map_err(|error| wrong(output::unreadable(&error)))?;
+    let page = fs::read_to_string(path).map_err(|error| wrong(twin::unreadable(&error)))?;
     let [start, end] = MARKS.map(|mark| page.find(mark));
     let (Some(start), Some(end)) = (start, end) else {
         return Err(wrong(format!("expected the marks {MARKS:?}, found none")));

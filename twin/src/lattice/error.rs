@@ -106,6 +106,15 @@ pub enum LatticeError {
     },
 }
 
+/// What the system says of a file that cannot be used, in the words of the program.
+pub fn unreadable(error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "file not found".into(),
+        std::io::ErrorKind::InvalidData => "expected UTF-8 text".into(),
+        kind => kind.to_string(),
+    }
+}
+
 /// The system's reason, in short where it is the usual one.
 fn reason(error: &std::io::Error) -> String {
     match error.kind() {

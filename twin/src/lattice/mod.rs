@@ -11,7 +11,7 @@ mod ramp;
 mod ring;
 
 pub use element::{Bend, Element, Kind, Misalignment, Plane};
-pub use error::LatticeError;
+pub use error::{LatticeError, unreadable};
 pub use parameter::{Parameter, ParameterPrior, Quadrupole, Supply};
 pub use particle::Particle;
 pub use ramp::RampPoint;

@@ -1,0 +1,101 @@
+//! Numbers of an HDF5 file, by the path of their dataset.
+
+use hdf5_pure::{Dataset, File, Group};
+
+use super::source::Source;
+use measured::MeasuredError;
+
+/// Numbers of a dataset at most.
+const LARGEST: u64 = 1 << 27;
+
+/// A matrix by its lines.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Matrix {
+    /// Numbers in a line.
+    pub width: usize,
+    /// All of them.
+    pub values: Vec<f64>,
+}
+
+/// True where the bytes are those of such a file.
+pub(super) fn is_one(bytes: &[u8]) -> bool {
+    hdf5_pure::is_hdf5_bytes(bytes)
+}
+
+/// The matrix of a dataset, or of several with commas between their paths, one below the other; a list is a column.
+///
+/// # Errors
+/// [`MeasuredError::Table`], with the datasets that there are where none is named.
+pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, MeasuredError> {
+    let name = source.path.display().to_string();
+    let refused = |problem: String| MeasuredError::Table { file: name.clone(), problem };
+    let file = File::from_bytes(bytes).map_err(|error| refused(error.to_string()))?;
+    let have = || {
+        let mut found = Vec::new();
+        list(&file.root(), "", &mut found);
+        found.iter().take(12).cloned().collect::<Vec<_>>().join(", ")
+    };
+    let Some(path) = &source.name else {
+        return Err(refused(format!("name a dataset, {name}:PATH; it has {}", have())));
+    };
+    let mut matrix = Matrix { width: 0, values: Vec::new() };
+    for path in path.split(',') {
+        let dataset =
+            file.dataset(path).map_err(|error| refused(format!("{path}: {error}; the file has {}", have())))?;
+        let width = match shape(&dataset).map_err(&refused)?.as_slice() {
+            [_, width] => *width,
+            [_] => 1,
+            _ => {
+                let problem = format!("{path}: expected a matrix or a list of numbers, found {}", words(&dataset));
+                return Err(refused(problem));
+            }
+        };
+        if !matrix.values.is_empty() && matrix.width != width {
+            let problem = format!("{path}: {width} numbers in a line, {} in the dataset before it", matrix.width);
+            return Err(refused(problem));
+        }
+        matrix.width = width;
+        matrix.values.extend(numbers(&dataset).map_err(|problem| refused(format!("{path}: {problem}")))?);
+    }
+    Ok(matrix)
+}
+
+/// Dimensions; the last runs fastest.
+pub(super) fn shape(dataset: &Dataset) -> Result<Vec<usize>, String> {
+    let shape = dataset.shape().map_err(|error| error.to_string())?;
+    match shape.iter().try_fold(1_u64, |all, one| all.checked_mul(*one)) {
+        Some(count) if count <= LARGEST => Ok(shape.into_iter().map(|one| one as usize).collect()),
+        _ => Err(format!("dimensions {shape:?}, of more than {LARGEST} numbers")),
+    }
+}
+
+/// All numbers of a dataset.
+pub(super) fn numbers(dataset: &Dataset) -> Result<Vec<f64>, String> {
+    let count: usize = shape(dataset)?.iter().product();
+    let values = dataset.read_f64().map_err(|error| format!("expected numbers, found {} ({error})", words(dataset)))?;
+    match values.len() {
+        found if found == count => Ok(values),
+        found => Err(format!("{count} numbers by its dimensions, {found} by its bytes")),
+    }
+}
+
+fn words(dataset: &Dataset) -> String {
+    let shape = dataset.shape().unwrap_or_default().iter().map(u64::to_string).collect::<Vec<_>>().join("x");
+    let kind = dataset.dtype().map_or("data of an unknown type".into(), |kind| kind.to_string());
+    if shape.is_empty() { kind } else { format!("{shape} {kind}") }
+}
+
+/// Paths of the datasets, with their dimensions.
+fn list(group: &Group, path: &str, found: &mut Vec<String>) {
+    for name in group.datasets().unwrap_or_default() {
+        let words = group.dataset(&name).map_or_else(|error| error.to_string(), |one| words(&one));
+        found.push(format!("{path}/{name} ({words})"));
+    }
+    if path.matches('/').count() < 4 {
+        for name in group.groups().unwrap_or_default() {
+            if let Ok(inner) = group.group(&name) {
+                list(&inner, &format!("{path}/{name}"), found);
+            }
+        }
+    }
+}

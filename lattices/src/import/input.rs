@@ -1,0 +1,38 @@
+//! The file that an import begins with: a lattice, or a LOCO file with everything.
+
+use std::fs;
+use std::path::Path;
+
+use super::element::Lattice;
+use super::loco::{self, Lacking, Loco};
+use super::mat::MatFile;
+use super::source::Source;
+use measured::MeasuredError;
+
+/// What was read.
+#[derive(Debug, Clone)]
+pub enum Input {
+    /// A lattice alone.
+    Lattice(Lattice),
+    /// A whole measurement.
+    Loco(Box<Loco>),
+}
+
+impl Input {
+    /// Read a file of any format; `lacking` is what a LOCO file may not state.
+    ///
+    /// # Errors
+    /// [`MeasuredError`].
+    pub fn read(path: &Path, lacking: &Lacking) -> Result<Self, MeasuredError> {
+        let Source { path: file, name } = Source::of(path);
+        let words = file.display().to_string();
+        let bytes = fs::read(&file).map_err(|source| MeasuredError::Read { file: words.clone(), source })?;
+        if name.is_none() && MatFile::is_one(&bytes) {
+            let file = MatFile::of(&words, bytes)?;
+            if loco::is_one(&file) {
+                return Ok(Self::Loco(Box::new(loco::read(&file, lacking)?)));
+            }
+        }
+        Lattice::read(path).map(Self::Lattice)
+    }
+}

@@ -1,0 +1,122 @@
+//! A value of a file and where it stands: `BPMData(1).HBPMIndex`.
+
+use super::Mat;
+use measured::MeasuredError;
+
+/// A value, with its place for errors.
+#[derive(Debug, Clone)]
+pub(in crate::import) struct Place<'a> {
+    file: &'a str,
+    path: String,
+    /// The value.
+    pub value: &'a Mat,
+}
+
+impl<'a> Place<'a> {
+    /// A variable.
+    pub fn of(file: &'a str, name: &str, value: &'a Mat) -> Self {
+        Self { file, path: name.into(), value }
+    }
+
+    /// Elements of a cell array or a struct array, called by Matlab's numbers; a struct's are structs of one.
+    pub fn elements(&self) -> Result<Vec<Self>, MeasuredError> {
+        let count = match self.value {
+            Mat::Cells(_, values) => values.len(),
+            Mat::Structs(_, _, values) => values.len(),
+            _ => return Err(self.expected("a cell array or a struct")),
+        };
+        Ok((0..count).map(|index| self.element(index)).collect())
+    }
+
+    fn element(&self, index: usize) -> Self {
+        match self.value {
+            Mat::Cells(_, values) => {
+                Self { path: format!("{}{{{}}}", self.path, index + 1), value: &values[index], ..*self }
+            }
+            _ => Self { path: format!("{}({})", self.path, index + 1), ..*self },
+        }
+    }
+
+    /// Names of a struct's fields.
+    pub fn names(&self) -> &'a [String] {
+        if let Mat::Structs(_, names, _) = self.value { names } else { &[] }
+    }
+
+    /// A field of one element of a struct array; none where there is no such field, or nothing in it.
+    pub fn field_of(&self, element: usize, name: &str) -> Option<Self> {
+        let Mat::Structs(shape, names, values) = self.value else { return None };
+        let at = names.iter().position(|own| own == name)?;
+        let value = values.get(element)?.get(at).filter(|value| !value.is_empty())?;
+        let number = if shape.iter().product::<usize>() > 1 { format!("({})", element + 1) } else { String::new() };
+        Some(Self { path: format!("{}{number}.{name}", self.path), value, ..*self })
+    }
+
+    /// A field of a struct of one.
+    pub fn field(&self, name: &str) -> Option<Self> {
+        self.field_of(0, name)
+    }
+
+    /// The same, which must be there.
+    pub fn need_of(&self, element: usize, name: &str) -> Result<Self, MeasuredError> {
+        let missing = || self.wrong(&format!("no field {name}, or nothing in it; found {}", self.names().join(", ")));
+        self.field_of(element, name).ok_or_else(missing)
+    }
+
+    /// The same of a struct of one.
+    pub fn need(&self, name: &str) -> Result<Self, MeasuredError> {
+        self.need_of(0, name)
+    }
+
+    /// Numbers, the first dimension running fastest.
+    pub fn numbers(&self) -> Result<&'a [f64], MeasuredError> {
+        match self.value {
+            Mat::Numbers(_, values) => Ok(values),
+            _ => Err(self.expected("numbers")),
+        }
+    }
+
+    /// As many numbers as there must be.
+    pub fn many(&self, count: usize, of_what: &str) -> Result<&'a [f64], MeasuredError> {
+        let found = self.numbers()?;
+        if found.len() == count { Ok(found) } else { Err(self.expected(&format!("{count} numbers, {of_what}"))) }
+    }
+
+    /// One number.
+    pub fn number(&self) -> Result<f64, MeasuredError> {
+        match self.numbers()? {
+            [one] if one.is_finite() => Ok(*one),
+            [one] => Err(self.wrong(&format!("expected a finite number, found {one}"))),
+            _ => Err(self.expected("one number")),
+        }
+    }
+
+    /// Numbers of Matlab, which begin with 1, as places below `length`.
+    pub fn places(&self, length: usize, of_what: &str) -> Result<Vec<usize>, MeasuredError> {
+        let place = |(at, number): (usize, &f64)| {
+            let is_one = number.fract() == 0.0 && (1.0..=length as f64).contains(number);
+            let problem = || format!("number {}: expected {of_what}, 1 to {length}, found {number}", at + 1);
+            is_one.then(|| *number as usize - 1).ok_or_else(|| self.wrong(&problem()))
+        };
+        self.numbers()?.iter().enumerate().map(place).collect()
+    }
+
+    /// Text.
+    pub fn text(&self) -> Option<&'a str> {
+        if let Mat::Text(text) = self.value { Some(text) } else { None }
+    }
+
+    /// Rows and columns of a matrix.
+    pub fn shape(&self) -> Option<[usize; 2]> {
+        if let Mat::Numbers(shape, _) = self.value { shape.as_slice().try_into().ok() } else { None }
+    }
+
+    /// Something else stands here.
+    pub fn expected(&self, what: &str) -> MeasuredError {
+        self.wrong(&format!("expected {what}, found {}", self.value.words()))
+    }
+
+    /// A problem of this value.
+    pub fn wrong(&self, problem: &str) -> MeasuredError {
+        MeasuredError::Table { file: self.file.into(), problem: format!("{}: {problem}", self.path) }
+    }
+}

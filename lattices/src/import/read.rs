@@ -1,0 +1,79 @@
+//! A lattice file, read by the format that its content shows.
+
+use std::fs;
+use std::path::Path;
+
+use super::element::Lattice;
+use super::mat::MatFile;
+use super::source::Source;
+use super::{at, at_mat, madx, pals, xsuite};
+use measured::MeasuredError;
+
+/// Nodes of a YAML file at most.
+const LARGEST: usize = 10_000_000;
+
+impl Lattice {
+    /// Read a file of any of the formats; of a MAT-file with several lattices `FILE:VARIABLE`.
+    ///
+    /// # Errors
+    /// [`MeasuredError::Table`]: the file is of no known format, or has an element that the twin of a measured ring cannot carry.
+    pub fn read(path: &Path) -> Result<Self, MeasuredError> {
+        let Source { path, name } = Source::of(path);
+        let file = path.display().to_string();
+        let bytes = fs::read(&path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        if MatFile::is_one(&bytes) {
+            return at_mat::read(&MatFile::of(&file, bytes)?, name.as_deref());
+        }
+        let text = String::from_utf8(bytes).map_err(|_| unknown(&file, "bytes that are no text"))?;
+        Self::parse(&file, &text)
+    }
+
+    /// Read the text of a file of any format that is text; `file` appears in errors.
+    ///
+    /// # Errors
+    /// As [`Lattice::read`].
+    pub fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
+        if text.trim_start().starts_with('@') {
+            return madx::read(file, text);
+        }
+        let value = value(file, text)?;
+        if value.get("atjson").is_some() {
+            at::read(file, &value)
+        } else if value.get("PALS").is_some() {
+            pals::read(file, &value)
+        } else if value.get("element_names").is_some() {
+            xsuite::read(file, &value)
+        } else {
+            let keys = value.as_object().map(|map| map.keys().take(8).cloned().collect::<Vec<_>>().join(", "));
+            let seen = keys.map_or_else(|| first_line(text), |keys| format!("the keys {keys}"));
+            Err(unknown(file, &seen))
+        }
+    }
+}
+
+/// JSON, in which Python may have written `NaN` and `Infinity` (null here), or YAML.
+fn value(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
+    let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
+    if text.trim_start().starts_with('{') {
+        return json5::from_str(text).map_err(|error| refused(error.to_string()));
+    }
+    if !text.contains("PALS:") {
+        return Err(unknown(file, &first_line(text)));
+    }
+    // a large ring has more nodes than the library's own limit
+    let options = serde_saphyr::options! {
+        budget: serde_saphyr::budget! { max_nodes: LARGEST, max_events: LARGEST },
+    };
+    serde_saphyr::from_str_with_options(text, options).map_err(|error| refused(error.to_string()))
+}
+
+fn first_line(text: &str) -> String {
+    format!("the line {:?}", text.lines().next().unwrap_or_default().chars().take(60).collect::<String>())
+}
+
+fn unknown(file: &str, seen: &str) -> MeasuredError {
+    let problem = format!(
+        "expected a lattice by pyAT (JSON with atjson, or a MAT-file), Xsuite (JSON with element_names), MAD-X (a table that begins with @) or in PALS, found {seen}"
+    );
+    MeasuredError::Table { file: file.into(), problem }
+}

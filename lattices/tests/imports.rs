@@ -1,0 +1,443 @@
+//! Lattices as their codes wrote them (recordings/measured/imports), and what is refused.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use lattices::import::{
+    Conventions, Instruments, KickIs, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, assemble,
+    bare, write,
+};
+use measured::lattice::ring;
+use measured::unknowns::groups;
+use measured::{Folder, MeasuredError, Model};
+use nalgebra::DMatrix;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use tempfile::TempDir;
+use twin::{Hold, Optics, Rf, Tunes};
+
+const FILES: [&str; 6] = [
+    "twelve-cells.at.json",
+    "twelve-cells.at.mat",
+    "twelve-cells.octave.mat",
+    "twelve-cells.tfs",
+    "twelve-cells.xsuite.json",
+    "twelve-cells.pals.yaml",
+];
+
+fn recorded(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/measured").join(name)
+}
+
+/// A lattice and its instruments, by patterns where the file has no types for them.
+fn imported(path: &Path) -> Result<(Lattice, Instruments), MeasuredError> {
+    let lattice = Lattice::read(path)?;
+    let by = |pattern: &str| [pattern.parse().unwrap()];
+    let instruments = Instruments::choose(&lattice, &by("bpm*"), &by("cor*"))?;
+    Ok((lattice, instruments))
+}
+
+fn tunes(folder: &Folder) -> Tunes {
+    Optics::of(&ring(folder, &[]).unwrap(), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap()
+}
+
+/// The response [mm/mrad] of the lattice as written.
+fn response(folder: &Folder) -> DMatrix<f64> {
+    Model::of(folder, &groups(folder).into(), Rf::FixedMomentum).unwrap().as_written().unwrap()
+}
+
+fn conventions() -> Conventions {
+    Conventions {
+        unit: OrbitUnit::Millimetres,
+        kick: PerInstrument::parse("--kick", "x=0.2,y=0.15").unwrap(),
+        kick_is: KickIs::Full,
+        signs: Signs([true, true]),
+        noise: PerInstrument::parse("--noise", "0.002").unwrap(),
+    }
+}
+
+/// The measurement of the twelve cells by a lattice file and a table.
+fn measurement(file: &str, table: &str, order: Option<Order>, conventions: &Conventions) -> Folder {
+    let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+    let table = Table::read(&recorded("imports").join(table)).unwrap();
+    let dispersion = Table::read(&recorded("imports/dispersion.csv")).unwrap();
+    let dispersion = order.is_none().then_some((&dispersion, 2000.0));
+    let measured = Measurement { matrix: &table, dispersion, order, conventions };
+    assemble(&lattice, &instruments, Some(499_654_096.7), &measured).unwrap()
+}
+
+#[test]
+fn tunes_are_those_that_madx_wrote() {
+    let table = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let stated = |name: &str| -> f64 {
+        let line = table.lines().find(|line| line.split_whitespace().nth(1) == Some(name)).unwrap();
+        line.split_whitespace().nth(3).unwrap().parse().unwrap()
+    };
+    for file in FILES {
+        let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+        let tunes = tunes(&bare(&lattice, &instruments).unwrap());
+        // MAD-X and the twin agree to 3e-10 with angles of 15 digits
+        assert!((tunes.x - stated("Q1")).abs() < 1e-9 && (tunes.y - stated("Q2")).abs() < 1e-9, "{file}: {tunes:?}");
+    }
+}
+
+#[test]
+fn all_formats_give_one_matrix() {
+    let of = |file: &str| {
+        let (lattice, instruments) = imported(&recorded("imports").join(file)).unwrap();
+        response(&bare(&lattice, &instruments).unwrap())
+    };
+    let first = of(FILES[0]);
+    for file in &FILES[1..] {
+        let largest = (of(file) - &first).amax();
+        assert!(largest < 1e-6, "{file}: {largest} mm/mrad");
+    }
+}
+
+#[test]
+fn what_is_imported_is_what_was_measured() {
+    let measured = Folder::read(&recorded("twelve-cells/before")).unwrap();
+    let imported = measurement(FILES[0], "response.csv", None, &conventions());
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("ring");
+    write(&imported, &path).unwrap();
+    let read = Folder::read(&path).unwrap();
+    assert_eq!((&read.matrix, &read.dispersion), (&measured.matrix, &measured.dispersion));
+    for (own, other) in read.correctors.iter().zip(&measured.correctors) {
+        assert_eq!((own.plane, own.at, own.kick), (other.plane, other.at, other.kick));
+    }
+    for (own, other) in read.monitors.iter().zip(&measured.monitors) {
+        assert_eq!((own.plane, own.at, own.sigma), (other.plane, other.at, other.sigma));
+    }
+    assert!((read.meta.rf - measured.meta.rf).abs() < 0.1 && read.meta.delta_rf == measured.meta.delta_rf);
+    assert!(twin::Ring::read(&path.join("machine.json")).is_ok());
+    let again = write(&imported, &path).unwrap_err().to_string();
+    assert!(again.contains("ring"), "{again}");
+}
+
+#[test]
+fn a_dataset_of_hdf5_is_a_table_without_names() {
+    let file = recorded("imports/response.h5");
+    let of = |path: &str| Table::read(Path::new(&format!("{}{path}", file.display())));
+    let (lattice, instruments) = imported(&recorded("imports/twelve-cells.at.mat")).unwrap();
+    let folder = |table: &Table, unit| {
+        let conventions = Conventions { unit, ..conventions() };
+        let measured =
+            Measurement { matrix: table, dispersion: None, order: Some(Order::Planes), conventions: &conventions };
+        assemble(&lattice, &instruments, None, &measured)
+    };
+    let own = folder(&of(":/response_matrix").unwrap(), OrbitUnit::Metres).unwrap();
+    let other = folder(&Table::read(&recorded("imports/response.txt")).unwrap(), OrbitUnit::Millimetres).unwrap();
+    // metres of the file, rounded once each way
+    assert!((own.matrix - other.matrix).amax() < 1e-15);
+    let said = |path: &str| of(path).unwrap_err().to_string();
+    assert!(said("").contains("response.h5:PATH; it has /dkick (f64), /measured_eta_x (12 f64), /measured_eta_y"));
+    assert!(said(":/orm").contains("path not found: orm; the file has /dkick (f64)"), "{}", said(":/orm"));
+    assert!(said(":/dkick").contains("expected a matrix or a list of numbers, found f64"));
+    let both = of(":/measured_eta_x,/measured_eta_y").unwrap();
+    assert!(folder(&both, OrbitUnit::Metres).unwrap_err().to_string().contains("1 columns, the lattice has 24"));
+    assert!(
+        said(":/response_matrix,/measured_eta_x")
+            .contains("/measured_eta_x: 1 numbers in a line, 24 in the dataset before it")
+    );
+    let conventions = Conventions { unit: OrbitUnit::Metres, ..conventions() };
+    let dispersion = Some((&both, 2000.0));
+    let matrix = &of(":/response_matrix").unwrap();
+    let measured = Measurement { matrix, dispersion, order: Some(Order::Planes), conventions: &conventions };
+    let dispersion = assemble(&lattice, &instruments, None, &measured).unwrap().dispersion.unwrap();
+    let stated = measurement("twelve-cells.at.json", "response.csv", None, &self::conventions()).dispersion.unwrap();
+    assert!((dispersion - stated).amax() < 1e-15);
+    let column = folder(&Table::read(&recorded("imports/values.octave.mat:i8")).unwrap(), OrbitUnit::Metres);
+    assert!(
+        column
+            .unwrap_err()
+            .to_string()
+            .contains("values.octave.mat:i8: 2 lines, the lattice has 24 channels in that order")
+    );
+    let lattice = Table::read(&recorded("imports/twelve-cells.at.mat:RING")).unwrap_err().to_string();
+    assert!(lattice.ends_with("RING: expected numbers, found 1x90 cells"), "{lattice}");
+}
+
+#[test]
+fn no_byte_of_hdf5_makes_it_panic() {
+    let whole = fs::read(recorded("imports/response.h5")).unwrap();
+    let mut random = StdRng::seed_from_u64(8);
+    for _ in 0..1500 {
+        let mut bytes = whole.clone();
+        for _ in 0..random.random_range(1..4) {
+            let at = random.random_range(8..bytes.len());
+            bytes[at] = if random.random() { 0xff } else { random.random() };
+        }
+        let folder = TempDir::new().unwrap();
+        let path = folder.path().join("some.h5");
+        fs::write(&path, bytes).unwrap();
+        drop(Table::read(Path::new(&format!("{}:/response_matrix", path.display()))));
+    }
+}
+
+#[test]
+fn conventions_change_units_sizes_and_signs_and_nothing_else() {
+    let plain = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &conventions());
+    let other =
+        Conventions { unit: OrbitUnit::Metres, kick_is: KickIs::Half, signs: Signs([false, true]), ..conventions() };
+    let other = measurement("twelve-cells.tfs", "response.txt", Some(Order::Planes), &other);
+    assert_eq!(other.matrix[(0, 0)], -1e3 * plain.matrix[(0, 0)]);
+    assert_eq!(other.matrix[(0, 12)], 1e3 * plain.matrix[(0, 12)]);
+    assert_eq!((other.correctors[0].kick, other.monitors[0].sigma), (0.4, 2.0));
+}
+
+/// A pyAT file of these elements.
+fn at(elements: &str) -> (TempDir, PathBuf) {
+    file("ring.json", &format!(r#"{{"atjson": 1, "elements": [{elements}], "properties": {{"energy": 1.5e9}}}}"#))
+}
+
+fn file(name: &str, text: &str) -> (TempDir, PathBuf) {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join(name);
+    fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+fn refused(path: &Path) -> String {
+    imported(path).unwrap_err().to_string()
+}
+
+const BPM: &str = r#"{"FamName": "BPM", "Class": "Monitor", "Length": 0.2}"#;
+const COR: &str =
+    r#"{"FamName": "COR", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "PolynomA": [0, 0.1]}"#;
+
+#[test]
+fn long_monitors_and_correctors_in_magnets_act_in_the_middle() {
+    let (_folder, path) = at(&format!("{BPM}, {COR}"));
+    let (lattice, instruments) = imported(&path).unwrap();
+    let folder = bare(&lattice, &instruments).unwrap();
+    let rows: Vec<(f64, f64, f64)> = folder.lattice.iter().map(|one| (one.s, one.length, one.k1)).collect();
+    let halves = [(0.0, 0.1, 0.0), (0.1, 0.0, 0.0), (0.1, 0.1, 0.0), (0.2, 0.2, 2.0), (0.4, 0.0, 0.0), (0.4, 0.2, 2.0)];
+    assert_eq!(rows, halves);
+    assert_eq!((folder.monitors[0].at, folder.correctors[0].at), (1, 4));
+    assert_eq!(groups(&folder).0, [[3, 5]], "the halves are one magnet");
+    assert_eq!(lattice.left_out["skew gradient (couples the planes)"], 1);
+}
+
+#[test]
+fn a_roll_by_an_eighth_of_a_turn_leaves_no_normal_gradient() {
+    let s = core::f64::consts::FRAC_1_SQRT_2;
+    let rolled = format!(
+        r#"{{"FamName": "COR", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "R1": [[{s}, 0, {s}]]}}"#
+    );
+    let (_folder, path) = at(&format!("{BPM}, {rolled}"));
+    let (lattice, _) = imported(&path).unwrap();
+    assert_eq!(lattice.elements[1].k1, 0.0);
+    assert_eq!(lattice.left_out.len(), 1);
+}
+
+/// By pyAT: a magnet that is tracked as a drift has no field, and method 0 of an edge no soft one.
+#[test]
+fn a_magnet_that_is_switched_off_has_no_field() {
+    let of = |element: &str| {
+        let (_folder, path) = at(&format!("{BPM}, {COR}, {element}"));
+        imported(&path).unwrap().0.elements[2].clone()
+    };
+    let quadrupole = r#""FamName": "Q", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "PassMethod""#;
+    assert_eq!(of(&format!(r#"{{{quadrupole}: "DriftPass"}}"#)).k1, 0.0);
+    assert_eq!(of(&format!(r#"{{{quadrupole}: "StrMPoleSymplectic4RadPass"}}"#)).k1, 2.0);
+    let dipole = r#""FamName": "B", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "EntranceAngle": 0.05, "FullGap": 0.04, "FringeInt1": 0.5, "FringeInt2": 0.5"#;
+    let whole = of(&format!("{{{dipole}}}"));
+    let half = of(&format!(r#"{{{dipole}, "FringeBendExit": 0}}"#));
+    assert_eq!((whole.fringe, whole.edge_in, half.fringe, half.edge_in), (0.02, 0.05, 0.01, 0.05));
+    let (_folder, path) = at(&format!(r#"{BPM}, {{{quadrupole}: "CavityPass"}}"#));
+    assert!(refused(&path).contains("element Q: pass method CavityPass of a Quadrupole is not known here"));
+    let (_folder, path) = at(&format!(r#"{BPM}, {{{dipole}, "PassMethod": "DriftPass"}}"#));
+    assert!(refused(&path).contains("element B: pass method DriftPass of a dipole"));
+}
+
+/// What moves the orbit is said, since the twin's is straight.
+#[test]
+fn kicks_displacements_and_rolls_are_said() {
+    let kicked = r#"{"FamName": "K", "Class": "Corrector", "Length": 0, "KickAngle": [1e-3, 0]}"#;
+    let dipole = r#"{"FamName": "Q", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [1e-4, 2]}"#;
+    let moved =
+        r#"{"FamName": "M", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "T1": [1e-3, 0, 0, 0, 0, 0]}"#;
+    let rolled = r#"{"FamName": "R", "Class": "Monitor", "Length": 0, "R1": [[0.8, 0, 0.6]]}"#;
+    let (_folder, path) = at(&format!("{BPM}, {COR}, {kicked}, {dipole}, {moved}, {rolled}"));
+    let left_out: Vec<(&str, usize)> = imported(&path).unwrap().0.left_out.into_iter().collect();
+    let begins = ["displacements", "kicks of correctors", "rolls of monitors", "skew gradient"];
+    assert!(left_out.iter().zip(begins).all(|((what, _), begin)| what.starts_with(begin)), "{left_out:?}");
+    assert_eq!(left_out.iter().map(|(_, count)| *count).collect::<Vec<_>>(), [1, 2, 1, 1]);
+}
+
+/// By Xsuite, `line.insert` leaves slices of a drift; an edge may be switched off.
+#[test]
+fn a_line_with_something_inserted_is_read() {
+    let line = |edge: &str| {
+        file(
+            "ring.json",
+            &format!(
+                r#"{{"element_names": ["d..0", "bpm", "d..1", "cor"], "elements": {{"d": {{"__class__": "Drift", "length": 2.0}},
+                "d..0": {{"__class__": "DriftSlice", "parent_name": "d", "weight": 0.25}}, "bpm": {{"__class__": "Marker"}},
+                "d..1": {{"__class__": "DriftSlice", "parent_name": "d", "weight": 0.75, "slice_offset": 0.5}},
+                "cor": {{"__class__": "RBend", "length": 1.0, "angle": 0.1, "shift_x": 0.001, "edge_entry_hgap": 0.02, "edge_entry_fint": 0.5{edge}}}}}}}"#
+            ),
+        )
+    };
+    let read = |edge: &str| {
+        let (_folder, path) = line(edge);
+        imported(&path).unwrap().0
+    };
+    let lattice = read("");
+    let lengths: Vec<f64> = lattice.elements.iter().map(|one| one.length).collect();
+    assert_eq!(lengths, [0.5, 0.0, 1.5, 1.0]);
+    assert_eq!(lattice.left_out.len(), 2, "displaced, and a soft edge at one side only");
+    let edges =
+        |lattice: &Lattice| (lattice.elements[3].edge_in, lattice.elements[3].edge_out, lattice.elements[3].fringe);
+    assert_eq!(edges(&lattice), (0.05, 0.05, 0.01));
+    assert_eq!(edges(&read(r#", "edge_entry_active": 0"#)), (0.0, 0.05, 0.0));
+    assert_eq!(edges(&read(r#", "edge_entry_model": "suppressed", "edge_exit_model": "full""#)), (0.0, 0.05, 0.0));
+}
+
+#[test]
+fn what_the_twin_cannot_carry_is_refused_with_its_element() {
+    let thin = r#"{"FamName": "T", "Class": "ThinMultipole", "Length": 0, "PolynomB": [0, 0.3]}"#;
+    let wiggler = r#"{"FamName": "W", "Class": "Wiggler", "Length": 1, "PassMethod": "GWigSymplecticPass"}"#;
+    let vertical = r#"{"FamName": "V", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "R1": [[0, 0, 1]]}"#;
+    let infinite = r#"{"FamName": "I", "Class": "Drift", "Length": Infinity}"#;
+    for (element, said) in [
+        (thin, "element T: a thin quadrupole of 0.3 /m"),
+        (wiggler, "element W: class Wiggler acts on the orbit"),
+        (vertical, "element V: a dipole rolled by 1.57"),
+        (infinite, "element I: Length: expected a finite number, found null"),
+    ] {
+        let (_folder, path) = at(element);
+        let found = refused(&path);
+        assert!(found.contains(said), "{found}");
+    }
+}
+
+#[test]
+fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
+    let line = |field: &str| {
+        let bend = format!(r#"{{"__class__": "Bend", "length": 1.0, "angle": 0.1{field}}}"#);
+        file(
+            "ring.json",
+            &format!(
+                r#"{{"element_names": ["bpm", "cor"], "elements": {{"bpm": {{"__class__": "Marker"}}, "cor": {bend}}}}}"#
+            ),
+        )
+    };
+    for same in ["", r#", "k0": 0.1"#, r#", "k0": 0.2, "k0_from_h": true"#] {
+        let (_folder, path) = line(same);
+        assert_eq!(imported(&path).unwrap().0.elements[1].bend, 0.1);
+    }
+    let (_folder, path) = line(r#", "k0": 0.11"#);
+    assert!(refused(&path).contains("element cor: field k0 0.11 /m bends by 0.11 rad, the reference orbit by 0.1 rad"));
+}
+
+#[test]
+fn a_replica_of_itself_is_refused() {
+    let line = r#"{"element_names": ["a"], "elements": {"a": {"__class__": "Replica", "parent_name": "b"}, "b": {"__class__": "Replica", "parent_name": "a"}}}"#;
+    let (_folder, path) = file("ring.json", line);
+    assert!(refused(&path).contains("element a of element_names, or what it replicates, is not among the elements"));
+}
+
+/// As Tao writes: `L`, `pc_ref`, and a dipole's numbers among `ParticleP`.
+const BY_TAO: &str = "PALS:
+  facility:
+    - begin:
+        kind: BeginningEle
+        ReferenceP:
+          pc_ref: 1.5e9
+    - bpm:
+        kind: Drift
+        L: 0.5
+    - cor:
+        kind: SBend
+        L: 2
+        ParticleP:
+          g_ref: 0.1
+          e1: 0.05
+    - ring:
+        kind: BeamLine
+        line: [begin, bpm, cor]
+    - lat:
+        kind: Lattice
+        branches:
+          - ring
+";
+
+#[test]
+fn the_words_of_tao_in_pals_are_read() {
+    let (_folder, path) = file("ring.pals.yaml", BY_TAO);
+    let (lattice, _) = imported(&path).unwrap();
+    let [bpm, cor] = lattice.elements.as_slice() else { panic!("{:?}", lattice.elements) };
+    assert_eq!((bpm.length, cor.length, cor.bend, cor.edge_in), (0.5, 2.0, 0.2, 0.05));
+    assert!((lattice.energy.unwrap() - 1.5).abs() < 1e-6);
+    let (_folder, path) = file("ring.pals.yaml", &BY_TAO.replace("g_ref", "g"));
+    assert!(refused(&path).contains("element cor: a dipole without g_ref or angle_ref"));
+}
+
+#[test]
+fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
+    let said = |text: &str| {
+        let (_folder, path) = file("ring.txt", text);
+        refused(&path)
+    };
+    assert!(said(r#"{"lattice": [], "beam": 1}"#).contains("found the keys beam, lattice"));
+    assert!(said("Q1: QUADRUPOLE, L=0.3;").contains("found the line \"Q1: QUADRUPOLE, L=0.3;\""));
+    assert!(said("@ ENERGY %le 1.5\n* NAME S\n").contains("the table lacks KEYWORD, L, ANGLE"));
+    assert!(said("PALS:\n  facility:\n    - use: ring\n").contains("ring stands in a line and not in the facility"));
+    assert!(said("PALS: [").contains("ring.txt: "));
+    assert!(said("").contains("found the line \"\""));
+}
+
+#[test]
+fn a_mat_file_is_read_by_the_name_of_its_lattice() {
+    let several = recorded("imports/twelve-cells.at.mat");
+    let of = |name: &str| Lattice::read(Path::new(&format!("{}:{name}", several.display())));
+    assert_eq!(of("RING").unwrap().elements.len(), 90);
+    let problem = of("THERING").unwrap_err().to_string();
+    assert!(problem.ends_with("THERING is no lattice of AT; found RING (1x90 cells)"), "{problem}");
+    let none = recorded("imports/values.octave.mat");
+    assert!(
+        refused(&none)
+            .contains("expected a cell array of elements with FamName, found f (a 1x1 struct), P (a 1x2 struct)")
+    );
+}
+
+#[test]
+fn a_table_of_madx_holds_all_elements_at_their_ends() {
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let without: String =
+        text.lines().filter(|line| !line.contains("QF.2\"")).map(|line| format!("{line}\n")).collect();
+    let (_folder, path) = file("ring.tfs", &without);
+    assert!(refused(&path).contains("COR.3 of 0.2 m ends at 0.9 m, the element before it at 0.4 m"));
+}
+
+#[test]
+fn tables_that_do_not_fit_are_refused() {
+    let (lattice, instruments) = imported(&recorded("imports/twelve-cells.at.json")).unwrap();
+    let said = |text: &str, order: Option<Order>| {
+        let (_folder, path) = file("r.csv", text);
+        let conventions = conventions();
+        let read = Table::read(&path).and_then(|matrix| {
+            assemble(
+                &lattice,
+                &instruments,
+                None,
+                &Measurement { matrix: &matrix, dispersion: None, order, conventions: &conventions },
+            )
+        });
+        read.map(|folder| format!("{:?}", folder.matrix)).unwrap_or_else(|error| error.to_string())
+    };
+    assert!(said("1 2\n3 4\n", None).contains("lines have no names; say their order with --order"));
+    assert!(said("1 2\n3 4\n", Some(Order::Pairs)).contains("2 lines, the lattice has 24 channels in that order"));
+    assert!(said("1 2\n3\n", None).contains("line 2: 1 numbers, line 1 has 2"));
+    assert!(said(",x:COR[1]\nBPM[1],0.5\n", None).contains("BPM[1] has both planes; write x:BPM[1] or y:BPM[1]"));
+    assert!(
+        said(",x:COR[1]\nx:BPM[13],0.5\n", None)
+            .contains("x:BPM[13] is none of the lattice's, which are x:BPM[1], y:BPM[1]")
+    );
+    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: number 2 stands there twice"));
+    assert!(said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number, found a"));
+    assert!(said("", None).contains("no line of numbers"));
+    assert!(said("# by hand\n; x:COR[1]; y:COR[2]\nx:BPM[2]; 0.5;\n", None).contains("0.5, NaN"));
+}
