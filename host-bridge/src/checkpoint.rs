@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use crc::{CRC_32_ISO_HDLC, Crc};
+use results::Remarked;
 use serde::{Deserialize, Serialize};
 
 use crate::health::Health;
-use crate::record::Remarked;
 use crate::source::queue::Faults;
 
 pub use keeper::Keeper;

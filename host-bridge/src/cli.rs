@@ -8,9 +8,9 @@ use diagnosis::validation::UnmodelledKind;
 use inference::nuts::NutsSettings;
 use lattices::export;
 use lattices::import::{self, Pattern};
+use shared_memory::{PUBLISHER, SERVICE};
 use twin::EffectText;
 
-use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
 use crate::source::address::Address;
 
@@ -864,6 +864,17 @@ pub enum FitModel {
     Resnet,
     /// The first order about the design, as one step of LOCO takes it
     Linear,
+}
+
+impl From<FitModel> for results::FitModel {
+    fn from(model: FitModel) -> Self {
+        match model {
+            FitModel::Twin => Self::Twin,
+            FitModel::Green => Self::Green,
+            FitModel::Resnet => Self::Resnet,
+            FitModel::Linear => Self::Linear,
+        }
+    }
 }
 
 /// Ways to fit.

@@ -13,9 +13,10 @@ use toml::de::DeTable;
 
 pub use feedback::Feedback;
 
+use shared_memory::{PUBLISHER, SERVICE};
+
 use crate::history::Plan;
 use crate::logs::Form;
-use crate::sink::shared_memory::{PUBLISHER, SERVICE};
 use crate::source::Rate;
 use crate::source::origin::Origin;
 

@@ -18,11 +18,12 @@ use std::thread;
 
 use estimator::StateError;
 
-use crate::sink::shared_memory::PublishError;
 use crate::source::desk::Wish;
 use crate::stop::Stop;
 pub use engine::{Engine, model_of, resume};
 pub use outlet::Outlet;
+use shared_memory::PublishError;
+
 use work::Work;
 
 /// Estimates that wait to be published; then the core waits, and frames wait in the queue.

@@ -16,11 +16,11 @@ use estimator::{FitQuality, FrameError, Layout, MonitorState, Sizes};
 use serde::{Deserialize, Serialize};
 use training::rooms::large;
 
-use crate::record::{EstimateRecord, ReadingUse};
 use filter::Filter;
-pub use instrument::State;
 use instrument::{Bounds, Instrument, Limits, Sample};
 pub use reporter::Reporter;
+use results::{EstimateRecord, ReadingUse};
+pub use shared_memory::{Condition, HealthRecord, State};
 
 /// Frames over which a monitor is judged.
 const MONITOR: u32 = 64;
@@ -74,30 +74,6 @@ impl Corrector {
         self.largest = self.largest.max(current.abs());
         current.abs() > ON * self.largest
     }
-}
-
-/// What is published of the health of one monitor or corrector.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Condition {
-    /// Its state.
-    pub state: State,
-    /// Filtered scatter, share of jumps, share of missing samples [1].
-    pub ratios: [f32; 3],
-}
-
-/// Health of the machine after a frame, and the evidence of the mismatch flag.
-#[derive(Debug, Clone, PartialEq)]
-pub struct HealthRecord {
-    /// The frame.
-    pub sequence: u32,
-    /// Frames so far.
-    pub frames: u32,
-    /// Readings against the model: chi-square and its degrees of freedom.
-    pub fit: FitQuality,
-    /// [B]
-    pub monitors: Vec<Condition>,
-    /// [C]
-    pub correctors: Vec<Condition>,
 }
 
 impl Health {

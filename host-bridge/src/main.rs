@@ -11,7 +11,7 @@ use host_bridge::command::{
     request, response, serve, simulate, study, surrogate, train, validate, watch,
 };
 use host_bridge::logs;
-use host_bridge::output::{self, OutputError};
+use results::output::{self, OutputError};
 
 fn main() -> ExitCode {
     logs::start();

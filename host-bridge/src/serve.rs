@@ -1,6 +1,7 @@
 //! The loop: every estimate of a source into every sink.
 
-use crate::record::EstimateRecord;
+use results::EstimateRecord;
+
 use crate::sink::{SinkError, Sinks};
 use crate::source::{Next, Source, SourceError};
 use crate::stop::Stop;
@@ -51,11 +52,10 @@ mod tests {
 
     use inference::Recording;
     use inference::stream::{self, Walk};
+    use results::{FitResult, Names, Remarked};
     use twin::Ring;
 
     use super::*;
-    use crate::record::{Names, Remarked};
-    use crate::result::FitResult;
     use crate::source::replay::Replay;
     use crate::source::{Clock, Rate};
 

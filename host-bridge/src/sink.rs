@@ -1,10 +1,9 @@
 //! Where estimates go: shared memory, a trace file, and whatever else implements [`Sink`].
 
-pub mod shared_memory;
 pub mod trace;
 
-use crate::output;
-use crate::record::EstimateRecord;
+use results::{EstimateRecord, output};
+use shared_memory::Publisher;
 
 /// Why a sink did not take an estimate.
 pub type SinkError = Box<dyn core::error::Error + Send + Sync>;
@@ -23,6 +22,12 @@ pub trait Sink {
     /// Whatever keeps it from doing so.
     fn finish(self: Box<Self>) -> Result<(), SinkError> {
         Ok(())
+    }
+}
+
+impl Sink for Publisher {
+    fn take(&mut self, record: &EstimateRecord) -> Result<(), SinkError> {
+        Ok(self.publish(record)?)
     }
 }
 
@@ -89,7 +94,6 @@ mod tests {
     use std::sync::{Arc, Mutex};
 
     use super::*;
-    use crate::record::tests::record;
 
     /// Takes some estimates, then fails; `Some` once finished.
     #[derive(Clone, Default)]
@@ -122,7 +126,7 @@ mod tests {
     fn every_sink_gets_every_estimate_and_is_finished() {
         let (one, two) = (short(9), short(9));
         let mut sinks = Sinks::default().with(Some(one.clone())).with_optional(Some(two.clone())).with(None::<Short>);
-        (0..3).for_each(|_| sinks.take(&record(2, 1)).unwrap());
+        (0..3).for_each(|_| sinks.take(&EstimateRecord::example(2, 1)).unwrap());
         sinks.finish().unwrap();
         assert_eq!([one, two].map(|sink| *sink.taken.lock().unwrap()), [(3, true); 2]);
     }
@@ -131,9 +135,9 @@ mod tests {
     fn a_sink_that_fails_ends_the_stream_unless_it_is_optional() {
         let (needed, optional) = (short(2), short(1));
         let mut sinks = Sinks::default().with_optional(Some(optional.clone())).with(Some(needed.clone()));
-        assert!(sinks.take(&record(2, 1)).is_ok());
-        assert!(sinks.take(&record(2, 1)).is_ok(), "the optional one has failed");
-        assert_eq!(sinks.take(&record(2, 1)).unwrap_err().to_string(), "full");
+        assert!(sinks.take(&EstimateRecord::example(2, 1)).is_ok());
+        assert!(sinks.take(&EstimateRecord::example(2, 1)).is_ok(), "the optional one has failed");
+        assert_eq!(sinks.take(&EstimateRecord::example(2, 1)).unwrap_err().to_string(), "full");
         sinks.finish().unwrap();
         assert_eq!(*optional.taken.lock().unwrap(), (1, false), "it was let go");
         assert_eq!(*needed.taken.lock().unwrap(), (2, true));

@@ -18,9 +18,8 @@ use core::time::Duration;
 use std::time::Instant;
 
 use estimator::Prepared;
+use results::{EstimateRecord, Remarked, Timing};
 
-use crate::record::{EstimateRecord, Remarked};
-use crate::result::Timing;
 use crate::stop::Stop;
 
 /// Why a source gives no more.

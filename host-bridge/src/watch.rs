@@ -10,8 +10,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use crate::sink::shared_memory::layout::Stamp;
-use crate::sink::shared_memory::{PublishError, Subscriber};
+use shared_memory::{PublishError, Stamp, Subscriber};
+
 use crate::sink::trace::{Trace, TraceError};
 use crate::stop::Stop;
 use view::View;
@@ -122,10 +122,10 @@ impl Tally {
 
 #[cfg(test)]
 mod tests {
+    use results::EstimateRecord;
+    use shared_memory::Publisher;
+
     use super::*;
-    use crate::record::EstimateRecord;
-    use crate::record::tests::record;
-    use crate::sink::shared_memory::Publisher;
 
     fn tally(stamps: &[(u64, u32)]) -> WatchSummary {
         let mut tally = Tally::default();
@@ -156,7 +156,7 @@ mod tests {
         };
         let service = options.service.clone();
         let writer = std::thread::spawn(move || {
-            let record = |frames| EstimateRecord { sequence: frames, frames, ..record(20, 10) };
+            let record = |frames| EstimateRecord { sequence: frames, frames, ..EstimateRecord::example(20, 10) };
             let mut publisher = Publisher::try_new(&service, "a test", &record(1).names).unwrap();
             for frames in [1, 2, 4, 5] {
                 publisher.publish(&record(frames)).unwrap();

@@ -1,7 +1,6 @@
 //! `orbitcal serve` with a device at the other end of a socket: what it writes is what `orbitcal replay` writes.
 
 use core::time::Duration;
-use estimator::Walk;
 use std::io::{Read as _, Write as _};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
@@ -11,11 +10,12 @@ use std::thread::{self, JoinHandle};
 use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
 use embedded_io::{ErrorKind, ErrorType, Read, ReadReady, Write};
 use estimator::Tables as _;
+use estimator::Walk;
 use estimator::booster::{Estimator, Green, LINE, PACKET, Request, Steer};
 use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Event, Inbox, Panel};
-use host_bridge::sink::shared_memory::Subscriber;
 use inference::{Recording, stream};
+use shared_memory::Subscriber;
 use training::rooms::large;
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");

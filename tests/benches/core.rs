@@ -5,10 +5,10 @@ use estimator::booster::{
     self, CHANNELS, CORRECTORS, COUPLINGS, Drive, Frame, Green, MONITORS, PARAMS, Prediction, SUPPLIES, TRIANGLE, WORDS,
 };
 use estimator::{Correlated, Gaussian, Layout, Prior, Reading, Solution, Surrogate, Walk};
-use host_bridge::result::Timing;
 use host_bridge::source::Times;
 use inference::stream::{self, Core};
 use inference::{Recording, StreamError};
+use results::Timing;
 use system_tests::repository;
 use twin::Ring;
 

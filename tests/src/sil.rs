@@ -1,18 +1,17 @@
 //! A recording through the emulated chip and through the core in process, side by side.
 
 use core::error::Error;
-use estimator::{Prepared, Walk};
 
 use estimator::wire::link::Status;
+use estimator::{Prepared, Walk};
 use host_bridge::cli::CoreModel;
-use host_bridge::record::{EstimateRecord, Names};
-use host_bridge::result::FitResult;
 use host_bridge::source::device::Fed;
 use host_bridge::source::link::{Heard, Link};
 use host_bridge::source::{Clock, Rate};
 use host_bridge::stop::Stop;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use results::{EstimateRecord, FitResult, Names};
 use twin::Ring;
 
 use crate::qemu::{Counts, Emulator, Image, Options, Run};

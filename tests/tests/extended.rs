@@ -1,12 +1,12 @@
 //! A machine with physics that its design lacks, estimated by the core with the design's tables and with a model file that holds it.
 
 use estimator::Walk;
-use host_bridge::model_file;
 use inference::stream::{self, Core};
 use inference::{Drive, Recording, simulate, with_priors};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, Normal};
+use results::model_file;
 use system_tests::machine::nees;
 use system_tests::repository;
 use twin::{Cycle, Effect, Machine, Rf, Ring, Tracked};

@@ -5,8 +5,9 @@ use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
+use results::output::{tell, warn};
+
 use super::{Checkpoint, lock, write};
-use crate::output::{tell, warn};
 use crate::source::queue::Queue;
 
 /// Writes checkpoints, and counts those that it could not write.

@@ -6,12 +6,12 @@ use std::time::Instant;
 
 use diagnosis::score::{Grade, Truth};
 use diagnosis::{Diagnosis, Finding, Verdict};
+use results::output::{fill, table};
 use serde::Serialize;
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Challenge;
-use crate::output::{self, fill, table};
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]

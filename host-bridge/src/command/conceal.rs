@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use diagnosis::validation::{Cases, Class};
 use inference::{BatchFit, TuneUse, simulate};
 use measured::Folder;
+use results::output;
 use serde_json::{Value, json};
 
 use super::{CommandError, campaign, machine, matrix, recording};
 use crate::cli::Conceal;
-use crate::output;
 
 /// Run it.
 ///

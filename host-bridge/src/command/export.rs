@@ -4,12 +4,11 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 
 use lattices::export::{self, Calibration, ExportError, Format, Lattice};
+use results::{Tunes, output};
 use serde::Serialize;
 
 use super::{CommandError, check_outputs, deliver, machine};
 use crate::cli::Export;
-use crate::output;
-use crate::result::Tunes;
 
 /// What was written. Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]

@@ -1,22 +1,16 @@
 //! `orbitcal fit`: the batch fit, by Gauss-Newton or by NUTS.
 
 use core::ops::ControlFlow;
-use std::sync::Arc;
 
 use indicatif::ProgressBar;
-use inference::campaign::supplies_of;
-use inference::nuts::{self, NutsRun, NutsSettings};
-use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::Recording;
+use inference::nuts::NutsSettings;
 use measured::Folder;
-use report::Page;
+use results::{FitResult, fit_by_draws, fit_by_steps, fit_page, output};
 use twin::Ring;
 
-use super::{
-    CommandError, campaign, check_outputs, deliver, expect_modelled, machine_with, matrix, progress, recording,
-};
+use super::{CommandError, check_outputs, deliver, machine_with, matrix, progress, recording};
 use crate::cli::{Fit, FitModel, Method};
-use crate::result::FitResult;
-use crate::{fit_page, output};
 
 /// Run it.
 ///
@@ -34,7 +28,7 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
         Method::Nuts => with_bar(options, &ring, &recording)?,
     };
     if let Some(path) = &options.report {
-        output::bytes(path, page(&ring, &recording, &result)?.render().as_bytes())?;
+        output::bytes(path, fit_page(&ring, &recording, &result)?.render().as_bytes())?;
     }
     deliver(&options.common, &result)
 }
@@ -57,18 +51,9 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)
 }
 
-/// The page of a fit.
-///
-/// # Errors
-/// [`CommandError::Other`] where the design or the calibrated ring has no stable motion.
-pub fn page(ring: &Ring, recording: &Recording, result: &FitResult) -> Result<Page, CommandError> {
-    let page = fit_page::page(&recording.powered(ring), &supplies_of(recording), result);
-    page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
-}
-
 fn with_spinner(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
     let spinner = if options.common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
-    let result = by_steps(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
+    let result = fit_by_steps(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
     spinner.finish_and_clear();
     result
 }
@@ -76,7 +61,7 @@ fn with_spinner(options: &Fit, ring: &Ring, recording: &Recording) -> Result<Fit
 fn with_bar(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
     let settings: NutsSettings = options.sampling.into();
     let bar = progress(settings.chains * (settings.warm_up + settings.draws), "draws", options.common.quiet);
-    let sampled = by_draws(ring, recording, options.model, settings, |done| {
+    let sampled = fit_by_draws(ring, recording, options.model.into(), settings, |done| {
         bar.set_position(done as u64);
         ControlFlow::Continue(())
     });
@@ -86,86 +71,4 @@ fn with_bar(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
         draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
     }
     Ok(result)
-}
-
-/// Damped Gauss-Newton on the twin; `progress` hears the number of each step.
-///
-/// # Errors
-/// [`CommandError`].
-pub fn by_steps(ring: &Ring, recording: &Recording, progress: impl FnMut(usize)) -> Result<FitResult, CommandError> {
-    let (campaign, fit) = fitted(ring, recording, progress)?;
-    let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
-    Ok(FitResult { notes, ..FitResult::of_fit(&campaign, &fit) })
-}
-
-/// The campaign and its batch fit, measured tunes as readings.
-fn fitted(
-    ring: &Ring,
-    recording: &Recording,
-    progress: impl FnMut(usize),
-) -> Result<(Campaign, BatchFit), CommandError> {
-    let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, progress)?;
-    Ok((campaign, fit))
-}
-
-/// NUTS about the Laplace approximation; `progress` as in [`nuts::sample`].
-///
-/// # Errors
-/// [`CommandError`].
-pub fn by_draws(
-    ring: &Ring,
-    recording: &Recording,
-    model: FitModel,
-    settings: NutsSettings,
-    progress: impl FnMut(usize) -> ControlFlow<()>,
-) -> Result<(FitResult, Draws), CommandError> {
-    expect_modelled(recording)?;
-    let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let (campaign, fit) = fitted(ring, recording, |_| ())?;
-    let reduced = Reduced::of(campaign, fit)?;
-    let ring = &reduced.campaign.ring;
-    let is_network = model == FitModel::Resnet;
-    let model = match model {
-        FitModel::Twin => ResponseModel::twin(ring).map_err(|e| failed(e.to_string()))?,
-        FitModel::Green => ResponseModel::green(ring).map_err(|e| failed(e.to_string()))?,
-        FitModel::Resnet => ResponseModel::resnet(ring)?,
-        FitModel::Linear => ResponseModel::linear(ring).map_err(|e| failed(e.to_string()))?,
-    };
-    let word = model.word();
-    let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
-    let posterior = Posterior::new(model, readings, Prior::of(ring));
-    let laplace = posterior.laplace(&reduced.fit.map_params).map_err(|e| failed(e.to_string()))?;
-    let names = ring.var_names();
-    let posterior = Arc::new(posterior);
-    let run = nuts::sample(posterior.clone(), Arc::new(laplace), &names, settings, progress);
-    let run = run.map_err(|e| failed(e.to_string()))?;
-    let result = FitResult::of_draws(&reduced, word, &run);
-    let extrapolated = is_network.then(|| outside(&posterior, &run));
-    Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))
-}
-
-/// Share of the draws outside the range that the model was made for.
-fn outside(posterior: &Posterior, run: &NutsRun) -> f64 {
-    let is_outside = |draw: &&Vec<f64>| {
-        let params: Vec<f64> = draw.iter().map(|var| var.ln()).collect();
-        !posterior.model.is_within(&posterior.readings.strength(&params)).unwrap_or(false)
-    };
-    let draws = || run.draws.chains.iter().flat_map(|chain| &chain.draws);
-    draws().filter(is_outside).count() as f64 / draws().count().max(1) as f64
-}
-
-/// How well the posterior was sampled.
-fn notes(run: &NutsRun) -> Vec<String> {
-    let summary = run.draws.summary();
-    let largest = summary.iter().map(|s| s.r_hat).fold(0.0, f64::max);
-    let bulk = summary.iter().map(|s| s.ess_bulk).fold(f64::INFINITY, f64::min);
-    let tail = summary.iter().map(|s| s.ess_tail).fold(f64::INFINITY, f64::min);
-    let divergences = run.draws.divergences();
-    let cost = 1e6 * run.seconds * run.threads as f64 / run.evaluations as f64;
-    let quality = format!(
-        "R-hat at most {largest:.4}, effective sample size at least {bulk:.0} (bulk) and {tail:.0} (tail), {divergences} divergences"
-    );
-    let effort = format!("{} evaluations in {:.1} s: {cost:.0} us each on one core", run.evaluations, run.seconds);
-    [quality, effort].into_iter().chain(run.divergences.iter().cloned()).collect()
 }

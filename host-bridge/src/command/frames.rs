@@ -3,14 +3,13 @@
 use inference::recording::{BelievedRf, Format, Header, Ramp, Recording, Row};
 use measured::named::named;
 use measured::{Calibrated, Fit, Folder, Model, RawOrbits, Straightened, calibrated, unknowns};
+use results::{Written, model_file, output};
 use training::extended;
 use twin::{Effect, EffectError, EffectKind, Plane, Rf, Ring};
 
 use super::matrix::{fitted, settings};
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::Frames;
-use crate::frames_result::Written;
-use crate::{model_file, output};
 
 /// Millimetres a metre, milliradians a radian.
 const MILLI: f64 = 1e-3;

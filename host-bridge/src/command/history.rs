@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use results::output::{self, OutputError, table};
 use serde_json::{Value, json};
 
 use super::{CommandError, check_outputs};
@@ -9,7 +10,6 @@ use crate::cli;
 use crate::config::Config;
 use crate::health::State;
 use crate::history::{self, History, HistoryError, Row, Span};
-use crate::output::{self, OutputError, table};
 
 impl From<HistoryError> for CommandError {
     fn from(error: HistoryError) -> Self {

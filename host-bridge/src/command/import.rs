@@ -8,11 +8,11 @@ use lattices::import::{
 };
 use measured::Folder;
 use measured::lattice::ring;
+use results::Imported;
 use twin::{Hold, Optics, Rf};
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::Import;
-use crate::import_result::Imported;
 
 /// Run it.
 ///

@@ -3,25 +3,13 @@
 use std::path::Path;
 
 use indicatif::ProgressBar;
-use measured::{Believed, Folder, MeasuredError, Model, Settings, Straightened};
-use nalgebra::DVector;
+use measured::{Believed, Folder, Settings, Straightened};
 use report::Page;
-use twin::{Hold, Optics, Rf};
+use results::{DiagnosedMatrix, FittedMatrix, StatedModel, output};
+use twin::Rf;
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::{self, Common, Method, Priors};
-use crate::matrix_page::Measured;
-use crate::matrix_result::{Found, MatrixDiagnosis, MatrixFit, StatedModel};
-use crate::output;
-
-impl From<MeasuredError> for CommandError {
-    fn from(error: MeasuredError) -> Self {
-        match error {
-            MeasuredError::Orbit(_) | MeasuredError::Singular(_) => Self::Other(error.to_string()),
-            _ => Self::Input(error.to_string()),
-        }
-    }
-}
 
 /// Fit it.
 ///
@@ -50,73 +38,6 @@ pub fn fit(options: &cli::Fit) -> Result<(), CommandError> {
     deliver(&options.common, &fitted.result)
 }
 
-/// A measured matrix with its cables put right, fitted.
-pub struct FittedMatrix {
-    straightened: Straightened,
-    settings: Settings,
-    /// What is said of it.
-    pub result: MatrixFit,
-}
-
-impl FittedMatrix {
-    /// Of a measurement as it was made; `say` hears what is done.
-    ///
-    /// # Errors
-    /// [`CommandError`].
-    pub fn of(as_measured: &Folder, settings: Settings, say: &mut dyn FnMut(&str)) -> Result<Self, CommandError> {
-        let straightened = Straightened::of(as_measured, &settings, say)?;
-        let result = result(&straightened, &settings)?;
-        Ok(Self { straightened, settings, result })
-    }
-
-    /// Its page.
-    ///
-    /// # Errors
-    /// [`CommandError`] where the lattice or the fitted ring has no stable motion.
-    pub fn page(&self) -> Result<Page, CommandError> {
-        Ok(measured_of(&self.straightened, &self.result, &self.settings)?.page()?)
-    }
-}
-
-/// A measured matrix with its cables put right, fitted and diagnosed.
-pub struct DiagnosedMatrix {
-    straightened: Straightened,
-    settings: Settings,
-    /// What is said of it.
-    pub result: MatrixDiagnosis,
-}
-
-impl DiagnosedMatrix {
-    /// Of a measurement as it was made, against a model that is believed if there is one; `say` hears what is done.
-    ///
-    /// # Errors
-    /// [`CommandError`].
-    pub fn of(
-        as_measured: &Folder,
-        believed: Option<&Believed>,
-        settings: Settings,
-        say: &mut dyn FnMut(&str),
-    ) -> Result<Self, CommandError> {
-        let straightened = Straightened::of(as_measured, &settings, say)?;
-        let Straightened { folder, cables, fit: fitted } = &straightened;
-        let diagnosis = measured::diagnose(folder, fitted, &settings, say)?;
-        let against = believed.map(|model| measured::against(as_measured, fitted, model, &settings, say));
-        let against = against.transpose()?;
-        let fit = result(&straightened, &settings)?;
-        let found = Found { cables, fitted, diagnosis: &diagnosis, against: against.as_ref() };
-        let result = MatrixDiagnosis::of(folder, settings.rf, &found, fit);
-        Ok(Self { straightened, settings, result })
-    }
-
-    /// Its page.
-    ///
-    /// # Errors
-    /// As [`FittedMatrix::page`].
-    pub fn page(&self) -> Result<Page, CommandError> {
-        Ok(measured_of(&self.straightened, &self.result.fit, &self.settings)?.page_of(&self.result)?)
-    }
-}
-
 /// Diagnose it.
 ///
 /// # Errors
@@ -139,17 +60,6 @@ pub fn diagnose(options: &cli::Diagnose) -> Result<(), CommandError> {
         write(path, &diagnosed.page()?)?;
     }
     deliver(&options.common, &diagnosed.result)
-}
-
-/// A fit with its ring and that of the lattice.
-fn measured_of<'r>(
-    Straightened { folder, fit, .. }: &'r Straightened,
-    result: &'r MatrixFit,
-    settings: &Settings,
-) -> Result<Measured<'r>, CommandError> {
-    let model = Model::of(folder, &fit.groups, settings.rf)?;
-    let rings = [model.at(&[], &DVector::zeros(0)), model.at(&fit.unknowns, &fit.values)];
-    Ok(Measured { folder, fit, result, rings })
 }
 
 /// Write a report.
@@ -201,10 +111,4 @@ pub(super) fn spinner(common: &Common) -> ProgressBar {
     let spinner = if common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
     spinner.enable_steady_tick(core::time::Duration::from_millis(100));
     spinner
-}
-
-fn result(Straightened { folder, cables, fit }: &Straightened, settings: &Settings) -> Result<MatrixFit, CommandError> {
-    let ring = Model::of(folder, &fit.groups, settings.rf)?.at(&fit.unknowns, &fit.values);
-    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok().and_then(|optics| optics.tunes().ok());
-    Ok(MatrixFit::of(folder, cables, fit, tunes.map(|tunes| [tunes.x, tunes.y])))
 }

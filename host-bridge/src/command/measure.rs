@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use control::{Control, Epics, Journal, Plan, Step, measure, preflight, recording, restore};
 use inference::Recording;
+use results::output::{self, fill};
 use serde::Serialize;
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::Measure;
-use crate::output::{self, fill};
 use crate::stop::Stop;
 
 /// Field names are those of the command's JSON.

@@ -30,95 +30,20 @@ use std::path::Path;
 use std::sync::Arc;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::campaign::furthest_stray;
-use inference::recording::BelievedRf;
-use inference::{BatchError, Campaign, Recording, RecordingError, stream, with_priors};
+use inference::{Recording, stream, with_priors};
+pub use results::CommandError;
+use results::{EstimateRecord, Names, campaign, expect_modelled, model_file, not_modelled, output, strays};
 use serde::Serialize;
+use shared_memory::{PublishError, Publisher};
 use training::Tables;
 use twin::{LatticeError, Ring};
 
 use crate::cli::{Common, CoreModel, Priors, Publishing};
-use crate::model_file::{self, ModelFileError};
-use crate::output::{self, OutputError};
-use crate::record::{EstimateRecord, Names};
 use crate::serve::serve;
 use crate::sink::Sinks;
-use crate::sink::shared_memory::{PublishError, Publisher};
 use crate::sink::trace::Trace;
 use crate::source::Source;
 use crate::stop::Stop;
-
-/// Why a command ended: bad arguments or input (exit 2), or anything else (exit 1), in one line.
-#[derive(Debug)]
-pub enum CommandError {
-    /// Arguments or input.
-    Input(String),
-    /// Anything else.
-    Other(String),
-}
-
-impl CommandError {
-    /// Nothing that the arguments or the input could help.
-    pub(crate) fn other(error: impl Display) -> Self {
-        Self::Other(error.to_string())
-    }
-
-    /// Somebody has asked for the end.
-    fn interrupted() -> Self {
-        Self::Other("interrupted; nothing was written".into())
-    }
-}
-
-impl From<LatticeError> for CommandError {
-    fn from(error: LatticeError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
-
-impl From<RecordingError> for CommandError {
-    fn from(error: RecordingError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
-
-impl From<stream::StreamError> for CommandError {
-    fn from(error: stream::StreamError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
-
-impl From<ModelFileError> for CommandError {
-    fn from(error: ModelFileError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
-
-impl From<OutputError> for CommandError {
-    fn from(error: OutputError) -> Self {
-        Self::Other(error.to_string())
-    }
-}
-
-impl From<BatchError> for CommandError {
-    fn from(error: BatchError) -> Self {
-        Self::Other(error.to_string())
-    }
-}
-
-impl core::error::Error for CommandError {}
-
-impl core::fmt::Display for CommandError {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        let (Self::Input(message) | Self::Other(message)) = self;
-        f.write_str(message)
-    }
-}
-
-impl From<twin::OrbitError> for CommandError {
-    fn from(error: twin::OrbitError) -> Self {
-        Self::Other(format!("no stable ring: {error}"))
-    }
-}
 
 /// The machine that was asked for, or the built-in one.
 fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
@@ -186,70 +111,10 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
     if common.speaks() { Ok(output::say(result)?) } else { Ok(()) }
 }
 
-/// A recording of a ring, screened.
-///
-/// # Errors
-/// [`CommandError::Input`] if its currents leave no stable ring, with the supply that is furthest from its nominal one.
-pub fn campaign(ring: &Ring, recording: &Recording) -> Result<Campaign, CommandError> {
-    Campaign::of(ring, recording).map_err(|error| {
-        let header = &recording.header;
-        let mean = |f: usize| recording.rows.iter().map(|row| row.supply[f]).sum::<f64>() / recording.rows.len() as f64;
-        let away = |f: &usize| (mean(*f) / header.nominal[*f]).ln().abs();
-        // along a ramp no supply stays at its nominal current
-        let steady = if header.ramp.is_given() { 0 } else { header.nominal.len() };
-        let furthest = (0..steady).max_by(|one, other| away(one).total_cmp(&away(other)));
-        let supply = furthest.map_or_else(String::new, |f| {
-            let name = &recording.powered(ring).supplies[f].name;
-            format!("; supply {name} is at {:.1} A, its nominal current is {:.1} A", mean(f), header.nominal[f])
-        });
-        CommandError::Input(format!(
-            "{}: no stable ring {} at its currents: {error}{supply}",
-            recording.name, ring.name
-        ))
-    })
-}
-
-/// What the header believes to be held that is not the momentum, so that only the exact twin models it.
-fn not_modelled(recording: &Recording) -> Option<String> {
-    let (key, what) = match recording.header.believed_rf {
-        BelievedRf::FixedMomentum => return None,
-        BelievedRf::FixedFrequency => ("fixed_frequency", "a fixed RF frequency"),
-        BelievedRf::RadialLoop => ("radial_loop", "a radial loop"),
-    };
-    let known_by = "orbitcal fit --method map and orbitcal diagnose do";
-    Some(format!("{}: header.toml, believed_rf = {key:?}: this does not model {what}; {known_by}", recording.name))
-}
-
-/// The same as an error, where results would be wrong without a word.
-///
-/// # Errors
-/// [`CommandError::Input`].
-pub fn expect_modelled(recording: &Recording) -> Result<(), CommandError> {
-    not_modelled(recording).map_or(Ok(()), |why| Err(CommandError::Input(why)))
-}
-
 /// The same as a line on stderr, of a core that goes on; a model file holds what it was made for.
 fn warn_if_not_modelled(ring: &Ring, recording: &Recording, has_model_file: bool) {
     let held = not_modelled(recording).filter(|_| !has_model_file);
     held.into_iter().chain(strays(ring, recording)).for_each(output::warn);
-}
-
-/// Distance of a supply at one time in the cycle from its mean over all frames up to which first order in it is enough: at three times
-/// as much the vars of simulated machines are off by 1.5 to 2 standard deviations.
-const STRAYS: f64 = 5e-4;
-
-/// That supplies follow the ramp too loosely for the core, which takes to first order what they are off their mean.
-fn strays(ring: &Ring, recording: &Recording) -> Option<String> {
-    let stray = furthest_stray(recording).filter(|stray| stray.off.abs() > STRAYS)?;
-    let supply = &recording.powered(ring).supplies[stray.supply].name;
-    Some(format!(
-        "{}: at {} ms supply {supply} is {:+.2} % off its mean over all times in the cycle; this is right up to {:.2} %, orbitcal fit \
-         beyond it",
-        recording.name,
-        stray.milliseconds,
-        100.0 * stray.off,
-        100.0 * STRAYS
-    ))
 }
 
 fn recording(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {

@@ -1,14 +1,13 @@
 //! `orbitcal replay`: recording to wire bytes to core to shared memory, frame by frame.
 
 use inference::stream::{self, Core};
+use results::{FitResult, Names};
 
 use super::{
     CommandError, check_outputs, deliver, machine_with, progress, recording, sinks, stream_all, tables,
     warn_if_not_modelled,
 };
 use crate::cli::{CoreModel, Replay};
-use crate::record::Names;
-use crate::result::FitResult;
 use crate::source::{self, Clock};
 use crate::stop::Stop;
 

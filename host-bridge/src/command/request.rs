@@ -3,10 +3,11 @@
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
+use results::output;
+use shared_memory::{self, Reply, RequestClient};
+
 use super::{CommandError, check_outputs};
 use crate::cli::{Ask, Request, Switch};
-use crate::output;
-use crate::sink::shared_memory::{self, Reply, RequestClient};
 
 /// Longest wait for the reply.
 const PATIENCE: Duration = Duration::from_secs(10);

@@ -3,6 +3,7 @@
 
 use estimator::Tables as _;
 use inference::{Recording, stream};
+use results::{FitResult, Names};
 use training::{LINE, Tables};
 use twin::Ring;
 
@@ -11,8 +12,6 @@ use super::{
     warn_if_not_modelled,
 };
 use crate::cli::Serve;
-use crate::record::Names;
-use crate::result::FitResult;
 use crate::serve::serve;
 use crate::source::Clock;
 use crate::source::address::Address;

@@ -11,6 +11,7 @@ use std::path::Path;
 use control::Plan;
 use control::simulated::{Fault, Settings, SimulatedMachine};
 use inference::simulate;
+use results::output;
 use serde::Deserialize;
 use serde_json::json;
 use twin::Ring;
@@ -18,7 +19,6 @@ use twin::Ring;
 use super::response::vars;
 use super::{CommandError, machine};
 use crate::cli::Simulate;
-use crate::output;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]

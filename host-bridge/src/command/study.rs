@@ -1,10 +1,10 @@
 //! `orbitcal study`: the published studies of a recording, as one report.
 
+use results::output;
 use studies::{self, Options};
 
 use super::{CommandError, check_outputs, expect_modelled, machine_with, progress, recording};
 use crate::cli::Study;
-use crate::output;
 
 /// Run it.
 ///

@@ -1,9 +1,9 @@
 //! `orbitcal surrogate check`: tables from the twin, and how wrong they are.
 
 use core::fmt;
-
 use std::path::Path;
 
+use results::output::{fill, table};
 use serde::Serialize;
 use training::SurrogateError;
 use training::network::checkpoint;
@@ -14,7 +14,6 @@ use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::{Surrogate, SurrogateAction};
-use crate::output::{fill, table};
 
 #[derive(Serialize)]
 struct Check {

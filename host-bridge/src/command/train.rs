@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use estimator::surrogate::ORBIT;
 use report::{Axes, Figure, Series};
+use results::output;
 use training::network::fit::{self, Plan, Progress, Trainee};
 use training::network::samples::{Samples, Source};
 use training::network::{checkpoint, tables};
@@ -14,7 +15,6 @@ use twin::Ring;
 
 use super::{CommandError, check_outputs, progress};
 use crate::cli::Train;
-use crate::output;
 use crate::stop::Stop;
 
 /// Seconds between two checkpoints.

@@ -11,11 +11,11 @@ use diagnosis::data::DataError;
 use diagnosis::validation::tables::Tables;
 use diagnosis::validation::{self, Case, Cases, Class, Outcome, UnmodelledKind};
 use inference::{Campaign, Recording};
+use results::output;
 use twin::{EffectKind, Ring};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Validate;
-use crate::output;
 
 /// Run it.
 ///

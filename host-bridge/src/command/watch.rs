@@ -1,8 +1,9 @@
 //! `orbitcal watch`: another process looks on.
 
+use results::output;
+
 use super::{CommandError, check_outputs};
 use crate::cli::Watch;
-use crate::output;
 use crate::watch::{WatchOptions, watch};
 
 /// Run it.

@@ -8,11 +8,11 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::surrogate::Unstable;
 use estimator::{FitQuality, Hold, IngestError, Prepared, StateError, Tables as _};
 use inference::stream::{Core, Feedback};
+use results::output::{tell, warn};
 use training::{LINE, Tables};
 
 use super::work::{Done, Saved, Taken};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Model};
-use crate::output::{tell, warn};
 use crate::source::desk::Wish;
 use crate::source::queue::{Arrived, Queue};
 

@@ -7,14 +7,14 @@ use std::time::Instant;
 
 use estimator::FitQuality;
 use inference::stream::Correction;
+use results::output::{tell, warn};
+use results::{EstimateRecord, Names, Remarked};
+use shared_memory::{Asked, FrameWriter, PublishError, Publisher, Reply, SetpointWriter};
 
 use super::work::{Done, Saved, Taken};
 use crate::checkpoint::{self, Checkpoint, Head};
 use crate::health::{HealthRecord, Reporter};
 use crate::history::Recorder;
-use crate::output::{tell, warn};
-use crate::record::{EstimateRecord, Names, Remarked};
-use crate::sink::shared_memory::{Asked, FrameWriter, PublishError, Publisher, Reply, SetpointWriter};
 use crate::source::desk::{Desk, Wish, reply};
 use crate::source::queue::{Arrived, Faults, Queue};
 use crate::web::Board;
@@ -277,5 +277,5 @@ impl Outlet {
 
 /// Time [ms since 1970].
 fn now_ms() -> u64 {
-    crate::sink::shared_memory::now_ns() / 1_000_000
+    shared_memory::now_ns() / 1_000_000
 }

@@ -1,47 +1,9 @@
 //! The state of one monitor or corrector: it changes at one bound and changes back at a lower one, and filters decide.
 
 use serde::{Deserialize, Serialize};
+use shared_memory::State;
 
 use super::filter::Filter;
-
-/// State of a monitor or a corrector.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[repr(u32)]
-pub enum State {
-    /// As expected.
-    #[default]
-    Ok = 0,
-    /// It scatters more than expected.
-    Noisy = 1,
-    /// It jumps occasionally.
-    Jumps = 2,
-    /// It does not report, or does nothing.
-    Dead = 3,
-    /// Its fault has ended a short while ago.
-    Back = 4,
-}
-
-impl State {
-    /// All of them, in the order of their codes.
-    pub const ALL: [Self; 5] = [Self::Ok, Self::Noisy, Self::Jumps, Self::Dead, Self::Back];
-
-    /// The state of a code in shared memory.
-    pub fn from_code(code: u32) -> Option<Self> {
-        Self::ALL.get(code as usize).copied()
-    }
-
-    /// In one word.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Noisy => "noisy",
-            Self::Jumps => "jumps",
-            Self::Dead => "dead",
-            Self::Back => "back",
-        }
-    }
-}
 
 /// Where a fault begins, and where it ends: lower, so that a ratio between the two changes nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -4,11 +4,11 @@ use core::time::Duration;
 use std::time::Instant;
 
 use estimator::{FitQuality, Sizes};
+use results::EstimateRecord;
+use results::output::warn;
+use shared_memory::HealthWriter;
 
 use super::{Health, measured};
-use crate::output::warn;
-use crate::record::EstimateRecord;
-use crate::sink::shared_memory::HealthWriter;
 
 /// It is published as often as this at least.
 const BEAT: Duration = Duration::from_secs(1);

@@ -5,10 +5,10 @@ use std::path::Path;
 use inference::Recording;
 use inference::recording::Row;
 use inference::stream::{self, Core};
+use results::Names;
 use twin::Ring;
 
 use super::*;
-use crate::record::Names;
 
 /// Rounds of the recording's 346 frames: each corrector is on in six of them.
 const ROUNDS: u32 = 8;

@@ -3,16 +3,16 @@
 //! A row is appended in one piece. If the process or the system dies within it, or the disk is full, the file ends in a piece of a row: at the next
 //! start what comes after the last whole row is set aside, and rows go on behind it.
 
+use core::time::Duration;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use core::time::Duration;
+use results::output::warn;
 
 use super::row::{Columns, Row};
 use super::{FILES, Tier};
-use crate::output::warn;
 
 /// Damaged ends that are kept; the oldest is removed when another one comes.
 const ASIDE: usize = 8;

@@ -8,12 +8,13 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::Instant;
 
+use results::EstimateRecord;
+use results::output::{tell, warn};
+
 use super::Plan;
 use super::files::{Files, HistoryError, lock};
 use super::row::{Columns, Row};
 use crate::health::{HealthRecord, State};
-use crate::output::{tell, warn};
-use crate::record::EstimateRecord;
 
 /// Rows that wait for the disk; further ones are left out and counted.
 const WAITING: usize = 64;
@@ -224,7 +225,6 @@ mod tests {
     use super::super::{Span, read};
     use super::*;
     use crate::health::Condition;
-    use crate::record::tests::record;
 
     impl Lost for AtomicU64 {
         fn count(&self) {
@@ -250,12 +250,13 @@ mod tests {
         let lost = Arc::new(AtomicU64::new(0));
         let keeper = Keeper::start(folder.path(), &plan, &columns(), lost.clone()).unwrap();
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
-        let (right, wrong) = (record(2, 1), EstimateRecord { mismatch: Some(true), ..record(2, 1) });
+        let (right, wrong) =
+            (EstimateRecord::example(2, 1), EstimateRecord { mismatch: Some(true), ..EstimateRecord::example(2, 1) });
         for (i, states) in [[State::Ok; 2], [State::Dead, State::Ok], [State::Ok, State::Back]].into_iter().enumerate()
         {
             recorder.note(if i == 1 { &wrong } else { &right });
             while !recorder.note(&right) {}
-            recorder.record(&record(2, 1), &health(states), 1_000_000 + i as u64);
+            recorder.record(&EstimateRecord::example(2, 1), &health(states), 1_000_000 + i as u64);
         }
         recorder.finish();
         assert_eq!(lost.load(Ordering::Relaxed), 0);
@@ -274,7 +275,7 @@ mod tests {
         // started again within the minute: no further row of it
         let keeper = Keeper::start(folder.path(), &plan, &columns(), lost).unwrap();
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
-        recorder.record(&record(2, 1), &health([Ok; 2]), 1_000_500);
+        recorder.record(&EstimateRecord::example(2, 1), &health([Ok; 2]), 1_000_500);
         recorder.finish();
         assert_eq!(["fine", "minutes", "hours"].map(rows), [4, 1, 1]);
     }
@@ -289,7 +290,7 @@ mod tests {
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
         fs::remove_dir_all(&path).unwrap();
         fs::write(&path, "").unwrap();
-        (0..3).for_each(|i| recorder.record(&record(2, 1), &health([State::Ok; 2]), i));
+        (0..3).for_each(|i| recorder.record(&EstimateRecord::example(2, 1), &health([State::Ok; 2]), i));
         recorder.finish();
         assert_eq!(lost.load(Ordering::Relaxed), 3);
     }

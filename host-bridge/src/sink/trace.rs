@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use estimator::Remarks;
+use results::output::{self, OutputError};
+use results::{EstimateRecord, Names, ReadingUse};
 use tempfile::NamedTempFile;
 
 use super::{Sink, SinkError};
-use crate::output::{self, OutputError};
-use crate::record::{EstimateRecord, Names, ReadingUse};
 
 /// Why a trace was not written.
 #[derive(Debug, thiserror::Error)]
@@ -127,13 +127,12 @@ fn wrong(path: &Path, reason: &dyn core::fmt::Display) -> TraceError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::tests::record;
 
     #[test]
     fn numbers_read_back_to_the_same_bits() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trace.csv");
-        let mut record = EstimateRecord { sequence: 4, nis: 33.3, ..record(48, 3) };
+        let mut record = EstimateRecord { sequence: 4, nis: 33.3, ..EstimateRecord::example(48, 3) };
         record.reading = vec![ReadingUse::Rejected, ReadingUse::Used, ReadingUse::Rejected];
         record.remarks.put_aside = true;
         let mut bits = 0x3f80_0001_u32; // 1 + one step, then scattered over all exponents
@@ -163,7 +162,7 @@ mod tests {
     fn an_unfinished_trace_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let mut trace = Trace::create(&folder.path().join("trace.csv")).unwrap();
-        trace.add(&record(2, 1)).unwrap();
+        trace.add(&EstimateRecord::example(2, 1)).unwrap();
         drop(trace);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
@@ -186,8 +185,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.csv");
         let mut trace = Trace::create(&path).unwrap();
-        trace.add(&record(2, 1)).unwrap();
-        let error = trace.add(&record(3, 1)).unwrap_err().to_string();
+        trace.add(&EstimateRecord::example(2, 1)).unwrap();
+        let error = trace.add(&EstimateRecord::example(3, 1)).unwrap_err().to_string();
         let expected = ": an estimate of test ring; the columns are those of test ring";
         assert_eq!(error, format!("{}{expected}", path.display()));
     }

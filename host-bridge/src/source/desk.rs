@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use results::model_file;
+use results::output::warn;
+use shared_memory::{Asked, Reply, Request, RequestServer};
 use training::Tables;
 use twin::Ring;
 
 use crate::config::Requests;
-use crate::model_file;
-use crate::output::warn;
-use crate::sink::shared_memory::{Asked, Reply, Request, RequestServer};
 
 /// What is to be done, once it is allowed.
 pub enum Wish {

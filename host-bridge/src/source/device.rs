@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use estimator::FitQuality;
 use inference::{Recording, stream};
+use results::output::warn;
+use results::{EstimateRecord, Names};
 use training::rooms::large::Request;
 
 use super::link::{Heard, Link, LinkError};
 use super::{Clock, Next, Source, SourceError, Times};
-use crate::output::warn;
-use crate::record::{EstimateRecord, Names};
 
 impl Heard {
     /// What it says to every sink.

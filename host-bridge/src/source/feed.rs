@@ -10,6 +10,7 @@ use std::path::Path;
 use std::thread;
 use std::time::Instant;
 
+use results::output::{tell, warn};
 use serialport::SerialPort;
 
 use super::address::Address;
@@ -17,7 +18,6 @@ use super::program::{Program, Running};
 use super::queue::Queue;
 use super::splitter::Splitter;
 use crate::config::{Role, Source, WhenFull};
-use crate::output::{tell, warn};
 use crate::stop::Stop;
 
 /// Longest wait in the system before somebody's wish to stop is looked at.

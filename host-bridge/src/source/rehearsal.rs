@@ -4,10 +4,10 @@ use std::io;
 use std::thread;
 
 use inference::{Recording, stream};
+use results::output::warn;
 
 use super::queue::Queue;
 use super::{Clock, Rate};
-use crate::output::warn;
 use crate::stop::Stop;
 
 /// Put the frames of a recording into a queue at a rate, then close it. Nothing is dropped: a queue that is full is waited for.

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use estimator::FitQuality;
 use inference::Recording;
 use inference::stream::{self, Core};
+use results::{EstimateRecord, Names};
 
 use super::{Clock, Next, Source, SourceError, Times};
-use crate::record::{EstimateRecord, Names};
 
 /// A recording and the core that it is streamed through.
 pub struct Replay<'r> {

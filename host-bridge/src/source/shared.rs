@@ -5,9 +5,10 @@ use std::io;
 use std::sync::mpsc::sync_channel;
 use std::thread;
 
+use results::output::warn;
+use shared_memory::{FrameReader, PublishError};
+
 use super::queue::Queue;
-use crate::output::warn;
-use crate::sink::shared_memory::{FrameReader, PublishError};
 use crate::stop::Stop;
 
 /// Longest wait before somebody's wish to stop is looked at.

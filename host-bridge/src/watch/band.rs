@@ -1,6 +1,6 @@
 //! A var against nominal in one line of a terminal: where its mean is, one and two error bars to each side, and where 1 is.
 
-use crate::record::EstimateRecord;
+use results::EstimateRecord;
 
 /// Smallest distance of the ends from 1.
 const LEAST: f32 = 0.02;

@@ -1,7 +1,8 @@
 //! Monitors and correctors that are not ok, the worst first, and where all are ok, those closest to it.
 
+use results::EstimateRecord;
+
 use crate::health::{Condition, HealthRecord, State};
-use crate::record::EstimateRecord;
 
 /// Lines of this many columns at most.
 pub(super) fn lines(
@@ -70,7 +71,6 @@ mod tests {
     use estimator::FitQuality;
 
     use super::*;
-    use crate::record::tests::record;
 
     #[test]
     fn the_worst_come_first_and_what_is_cut_is_counted() {
@@ -87,7 +87,8 @@ mod tests {
             ],
             correctors: vec![condition(State::Jumps, [1.0, 0.2, 0.2])],
         };
-        let told = |health: &HealthRecord, height| lines(&record(2, 3), health, &["H_A4".to_owned()], height);
+        let told =
+            |health: &HealthRecord, height| lines(&EstimateRecord::example(2, 3), health, &["H_A4".to_owned()], height);
         let all = [
             "M2       dead   missing or without effect in 75 % of its frames",
             "H_A4     jumps  20 % of its frames are far off",

@@ -8,13 +8,12 @@ use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
+use results::output::lines;
+use results::{EstimateRecord, ReadingUse, state_word};
+use shared_memory::Published;
 
 use super::{WatchSummary, band, ill};
 use crate::health::HealthRecord;
-use crate::output::lines;
-use crate::record::{EstimateRecord, ReadingUse};
-use crate::result::word;
-use crate::sink::shared_memory::Published;
 
 /// Lines above the grid.
 const HEADER: u16 = 3;
@@ -235,7 +234,7 @@ fn cell(record: &EstimateRecord, i: usize, grid: &Grid, reach: f32) -> [Span<'st
 fn unwell(record: &EstimateRecord, width: usize, height: usize) -> Vec<String> {
     let tell = |b: usize| {
         let (mm, rejected) = (1e3 * record.monitor_sigma[b], record.monitor_rejected[b]);
-        let (name, state) = (&record.names.monitors[b], word(record.monitor_state[b]));
+        let (name, state) = (&record.names.monitors[b], state_word(record.monitor_state[b]));
         format!("{name} {state} {mm:.2} mm ({rejected} rejected)")
     };
     let is_unwell = |b: &usize| record.monitor_state[*b] != MonitorState::Ok;
@@ -270,12 +269,11 @@ mod tests {
 
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
+    use results::Names;
+    use shared_memory::Stamp;
 
     use super::*;
     use crate::health::{Condition, State};
-    use crate::record::Names;
-    use crate::record::tests::record;
-    use crate::sink::shared_memory::layout::Stamp;
 
     fn screen() -> Screen {
         Screen::new("orbitcal/estimate".to_owned())
@@ -290,7 +288,7 @@ mod tests {
 
     /// The Booster, with its last var and its first monitor off.
     fn booster() -> EstimateRecord {
-        let mut record = EstimateRecord { sequence: 345, frames: 346, nis: 34.65, ..record(48, 33) };
+        let mut record = EstimateRecord { sequence: 345, frames: 346, nis: 34.65, ..EstimateRecord::example(48, 33) };
         record.names = Names::of(&twin::Ring::booster());
         record.sigma = vec![0.003; 48];
         record.mean[47] = 0.958;
@@ -325,7 +323,7 @@ mod tests {
 
     #[test]
     fn what_is_cut_is_counted() {
-        let mut record = record(260, 120);
+        let mut record = EstimateRecord::example(260, 120);
         record.monitor_state = vec![MonitorState::Dead; 120];
         record.mismatch = Some(true);
         let text = drawn(&filled(&record), 80, 24);
@@ -338,7 +336,7 @@ mod tests {
 
     #[test]
     fn long_names_keep_their_numbers() {
-        let mut record = record(4, 2);
+        let mut record = EstimateRecord::example(4, 2);
         let vars = (0..4).map(|i| format!("SR01_QUAD_{i}")).collect();
         record.names = Arc::new(Names { vars, ..(*record.names).clone() });
         assert!(drawn(&filled(&record), 80, 24).contains("SR01_QUAD_3 1.0000  1.00  +0.0"));
@@ -347,7 +345,7 @@ mod tests {
     #[test]
     fn no_size_is_too_small_or_too_large() {
         for (width, height) in [(1, 1), (20, 5), (80, 24), (200, 60), (400, 10)] {
-            for record in [booster(), record(0, 0), record(260, 500)] {
+            for record in [booster(), EstimateRecord::example(0, 0), EstimateRecord::example(260, 500)] {
                 drawn(&filled(&record), width, height);
             }
             drawn(&screen(), width, height);

@@ -6,12 +6,11 @@ use std::time::Instant;
 
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers};
+use results::{EstimateRecord, ReadingUse};
+use shared_memory::{HealthReader, Published, Stamp, now_ns};
 
 use super::screen::Screen;
 use super::{WatchOptions, WatchSummary};
-use crate::record::{EstimateRecord, ReadingUse};
-use crate::sink::shared_memory::layout::Stamp;
-use crate::sink::shared_memory::{HealthReader, Published, now_ns};
 
 /// Time between two pictures: what an eye can follow.
 const REDRAW: Duration = Duration::from_millis(100);
@@ -144,11 +143,11 @@ fn line(record: &EstimateRecord) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::tests::record;
 
     #[test]
     fn a_line_names_the_farthest_var() {
-        let mut record = EstimateRecord { sequence: 123_456, frames: 123_455, nis: 3.3, ..record(48, 33) };
+        let mut record =
+            EstimateRecord { sequence: 123_456, frames: 123_455, nis: 3.3, ..EstimateRecord::example(48, 33) };
         record.reading = vec![ReadingUse::Absent; 33];
         record.reading[..4].copy_from_slice(&[
             ReadingUse::Used,
@@ -166,7 +165,7 @@ mod tests {
     #[test]
     fn a_publisher_is_named_once() {
         let stamp = Stamp { publisher: "control room".into(), started_ns: 3, published_ns: 4 };
-        let published = Published { record: record(2, 1), stamp };
+        let published = Published { record: EstimateRecord::example(2, 1), stamp };
         let mut from = None;
         assert_eq!(told(&published, &mut from)[0], "from control room: test ring");
         assert_eq!(told(&published, &mut from).len(), 1);

@@ -4,13 +4,14 @@ use core::time::Duration;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
+use results::EstimateRecord;
+use shared_memory::now_ns;
+
 use super::metrics::Metrics;
 use super::state::Place;
 use super::trail::Trails;
 use crate::health::HealthRecord;
 use crate::history::History;
-use crate::record::EstimateRecord;
-use crate::sink::shared_memory::now_ns;
 use crate::source::queue::Queue;
 
 /// Latencies of which the median is shown.

@@ -9,11 +9,11 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
+use results::EstimateRecord;
+use shared_memory::now_ns;
 
 use crate::health::{Condition, HealthRecord, State};
 use crate::history;
-use crate::record::EstimateRecord;
-use crate::sink::shared_memory::now_ns;
 use crate::source::queue::Queue;
 
 type Number = Gauge<f64, AtomicU64>;
@@ -162,7 +162,6 @@ impl Metrics {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::tests::record;
     use crate::source::queue::Faults;
     use estimator::FitQuality;
 
@@ -171,13 +170,16 @@ mod tests {
         let metrics = Metrics::default();
         let queue = Queue::new(1, Faults { dropped: 7, ..Faults::default() });
         queue.push(vec![0]);
-        metrics.count(&EstimateRecord { mismatch: Some(true), ..record(2, 3) }, Duration::from_micros(70));
-        metrics.count(&record(2, 3), Duration::from_millis(2));
+        metrics.count(
+            &EstimateRecord { mismatch: Some(true), ..EstimateRecord::example(2, 3) },
+            Duration::from_micros(70),
+        );
+        metrics.count(&EstimateRecord::example(2, 3), Duration::from_millis(2));
         let condition = |state| Condition { state, ratios: [0.0; 3] };
         let fit = FitQuality { chi_square: 12.5, degrees_of_freedom: 10.0 };
         let monitors = [State::Ok, State::Ok, State::Dead].map(condition).to_vec();
         let health = HealthRecord { sequence: 9, frames: 2, fit, monitors, correctors: vec![] };
-        metrics.show(&EstimateRecord { sequence: 9, ..record(2, 3) }, &health);
+        metrics.show(&EstimateRecord { sequence: 9, ..EstimateRecord::example(2, 3) }, &health);
         let text = metrics.text(&queue);
         for line in [
             "orbitcal_frames_total 2",

@@ -1,13 +1,13 @@
 //! The numbers of the page as JSON.
 
+use results::ReadingUse;
 use serde::Serialize;
 use serde_json::{Value, json};
+use shared_memory::now_ns;
 use twin::Ring;
 
 use super::board::Board;
 use crate::health::{Condition, State};
-use crate::record::ReadingUse;
-use crate::sink::shared_memory::now_ns;
 
 /// Where the vars and instruments are along the ring, in the order of records.
 #[derive(Debug, Clone, Default, Serialize)]

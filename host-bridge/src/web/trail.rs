@@ -3,9 +3,10 @@
 
 use std::collections::VecDeque;
 
+use results::EstimateRecord;
+
 use crate::health::HealthRecord;
 use crate::history::Row;
-use crate::record::EstimateRecord;
 
 /// Points of a trail.
 const POINTS: usize = 360;

@@ -7,7 +7,7 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
 use std::process::Command;
 
-use host_bridge::sink::shared_memory::Subscriber;
+use shared_memory::Subscriber;
 
 use crate::place::{Frames, Place, connected, listening, port};
 

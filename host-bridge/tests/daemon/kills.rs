@@ -11,10 +11,10 @@ use std::thread;
 use std::time::Instant;
 
 use estimator::Tables as _;
-use host_bridge::record::{EstimateRecord, Names};
-use host_bridge::sink::shared_memory::{Published, Subscriber};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use results::{EstimateRecord, Names};
+use shared_memory::{Published, Subscriber};
 use training::LINE;
 
 use crate::place::{Frames, Place, SOON, bits, port};

@@ -8,8 +8,8 @@ use std::os::unix::process::CommandExt;
 use std::process::{Command, Output};
 use std::thread;
 
-use host_bridge::sink::shared_memory::Subscriber;
 use serde_json::Value;
+use shared_memory::Subscriber;
 
 use crate::place::{Frames, Place, connected, listening, port};
 

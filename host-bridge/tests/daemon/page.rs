@@ -9,8 +9,8 @@ use std::process::Command;
 use std::thread;
 use std::time::Instant;
 
-use host_bridge::sink::shared_memory::Subscriber;
 use serde_json::Value;
+use shared_memory::Subscriber;
 
 use crate::place::{Frames, Place, SOON, connected, listening, port};
 

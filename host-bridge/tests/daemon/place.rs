@@ -8,10 +8,10 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Instant;
 
-use host_bridge::record::EstimateRecord;
-use host_bridge::sink::shared_memory::Subscriber;
 use inference::Recording;
 use inference::stream::{self, Core};
+use results::EstimateRecord;
+use shared_memory::Subscriber;
 use twin::Ring;
 
 pub const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");

@@ -11,8 +11,8 @@ use std::time::Instant;
 
 use estimator::{MonitorState, Tables as _};
 use host_bridge::health::State;
-use host_bridge::model_file;
-use host_bridge::sink::shared_memory::{HealthReader, Subscriber};
+use results::model_file;
+use shared_memory::{HealthReader, Subscriber};
 use training::LINE;
 use twin::Effect;
 

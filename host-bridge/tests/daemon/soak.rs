@@ -8,9 +8,9 @@ use std::net::TcpStream;
 use std::thread;
 use std::time::Instant;
 
-use host_bridge::sink::shared_memory::Subscriber;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use shared_memory::Subscriber;
 
 use crate::place::{Frames, Place, SOON, bits, connected, port};
 

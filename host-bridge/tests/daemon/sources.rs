@@ -8,9 +8,9 @@ use std::process::Command;
 use std::thread;
 use std::time::Instant;
 
-use host_bridge::record::EstimateRecord;
-use host_bridge::sink::shared_memory::{FrameWriter, Subscriber};
+use results::EstimateRecord;
 use serialport::{SerialPort, TTYPort};
+use shared_memory::{FrameWriter, Subscriber};
 
 use crate::place::{Frames, Place, RECORDING, connected, listening, port};
 

@@ -9,7 +9,7 @@ use std::process::{Command, Output};
 use std::thread;
 use std::time::Instant;
 
-use host_bridge::sink::shared_memory::{SetpointReader, Setpoints, Subscriber};
+use shared_memory::{SetpointReader, Setpoints, Subscriber};
 
 use crate::place::{Frames, Place, SOON, connected, listening, port};
 

@@ -9,11 +9,11 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use host_bridge::output;
 use inference::{BatchFit, Campaign, Laplace, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
+use results::output;
 use serde::Serialize;
 use serde_json::{Value, json};
 use system_tests::repository;

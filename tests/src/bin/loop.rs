@@ -8,8 +8,8 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use comfy_table::CellAlignment;
-use host_bridge::output::{self, table};
 use report::{Axes, Figure, Series};
+use results::output::{self, table};
 use serde_json::json;
 use system_tests::feedback::{
     Chip, Control, Known, Loop, REGIONS, Sample, Scenario, WALK, held, recommended, rms, settled,

@@ -16,8 +16,8 @@ use std::thread;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Parser;
-use host_bridge::sink::shared_memory::{Published, Subscriber};
 use inference::{Recording, stream};
+use shared_memory::{Published, Subscriber};
 use twin::Ring;
 
 /// Frames that are later than this are counted as late.

@@ -7,11 +7,11 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use comfy_table::CellAlignment;
-use host_bridge::output::{self, table};
-use host_bridge::record::Names;
-use host_bridge::sink::shared_memory::{PUBLISHER, Publisher, SERVICE};
 use inference::{Recording, stream};
+use results::Names;
+use results::output::{self, table};
 use serde_json::{Value, json};
+use shared_memory::{PUBLISHER, Publisher, SERVICE};
 use system_tests::qemu::{Image, Sizes};
 use system_tests::repository;
 use system_tests::sil::{Comparison, compare, largest};

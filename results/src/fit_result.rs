@@ -16,7 +16,7 @@ use serde::Serialize;
 use studies::Sampled;
 use twin::Ring;
 
-pub use monitor::{Monitor, faults, monitors, word};
+pub use monitor::{Monitor, faults, monitors, state_word};
 pub use tunes::{TuneMeasured, Tunes, TunesMeasured};
 use tunes::{measured, tunes};
 use var::covariance;

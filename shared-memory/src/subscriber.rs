@@ -8,11 +8,11 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::subscriber;
 use iceoryx2::prelude::ipc;
 use iceoryx2::sample::Sample;
+use results::EstimateRecord;
 
 use super::layout::{Header, Known, Stamp, decode};
 use super::services::{Services, join};
 use super::{BUFFER, PublishError};
-use crate::record::EstimateRecord;
 
 /// Name of a reader's process among the nodes of the shared memory.
 const READER: &str = "orbitcal-reader";

@@ -86,7 +86,7 @@ pub struct EstimateRecord {
     pub rejected_frames: u32,
     /// What is to be said of this frame as a whole.
     pub remarks: Remarks,
-    /// How often each of that was said, this frame included: since [`crate::serve::serve`] began to count, or since the first start of what was resumed.
+    /// How often each of that was said, this frame included: since whoever serves it began to count, or since the first start of what was resumed.
     pub remarked: Remarked,
     /// Digest of the tables that predict; none where that is not known.
     pub tables: Option<u32>,
@@ -126,6 +126,38 @@ pub struct EstimateRecord {
 }
 
 impl EstimateRecord {
+    /// One of a ring with this many vars `V0 ..` and monitors `M0 ..`, for examples and tests: all vars 1.000 ± 0.010, all readings used.
+    pub fn example(vars: usize, monitors: usize) -> Self {
+        let names = |letter: &str, count| (0..count).map(|i| format!("{letter}{i}")).collect();
+        let names = Names { machine: "test ring".into(), vars: names("V", vars), monitors: names("M", monitors) };
+        Self {
+            names: Arc::new(names),
+            sequence: 0,
+            time_us: 0,
+            frames: 1,
+            rejected_frames: 0,
+            remarks: Remarks::default(),
+            remarked: Remarked::default(),
+            tables: None,
+            linearised: false,
+            mismatch: Some(false),
+            nis: 0.0,
+            tune_innovation: [None; 2],
+            log_evidence: 0.0,
+            mean: vec![1.0; vars],
+            sigma: vec![0.01; vars],
+            map_params: vec![0.0; vars],
+            centre: vec![0.0; vars],
+            params_sigma: vec![0.01; vars],
+            clipped: vec![false; vars],
+            covariance: (0..vars).flat_map(|i| (0..=i).map(move |j| if i == j { 0.01 * 0.01 } else { 0.0 })).collect(),
+            reading: vec![ReadingUse::Used; monitors],
+            monitor_state: vec![MonitorState::Ok; monitors],
+            monitor_sigma: vec![0.15e-3; monitors],
+            monitor_rejected: vec![0; monitors],
+        }
+    }
+
     /// What a core says after a frame, with the covariance of all `ln var`, the lower triangle row by row, or more, and its mismatch alarm.
     pub fn of(names: &Arc<Names>, estimate: Estimate, of_params: &[f32], mismatch: Option<bool>) -> Self {
         let reading = |(accepted, rejected): (&bool, &bool)| match (accepted, rejected) {
@@ -228,46 +260,14 @@ fn of_vars(mean: &[f32], of_params: &[f32]) -> Vec<f32> {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use estimator::Walk;
 
     use super::*;
 
-    /// A record of a ring with this many vars `V0 ..` and monitors `M0 ..`: all vars 1.000 ± 0.010, all readings used.
-    pub(crate) fn record(vars: usize, monitors: usize) -> EstimateRecord {
-        let names = |letter: &str, count| (0..count).map(|i| format!("{letter}{i}")).collect();
-        let names = Names { machine: "test ring".into(), vars: names("V", vars), monitors: names("M", monitors) };
-        EstimateRecord {
-            names: Arc::new(names),
-            sequence: 0,
-            time_us: 0,
-            frames: 1,
-            rejected_frames: 0,
-            remarks: Remarks::default(),
-            remarked: Remarked::default(),
-            tables: None,
-            linearised: false,
-            mismatch: Some(false),
-            nis: 0.0,
-            tune_innovation: [None; 2],
-            log_evidence: 0.0,
-            mean: vec![1.0; vars],
-            sigma: vec![0.01; vars],
-            map_params: vec![0.0; vars],
-            centre: vec![0.0; vars],
-            params_sigma: vec![0.01; vars],
-            clipped: vec![false; vars],
-            covariance: (0..vars).flat_map(|i| (0..=i).map(move |j| if i == j { 0.01 * 0.01 } else { 0.0 })).collect(),
-            reading: vec![ReadingUse::Used; monitors],
-            monitor_state: vec![MonitorState::Ok; monitors],
-            monitor_sigma: vec![0.15e-3; monitors],
-            monitor_rejected: vec![0; monitors],
-        }
-    }
-
     #[test]
     fn the_covariance_is_symmetric_and_its_diagonal_is_sigma_squared() {
-        let mut record = record(4, 2);
+        let mut record = EstimateRecord::example(4, 2);
         record.covariance[4] = 0.5; // after (0,0) (1,0) (1,1) (2,0)
         assert_eq!([record.covariance_of(2, 1), record.covariance_of(1, 2)], [0.5, 0.5]);
         assert_eq!(record.covariance_of(3, 3), record.sigma[3] * record.sigma[3]);
@@ -276,7 +276,7 @@ pub(crate) mod tests {
     #[test]
     fn what_is_no_number_or_does_not_fit_is_not_usable() {
         let is_usable = |change: fn(&mut EstimateRecord)| {
-            let mut record = record(2, 1);
+            let mut record = EstimateRecord::example(2, 1);
             change(&mut record);
             record.is_usable()
         };

@@ -9,7 +9,7 @@ use nalgebra::DMatrix;
 use report::{Axes, Band, Figure, Page, Reference, Section, Series, Table};
 use twin::{CalibratedOptics, Hold, Optics, OrbitError, Ring, Tunes, Twiss};
 
-use crate::result::{FitResult, TuneMeasured};
+use crate::fit_result::{FitResult, TuneMeasured};
 
 /// What each figure's band is.
 const BAND: &str = "Bands are 68 % intervals.";

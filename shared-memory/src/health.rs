@@ -4,11 +4,10 @@ use std::sync::Arc;
 
 use estimator::FitQuality;
 use iceoryx2::prelude::ZeroCopySend;
+use results::Names;
 
 use super::latest::{Reader, Writer};
-use super::{PublishError, now_ns};
-use crate::health::{Condition, HealthRecord, State};
-use crate::record::Names;
+use super::{Condition, HealthRecord, PublishError, State, now_ns};
 
 /// What the health of a service of estimates is called: its name, and this.
 const SUFFIX: &str = "/health";
@@ -143,12 +142,14 @@ fn correctors(header: &HealthHeader, payload: &[u32], instruments: usize) -> Vec
 
 #[cfg(test)]
 mod tests {
+    use results::EstimateRecord;
+
     use super::*;
 
     #[test]
     fn whoever_joins_late_gets_the_last_record() {
         let service = format!("orbitcal/test/{}/ill", std::process::id());
-        let names = crate::record::tests::record(2, 3).names;
+        let names = EstimateRecord::example(2, 3).names;
         let mut writer = HealthWriter::try_new(&service, "a test", &names, &["H_A1".into()]).unwrap();
         let condition = |state, ratio| Condition { state, ratios: [ratio, 0.5, 0.25] };
         let record = |sequence| HealthRecord {

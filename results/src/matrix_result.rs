@@ -13,8 +13,8 @@ use measured::{Against, Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
 use twin::Rf;
 
+use crate::fit_result::{Monitor, Tunes};
 use crate::output::{fill, table};
-use crate::result::{Monitor, Tunes};
 
 /// Strength factors and instruments of a measured matrix. Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]

@@ -20,7 +20,7 @@ pub struct Monitor {
 pub fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
     let monitor = |(name, health): (String, &Health)| Monitor {
         name,
-        state: word(health.state),
+        state: state_word(health.state),
         sigma_mm: f64::from(health.noise) * 1e3,
         rejected: health.rejected,
     };
@@ -28,7 +28,7 @@ pub fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
 }
 
 /// The word for a state in tables and JSON.
-pub fn word(state: MonitorState) -> &'static str {
+pub fn state_word(state: MonitorState) -> &'static str {
     match state {
         MonitorState::Ok => "ok",
         MonitorState::Noisy => "noisy",
@@ -41,7 +41,7 @@ pub fn word(state: MonitorState) -> &'static str {
 pub fn faults(monitors: &[Monitor]) -> String {
     let fault =
         |m: &Monitor| format!("{} {} ({:.2} mm, {} readings rejected)", m.name, m.state, m.sigma_mm, m.rejected);
-    let faults: Vec<String> = monitors.iter().filter(|m| m.state != word(MonitorState::Ok)).map(fault).collect();
+    let faults: Vec<String> = monitors.iter().filter(|m| m.state != state_word(MonitorState::Ok)).map(fault).collect();
     if faults.is_empty() { "all ok".into() } else { faults.join("; ") }
 }
 
@@ -50,7 +50,7 @@ impl EstimateRecord {
     pub(super) fn monitors(&self) -> Vec<Monitor> {
         let monitor = |b: usize| Monitor {
             name: self.names.monitors[b].clone(),
-            state: word(self.monitor_state[b]),
+            state: state_word(self.monitor_state[b]),
             sigma_mm: f64::from(self.monitor_sigma[b]) * 1e3,
             rejected: self.monitor_rejected[b],
         };

@@ -38,7 +38,7 @@ pub fn say(text: impl Display) -> Result<(), OutputError> {
     }
 }
 
-/// What went wrong: a line on stderr, see [`crate::logs`], whether or not anybody reads it.
+/// What went wrong: a line on stderr where the program says so, whether or not anybody reads it.
 pub fn warn(text: impl Display) {
     tracing::warn!("{text}");
 }

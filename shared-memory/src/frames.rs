@@ -9,9 +9,8 @@ use iceoryx2::port::{publisher, subscriber};
 use iceoryx2::prelude::{AllocationStrategy, ipc};
 use iceoryx2::service::port_factory::{PortFactory as _, event, publish_subscribe};
 
-use super::services::{join, joined, news};
+use super::services::{NODES, join, joined, news};
 use super::{BUFFER, PUBLISHERS, PublishError, SUBSCRIBERS};
-use crate::sink::shared_memory::services::NODES;
 
 /// Frames, the event that announces them, and the process that has joined both.
 struct Frames {

@@ -1,13 +1,12 @@
 //! A record as bytes in shared memory, the same for readers in any language.
 //!
-#![doc = include_str!("../../../../docs/shared-memory.md")]
+#![doc = include_str!("../../docs/shared-memory.md")]
 
 use std::sync::Arc;
 
 use estimator::{MonitorState, Remarks};
 use iceoryx2::prelude::ZeroCopySend;
-
-use crate::record::{EstimateRecord, Names, ReadingUse, Remarked};
+use results::{EstimateRecord, Names, ReadingUse, Remarked};
 
 /// What holds for a whole record; see the module's first table.
 #[repr(C)]
@@ -306,7 +305,6 @@ mod tests {
     use core::mem::{align_of, offset_of, size_of};
 
     use super::*;
-    use crate::record::tests::record;
 
     fn stamp() -> Stamp {
         Stamp { publisher: "control room".into(), started_ns: 7, published_ns: 9 }
@@ -323,9 +321,13 @@ mod tests {
             let (header, payload) = encoded(record);
             decode(&header, &payload, &mut known).unwrap().0
         };
-        let (one, same, other) = (read(&record(3, 2)), read(&record(3, 2)), read(&record(2, 3)));
+        let (one, same, other) = (
+            read(&EstimateRecord::example(3, 2)),
+            read(&EstimateRecord::example(3, 2)),
+            read(&EstimateRecord::example(2, 3)),
+        );
         assert!(Arc::ptr_eq(&one.names, &same.names));
-        assert_eq!(other.names, record(2, 3).names);
+        assert_eq!(other.names, EstimateRecord::example(2, 3).names);
     }
 
     #[test]
@@ -345,7 +347,7 @@ mod tests {
 
     #[test]
     fn the_payload_is_the_documented_one() {
-        let mut record = record(3, 2);
+        let mut record = EstimateRecord::example(3, 2);
         record.covariance = (0..6).map(|i| i as f32).collect();
         (record.clipped[2], record.monitor_rejected[1]) = (true, 41);
         (record.remarks.put_aside, record.remarks.unsolved, record.remarked.put_aside_frames) = (true, true, 12);
@@ -379,7 +381,7 @@ mod tests {
     #[test]
     fn a_record_of_any_size_survives_shared_memory() {
         for (vars, monitors) in [(0, 0), (1, 2), (20, 20), (48, 33), (260, 500)] {
-            let mut record = record(vars, monitors);
+            let mut record = EstimateRecord::example(vars, monitors);
             (record.mismatch, record.linearised, record.nis, record.time_us) = (None, true, 2.5, 1 << 40);
             record.tables = Some(0xfeed);
             record.tune_innovation = [None, Some(-1e-3)];
@@ -392,7 +394,7 @@ mod tests {
 
     #[test]
     fn what_is_no_record_is_refused_with_its_numbers() {
-        let (header, payload) = encoded(&record(2, 1));
+        let (header, payload) = encoded(&EstimateRecord::example(2, 1));
         let refused = |header: &Header, payload: &[u32]| decode(header, payload, &mut None).unwrap_err().to_string();
         let expected = "2 vars, 1 monitors and 32 bytes of names take 27 words, found 26";
         assert_eq!(refused(&header, &payload[1..]), expected);

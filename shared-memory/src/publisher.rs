@@ -1,104 +1,16 @@
-//! Estimates in shared memory: loan, write, send; up to 16 readers, none of which can hold the writer up.
-//!
-//! A slow reader loses its oldest estimates, and can tell by the gap in [`EstimateRecord::frames`]. A process that is
-//! killed leaves shared memory behind, which the next process that joins any service clears away. Layout: [`layout`].
-
-mod frames;
-mod health;
-mod latest;
-pub mod layout;
-mod requests;
-mod services;
-mod setpoints;
-mod subscriber;
+//! The writer of estimates: loan, write, send.
 
 use core::fmt::Display;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher;
 use iceoryx2::prelude::ipc;
+use results::{EstimateRecord, Names};
 
-use super::{Sink, SinkError};
-use crate::record::{EstimateRecord, Names};
-pub use frames::{FrameReader, FrameWriter};
-pub use health::{HealthReader, HealthWriter};
-use layout::{Header, Stamp};
-pub use requests::{Asked, Reply, Request, RequestClient, RequestServer};
-use services::{Services, join};
-pub use setpoints::{SetpointHeader, SetpointReader, SetpointWriter, Setpoints};
-pub use subscriber::{Published, Subscriber};
-
-/// Name of the service of estimates, and of the event that announces each of them.
-pub const SERVICE: &str = "orbitcal/estimate";
-/// Name of a publisher where none is given.
-pub const PUBLISHER: &str = "orbitcal";
-/// Estimates that a reader who joins late still gets.
-pub const HISTORY: usize = 16;
-/// Estimates that wait for a slow reader: a quarter of a second at 1 kHz.
-pub const BUFFER: usize = 256;
-/// Readers at a time.
-pub const SUBSCRIBERS: usize = 16;
-/// Writers at a time: a restarted one can join before the dead one is cleared away.
-pub const PUBLISHERS: usize = 4;
-
-/// Why estimates cannot be sent or heard.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum PublishError {
-    /// The name can be no service's or publisher's.
-    #[error("{name:?}: expected a name of 1 to 127 printable ASCII characters, not beginning with iox2://")]
-    Name {
-        /// The name.
-        name: String,
-    },
-    /// The shared memory cannot be joined.
-    #[error(
-        "service {service}: cannot create its {part}: {reason} (all processes need one user and one version, see \
-         docs/shared-memory.md)"
-    )]
-    Join {
-        /// The service.
-        service: String,
-        /// What could not be made.
-        part: &'static str,
-        /// Why.
-        reason: String,
-    },
-    /// Two daemons would publish as one.
-    #[error("service {service}: another daemon publishes there; give each a publish.service of its own")]
-    Taken {
-        /// The service.
-        service: String,
-    },
-    /// An estimate was not sent.
-    #[error("service {service}: estimate {sequence} was not sent: {reason}")]
-    Send {
-        /// The service.
-        service: String,
-        /// Sequence number of its frame.
-        sequence: u32,
-        /// Why.
-        reason: String,
-    },
-    /// A raw frame was not sent.
-    #[error("service {service}: a frame was not sent: {reason}")]
-    SendFrame {
-        /// The service.
-        service: String,
-        /// Why.
-        reason: String,
-    },
-    /// Waiting or receiving failed.
-    #[error("service {service}: cannot receive: {reason}")]
-    Receive {
-        /// The service.
-        service: String,
-        /// Why.
-        reason: String,
-    },
-}
+use super::layout::{self, Header, Stamp};
+use super::services::{Services, join};
+use super::{PublishError, now_ns};
 
 /// The writer's end.
 pub struct Publisher {
@@ -170,24 +82,13 @@ impl Publisher {
     }
 }
 
-impl Sink for Publisher {
-    fn take(&mut self, record: &EstimateRecord) -> Result<(), SinkError> {
-        Ok(self.publish(record)?)
-    }
-}
-
-/// Time [ns since 1970].
-pub(crate) fn now_ns() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64)
-}
-
 #[cfg(test)]
 mod tests {
     use core::time::Duration;
     use std::time::Instant;
 
     use super::*;
-    use crate::record::tests;
+    use crate::{Published, Subscriber};
 
     const SOON: Duration = Duration::from_secs(5);
 
@@ -196,7 +97,7 @@ mod tests {
     }
 
     fn record(frames: u32) -> EstimateRecord {
-        EstimateRecord { frames, mean: vec![frames as f32; 20], ..tests::record(20, 10) }
+        EstimateRecord { frames, mean: vec![frames as f32; 20], ..EstimateRecord::example(20, 10) }
     }
 
     fn publisher(test: &str) -> Publisher {

@@ -1,0 +1,94 @@
+//! A measured response matrix fitted and diagnosed: the results of `orbitcal fit` and `orbitcal diagnose`, and their pages.
+
+use measured::{Believed, Folder, Model, Settings, Straightened};
+use nalgebra::DVector;
+use report::Page;
+use twin::{Hold, Optics};
+
+use crate::error::CommandError;
+use crate::matrix_page::Measured;
+use crate::matrix_result::{Found, MatrixDiagnosis, MatrixFit};
+
+/// A measured matrix with its cables put right, fitted.
+pub struct FittedMatrix {
+    straightened: Straightened,
+    settings: Settings,
+    /// What is said of it.
+    pub result: MatrixFit,
+}
+
+impl FittedMatrix {
+    /// Of a measurement as it was made; `say` hears what is done.
+    ///
+    /// # Errors
+    /// [`CommandError`].
+    pub fn of(as_measured: &Folder, settings: Settings, say: &mut dyn FnMut(&str)) -> Result<Self, CommandError> {
+        let straightened = Straightened::of(as_measured, &settings, say)?;
+        let result = result(&straightened, &settings)?;
+        Ok(Self { straightened, settings, result })
+    }
+
+    /// Its page.
+    ///
+    /// # Errors
+    /// [`CommandError`] where the lattice or the fitted ring has no stable motion.
+    pub fn page(&self) -> Result<Page, CommandError> {
+        Ok(measured_of(&self.straightened, &self.result, &self.settings)?.page()?)
+    }
+}
+
+/// A measured matrix with its cables put right, fitted and diagnosed.
+pub struct DiagnosedMatrix {
+    straightened: Straightened,
+    settings: Settings,
+    /// What is said of it.
+    pub result: MatrixDiagnosis,
+}
+
+impl DiagnosedMatrix {
+    /// Of a measurement as it was made, against a model that is believed if there is one; `say` hears what is done.
+    ///
+    /// # Errors
+    /// [`CommandError`].
+    pub fn of(
+        as_measured: &Folder,
+        believed: Option<&Believed>,
+        settings: Settings,
+        say: &mut dyn FnMut(&str),
+    ) -> Result<Self, CommandError> {
+        let straightened = Straightened::of(as_measured, &settings, say)?;
+        let Straightened { folder, cables, fit: fitted } = &straightened;
+        let diagnosis = measured::diagnose(folder, fitted, &settings, say)?;
+        let against = believed.map(|model| measured::against(as_measured, fitted, model, &settings, say));
+        let against = against.transpose()?;
+        let fit = result(&straightened, &settings)?;
+        let found = Found { cables, fitted, diagnosis: &diagnosis, against: against.as_ref() };
+        let result = MatrixDiagnosis::of(folder, settings.rf, &found, fit);
+        Ok(Self { straightened, settings, result })
+    }
+
+    /// Its page.
+    ///
+    /// # Errors
+    /// As [`FittedMatrix::page`].
+    pub fn page(&self) -> Result<Page, CommandError> {
+        Ok(measured_of(&self.straightened, &self.result.fit, &self.settings)?.page_of(&self.result)?)
+    }
+}
+
+/// A fit with its ring and that of the lattice.
+fn measured_of<'r>(
+    Straightened { folder, fit, .. }: &'r Straightened,
+    result: &'r MatrixFit,
+    settings: &Settings,
+) -> Result<Measured<'r>, CommandError> {
+    let model = Model::of(folder, &fit.groups, settings.rf)?;
+    let rings = [model.at(&[], &DVector::zeros(0)), model.at(&fit.unknowns, &fit.values)];
+    Ok(Measured { folder, fit, result, rings })
+}
+
+fn result(Straightened { folder, cables, fit }: &Straightened, settings: &Settings) -> Result<MatrixFit, CommandError> {
+    let ring = Model::of(folder, &fit.groups, settings.rf)?.at(&fit.unknowns, &fit.values);
+    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok().and_then(|optics| optics.tunes().ok());
+    Ok(MatrixFit::of(folder, cables, fit, tunes.map(|tunes| [tunes.x, tunes.y])))
+}
