@@ -72,7 +72,7 @@ serve-soak: toolchain ## two million frames with 5 % faults of every kind throug
 	cargo test --locked --release --workspace --test daemon -- --ignored --exact soak::serve_soak --nocapture
 
 clients: .venv-iceoryx target/tools/bin/iox2 ## readers of the shared memory that are not ours, against the daemon: the example in Python and iox2 of iceoryx2; minutes, the first time
-	cargo test --locked -p host-bridge --test daemon -- clients:: --nocapture
+	cargo test --locked -p orbitcal --test daemon -- clients:: --nocapture
 
 .venv-iceoryx:
 	python3 -m venv .venv-iceoryx

@@ -8,6 +8,7 @@ use core::net::SocketAddr;
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
+use results::CommandError;
 use serde::Deserialize;
 use toml::de::DeTable;
 
@@ -402,6 +403,12 @@ fn of_toml(text: &str, error: &toml::de::Error) -> Problem {
 /// Line of a byte of a text, counted from 1.
 fn line(text: &str, at: usize) -> usize {
     1 + text.bytes().take(at).filter(|byte| *byte == b'\n').count()
+}
+
+impl From<ConfigError> for CommandError {
+    fn from(error: ConfigError) -> Self {
+        Self::Input(error.to_string())
+    }
 }
 
 #[cfg(test)]

@@ -1,21 +1,30 @@
-//! The host's side of orbitcal. Estimates come from a [`source`] (the core fed by a recording, a device), pass the loop
-//! [`serve`], and go to every [`sink`] (shared memory, trace); a [`result`] is what a command prints. `main.rs` joins these parts.
+//! The daemon of orbitcal, and what else follows a machine. Estimates come from a [`source`] (the core fed by a recording, a device), pass
+//! the loop [`serve`], and go to every [`sink`] (shared memory, trace). A [`service`] is all of it as a configuration says, for months:
+//! with checkpoints, a [`history`], the health of instruments, an orbit feedback and a page.
+//!
+//! ```
+//! use host_bridge::config::Config;
+//!
+//! let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/booster.toml");
+//! let config = Config::read(file.as_ref())?;
+//! assert_eq!(config.publish.service, "orbitcal/estimate");
+//! # Ok::<(), host_bridge::config::ConfigError>(())
+//! ```
 
-pub mod checkpoint;
-pub mod cli;
-pub mod command;
+mod checkpoint;
 pub mod config;
-pub mod daemon;
-pub mod health;
+mod daemon;
+mod health;
 pub mod history;
 pub mod logs;
-pub mod next_plan;
 pub mod serve;
+pub mod service;
 pub mod sink;
 pub mod source;
 pub mod stop;
-pub mod watch;
-pub mod web;
+mod web;
+
+pub use checkpoint::write as write_checkpoint;
 
 /// The worked examples of `docs/extending.md`, compiled and run as a test.
 #[cfg(doctest)]

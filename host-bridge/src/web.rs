@@ -10,6 +10,5 @@ mod state;
 mod trail;
 
 pub use board::Board;
-pub use metrics::Metrics;
-pub use server::{WebError, start};
+pub use server::start;
 pub use state::Place;

@@ -1,5 +1,7 @@
 //! What is said of a recording before anything is made of it.
 
+use std::path::Path;
+
 use inference::campaign::furthest_stray;
 use inference::recording::BelievedRf;
 use inference::{Campaign, Recording};
@@ -65,4 +67,17 @@ pub fn strays(ring: &Ring, recording: &Recording) -> Option<String> {
         100.0 * stray.off,
         100.0 * STRAYS
     ))
+}
+
+/// Read a recording of a ring.
+///
+/// # Errors
+/// [`CommandError::Input`], also for a measured response matrix.
+pub fn recording(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {
+    if measured::Folder::is_one(path) {
+        let path = path.display();
+        let problem = format!("{path} holds a measured response matrix; `fit`, `diagnose` and `compare` read one");
+        return Err(CommandError::Input(problem));
+    }
+    Ok(Recording::read(path, ring)?)
 }

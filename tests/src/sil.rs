@@ -4,13 +4,13 @@ use core::error::Error;
 
 use estimator::wire::link::Status;
 use estimator::{Prepared, Walk};
-use host_bridge::cli::CoreModel;
 use host_bridge::source::device::Fed;
 use host_bridge::source::link::{Heard, Link};
 use host_bridge::source::{Clock, Rate};
 use host_bridge::stop::Stop;
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
+use orbitcal::CoreModel;
 use results::{EstimateRecord, FitResult, Names};
 use twin::Ring;
 

@@ -3,11 +3,11 @@
 
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
-use estimator::Walk;
 use std::io::Write;
 use std::process::Command;
 use std::sync::{Arc, LazyLock};
 
+use estimator::Walk;
 use estimator::booster::Frame;
 use estimator::wire::link::{Refusal, Status};
 use estimator::{Hold, Tables as _};

@@ -9,6 +9,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use results::CommandError;
 use results::output::warn;
 
 use super::row::{Columns, Row};
@@ -196,6 +197,12 @@ pub(super) fn lock(folder: &Path) -> Result<File, HistoryError> {
             Err(HistoryError::of(folder, "another daemon writes its history there; give each a folder of its own"))
         }
         Err(fs::TryLockError::Error(error)) => Err(HistoryError::of(&path, error)),
+    }
+}
+
+impl From<HistoryError> for CommandError {
+    fn from(error: HistoryError) -> Self {
+        Self::Input(error.to_string())
     }
 }
 

@@ -4,7 +4,7 @@ use core::error::Error;
 use std::process::ExitCode;
 
 use clap::Parser;
-use host_bridge::command::progress;
+use orbitcal::progress;
 use system_tests::endurance::{Endured, endure};
 use system_tests::qemu::Image;
 

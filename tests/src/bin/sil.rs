@@ -54,7 +54,7 @@ fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
     for (name, process_noise) in RECORDINGS {
         let mut recording = Recording::read(&repository(name), &ring)?;
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
-        let bar = host_bridge::command::progress(recording.rows.len(), "frames", false);
+        let bar = orbitcal::progress(recording.rows.len(), "frames", false);
         let walk = stream::walk_per_cycle(&recording, process_noise, 0.0);
         let comparison = compare(&image, (&ring, &recording), walk, true, |record| {
             bar.inc(1);

@@ -1,49 +1,79 @@
 //! The commands, one file each.
 
-pub mod challenge;
-pub mod check;
-pub mod compare;
-pub mod conceal;
-pub mod daemon;
-pub mod diagnose;
-pub mod export;
-pub mod fit;
-pub mod frames;
-pub mod history;
-pub mod import;
-pub mod matrix;
-pub mod measure;
-pub mod replay;
-pub mod request;
-pub mod response;
-pub mod serve;
-pub mod simulate;
-pub mod study;
-pub mod surrogate;
-pub mod train;
-pub mod validate;
-pub mod watch;
+mod challenge;
+mod check;
+mod compare;
+mod conceal;
+mod diagnose;
+mod export;
+mod fit;
+mod frames;
+mod history;
+mod import;
+mod matrix;
+mod measure;
+mod replay;
+mod request;
+mod response;
+mod serve;
+mod simulate;
+mod study;
+mod surrogate;
+mod train;
+mod validate;
+mod watch;
 
 use core::fmt::Display;
 use std::borrow::Cow;
 use std::path::Path;
 use std::sync::Arc;
 
+use host_bridge::serve::serve;
+use host_bridge::sink::Sinks;
+use host_bridge::sink::trace::Trace;
+use host_bridge::source::Source;
+use host_bridge::stop::Stop;
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::{Recording, stream, with_priors};
-pub use results::CommandError;
-use results::{EstimateRecord, Names, campaign, expect_modelled, model_file, not_modelled, output, strays};
+use inference::{Recording, with_priors};
+use results::{
+    CommandError, EstimateRecord, Names, campaign, expect_modelled, model_file, not_modelled, output, recording, strays,
+};
 use serde::Serialize;
 use shared_memory::{PublishError, Publisher};
 use training::Tables;
 use twin::{LatticeError, Ring};
 
-use crate::cli::{Common, CoreModel, Priors, Publishing};
-use crate::serve::serve;
-use crate::sink::Sinks;
-use crate::sink::trace::Trace;
-use crate::source::Source;
-use crate::stop::Stop;
+use crate::cli::{Cli, Command, Common, CoreModel, Priors, Publishing};
+
+/// Run the command of a command line.
+///
+/// # Errors
+/// [`CommandError`].
+pub fn run(cli: &Cli) -> Result<(), CommandError> {
+    match &cli.command {
+        Command::Check(options) => check::run(options),
+        Command::Replay(options) => replay::run(options),
+        Command::Watch(options) => watch::run(options),
+        Command::Response(options) => response::run(options),
+        Command::Fit(options) => fit::run(options),
+        Command::Study(options) => study::run(options),
+        Command::Diagnose(options) => diagnose::run(options),
+        Command::Compare(options) => compare::run(options),
+        Command::Frames(options) => frames::run(options),
+        Command::Conceal(options) => conceal::run(options),
+        Command::Challenge(options) => challenge::run(options),
+        Command::Import(options) => import::run(options),
+        Command::Export(options) => export::run(options),
+        Command::Validate(options) => validate::run(options),
+        Command::Request(options) => request::run(options),
+        Command::History(options) => history::run(options),
+        Command::Serve(options) => serve::run(options),
+        Command::Measure(options) => measure::run(options),
+        Command::Simulate(options) => simulate::run(options),
+        Command::Surrogate(options) => surrogate::run(options),
+        Command::Train(options) => train::run(options),
+    }
+}
 
 /// The machine that was asked for, or the built-in one.
 fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
@@ -58,12 +88,11 @@ fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeErr
 /// The core's tables: those of a model file, or of the ring as designed.
 fn tables(model: CoreModel, ring: &Ring, file: Option<&Path>) -> Result<Tables, CommandError> {
     match (model, file) {
-        (CoreModel::Green, Some(path)) => Ok(model_file::read(path, ring)?),
         (CoreModel::Resnet, Some(path)) => Err(CommandError::Input(format!(
             "{}: the network has no terms of a model file; leave out --model resnet",
             path.display()
         ))),
-        (_, None) => Ok(training::green::tables(ring).map_err(stream::StreamError::from)?),
+        _ => model_file::read_or_design(file, ring),
     }
 }
 
@@ -115,15 +144,6 @@ fn deliver<R: Serialize + Display>(common: &Common, result: &R) -> Result<(), Co
 fn warn_if_not_modelled(ring: &Ring, recording: &Recording, has_model_file: bool) {
     let held = not_modelled(recording).filter(|_| !has_model_file);
     held.into_iter().chain(strays(ring, recording)).for_each(output::warn);
-}
-
-fn recording(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {
-    if measured::Folder::is_one(path) {
-        let path = path.display();
-        let problem = format!("{path} holds a measured response matrix; `fit`, `diagnose` and `compare` read one");
-        return Err(CommandError::Input(problem));
-    }
-    Ok(Recording::read(path, ring)?)
 }
 
 /// A progress bar; hidden in a pipe by indicatif itself, and when nothing but errors is wanted.

@@ -10,10 +10,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
+use host_bridge::sink::trace::{Trace, TraceError};
+use host_bridge::stop::Stop;
 use shared_memory::{PublishError, Stamp, Subscriber};
 
-use crate::sink::trace::{Trace, TraceError};
-use crate::stop::Stop;
 use view::View;
 
 /// What to watch, and when to stop.

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use control::{Control, Epics, Journal, Plan, Step, measure, preflight, recording, restore};
+use host_bridge::stop::Stop;
 use inference::Recording;
 use results::output::{self, fill};
 use serde::Serialize;
@@ -12,7 +13,6 @@ use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::Measure;
-use crate::stop::Stop;
 
 /// Field names are those of the command's JSON.
 #[derive(Debug, Serialize)]

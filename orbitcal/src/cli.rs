@@ -5,14 +5,13 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diagnosis::validation::UnmodelledKind;
+use host_bridge::source::Rate;
+use host_bridge::source::address::Address;
 use inference::nuts::NutsSettings;
 use lattices::export;
 use lattices::import::{self, Pattern};
 use shared_memory::{PUBLISHER, SERVICE};
 use twin::EffectText;
-
-use crate::source::Rate;
-use crate::source::address::Address;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
 #[derive(Debug, Parser)]

@@ -9,15 +9,13 @@ use inference::Recording;
 use inference::recording::Header;
 use inference::stream::{self, Core, Feedback};
 use results::output::{self, tell};
-use results::{Names, Remarked};
+use results::{CommandError, Names, Remarked, model_file, recording};
 use shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer, SetpointWriter};
 use training::rooms::large;
 use twin::Ring;
 
-use super::{CommandError, machine, recording, tables};
 use crate::checkpoint::{Head, Keeper};
-use crate::cli::CoreModel;
-use crate::config::{self, Config, ConfigError, Publish, Source};
+use crate::config::{self, Config, Publish, Source};
 use crate::daemon::{self, Engine, Outlet};
 use crate::health::{Health, Reporter};
 use crate::history::{self, Columns, Recorder};
@@ -30,12 +28,6 @@ use crate::source::queue::{Faults, Queue};
 use crate::source::{feed, rehearsal, shared};
 use crate::stop::Stop;
 use crate::web::{self, Board, Place};
-
-impl From<ConfigError> for CommandError {
-    fn from(error: ConfigError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
 
 /// Say everything that is wrong with a configuration, the machine's files included; nothing is started.
 ///
@@ -188,10 +180,10 @@ fn plan(path: &Path, ring: &Ring) -> Result<Plan, CommandError> {
 /// The ring, and a core for it at its prior.
 fn build(config: &Config) -> Result<(Ring, Core), CommandError> {
     let machine_file = &config.machine;
-    let ring = machine(machine_file.file.as_deref())?;
+    let ring = machine_file.file.as_deref().map_or_else(|| Ok(Ring::booster()), Ring::read)?;
     let recording = calibration(&machine_file.recording, &ring)?;
     let powered = recording.powered(&ring);
-    let tables = tables(CoreModel::Green, &powered, machine_file.model_file.as_deref())?;
+    let tables = model_file::read_or_design(machine_file.model_file.as_deref(), &powered)?;
     let setup = stream::setup(&powered, &recording, config.walk.into())?;
     let core = Core::with_tables(tables, setup)?;
     Ok((ring, core))

@@ -1,5 +1,7 @@
 //! `orbitcal replay`: recording to wire bytes to core to shared memory, frame by frame.
 
+use host_bridge::source::{self, Clock};
+use host_bridge::stop::Stop;
 use inference::stream::{self, Core};
 use results::{FitResult, Names};
 
@@ -8,8 +10,6 @@ use super::{
     warn_if_not_modelled,
 };
 use crate::cli::{CoreModel, Replay};
-use crate::source::{self, Clock};
-use crate::stop::Stop;
 
 /// Metres a micrometre.
 const MICRO: f32 = 1e-6;

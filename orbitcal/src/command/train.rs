@@ -6,6 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use estimator::surrogate::ORBIT;
+use host_bridge::stop::Stop;
 use report::{Axes, Figure, Series};
 use results::output;
 use training::network::fit::{self, Plan, Progress, Trainee};
@@ -15,7 +16,6 @@ use twin::Ring;
 
 use super::{CommandError, check_outputs, progress};
 use crate::cli::Train;
-use crate::stop::Stop;
 
 /// Seconds between two checkpoints.
 const SAVED_EVERY: u64 = 30;

@@ -10,9 +10,8 @@ use std::thread;
 use std::time::Instant;
 
 use estimator::{MonitorState, Tables as _};
-use host_bridge::health::State;
 use results::model_file;
-use shared_memory::{HealthReader, Subscriber};
+use shared_memory::{HealthReader, State, Subscriber};
 use training::LINE;
 use twin::Effect;
 

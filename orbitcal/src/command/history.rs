@@ -2,20 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
+use host_bridge::config::Config;
+use host_bridge::history::{self, History, Row, Span};
 use results::output::{self, OutputError, table};
 use serde_json::{Value, json};
+use shared_memory::State;
 
 use super::{CommandError, check_outputs};
 use crate::cli;
-use crate::config::Config;
-use crate::health::State;
-use crate::history::{self, History, HistoryError, Row, Span};
-
-impl From<HistoryError> for CommandError {
-    fn from(error: HistoryError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
 
 /// Vars that fit beside the rest in a table.
 const VARS: usize = 2;

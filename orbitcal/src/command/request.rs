@@ -29,7 +29,7 @@ pub fn run(options: &Request) -> Result<(), CommandError> {
     let mut client = RequestClient::try_new(&options.service).map_err(CommandError::other)?;
     match (client.ask(&request, PATIENCE).map_err(CommandError::other)?, to) {
         (Reply::Done(bytes), Some(out)) => {
-            crate::checkpoint::write(out, &bytes)
+            host_bridge::write_checkpoint(out, &bytes)
                 .map_err(|error| CommandError::Other(format!("{}: {error}", out.display())))?;
             output::say(format_args!("{}: {} bytes", out.display(), bytes.len()))?;
         }

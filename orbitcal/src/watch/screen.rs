@@ -10,10 +10,9 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 use results::output::lines;
 use results::{EstimateRecord, ReadingUse, state_word};
-use shared_memory::Published;
+use shared_memory::{HealthRecord, Published};
 
 use super::{WatchSummary, band, ill};
-use crate::health::HealthRecord;
 
 /// Lines above the grid.
 const HEADER: u16 = 3;
@@ -270,10 +269,9 @@ mod tests {
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
     use results::Names;
-    use shared_memory::Stamp;
+    use shared_memory::{Condition, Stamp, State};
 
     use super::*;
-    use crate::health::{Condition, State};
 
     fn screen() -> Screen {
         Screen::new("orbitcal/estimate".to_owned())

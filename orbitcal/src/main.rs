@@ -5,12 +5,9 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use clap::error::ErrorKind;
-use host_bridge::cli::{Cli, Command};
-use host_bridge::command::{
-    CommandError, challenge, check, compare, conceal, diagnose, export, fit, frames, history, import, measure, replay,
-    request, response, serve, simulate, study, surrogate, train, validate, watch,
-};
 use host_bridge::logs;
+use orbitcal::Cli;
+use results::CommandError;
 use results::output::{self, OutputError};
 
 fn main() -> ExitCode {
@@ -25,30 +22,7 @@ fn main() -> ExitCode {
         Err(error) if error.use_stderr() => return refuse(&first_line(&error)),
         Err(help) => return said(output::say(help.to_string().trim_end())),
     };
-    let done = match &cli.command {
-        Command::Check(options) => check::run(options),
-        Command::Replay(options) => replay::run(options),
-        Command::Watch(options) => watch::run(options),
-        Command::Response(options) => response::run(options),
-        Command::Fit(options) => fit::run(options),
-        Command::Study(options) => study::run(options),
-        Command::Diagnose(options) => diagnose::run(options),
-        Command::Compare(options) => compare::run(options),
-        Command::Frames(options) => frames::run(options),
-        Command::Conceal(options) => conceal::run(options),
-        Command::Challenge(options) => challenge::run(options),
-        Command::Import(options) => import::run(options),
-        Command::Export(options) => export::run(options),
-        Command::Validate(options) => validate::run(options),
-        Command::Request(options) => request::run(options),
-        Command::History(options) => history::run(options),
-        Command::Serve(options) => serve::run(options),
-        Command::Measure(options) => measure::run(options),
-        Command::Simulate(options) => simulate::run(options),
-        Command::Surrogate(options) => surrogate::run(options),
-        Command::Train(options) => train::run(options),
-    };
-    match done {
+    match orbitcal::run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(CommandError::Input(message)) => refuse(&message),
         Err(CommandError::Other(message)) => fail(&message),

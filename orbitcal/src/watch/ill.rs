@@ -1,8 +1,7 @@
 //! Monitors and correctors that are not ok, the worst first, and where all are ok, those closest to it.
 
 use results::EstimateRecord;
-
-use crate::health::{Condition, HealthRecord, State};
+use shared_memory::{Condition, HealthRecord, State};
 
 /// Lines of this many columns at most.
 pub(super) fn lines(

@@ -2,22 +2,22 @@
 //! core in process.
 
 use estimator::Tables as _;
+use host_bridge::serve::serve;
+use host_bridge::service;
+use host_bridge::source::Clock;
+use host_bridge::source::address::Address;
+use host_bridge::source::device::{Fed, Overheard};
+use host_bridge::source::link::{Line, Link};
+use host_bridge::stop::Stop;
 use inference::{Recording, stream};
 use results::{FitResult, Names};
 use training::{LINE, Tables};
 use twin::Ring;
 
 use super::{
-    CommandError, check_outputs, daemon, deliver, machine, progress, recording, sinks, stream_all, tables,
-    warn_if_not_modelled,
+    CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables, warn_if_not_modelled,
 };
 use crate::cli::Serve;
-use crate::serve::serve;
-use crate::source::Clock;
-use crate::source::address::Address;
-use crate::source::device::{Fed, Overheard};
-use crate::source::link::{Line, Link};
-use crate::stop::Stop;
 
 /// Run it.
 ///
@@ -25,8 +25,8 @@ use crate::stop::Stop;
 /// [`CommandError`].
 pub fn run(options: &Serve) -> Result<(), CommandError> {
     match (&options.config, &options.source) {
-        (Some(config), _) if options.check => daemon::check(config),
-        (Some(config), _) => daemon::run(config),
+        (Some(config), _) if options.check => service::check(config),
+        (Some(config), _) => service::run(config),
         (None, Some(source)) => relay(options, source),
         (None, None) => Err(CommandError::Input("a configuration or --source is needed".into())),
     }
