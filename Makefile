@@ -95,7 +95,7 @@ measured: toolchain ## four measured rings beside LOCO's fits of them: the numbe
 	cargo test --locked --release --workspace --test measured -- --include-ignored --nocapture --test-threads 2
 
 figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from the page of its recording
-	cargo run --locked --release -p diagnosis --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence
+	cargo run --locked --release -p results --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence
 
 bench: toolchain .venv ## medians of the hot paths, and pyAT on the same response
 	cargo bench --locked -p system-tests

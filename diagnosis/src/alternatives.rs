@@ -143,7 +143,7 @@ impl Alternative {
 }
 
 /// Probability of what looks like one of some effects, from the sum of theirs.
-pub(super) fn imitating(library: f64) -> f64 {
+pub fn imitating(library: f64) -> f64 {
     library * IMITATED / (1.0 - IMITATED)
 }
 

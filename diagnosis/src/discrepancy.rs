@@ -16,7 +16,7 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
-pub(crate) mod gradient;
+mod gradient;
 
 use core::ops::Range;
 
@@ -31,6 +31,7 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::location::Location;
 use super::settings::Settings;
+pub use gradient::steering;
 use gradient::{Changing, Runs, Where};
 
 /// Free amplitudes at one place, and their evidence.
@@ -555,11 +556,11 @@ mod tests {
     use inference::Campaign;
     use inference::simulate::{self, Beyond, Hardware};
     use nalgebra::MatrixXx2;
+    use validation::{Unmodelled, UnmodelledKind};
 
     use super::*;
     use crate::hypothesis::Hypothesis;
     use crate::testing::{Coloured, template};
-    use crate::validation::{Unmodelled, UnmodelledKind};
     use crate::{Diagnosis, Verdict};
 
     fn seen_of(data: &Data, fitted: &Fitted) -> Seen {

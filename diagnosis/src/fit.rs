@@ -507,7 +507,7 @@ fn machine_at(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn predicted_by(
+pub fn predicted_by(
     data: &Data,
     hypothesis: &Hypothesis,
     campaign: usize,
@@ -525,7 +525,7 @@ pub(super) fn predicted_by(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn of_element(
+pub fn of_element(
     data: &Data,
     hypothesis: &Hypothesis,
     campaign: usize,
@@ -556,7 +556,7 @@ pub(super) fn of_element(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
+pub fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
     let (readings, tunes, tune_changes) = machine.readings(drives)?;
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }

@@ -79,11 +79,11 @@ pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
 mod tests {
     use inference::Campaign;
     use twin::EffectKind;
+    use validation::{Cases, Class};
 
     use super::*;
     use crate::average::Vars;
     use crate::testing::template;
-    use crate::validation::{Cases, Class};
 
     /// A sextupole next to an integer tune, which the orbit passes some tenths of a millimetre off the estimated place: linearised on the estimated orbit, each pass
     /// went further away, and two effects were named that are not there.

@@ -24,12 +24,6 @@ pub fn ideal(ring: &Ring) -> Hardware {
     Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 }
 }
 
-/// Readings, rows frames, columns read monitors.
-pub fn readings(recording: &Recording) -> DMatrix<f64> {
-    let rows = &recording.rows;
-    DMatrix::from_fn(rows.len(), rows[0].reading.len(), |i, b| rows[i].reading[b].unwrap_or(f64::NAN))
-}
-
 /// Neighbours that share a crate.
 pub const CRATE: core::ops::Range<usize> = 8..13;
 

@@ -596,7 +596,7 @@ fn power(found: &Found) -> String {
 }
 
 /// A clause as the beginning of a sentence.
-pub(super) fn capitalised(text: &str) -> String {
+pub fn capitalised(text: &str) -> String {
     let mut characters = text.chars();
     characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
 }

@@ -4,7 +4,6 @@ use core::time::Duration;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use diagnosis::validation::UnmodelledKind;
 use host_bridge::source::Rate;
 use host_bridge::source::address::Address;
 use inference::nuts::NutsSettings;
@@ -12,6 +11,7 @@ use lattices::export;
 use lattices::import::{self, Pattern};
 use shared_memory::{PUBLISHER, SERVICE};
 use twin::EffectText;
+use validation::UnmodelledKind;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
 #[derive(Debug, Parser)]

@@ -7,12 +7,13 @@ use diagnosis::average::Vars;
 use diagnosis::beyond::Beyond;
 use diagnosis::heldout::Score;
 use diagnosis::imperfection::{Imperfection, Measure};
-use diagnosis::{Diagnosis, Finding, page};
+use diagnosis::{Diagnosis, Finding};
 use inference::Recording;
 use report::Page;
 use serde::Serialize;
 use twin::{Measured, Ring};
 
+use crate::diagnosis_page::page;
 use crate::error::CommandError;
 use crate::fit_result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 use crate::output::{fill, table};
@@ -166,8 +167,8 @@ impl From<&Imperfection> for ImperfectionResult {
 /// # Errors
 /// [`CommandError::Other`] where the machine that was found is not stable.
 pub fn diagnosis_page(diagnosis: &Diagnosis, recording: &Recording) -> Result<Page, CommandError> {
-    let page = page::page(diagnosis, recording);
-    page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
+    let made = page(diagnosis, recording);
+    made.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
 }
 
 impl DiagnosisResult {

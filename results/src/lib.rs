@@ -21,6 +21,7 @@
 mod campaign;
 mod check_result;
 mod compare;
+mod diagnosis_page;
 mod diagnosis_result;
 mod error;
 mod fit;

@@ -1,12 +1,12 @@
 //! Rings that are not the Booster, simulated by pyAT: ten cells with two families, and eight with three families whose
 //! monitors and correctors act in both planes (`tests/peers/three_families.py`).
 
-use diagnosis::score::{Grade, Truth};
 use diagnosis::{Diagnosis, Verdict};
 use estimator::Walk;
 use inference::{BatchFit, Campaign, Recording, TuneUse, simulate, stream};
 use system_tests::repository;
 use twin::{Effect, EffectKind, Ring};
+use validation::{Grade, Truth};
 
 fn read(folder: &str, name: &str) -> (Ring, Recording, Truth) {
     let home = repository("recordings").join(folder);

@@ -7,8 +7,6 @@ use diagnosis::fit::Fitted;
 use diagnosis::hypothesis::{Hypothesis, Term};
 use diagnosis::imperfection::{Imperfection, Measure};
 use diagnosis::scan::{candidates, scan};
-use diagnosis::score::{Grade, Truth};
-use diagnosis::validation::{Cases, Class, Unmodelled, UnmodelledKind};
 use diagnosis::{Diagnosis, Verdict, data::Data, sample};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
@@ -16,6 +14,7 @@ use inference::{Campaign, Recording};
 use nalgebra::DVector;
 use system_tests::repository;
 use twin::{Effect, EffectKind, Machine, Measured, Rf, Ring};
+use validation::{Cases, Class, Grade, Truth, Unmodelled, UnmodelledKind};
 
 fn read(name: &str) -> Recording {
     Recording::read(&repository("recordings").join(name), &Ring::booster()).unwrap()

@@ -34,7 +34,7 @@ pub(super) struct Changing {
 }
 
 /// What `ln` of each quadrupole's gradient does, with the kick that it gives to an orbit (x, y) at every element [m].
-pub(crate) fn steering(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]]) -> Vec<Signature> {
+pub fn steering(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]]) -> Vec<Signature> {
     let with_kick = |(q, mut gradient): (usize, Signature)| {
         gradient += kick(signatures, ring, q, orbit[ring.quadrupoles[q].element]);
         gradient
@@ -216,10 +216,10 @@ mod tests {
     use inference::Campaign;
     use inference::simulate::{self, Beyond, Hardware, Truth};
     use twin::Machine;
+    use validation::{Unmodelled, UnmodelledKind};
 
     use super::*;
     use crate::testing::template;
-    use crate::validation::{Unmodelled, UnmodelledKind};
     use crate::{Diagnosis, Verdict};
 
     /// A gradient moves the orbit of misaligned quadrupoles by what it kicks where that passes its own axis.

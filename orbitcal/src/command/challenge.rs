@@ -4,11 +4,11 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use diagnosis::score::{Grade, Truth};
 use diagnosis::{Diagnosis, Finding, Verdict};
 use results::output::{fill, table};
 use serde::Serialize;
 use twin::Ring;
+use validation::{Grade, Truth};
 
 use super::{CommandError, check_outputs, deliver, machine, progress, recording};
 use crate::cli::Challenge;

@@ -3,11 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use diagnosis::validation::{Cases, Class};
 use inference::{BatchFit, TuneUse, simulate};
 use measured::Folder;
 use results::output;
 use serde_json::{Value, json};
+use validation::{Cases, Class};
 
 use super::{CommandError, campaign, machine, matrix, recording};
 use crate::cli::Conceal;

@@ -8,11 +8,10 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use diagnosis::data::DataError;
-use diagnosis::validation::tables::Tables;
-use diagnosis::validation::{self, Case, Cases, Class, Outcome, UnmodelledKind};
 use inference::{Campaign, Recording};
 use results::output;
 use twin::{EffectKind, Ring};
+use validation::{Case, Cases, Class, Outcome, Tables, UnmodelledKind};
 
 use super::{CommandError, check_outputs, machine, progress, recording};
 use crate::cli::Validate;
