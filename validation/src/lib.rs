@@ -23,7 +23,9 @@
 //! # Ok::<(), Box<dyn core::error::Error>>(())
 //! ```
 
+mod campaigns;
 mod case;
+mod challenge;
 mod imperfect;
 mod mixes;
 mod outcome;
@@ -33,7 +35,9 @@ mod tables;
 mod testing;
 mod unmodelled;
 
+pub use campaigns::{CampaignError, known, run_all};
 pub use case::{Case, Cases, Class};
+pub use challenge::{Challenge, FolderError, Scored, folders};
 pub use outcome::{Outcome, run};
 pub use score::{Grade, Truth};
 pub use tables::Tables;
