@@ -8,7 +8,8 @@ use core::f64::consts::SQRT_2;
 use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Machine, Monitor, Optics, OrbitError, Place, Plane, Ring, Tunes};
 
-use inference::{Factor, Screened};
+use evidence::Factor;
+use inference::Screened;
 
 /// The orbit without kicks: its size, its changes and its uncertainty.
 #[derive(Debug, Clone)]

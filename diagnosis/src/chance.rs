@@ -6,7 +6,7 @@
 //!
 //! Source: A. C. Davison and D. V. Hinkley, Bootstrap Methods and their Application (1997), ch. 4.2, eq. 4.11.
 
-use inference::Factor;
+use evidence::Factor;
 use nalgebra::{DMatrix, DVectorView};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};

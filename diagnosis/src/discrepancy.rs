@@ -6,7 +6,7 @@
 //!
 //! `ln Bayes factor = -ln det(1 + omega^2 G)/2 + omega^2 g (1 + omega^2 G)^-1 g/2`,
 //!
-//! averaged over omega from well below the noise to millimetres. It assumes nothing of the physics; the determinant corrects for the
+//! ([`evidence`]), averaged over omega from well below the noise to millimetres. It assumes nothing of the physics; the determinant corrects for the
 //! number of free amplitudes.
 //!
 //! Sums are taken monitor by monitor. Where monitors have noise in common within a frame, a pattern that only one of them reads leaves
@@ -21,7 +21,7 @@ mod gradient;
 use core::ops::Range;
 
 use estimator::MonitorState;
-use inference::Factor;
+use evidence::{Evidence, Factor, log_bayes_factor};
 use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
 use twin::{Plane, Signature, Signatures};
 
@@ -328,21 +328,14 @@ fn marginals(pull: &DVector<f64>, gram: &DMatrix<f64>) -> [f64; SIZES.len()] {
     let SymmetricEigen { eigenvectors, eigenvalues } = gram.clone().symmetric_eigen();
     let along = eigenvectors.tr_mul(pull);
     SIZES.map(|size| {
-        let variance = size * size;
-        let of = |(pull, power): (&f64, &f64)| {
-            variance * pull * pull / (1.0 + variance * power) - (variance * power).ln_1p()
-        };
-        0.5 * along.iter().zip(&eigenvalues).filter(|(_, power)| **power > slack).map(of).sum::<f64>()
+        let along = along.iter().zip(&eigenvalues).filter(|(_, power)| **power > slack);
+        along.map(|(pull, power)| Evidence::from_score(*pull, *power, size).log_bayes_factor).sum::<f64>()
     })
 }
 
 /// `ln` Bayes factor of free amplitudes of one standard deviation, given their projected pull and Gram matrix.
 fn marginal(pull: &DVector<f64>, gram: &DMatrix<f64>, size: f64) -> f64 {
-    let variance = size * size;
-    let mut grown = gram * variance;
-    (0..grown.ncols()).for_each(|i| grown[(i, i)] += 1.0);
-    let Some(factor) = Factor::of(grown) else { return f64::NEG_INFINITY };
-    0.5 * (variance * factor.whiten(pull).norm_squared() - factor.log_determinant())
+    log_bayes_factor(pull, gram, size).unwrap_or(f64::NEG_INFINITY)
 }
 
 /// Steps at the edges of the stretches of time: rows pools, columns edges.

@@ -4,7 +4,7 @@
 //!
 //! `cost = |r(u)|^2 + |u|^2`, `ln evidence = -cost/2 - ln det(1 + J^T J)/2` (Laplace),
 //!
-//! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::evidence`]). The normalisation of
+//! minimised by damped Gauss-Newton within the range of the vars (which cuts the integral: [`super::units`]). The normalisation of
 //! the data is included, since hypotheses with drifting baselines change their covariance. The ordinary imperfections, many and
 //! small, are taken to first order about the start of the fit (gains no lower than -0.5), but for those that change the focusing.
 
@@ -16,11 +16,10 @@ use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signat
 use super::data::Data;
 use super::element::Form;
 use super::error::FitError;
-use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Member, Term, Unknown};
 use super::ordinary::Family;
-use inference::Factor;
-use inference::factor::gram;
+use super::units::{Units, Within};
+use evidence::{Factor, gram};
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.

@@ -18,7 +18,7 @@
 //! Comput. 13 (2001) 1103, eq. 10, what is left out of a Gaussian process.
 
 use estimator::MonitorState;
-use inference::Factor;
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;

@@ -6,9 +6,9 @@ use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
 use super::element::{Element, Form};
-use super::evidence::Units;
 use super::ordinary::{Family, is_absorbed};
 use super::scatter::Scatter;
+use super::units::Units;
 
 /// One effect that a hypothesis holds, its amplitude unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

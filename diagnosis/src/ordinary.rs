@@ -17,7 +17,7 @@
 use core::iter;
 use core::ops::Range;
 
-use inference::Factor;
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Measured, Plane, Ring, Site, Unit};
 

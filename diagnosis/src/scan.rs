@@ -3,13 +3,13 @@
 //! With `d` the whitened signature of a candidate in units of its prior standard deviation, and `P` the projection that removes
 //! what the fit's own unknowns can absorb, `g = d P r` and `h = d P d`:
 //!
-//! `ln Bayes factor = g^2/(1 + h)/2 - ln(1 + h)/2`, or `g - h/2` for an effect without an amplitude.
+//! `ln Bayes factor = g^2/(1 + h)/2 - ln(1 + h)/2` ([`Evidence`]), or `g - h/2` for an effect without an amplitude.
 //!
 //! Source: C. R. Rao's score test; A. E. Raftery, Biometrika 83 (1996) 251, for its Bayes factor.
 
 use core::convert::Infallible;
 
-use inference::Factor;
+use evidence::{Evidence, Factor};
 use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
@@ -157,8 +157,8 @@ impl SignatureScore {
 
     /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
     pub fn of_amplitude(self) -> (f64, f64) {
-        let Self { pull, power } = self;
-        (pull / (1.0 + power), 0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p())
+        let Evidence { amplitude, log_bayes_factor, .. } = Evidence::from_score(self.pull, self.power, 1.0);
+        (amplitude, log_bayes_factor)
     }
 
     /// The latter, of an effect with or without an amplitude.

@@ -6,7 +6,6 @@ pub mod campaign;
 mod cmdstan;
 pub mod diagnostics;
 pub mod draws;
-pub mod factor;
 pub mod map_fit;
 pub mod model;
 pub mod nuts;
@@ -20,7 +19,6 @@ pub mod stream;
 
 pub use campaign::{Campaign, Drive, Meter, Screened};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
-pub use factor::Factor;
 pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, TuneUse};
 pub use model::{GreenModel, ResnetModel, ResponseModel};
 pub use posterior::{Laplace, LaplaceError, Posterior};

@@ -9,7 +9,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::factor::Factor;
+use evidence::Factor;
 
 /// A cost that is (nearly) a sum of squares.
 pub trait Objective {

@@ -7,7 +7,7 @@
 //!
 //! With `d` the whitened differences and `s` the whitened derivative of a signal, of the prior standard deviation `w`,
 //!
-//! `ln Bayes factor = (d.s)^2 w^2/(1 + w^2 s.s)/2 - ln(1 + w^2 s.s)/2`,
+//! `ln Bayes factor = (d.s)^2 w^2/(1 + w^2 s.s)/2 - ln(1 + w^2 s.s)/2` ([`Evidence`]),
 //!
 //! the leaders' with the exact signal at the best amplitude. Probabilities follow as in [`super::search`]. What is found has to be rare
 //! among the same frames with another one of each run as its first, which keeps all that monitors share within a frame, and each run has to be
@@ -19,6 +19,7 @@ mod unsteady;
 
 use core::ops::Range;
 
+use evidence::Evidence;
 use nalgebra::{DMatrix, DMatrixView, DVector};
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
@@ -276,7 +277,8 @@ impl<'c> Within<'c> {
     fn weights(&self, slopes: &[DMatrix<f64>], white: &DMatrix<f64>) -> Vec<f64> {
         let of_term = |(slope, &term): (&DMatrix<f64>, &Term)| {
             let spread = self.spread_of(term);
-            log_bayes(slope.dot(white) / spread, slope.norm_squared() / spread, width(term)) + self.log_prior(term)
+            let evidence = Evidence::from_score(slope.dot(white) / spread, slope.norm_squared() / spread, width(term));
+            evidence.log_bayes_factor + self.log_prior(term)
         };
         let of_unmodelled = self.stretch(white).log_bayes + log_prior_unmodelled();
         slopes.iter().zip(&self.terms).map(of_term).chain([of_unmodelled]).collect()
@@ -295,7 +297,8 @@ impl<'c> Within<'c> {
         let each = each.flat_map(|at| SHARES.map(|share| (at, share)));
         let weigh = |((from, to), share): ((usize, usize), f64)| {
             let ((pull, power), (more, powerful)) = (sums[from], sums[to + 1]);
-            (log_bayes(more - pull, powerful - power, share), (runs[from].start, runs[to].end - 1), share)
+            let evidence = Evidence::from_score(more - pull, powerful - power, share);
+            (evidence.log_bayes_factor, (runs[from].start, runs[to].end - 1), share)
         };
         let all: Vec<(f64, (usize, usize), f64)> = each.map(weigh).collect();
         let best = all.iter().copied().fold((f64::NEG_INFINITY, (0, 0), 0.0), |a, b| if b.0 > a.0 { b } else { a });
@@ -360,12 +363,12 @@ impl<'c> Within<'c> {
         let slope = self.slope(&Signals::of(self.campaign, &without), term, amplitude);
         let left = self.differences.whiten(&without);
         let spread = self.spread_of(term);
-        let power = width.powi(2) * slope.norm_squared() / spread;
         let gained = (self.white.norm_squared() - left.norm_squared()) / spread;
-        let log_bayes = 0.5 * (gained - (amplitude / width).powi(2) - power.ln_1p());
+        let evidence = Evidence::about(amplitude, gained, slope.norm_squared() / spread, width);
+        let (log_bayes, sigma) = (evidence.log_bayes_factor, evidence.sigma);
         let runs = self.differences.runs.iter().map(|run| (run.clone(), 0..slope.ncols()));
         let gain = held_out(&slope.as_view(), &(&left + &slope * amplitude).as_view(), width, runs);
-        Fit { at, term, amplitude, sigma: width / (1.0 + power).sqrt(), log_bayes, gain, signal }
+        Fit { at, term, amplitude, sigma, log_bayes, gain, signal }
     }
 
     /// Probability that the best of all is as good where another frame of each run takes the place of the first.
@@ -516,12 +519,6 @@ fn held_out(
 /// True for a gain of more than two standard errors.
 fn is_validated((gain, sigma): (f64, f64)) -> bool {
     gain > VALIDATED * sigma
-}
-
-/// `ln` Bayes factor of an amplitude of standard deviation `width`, to first order.
-fn log_bayes(pull: f64, power: f64, width: f64) -> f64 {
-    let (variance, grown) = (width * width, 1.0 + width * width * power);
-    0.5 * (variance * pull * pull / grown - grown.ln())
 }
 
 fn log_prior_unmodelled() -> f64 {

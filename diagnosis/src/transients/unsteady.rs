@@ -11,6 +11,7 @@
 
 use core::ops::Range;
 
+use evidence::log_bayes_factor_of_alike;
 use nalgebra::{DMatrix, DVector};
 
 use super::Shown;
@@ -140,7 +141,7 @@ impl Sums {
     /// Of kicks that move the monitors by `size` [m] rms; `variance` along the pattern without them.
     fn log_bayes(&self, size: f64, variance: f64) -> f64 {
         let q = size * size * self.power / (self.frames * variance);
-        0.5 * (self.along / variance * q / (1.0 + q) - self.count * q.ln_1p())
+        log_bayes_factor_of_alike(self.along / variance * q, q, self.count)
     }
 }
 

@@ -6,9 +6,9 @@
 use nalgebra::{DMatrix, DVector, DVectorView};
 
 use super::common::{Common, Eliminated, Weighed};
-use crate::factor::Factor;
 use crate::optimise::Quadratic;
 use crate::prior::Prior;
+use evidence::Factor;
 
 /// Sums over readings, and the prior, about some params.
 #[derive(Debug, Clone)]

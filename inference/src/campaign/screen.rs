@@ -19,8 +19,8 @@ use super::normal::{Normal, Terms};
 use super::rms_by_plane;
 use super::setting::Settings;
 use super::times::Times;
-use crate::factor::Factor;
 use crate::prior::Prior;
+use evidence::Factor;
 
 /// The monitors, and their readings that count.
 #[derive(Debug, Clone, PartialEq)]

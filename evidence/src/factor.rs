@@ -61,7 +61,14 @@ impl Factor {
     where
         DefaultAllocator: Allocator<Dyn, C>,
     {
-        let mut right = self.whiten(right);
+        self.solve_transposed(self.whiten(right))
+    }
+
+    /// `L^-T B`.
+    pub fn solve_transposed<C: Dim>(&self, mut right: OMatrix<f64, Dyn, C>) -> OMatrix<f64, Dyn, C>
+    where
+        DefaultAllocator: Allocator<Dyn, C>,
+    {
         backward(self.lower.as_view(), whole(&mut right));
         right
     }

@@ -8,8 +8,9 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector};
 
+use evidence::Factor;
+use inference::Prior;
 use inference::bounded::Coordinates;
-use inference::{Factor, Prior};
 
 /// Precision given to a var that is held.
 const HELD: f64 = 1e12;
