@@ -98,7 +98,7 @@ impl Departures {
         let gain = match self.unknowns[at].kind {
             Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
             Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-            Kind::Skew(_) => return (after - before, self.sigma(at)),
+            Kind::Skew(_) | Kind::Gradient(_) => return (after - before, self.sigma(at)),
             _ => None,
         };
         match gain.and_then(|gain| self.unknowns.iter().position(|one| one.kind == gain)) {
@@ -150,7 +150,7 @@ fn followed(uncertainty: &Uncertainty, unknowns: &[Unknown], errors: &DMatrix<f6
 pub fn beforehand(kind: Kind) -> f64 {
     match kind {
         Kind::Strength(_) => DEPARTURES.strength,
-        Kind::Skew(_) => DEPARTURES.skew,
+        Kind::Skew(_) | Kind::Gradient(_) => DEPARTURES.skew,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::RfScale | Kind::HeldFrequency => DEPARTURES.gain,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => DEPARTURES.coupling,
     }

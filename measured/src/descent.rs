@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use crate::data::residual;
 use crate::error::MeasuredError;
 use crate::model::{Model, Prediction};
-use crate::normal::{Normal, Places, in_widths, times};
+use crate::normal::{Normal, Places, in_widths, inverse, times};
 use crate::unknowns::Unknown;
 
 /// Steps of one descent; those of measured rings take 5 to 60.
@@ -71,7 +71,7 @@ pub fn descend(
         match further.flatten() {
             Some(better) => (values, prediction) = better,
             None => {
-                let covariance = times(factor.inverse(), &width);
+                let covariance = times(inverse(&matrix).ok_or(MeasuredError::Singular(step))?, &width);
                 return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
             }
         }

@@ -1,59 +1,163 @@
-//! What the model of a measured matrix lacks: what the RF holds, cables, and instruments whose readings nothing explains.
+//! What the model of a measured matrix lacks: wrong cables, what the RF holds, members that stand out of what their kind does everywhere, and instruments
+//! whose readings nothing explains.
 //!
-//! The pattern `d` of a held frequency is scored to first order about the fit, all unknowns adapting. With `r` the residuals, `W` the weights and
-//! `P` the projection that removes what the unknowns can absorb, `g = d P r` and `h = d P d`:
-//!
-//! `ln Bayes factor = g^2/(1 + h)/2 - ln(1 + h)/2` for a share with a prior width of 1.
-//!
-//! It is then fitted with all unknowns, and the error of the model is learnt anew. What patterns gain that are like it, the same orbit with
-//! the kicks' shares in other correctors, tells how much chance and the model's other errors give.
+//! The path from top to bottom: what is held is decided beside the fit ([`Share`]); everything that an ordinary ring has is fitted, family by family
+//! ([`Hierarchy`]); members that stand out are released, and all is fitted anew ([`search`]); what was found has to predict elements that it was
+//! not fitted to ([`HeldOut`]).
 
 use nalgebra::{DMatrix, DVector};
-use rand::SeedableRng;
-use rand::rngs::StdRng;
-use rand::seq::SliceRandom;
-use twin::{Plane, Rf};
+use twin::Rf;
 
-use crate::about::About;
-use crate::descent::descend;
+use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Learnt, Settings, with_model_error};
+use crate::fit::{Fit, Settings, fit};
 use crate::folder::Folder;
-use crate::model::{Model, Prediction};
-use crate::sides::{Sides, sides};
-use crate::standing::{Standing, standing};
-use crate::unknowns::{Kind, Unknown};
+use crate::held_out::{Fitted, HeldOut};
+use crate::hierarchy::Hierarchy;
+use crate::hold::Share;
+use crate::model::Model;
+use crate::normal::Places;
+use crate::search::{NAMED, Outlier, Rival, Search, search};
+use crate::straight::DEAD;
+use crate::unknowns::{Groups, Kind, name};
+use crate::wiring::Wiring;
 
-/// Patterns that the term of a held frequency is compared with.
-const SHUFFLES: usize = 99;
+/// Searches, each about the fit with what the one before has found.
+const SEARCHES: usize = 4;
+/// An instrument is worse than others from this ratio on.
+const WORSE: f64 = 2.5;
+/// Probability beforehand of a wrong cable, and of another hold.
+const RARE: f64 = 1e-3;
+/// Standard errors that held-out elements must gain.
+const PREDICTS: f64 = 2.0;
 
-/// The share of a held frequency, fitted with everything else.
+/// What was found.
 #[derive(Debug, Clone)]
-pub struct Share {
-    /// 1 where the frequency is held, 0 where the momentum is.
-    pub value: f64,
-    /// Its standard deviation by the scatter of the residuals, alike along rows and columns.
-    pub scatter: f64,
-    /// What the model misses of the measured dispersion, relative: the term is the product of two dispersions, and errors of the model's
-    /// dispersion are long waves, which do not average.
-    pub systematic: f64,
-    /// Gain of `ln` likelihood, the errors of the model learnt in both fits.
-    pub gain: f64,
-    /// How many of `shuffles` patterns with the correctors' shares exchanged gain as much, to first order.
-    pub as_good: usize,
-    /// Patterns tried.
-    pub shuffles: usize,
+pub struct Diagnosis {
+    /// Of the held frequency.
+    pub share: Share,
+    /// What stands out, the largest gain first.
+    pub findings: Vec<Finding>,
+    /// What is ordinary: families with their means and scatters.
+    pub imperfections: Vec<Imperfection>,
+    /// Amplitudes at which anything else would be named.
+    pub limits: Vec<Limit>,
+    /// Instruments whose readings are explained worse than others', the worst first.
+    pub unexplained: Vec<Unexplained>,
+    /// The fit as LOCO has it, and the fit with families and findings, on elements held out.
+    pub held_out: [HeldOut; 2],
+    /// The fit with families and findings.
+    pub hierarchy: Hierarchy,
+    /// One word.
+    pub verdict: Verdict,
 }
 
-impl Share {
-    /// Standard deviation of the share, both causes together.
-    pub fn sigma(&self) -> f64 {
-        self.scatter.hypot(self.systematic)
+/// One word for a measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing stands out.
+    Consistent,
+    /// What stands out is named.
+    Identified,
+    /// Something stands out, and its alternatives are as probable.
+    Ambiguous,
+    /// The fit did not end: nothing that is fitted is near the measurement.
+    Unexplained,
+}
+
+impl Verdict {
+    /// Its word in results.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Consistent => "consistent",
+            Self::Identified => "identified",
+            Self::Ambiguous => "ambiguous",
+            Self::Unexplained => "unexplained",
+        }
     }
 }
 
+/// What was found.
+#[derive(Debug, Clone, PartialEq)]
+pub enum What {
+    /// A cable that was put right, or an instrument that was left out.
+    Cable(Wiring),
+    /// What the RF holds.
+    Hold(Rf),
+    /// A member of a family that stands out.
+    Member(Kind),
+}
+
+/// Something that was found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finding {
+    /// What it is.
+    pub what: What,
+    /// Word of the kind.
+    pub word: &'static str,
+    /// Where, empty for the whole ring.
+    pub at: String,
+    /// Path length [m].
+    pub s: Option<f64>,
+    /// Distance from the mean of its family, share of a hold, 1 of a cable.
+    pub amplitude: f64,
+    /// Its standard deviation.
+    pub sigma: f64,
+    /// `ln` Bayes factor [nat].
+    pub gain: f64,
+    /// Probability beside its alternatives and nothing at all.
+    pub probability: f64,
+    /// Others that explain the same, the most probable first.
+    pub alternatives: Vec<Alternative>,
+}
+
+/// Another explanation.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Alternative {
+    /// Word of the kind.
+    pub word: &'static str,
+    /// Where.
+    pub at: String,
+    /// Amplitude and its standard deviation.
+    pub amplitude: [f64; 2],
+    /// `ln` Bayes factor [nat].
+    pub gain: f64,
+    /// Its probability.
+    pub probability: f64,
+}
+
+/// What a kind does everywhere.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Imperfection {
+    /// Word of the kind.
+    pub word: &'static str,
+    /// What the members share.
+    pub class: String,
+    /// Members.
+    pub count: usize,
+    /// Mean, from what is expected.
+    pub mean: f64,
+    /// Scatter about it.
+    pub scatter: f64,
+    /// Standard deviation of one member, median.
+    pub sigma: f64,
+}
+
+/// What would be named.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Limit {
+    /// Word of the kind.
+    pub word: &'static str,
+    /// Where.
+    pub at: String,
+    /// Distance from the mean of its family at which it would be named.
+    pub amplitude: f64,
+    /// Standard deviation of an estimate of that distance by the data's errors and the scatter of the others.
+    pub sigma: f64,
+}
+
 /// An instrument whose readings the model explains worse than those of the others.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Unexplained {
     /// Its name.
     pub at: String,
@@ -63,173 +167,252 @@ pub struct Unexplained {
     pub ratio: f64,
 }
 
-/// What was found.
-#[derive(Debug, Clone)]
-pub struct Diagnosis {
-    /// Of the held frequency.
-    pub share: Share,
-    /// Of instruments, the worst first.
-    pub unexplained: Vec<Unexplained>,
-    /// Values that stand out of those of their kind.
-    pub standing: Vec<Standing>,
-    /// Where what is left over lies.
-    pub sides: Sides,
+impl Diagnosis {
+    /// Of a fitted measurement whose cables were put right; `progress` is told what is being done.
+    ///
+    /// # Errors
+    /// [`MeasuredError`].
+    pub fn of_fit(
+        (folder, cables): (&Folder, &[Wiring]),
+        fitted: &Fit,
+        settings: &Settings,
+        progress: &mut dyn FnMut(&str),
+    ) -> Result<Self, MeasuredError> {
+        progress("what the RF holds");
+        let share = Share::of_fit(folder, fitted, settings, progress)?;
+        let settings = Settings { rf: share.other().unwrap_or(settings.rf), ..*settings };
+        let refitted = share.other().map(|_| fit(folder, &settings, progress)).transpose()?;
+        let fitted = refitted.as_ref().unwrap_or(fitted);
+        let hierarchy = Hierarchy::of_fit(folder, fitted, &settings, progress)?;
+        let (hierarchy, found) = released(hierarchy, folder, fitted, &settings, progress)?;
+        progress("elements held out");
+        let held_out = [as_loco(folder, fitted, &settings)?, with_families(&hierarchy, fitted)?];
+        let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
+        let members = found.outliers.iter().map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
+        let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
+        findings.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        let verdict = verdict(fitted, &findings, &held_out);
+        Ok(Self {
+            imperfections: imperfections(&hierarchy),
+            limits: limits(folder, &hierarchy, &found),
+            unexplained: unexplained(folder, fitted, &hierarchy),
+            share,
+            findings,
+            held_out,
+            hierarchy,
+            verdict,
+        })
+    }
 }
 
-/// An instrument is worse than others from this ratio on.
-const WORSE: f64 = 2.5;
-
-/// Diagnose a fitted measurement.
-///
-/// # Errors
-/// [`MeasuredError`].
-pub fn diagnose(
+/// Search and release until nothing more stands out.
+fn released(
+    mut hierarchy: Hierarchy,
     folder: &Folder,
     fitted: &Fit,
     settings: &Settings,
     progress: &mut dyn FnMut(&str),
-) -> Result<Diagnosis, MeasuredError> {
-    let model = Model::of(folder, &fitted.groups, settings.rf)?;
-    let share = share(folder, fitted, &model, settings, progress)?;
-    progress("lattice or instruments");
-    let unexplained = unexplained(folder, fitted);
-    // where the fit did not end its values are not those of the ring
-    let standing = if fitted.has_ended { standing(folder, fitted) } else { Vec::new() };
-    Ok(Diagnosis { share, sides: sides(folder, fitted, &model)?, standing, unexplained })
-}
-
-/// Of an amplitude with a prior standard deviation of 1.
-fn of_amplitude((pull, power): (f64, f64)) -> f64 {
-    0.5 * pull * pull / (1.0 + power) - 0.5 * power.ln_1p()
-}
-
-/// The unknowns of a fit with the share of a held frequency among those of the machine.
-fn with_share(fitted: &Fit, share: f64) -> (Vec<Unknown>, DVector<f64>) {
-    let at = fitted.groups[0].len() + fitted.groups[1].len();
-    let (mut unknowns, mut values) = (fitted.unknowns.clone(), fitted.values.as_slice().to_vec());
-    unknowns.insert(at, Unknown { kind: Kind::HeldFrequency, mean: share, width: 1.0 });
-    values.insert(at, share);
-    (unknowns, DVector::from_vec(values))
-}
-
-/// The share of a held frequency.
-fn share(
-    folder: &Folder,
-    fitted: &Fit,
-    model: &Model,
-    settings: &Settings,
-    progress: &mut dyn FnMut(&str),
-) -> Result<Share, MeasuredError> {
-    let believed = f64::from(u8::from(settings.rf == Rf::FixedFrequency));
-    let (unknowns, values) = with_share(fitted, believed);
-    let at = fitted.groups[0].len() + fitted.groups[1].len();
-    let pattern = model.predict(&unknowns, &values)?.by_machine.swap_remove(at);
-    let horizontal = folder.correctors.iter().enumerate().filter(|(_, one)| one.plane == Plane::X && one.is_used);
-    let horizontal: Vec<usize> = horizontal.map(|(column, _)| column).collect();
-    let patterns: Vec<DMatrix<f64>> = (1..=SHUFFLES as u64).map(|seed| shuffled(&pattern, &horizontal, seed)).collect();
-    // by squares: tails that the missing term has given the errors would hide it from a rank by their likelihood
-    let data = &fitted.data;
-    let precision = data.precision(&fitted.missed);
-    let prediction = model.predict(&fitted.unknowns, &fitted.values)?;
-    let about = About::of(&fitted.unknowns, prediction, precision.component_mul(&fitted.residual), precision)?;
-    let own = of_amplitude(about.score(&pattern));
-    let as_good = patterns.iter().filter(|pattern| of_amplitude(about.score(pattern)) >= own).count();
-    let from = descend(model, &unknowns, &data.measured, &data.weight(&fitted.missed, &fitted.residual), values)?;
-    let Learnt { here, missed, uncertainty } = with_model_error(model, &unknowns, data, from, progress)?;
-    let residual = data.residual(&here.prediction);
-    let gain = data.log_likelihood(&missed, &residual) - data.log_likelihood(&fitted.missed, &fitted.residual);
-    let systematic = dispersion_missed(folder, &here.prediction);
-    let slope = data.weight(&missed, &residual).component_mul(&residual);
-    let (value, scatter) = (here.values[at], uncertainty.sigma[at]);
-    let beside = About::of(&unknowns, here.prediction, slope, data.information(&missed))?;
-    let scatter = scatter.max(beside.of_patterns(&patterns));
-    Ok(Share { value, scatter, systematic, gain, as_good, shuffles: SHUFFLES })
-}
-
-/// Scatter of the measured horizontal dispersion about the predicted one, at the scale that suits it best, over the rms of the predicted: by the
-/// median, since few monitors are far off. 0 where it was not measured.
-fn dispersion_missed(folder: &Folder, at: &Prediction) -> f64 {
-    let Some(dispersion) = &folder.dispersion else { return 0.0 };
-    let read = (0..folder.monitors.len())
-        .filter(|&row| folder.monitors[row].is_used && folder.monitors[row].plane == Plane::X);
-    let last = at.matrix.ncols() - 1;
-    let pairs: Vec<(f64, f64)> =
-        read.map(|row| (dispersion[row], at.matrix[(row, last)])).filter(|(m, _)| m.is_finite()).collect();
-    let [squares, product] =
-        [pairs.iter().map(|(_, p)| p * p).sum::<f64>(), pairs.iter().map(|(m, p)| m * p).sum::<f64>()];
-    let scale = product / squares;
-    let mut off: Vec<f64> = pairs.iter().map(|(m, p)| (m - scale * p).abs()).collect();
-    off.sort_by(f64::total_cmp);
-    if pairs.is_empty() || squares == 0.0 {
-        return 0.0;
+) -> Result<(Hierarchy, Search), MeasuredError> {
+    let mut found = Search { outliers: Vec::new(), limits: Vec::new() };
+    // a fit that did not end is of no ring
+    for _ in 0..if fitted.has_ended { SEARCHES } else { 0 } {
+        progress("what stands out");
+        let further = search(&hierarchy)?;
+        found.limits = further.limits;
+        if further.outliers.is_empty() {
+            break;
+        }
+        found.outliers.extend(further.outliers);
+        let released = found.outliers.iter().map(|outlier| outlier.unknown).collect();
+        hierarchy = hierarchy.with_released(folder, (&fitted.data, settings), released, progress)?;
     }
-    let rms = scale.abs() * (squares / pairs.len() as f64).sqrt();
-    1.4826 * off.get(off.len() / 2).copied().unwrap_or(0.0) / rms
+    found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
+    Ok((hierarchy, found))
 }
 
-/// The pattern with the columns of some correctors exchanged at random, the size of each with it.
-fn shuffled(pattern: &DMatrix<f64>, columns: &[usize], seed: u64) -> DMatrix<f64> {
-    let mut order = columns.to_vec();
-    order.shuffle(&mut StdRng::seed_from_u64(seed));
-    let mut other = pattern.clone();
-    for (&to, &from) in columns.iter().zip(&order) {
-        other.set_column(to, &pattern.column(from));
+/// A member must predict elements that it was not fitted to; cables and holds are in both predictions.
+fn verdict(fitted: &Fit, findings: &[Finding], [before, after]: &[HeldOut; 2]) -> Verdict {
+    let (gain, error) = after.gain_over(before);
+    let is_named =
+        |finding: &Finding| finding.is_named() && (!matches!(finding.what, What::Member(_)) || gain > PREDICTS * error);
+    if !fitted.has_ended {
+        Verdict::Unexplained
+    } else if findings.iter().any(is_named) {
+        Verdict::Identified
+    } else if findings.is_empty() {
+        Verdict::Consistent
+    } else {
+        Verdict::Ambiguous
     }
-    other
+}
+
+impl Finding {
+    fn of_outlier(folder: &Folder, hierarchy: &Hierarchy, outlier: &Outlier) -> Self {
+        let kind = hierarchy.unknowns[outlier.unknown].kind;
+        let alternative = |rival: &Rival| {
+            let kind = hierarchy.unknowns[rival.unknown].kind;
+            let (word, at) = (word(folder, &hierarchy.groups, kind), name(folder, &hierarchy.groups, kind));
+            Alternative { word, at, amplitude: rival.amplitude, gain: rival.gain, probability: rival.probability }
+        };
+        Self {
+            what: What::Member(kind),
+            word: match kind {
+                Kind::MonitorGain(_) if hierarchy.values[outlier.unknown].abs() < DEAD => "bpm_dead",
+                Kind::CorrectorGain(_) if hierarchy.values[outlier.unknown].abs() < DEAD => "corrector_dead",
+                _ => word(folder, &hierarchy.groups, kind),
+            },
+            at: name(folder, &hierarchy.groups, kind),
+            s: Some(path_length(folder, &hierarchy.groups, kind)),
+            amplitude: hierarchy.off_family(outlier.unknown),
+            sigma: hierarchy.uncertainty.sigma[outlier.unknown],
+            gain: outlier.gain,
+            probability: outlier.probability,
+            alternatives: outlier.alternatives.iter().map(alternative).collect(),
+        }
+    }
+
+    /// Of a hold that is not the one that was believed.
+    fn of_share(share: &Share) -> Option<Self> {
+        let held = share.other()?;
+        let (word, amplitude) = match held {
+            Rf::FixedFrequency => ("fixed_rf_frequency", share.value),
+            Rf::FixedMomentum => ("fixed_momentum", 1.0 - share.value),
+        };
+        let (gain, probability) = (share.gain, certain(share.gain));
+        let (what, at, s) = (What::Hold(held), String::new(), None);
+        Some(Self { what, word, at, s, amplitude, sigma: share.sigma(), gain, probability, alternatives: Vec::new() })
+    }
+
+    /// Of a cable, with half the sum of squares that it would leave.
+    fn of_cable(folder: &Folder, hierarchy: &Hierarchy, data: &Data, cable: &Wiring) -> Self {
+        let (word, at) = cable.named(folder);
+        let gain = cable.squares(folder, &hierarchy.prediction.matrix, |row, column| {
+            hierarchy.missed[data.block[(row, column)]].spread(folder.monitors[row].sigma)
+        }) / 2.0;
+        let (what, s, probability) = (What::Cable(cable.clone()), None, certain(gain));
+        Self { what, word, at, s, amplitude: 1.0, sigma: 0.0, gain, probability, alternatives: Vec::new() }
+    }
+
+    /// True where it is named.
+    pub fn is_named(&self) -> bool {
+        self.probability >= NAMED
+    }
+}
+
+/// Probability of something that is one in a thousand beforehand.
+fn certain(gain: f64) -> f64 {
+    1.0 / (1.0 + (RARE.recip().ln() - gain).exp())
+}
+
+/// Word of a kind at its place: a gradient in a dipole has one of its own.
+fn word(folder: &Folder, groups: &Groups, kind: Kind) -> &'static str {
+    match kind {
+        Kind::Gradient(group) if folder.lattice[groups[2][group][0]].bend != 0.0 => "dipole_gradient",
+        _ => kind.word(),
+    }
+}
+
+/// Where something is [m].
+fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
+    let middle = |row: usize| folder.lattice[row].s + 0.5 * folder.lattice[row].length;
+    match kind {
+        Kind::Strength(group) => middle(groups[0][group][0]),
+        Kind::Skew(group) => middle(groups[1][group][0]),
+        Kind::Gradient(group) => middle(groups[2][group][0]),
+        Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => middle(folder.monitors[row].at),
+        Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => middle(folder.correctors[column].at),
+        Kind::RfScale | Kind::HeldFrequency => 0.0,
+    }
+}
+
+fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
+    let learnt = hierarchy.families.iter().filter(|family| family.is_learnt());
+    let told = learnt.map(|family| {
+        let width = hierarchy.unknowns[family.members[0]].width;
+        let mut sigma: Vec<f64> = family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]).collect();
+        sigma.sort_by(f64::total_cmp);
+        Imperfection {
+            word: family.kind,
+            class: family.class.clone(),
+            count: family.members.len(),
+            mean: family.mean * width,
+            scatter: family.scale * width,
+            sigma: sigma[sigma.len() / 2],
+        }
+    });
+    told.collect()
+}
+
+fn limits(folder: &Folder, hierarchy: &Hierarchy, found: &Search) -> Vec<Limit> {
+    let limit = |&(unknown, [amplitude, sigma]): &(usize, [f64; 2])| {
+        let kind = hierarchy.unknowns[unknown].kind;
+        Limit {
+            word: word(folder, &hierarchy.groups, kind),
+            at: name(folder, &hierarchy.groups, kind),
+            amplitude,
+            sigma,
+        }
+    };
+    found.limits.iter().map(limit).collect()
+}
+
+/// The fit as LOCO has it on elements held out.
+fn as_loco(folder: &Folder, fitted: &Fit, settings: &Settings) -> Result<HeldOut, MeasuredError> {
+    let n = fitted.unknowns.len();
+    let prediction = Model::of(folder, &fitted.groups, settings.rf)?.predict(&fitted.unknowns, &fitted.values)?;
+    let places = Places::of(&fitted.unknowns, prediction.matrix.nrows(), prediction.matrix.ncols());
+    let each = fitted.unknowns.iter().zip(&fitted.values);
+    let pull = DVector::from_iterator(n, each.map(|(unknown, value)| (value - unknown.mean) / unknown.width));
+    let width = DVector::from_iterator(n, fitted.unknowns.iter().map(|unknown| unknown.width));
+    let fit = Fitted {
+        places: &places,
+        prediction: &prediction,
+        precision: &DMatrix::identity(n, n),
+        pull: &pull,
+        missed: &fitted.missed,
+        width: &width,
+    };
+    HeldOut::of_fit(&fitted.data, &fit)
+}
+
+/// The fit with families and findings on elements held out.
+fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, MeasuredError> {
+    let (rows, columns) = hierarchy.prediction.matrix.shape();
+    let places = Places::of(&hierarchy.unknowns, rows, columns);
+    let width =
+        DVector::from_iterator(hierarchy.unknowns.len(), hierarchy.unknowns.iter().map(|unknown| unknown.width));
+    let precision = hierarchy.precision();
+    let pull = &precision * hierarchy.off_means();
+    let fit = Fitted {
+        places: &places,
+        prediction: &hierarchy.prediction,
+        precision: &precision,
+        pull: &pull,
+        missed: &hierarchy.missed,
+        width: &width,
+    };
+    HeldOut::of_fit(&fitted.data, &fit)
 }
 
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
-fn unexplained(folder: &Folder, fitted: &Fit) -> Vec<Unexplained> {
-    let (squares, sigma) = (fitted.squares(), &fitted.data.sigma);
-    let (all, elements) = (squares.sum(), fitted.data.elements() as f64);
+fn unexplained(folder: &Folder, fitted: &Fit, hierarchy: &Hierarchy) -> Vec<Unexplained> {
+    let (data, residual) = (&fitted.data, &hierarchy.residual);
+    let squares = residual.component_mul(residual).component_mul(&data.precision(&hierarchy.missed));
+    let (sum, elements) = (squares.sum(), data.elements() as f64);
     let judge = |at: String, squares: f64, residual: f64, n: usize| {
-        let others = (all - squares) / (elements - n as f64);
+        let others = (sum - squares) / (elements - n as f64);
         Unexplained { at, rms: (residual / n.max(1) as f64).sqrt(), ratio: squares / n.max(1) as f64 / others }
     };
     let counted = |sigmas: &mut dyn Iterator<Item = &f64>| sigmas.filter(|sigma| sigma.is_finite()).count();
-    let rows = (0..folder.monitors.len()).map(|i| {
-        judge(
-            folder.monitor(i),
-            squares.row(i).sum(),
-            fitted.residual.row(i).norm_squared(),
-            counted(&mut sigma.row(i).iter()),
-        )
+    let rows = (0..folder.monitors.len()).map(|row| {
+        let count = counted(&mut data.sigma.row(row).iter());
+        judge(folder.monitor(row), squares.row(row).sum(), residual.row(row).norm_squared(), count)
     });
-    let columns = (0..folder.correctors.len()).map(|j| {
-        judge(
-            folder.corrector(j),
-            squares.column(j).sum(),
-            fitted.residual.column(j).norm_squared(),
-            counted(&mut sigma.column(j).iter()),
-        )
+    let columns = (0..folder.correctors.len()).map(|column| {
+        let count = counted(&mut data.sigma.column(column).iter());
+        judge(folder.corrector(column), squares.column(column).sum(), residual.column(column).norm_squared(), count)
     });
     let mut worst: Vec<Unexplained> = rows.chain(columns).filter(|one| one.ratio > WORSE).collect();
     worst.sort_by(|a, b| b.ratio.total_cmp(&a.ratio));
     worst
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::fit::fit;
-    use crate::testing::{NOISE, machine, measured, ring};
-
-    fn diagnosed(folder: &Folder, rf: Rf) -> Diagnosis {
-        let settings = Settings { rf, ..Settings::default() };
-        let fitted = fit(folder, &settings, &mut |_| ()).unwrap();
-        diagnose(folder, &fitted, &settings, &mut |_| ()).unwrap()
-    }
-
-    #[test]
-    fn a_held_frequency_that_the_model_lacks_is_found_in_its_size() {
-        let ring = ring();
-        let folder = measured(&ring, &machine(&ring, 11), NOISE, 1);
-        let found = diagnosed(&folder, Rf::FixedMomentum);
-        assert_eq!(found.share.as_good, 0);
-        assert!((found.share.value - 1.0).abs() < 3.0 * found.share.sigma(), "{:?}", found.share);
-        assert!(found.share.sigma() < 0.1, "{:?}", found.share);
-        let right = diagnosed(&folder, Rf::FixedFrequency);
-        assert!((right.share.value - 1.0).abs() < 3.0 * right.share.sigma(), "{:?}", right.share);
-        assert!(right.unexplained.is_empty(), "{:?}", right);
-    }
 }

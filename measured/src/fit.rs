@@ -16,10 +16,10 @@ use crate::descent::{Descent, descend};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::missed::Missed;
-use crate::model::Model;
+use crate::model::{Model, Prediction};
 use crate::normal::Places;
 use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Kind, Magnets, Unknown, Widths, groups, unknowns};
+use crate::unknowns::{Groups, Kind, Unknown, Widths, groups, unknowns};
 
 /// How a matrix is fitted.
 #[derive(Debug, Clone, Copy)]
@@ -42,8 +42,8 @@ impl Default for Settings {
 /// A fitted measurement.
 #[derive(Debug, Clone)]
 pub struct Fit {
-    /// Groups of gradients and of skew gradients.
-    pub groups: [Vec<Magnets>; 2],
+    /// Groups of magnets.
+    pub groups: Groups,
     /// What is fitted.
     pub unknowns: Vec<Unknown>,
     /// Most probable values.
@@ -82,7 +82,7 @@ const LEAST_LEFT: f64 = 0.1;
 /// # Errors
 /// [`MeasuredError`].
 pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str)) -> Result<Fit, MeasuredError> {
-    let groups: [Vec<Magnets>; 2] = groups(folder).into();
+    let groups = groups(folder);
     let model = Model::of(folder, &groups, settings.rf)?;
     let of_reference = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.coupling == "Yes");
     let coupling = settings.coupling.unwrap_or(of_reference);
@@ -153,7 +153,8 @@ pub fn with_model_error(
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
         let residual = data.residual(&here.prediction);
-        missed = learnt(data, &errors(unknowns, &here, &residual, &data.weight(&missed, &residual)));
+        let places = Places::of(unknowns, residual.nrows(), residual.ncols());
+        missed = learn_missed(data, &places, &here.prediction, (&residual, &here.covariance), &missed);
         let weight = data.weight(&missed, &residual);
         here = descend(model, unknowns, &data.measured, &weight, here.values)?;
         steps += here.steps;
@@ -172,20 +173,21 @@ pub struct Learnt {
     pub uncertainty: Uncertainty,
 }
 
-/// Residuals as large as the errors that they are left of [mm]: the unknowns follow each element with a share `h` of it, its weight times the
-/// variance that their covariance gives it, and leave `1 - h` of its variance.
+/// What the model misses in each block, from residuals [mm] that are as large as the errors that they are left of: unknowns of some covariance follow
+/// each element with a share `h` of it, its weight times the variance that their covariance gives it, and leave `1 - h` of its variance.
 ///
 /// Source: D. A. Belsley, E. Kuh and R. E. Welsch, Regression Diagnostics (1980), eq. 2.15.
-fn errors(unknowns: &[Unknown], here: &Descent, residual: &DMatrix<f64>, weight: &DMatrix<f64>) -> DMatrix<f64> {
-    let places = Places::of(unknowns, residual.nrows(), residual.ncols());
-    let followed = places.variance(&here.prediction, &here.covariance).component_mul(weight);
-    residual.zip_map(&followed, |residual, followed| residual / (1.0 - followed).max(LEAST_LEFT).sqrt())
-}
-
-/// What the model misses in each block, from the errors of its elements [mm].
-fn learnt(data: &Data, errors: &DMatrix<f64>) -> [Missed; 6] {
+pub fn learn_missed(
+    data: &Data,
+    places: &Places,
+    prediction: &Prediction,
+    (residual, covariance): (&DMatrix<f64>, &DMatrix<f64>),
+    missed: &[Missed; 6],
+) -> [Missed; 6] {
+    let followed = places.variance(prediction, covariance).component_mul(&data.weight(missed, residual));
+    let errors = residual.zip_map(&followed, |residual, followed| residual / (1.0 - followed).max(LEAST_LEFT).sqrt());
     let mut of_block: [Vec<(f64, f64)>; 6] = Default::default();
-    for ((&block, &sigma), &error) in data.block.iter().zip(&data.sigma).zip(errors) {
+    for ((&block, &sigma), &error) in data.block.iter().zip(&data.sigma).zip(&errors) {
         if sigma.is_finite() {
             of_block[block].push((error, sigma));
         }

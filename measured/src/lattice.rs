@@ -1,7 +1,8 @@
 //! The ring of the twin from the rows of a lattice.
 //!
 //! Rows are written as a machine file (docs/machine.md), with one name each: `QF.5`. A corrector kicks in its middle, which is what a kick
-//! spread along a field-free length does. A magnet with a skew gradient to be fitted is cut in two, with a thin skew gradient between its halves.
+//! spread along a field-free length does. A magnet with a skew gradient or a further gradient to be fitted is cut in two, with a
+//! thin one between its halves.
 //! Sextupoles are left out: on the reference orbit they do nothing to first order in the kicks.
 
 use serde_json::{Value, json};
@@ -13,7 +14,7 @@ use crate::folder::{Folder, Row};
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
 
-/// The ring, with a thin skew gradient in the middle of some rows.
+/// The ring, with a thin element, a gradient of either kind, in the middle of some rows.
 ///
 /// # Errors
 /// [`MeasuredError::Lattice`].

@@ -6,7 +6,6 @@
 //!
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
-mod about;
 pub mod believed;
 pub mod calibrated;
 pub mod compare;
@@ -16,8 +15,12 @@ pub mod departure;
 pub mod descent;
 pub mod diagnose;
 pub mod error;
+pub mod family;
 pub mod fit;
 pub mod folder;
+pub mod held_out;
+pub mod hierarchy;
+pub mod hold;
 pub mod lattice;
 mod likeness;
 pub mod missed;
@@ -26,8 +29,7 @@ pub mod named;
 pub mod normal;
 pub mod raw;
 mod released;
-pub mod sides;
-pub mod standing;
+pub mod search;
 pub mod straight;
 #[cfg(test)]
 mod testing;
@@ -39,7 +41,7 @@ pub use believed::{Against, Believed, against};
 pub use calibrated::Calibrated;
 pub use compare::{Change, Changes, compare};
 pub use conceal::{Concealed, conceal};
-pub use diagnose::{Diagnosis, diagnose};
+pub use diagnose::Diagnosis;
 pub use error::MeasuredError;
 pub use fit::{Fit, Settings, fit};
 pub use folder::Folder;

@@ -8,12 +8,12 @@
 //! dispersion was measured, is the change of the orbit with the RF frequency.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Gradient, Hold, Kind as Field, Observer, Optics, Place, Plane, Rf, Ring, Source};
+use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Place, Plane, Rf, Ring, Source};
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{parts, ring};
-use crate::unknowns::{Kind, Magnets, Unknown};
+use crate::unknowns::{Groups, Kind, Unknown};
 
 /// Millimetres a metre.
 const MILLI: f64 = 1e3;
@@ -26,9 +26,10 @@ pub struct Model {
     /// Relative step of the RF frequency.
     rf_step: f64,
     has_dispersion: bool,
-    /// Elements of each group, with their gradients at the start; of a skew group the thin elements.
+    /// Elements of each group, with their gradients at the start; thin elements of each group of skew gradients and of further gradients.
     strengths: Vec<Vec<(usize, f64)>>,
     skews: Vec<Vec<usize>>,
+    gradients: Vec<Vec<usize>>,
     /// Element of each monitor's row and of each corrector's column, with the plane.
     monitors: Vec<(usize, Plane)>,
     correctors: Vec<(usize, Plane)>,
@@ -37,10 +38,11 @@ pub struct Model {
 }
 
 /// A predicted matrix and its derivatives.
+#[derive(Debug, Clone)]
 pub struct Prediction {
     /// The matrix [mm], with the dispersion as its last column.
     pub matrix: DMatrix<f64>,
-    /// By strengths, then skew gradients, then the share of a held RF frequency, the same shape each.
+    /// By strengths, then skew gradients, then further gradients, then the share of a held RF frequency, the same shape each.
     pub by_machine: Vec<DMatrix<f64>>,
     /// By the gain and by the coupling of the monitor of each row.
     pub by_monitor: [DMatrix<f64>; 2],
@@ -61,8 +63,8 @@ impl Model {
     ///
     /// # Errors
     /// [`MeasuredError::Lattice`].
-    pub fn of(folder: &Folder, groups: &[Vec<Magnets>; 2], rf: Rf) -> Result<Self, MeasuredError> {
-        let cut: Vec<usize> = groups[1].iter().flatten().copied().collect();
+    pub fn of(folder: &Folder, groups: &Groups, rf: Rf) -> Result<Self, MeasuredError> {
+        let cut: Vec<usize> = groups[1..].iter().flatten().flatten().copied().collect();
         let ring = ring(folder, &cut)?;
         let named = |row: usize| parts(&folder.element(row), cut.contains(&row));
         let mut strengths = Vec::new();
@@ -75,11 +77,11 @@ impl Model {
             }
             strengths.push(elements);
         }
-        let mut skews = Vec::new();
-        for group in &groups[1] {
-            let thin = group.iter().filter_map(|&row| named(row).1).map(|name| ring.element(&name));
-            skews.push(thin.collect::<Result<Vec<_>, _>>()?);
-        }
+        let thin = |group: &Vec<usize>| -> Result<Vec<usize>, LatticeError> {
+            group.iter().filter_map(|&row| named(row).1).map(|name| ring.element(&name)).collect()
+        };
+        let skews = groups[1].iter().map(thin).collect::<Result<_, _>>()?;
+        let gradients = groups[2].iter().map(thin).collect::<Result<_, _>>()?;
         let place = |kind: &str, at: usize| ring.element(&format!("{kind} {}", folder.element(at)));
         let monitors = folder.monitors.iter().map(|one| Ok((place("bpm", one.at)?, one.plane)));
         let correctors = folder.correctors.iter().map(|one| Ok((place("corrector", one.at)?, one.plane)));
@@ -88,7 +90,7 @@ impl Model {
         let kicks = folder.correctors.iter().map(|one| one.kick).collect();
         let rf_step = folder.meta.delta_rf / folder.meta.rf;
         let has_dispersion = folder.dispersion.is_some();
-        Ok(Self { ring, rf, rf_step, has_dispersion, strengths, skews, monitors, correctors, kicks })
+        Ok(Self { ring, rf, rf_step, has_dispersion, strengths, skews, gradients, monitors, correctors, kicks })
     }
 
     /// The same with the kicks and the RF step of another measurement.
@@ -115,6 +117,13 @@ impl Model {
                     for &element in &self.skews[group] {
                         if let Field::Multipole { k1sl, .. } = &mut ring.elements[element].kind {
                             *k1sl = value;
+                        }
+                    }
+                }
+                Kind::Gradient(group) => {
+                    for &element in &self.gradients[group] {
+                        if let Field::Multipole { k1l, .. } = &mut ring.elements[element].kind {
+                            *k1l = value;
                         }
                     }
                 }
@@ -224,8 +233,10 @@ impl Model {
             .iter()
             .map(|group| group.iter().map(|&(at, per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>());
         let skews = self.skews.iter().map(|group| group.iter().map(|&at| optics.skew_gradient(at)).collect());
+        let gradients = self.gradients.iter().map(|group| group.iter().map(|&at| optics.gradient(at)).collect());
         strengths
             .chain(skews)
+            .chain(gradients)
             .map(|gradients| self.by_gradients(optics, (observers, sources), rf, &gradients))
             .collect()
     }
@@ -270,7 +281,7 @@ impl Model {
                 Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
                 Kind::RfScale => all.rf = value,
                 Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_) | Kind::Skew(_) => {}
+                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) => {}
             }
         }
         all
@@ -312,7 +323,7 @@ mod tests {
         let folder = ring();
         let (model, unknowns, values) = machine(&folder, 4);
         let at = model.predict(&unknowns, &values).unwrap();
-        let rows: Vec<usize> = (0..24).map(|group| crate::unknowns::groups(&folder).0[group][0]).collect();
+        let rows: Vec<usize> = (0..24).map(|group| crate::unknowns::groups(&folder)[0][group][0]).collect();
         let places: Vec<f64> =
             rows.iter().map(|&row| folder.lattice[row].s + folder.lattice[row].length / 2.0).collect();
         let [thin, _] = model.by_thin_gradients(&unknowns, &values, &places).unwrap();
@@ -328,7 +339,10 @@ mod tests {
     fn derivatives_are_those_of_differences() {
         let folder = ring();
         let (model, mut unknowns, values) = machine(&folder, 3);
-        let magnets = unknowns.iter().filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_))).count();
+        let magnets = unknowns
+            .iter()
+            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_)))
+            .count();
         // between the two holds both count
         unknowns.insert(magnets, Unknown { kind: Kind::HeldFrequency, mean: 1.0, width: 1.0 });
         let values = values.insert_row(magnets, 0.4);

@@ -87,7 +87,7 @@ impl Straightened {
 
 /// The matrix is about as large as that of the lattice as written: in another unit its instruments look dead.
 fn expect_unit(folder: &Folder, settings: &Settings) -> Result<(), MeasuredError> {
-    let written = Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?;
+    let written = Model::of(folder, &groups(folder), settings.rf)?.as_written()?;
     let counts = |&(i, j): &(usize, usize)| {
         let (monitor, corrector) = (&folder.monitors[i], &folder.correctors[j]);
         monitor.plane == corrector.plane && monitor.is_used && corrector.is_used && folder.matrix[(i, j)].is_finite()

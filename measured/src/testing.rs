@@ -74,7 +74,7 @@ pub fn normal(seed: u64) -> impl FnMut() -> f64 {
 
 /// The model of the ring, its unknowns, and values of an imperfect machine: strengths 1 %, skew gradients 0.002 /m, gains 3 %, couplings 1 %.
 pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>) {
-    let groups = groups(folder).into();
+    let groups = groups(folder);
     let model = Model::of(folder, &groups, Rf::FixedFrequency).unwrap();
     let all = unknowns(folder, [&groups[0], &groups[1]].map(Vec::len), true, &Widths::default());
     let mut normal = normal(seed);
@@ -83,7 +83,7 @@ pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>
         Kind::Skew(_) => 0.002,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.03,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.01,
-        Kind::RfScale | Kind::HeldFrequency => 0.0,
+        Kind::Gradient(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
     };
     let values = all.iter().map(|one| one.mean + size(one.kind) * normal());
     let values = DVector::from_iterator(all.len(), values);

@@ -32,8 +32,8 @@ pub struct Uncertainty {
     together: DMatrix<f64>,
     /// `J^T s s J` of all elements.
     alone: DMatrix<f64>,
-    /// Precision of the prior.
-    prior: DVector<f64>,
+    /// `J^T W J` of independent errors of the learnt size.
+    information: DMatrix<f64>,
 }
 
 impl Uncertainty {
@@ -43,38 +43,54 @@ impl Uncertainty {
     /// [`MeasuredError::Singular`].
     pub fn of(unknowns: &[Unknown], at: &Prediction, data: &Data, missed: &[Missed; 6]) -> Result<Self, MeasuredError> {
         let residual = data.residual(at);
+        let places = Places::of(unknowns, residual.nrows(), residual.ncols());
+        let nothing = DMatrix::zeros(residual.nrows(), residual.ncols());
+        let information = Normal::of(&places, at, &nothing, &data.information(missed), unknowns.len()).matrix;
+        let independent = covariance(unknowns, information.clone())?;
+        Ok(Self::about((&places, at), (independent, information), (data, missed)))
+    }
+
+    /// About a prediction, with the covariance of the unknowns with independent errors and what the data say of them, `J^T W J`.
+    pub fn about(
+        (places, at): (&Places, &Prediction),
+        (independent, information): (DMatrix<f64>, DMatrix<f64>),
+        (data, missed): (&Data, &[Missed; 6]),
+    ) -> Self {
+        let (residual, n) = (data.residual(at), independent.nrows());
         let slope = data.weight(missed, &residual).component_mul(&residual);
-        let places = Places::of(unknowns, slope.nrows(), slope.ncols());
         let nothing = DMatrix::zeros(slope.nrows(), slope.ncols());
-        let squares = slope.component_mul(&slope);
-        let independent = covariance(unknowns, at, &data.information(missed))?;
-        let together = together(&places, at, &slope, unknowns.len());
-        let alone = Normal::of(&places, at, &nothing, &squares, unknowns.len()).matrix;
-        let prior = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width.powi(-2)));
-        let mut all = Self { independent, sigma: DVector::zeros(unknowns.len()), together, alone, prior };
-        let (of_lines, of_elements) = (all.together.tr_mul(&all.independent), &all.alone * &all.independent);
-        all.sigma = DVector::from_fn(unknowns.len(), |i, _| {
+        let together = together(places, at, &slope, n);
+        let alone = Normal::of(places, at, &nothing, &slope.component_mul(&slope), n).matrix;
+        let mut all = Self { independent, sigma: DVector::zeros(n), together, alone, information };
+        let of_lines = all.together.tr_mul(&all.independent);
+        let [of_elements, of_data] = [&all.alone, &all.information].map(|matrix| matrix * &all.independent);
+        all.sigma = DVector::from_fn(n, |i, _| {
             let direction = all.independent.column(i);
-            let of_prior = direction.component_mul(&direction).dot(&all.prior);
-            let (lines, elements) = (of_lines.column(i).norm_squared(), direction.dot(&of_elements.column(i)));
-            variance(lines, elements, of_prior, all.independent[(i, i)]).sqrt()
+            let [elements, data] = [&of_elements, &of_data].map(|matrix| direction.dot(&matrix.column(i)));
+            variance(of_lines.column(i).norm_squared(), elements, data, all.independent[(i, i)]).sqrt()
         });
-        Ok(all)
+        all
+    }
+
+    /// How many times larger the variance that the data leave an unknown is than that of independent errors.
+    pub fn widening(&self, unknown: usize) -> f64 {
+        let direction = self.independent.column(unknown);
+        let of_data = direction.dot(&(&self.information * direction));
+        let of_prior = self.independent[(unknown, unknown)] - of_data;
+        if of_data > 0.0 { ((self.sigma[unknown].powi(2) - of_prior) / of_data).max(1.0) } else { 1.0 }
     }
 
     /// Variance of a combination of the unknowns.
     pub fn variance(&self, combination: &DVector<f64>) -> f64 {
         let direction = &self.independent * combination;
-        let of_prior = direction.component_mul(&direction).dot(&self.prior);
-        let (lines, elements) =
-            (self.together.tr_mul(&direction).norm_squared(), direction.dot(&(&self.alone * &direction)));
-        variance(lines, elements, of_prior, combination.dot(&direction))
+        let [elements, data] = [&self.alone, &self.information].map(|matrix| direction.dot(&(matrix * &direction)));
+        variance(self.together.tr_mul(&direction).norm_squared(), elements, data, combination.dot(&direction))
     }
 }
 
-/// From the sums of squares over lines and over elements, what the prior adds, and the variance with independent errors of the learnt size.
-fn variance(lines: f64, elements: f64, of_prior: f64, independent: f64) -> f64 {
-    (lines - elements).max(elements).max(independent - of_prior) + of_prior
+/// From the sums of squares over lines and over elements, what independent errors of the learnt size make, and the whole variance with these.
+fn variance(lines: f64, elements: f64, of_data: f64, independent: f64) -> f64 {
+    (lines - elements).max(elements).max(of_data) + independent - of_data
 }
 
 /// What each row, then each column says of the unknowns, `J^T s`.

@@ -1,6 +1,6 @@
 //! What is fitted: magnets, and the instruments that see them.
 
-use crate::folder::Folder;
+use crate::folder::{Folder, Row};
 
 /// One fitted number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,6 +9,8 @@ pub enum Kind {
     Strength(usize),
     /// Integrated skew gradient of each magnet of a group [1/m].
     Skew(usize),
+    /// Integrated gradient of each magnet of a group beside its own [1/m].
+    Gradient(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
     HeldFrequency,
     /// What a monitor reads of its own plane: 1 if it is right, 0 if it is dead.
@@ -29,6 +31,7 @@ impl Kind {
         match self {
             Self::Strength(_) => "quadrupole_gradient",
             Self::Skew(_) => "skew_gradient",
+            Self::Gradient(_) => "stray_gradient",
             Self::HeldFrequency => "fixed_rf_frequency",
             Self::MonitorGain(_) => "bpm_gain",
             Self::MonitorCoupling(_) => "bpm_coupling",
@@ -53,6 +56,9 @@ pub struct Unknown {
 /// Magnets that share one factor: rows of the lattice.
 pub type Magnets = Vec<usize>;
 
+/// Groups of gradients, of skew gradients, and of gradients beside those of the lattice.
+pub type Groups = [Vec<Magnets>; 3];
+
 /// Prior standard deviations.
 #[derive(Debug, Clone, Copy)]
 pub struct Widths {
@@ -75,13 +81,16 @@ impl Default for Widths {
 }
 
 /// Groups of gradients and of skew gradients: those of the reference fit, else every quadrupole by itself.
-pub fn groups(folder: &Folder) -> (Vec<Magnets>, Vec<Magnets>) {
-    let Some(reference) = &folder.meta.reference_fit else { return (single(folder), Vec::new()) };
+pub fn groups(folder: &Folder) -> Groups {
+    let quadrupoles = |row: &Row| row.k1 != 0.0 && row.bend == 0.0;
+    let Some(reference) = &folder.meta.reference_fit else {
+        return [magnets(folder, quadrupoles), Vec::new(), Vec::new()];
+    };
     let of = |is_gradient: bool| {
         let groups = reference.fit_parameters.iter().filter(move |one| (one.field == "K") == is_gradient);
         groups.map(|one| distinct(&one.elements)).collect()
     };
-    (of(true), of(false))
+    [of(true), of(false), Vec::new()]
 }
 
 fn distinct(rows: &[usize]) -> Magnets {
@@ -91,10 +100,10 @@ fn distinct(rows: &[usize]) -> Magnets {
     rows
 }
 
-/// Every straight magnet with a gradient; neighbouring rows of one name, with nothing of length between them, are one magnet.
-fn single(folder: &Folder) -> Vec<Magnets> {
+/// Every magnet of some sort; neighbouring rows of one name, with nothing of length between them, are one magnet.
+pub fn magnets(folder: &Folder, is_magnet: impl Fn(&Row) -> bool) -> Vec<Magnets> {
     let mut groups: Vec<Magnets> = Vec::new();
-    for (row, one) in folder.lattice.iter().enumerate().filter(|(_, one)| one.k1 != 0.0 && one.bend == 0.0) {
+    for (row, one) in folder.lattice.iter().enumerate().filter(|(_, one)| is_magnet(one)) {
         let joins = |group: &Magnets| {
             let &last = group.last().expect("groups are not empty");
             folder.lattice[last].name == one.name
@@ -135,10 +144,11 @@ pub fn unknowns(folder: &Folder, [strengths, skews]: [usize; 2], coupling: bool,
 }
 
 /// Name of an unknown.
-pub fn name(folder: &Folder, groups: &[Vec<Magnets>; 2], kind: Kind) -> String {
+pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
     match kind {
         Kind::Strength(group) => folder.element(groups[0][group][0]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
+        Kind::Gradient(group) => folder.element(groups[2][group][0]),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),

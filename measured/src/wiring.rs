@@ -53,7 +53,7 @@ const ALIVE: f64 = 0.2;
 /// # Errors
 /// [`MeasuredError`].
 pub fn straightened(folder: &Folder, settings: &Settings) -> Result<(Folder, Vec<Wiring>), MeasuredError> {
-    Ok(straightened_by(folder, &Model::of(folder, &groups(folder).into(), settings.rf)?.as_written()?))
+    Ok(straightened_by(folder, &Model::of(folder, &groups(folder), settings.rf)?.as_written()?))
 }
 
 /// The same by a matrix that perfect instruments would measure, or that the same ones have measured before [mm].
@@ -190,6 +190,34 @@ impl Wiring {
                 }
             }
         }
+    }
+}
+
+impl Wiring {
+    /// Sum of squares that the wrong cable, or the dead instrument as a live one, would leave of a prediction [mm], over the squares of the elements' errors [mm].
+    pub fn squares(&self, right: &Folder, predicted: &DMatrix<f64>, error: impl Fn(usize, usize) -> f64) -> f64 {
+        let mut wrong = right.clone();
+        match self {
+            Self::MonitorsDead(rows) => rows.iter().for_each(|&row| wrong.matrix.row_mut(row).fill(0.0)),
+            Self::CorrectorsDead(columns) => {
+                columns.iter().for_each(|&column| wrong.matrix.column_mut(column).fill(0.0))
+            }
+            _ => self.put_right(&mut wrong),
+        }
+        let changed = |row: usize, column: usize| match self {
+            Self::MonitorsDead(rows) => rows.contains(&row),
+            Self::CorrectorsDead(columns) => columns.contains(&column),
+            _ => wrong.matrix[(row, column)] != right.matrix[(row, column)],
+        };
+        let (rows, columns) = right.matrix.shape();
+        let elements = (0..columns).flat_map(|column| (0..rows).map(move |row| (row, column)));
+        let off = elements.filter(|&(row, column)| changed(row, column)).map(|(row, column)| {
+            let [wrong, right] = [&wrong, right].map(|folder| folder.matrix[(row, column)] - predicted[(row, column)]);
+            // a dead one is compared with what it reads
+            let right = if matches!(self, Self::MonitorsDead(_) | Self::CorrectorsDead(_)) { 0.0 } else { right };
+            (wrong * wrong - right * right) / error(row, column).powi(2)
+        });
+        off.filter(|square| square.is_finite()).sum::<f64>().max(0.0)
     }
 }
 

@@ -61,13 +61,23 @@ fn factors_are_found_within_their_errors() {
 fn exchanged_monitors_and_a_held_frequency_are_found() {
     let result = json(&["diagnose", BEFORE, "--rf", "fixed-momentum"]);
     let findings = result["findings"].as_array().unwrap();
+    // by their gains: a wrong cable leaves the most
     assert_eq!((&findings[0]["kind"], &findings[0]["at"]), (&"bpm_swap".into(), &"x_BPM.22,x_BPM.52".into()));
     assert_eq!(findings[0]["sentence"], "x_BPM.22 and x_BPM.52 are exchanged");
     assert_eq!(findings[1]["kind"], "fixed_rf_frequency");
+    let gains: Vec<f64> = findings.iter().map(|one| one["log_evidence_gain"].as_f64().unwrap()).collect();
+    assert!(gains.is_sorted_by(|a, b| a >= b), "{gains:?}");
+    assert!(findings.iter().all(|one| one["probability"].as_f64().unwrap() > 0.95 && one["alternatives"].is_array()));
     let [amplitude, sigma] = ["amplitude", "sigma"].map(|key| findings[1][key].as_f64().unwrap());
     assert!((amplitude - 1.0).abs() < 3.0 * sigma && sigma < 0.1, "{amplitude} {sigma}");
     let result = json(&["diagnose", BEFORE]);
     assert_eq!(result["findings"].as_array().unwrap().len(), 1, "{}", result["sentence"]);
+    // what an ordinary ring has, what would be named, and elements held out
+    assert!(
+        result["imperfections"].as_array().unwrap().iter().any(|one| one["kind"] == "bpm_gain" && one["at"] == "x")
+    );
+    assert!(result["limits"].as_array().unwrap().len() > 100 && result["vars_after"].as_array().unwrap().len() == 24);
+    assert!(result["fit"]["after"]["heldout_elpd"].is_f64() && result["fit"]["elpd_gain_se"].is_f64());
 }
 
 #[test]
@@ -104,7 +114,7 @@ fn what_a_matrix_is_not_for_is_said() {
     assert!(refused(&["fit", BEFORE, "--machine", "machines/x.json"]).contains("--machine is for a recording"));
 }
 
-/// Effects put into the matrix by a seed, its cables put right before: a wrong cable is named, nothing else is said.
+/// Effects put into the matrix by a seed, its cables put right before: a wrong cable is named, nothing else is said but the effect itself.
 #[test]
 fn what_was_concealed_is_found_again() {
     let folder = tempfile::tempdir().unwrap();
@@ -119,10 +129,10 @@ fn what_was_concealed_is_found_again() {
         let result = json(&["diagnose", out]);
         let found: Vec<&str> =
             result["findings"].as_array().unwrap().iter().map(|one| one["at"].as_str().unwrap()).collect();
+        let place = effect["at"].as_str().unwrap();
         let is_cable = ["bpm_swap", "bpm_reversed"].contains(&effect["kind"].as_str().unwrap());
         cables += usize::from(is_cable);
-        let expected = if is_cable { vec![effect["at"].as_str().unwrap()] } else { Vec::new() };
-        assert_eq!(found, expected, "seed {seed}: {effect}");
+        assert!(found == [place] || (!is_cable && found.is_empty()), "seed {seed}: {effect}, found {found:?}");
         assert!(refused(&conceal).contains("neither is overwritten"));
     }
     assert!(cables >= 3, "{cables} cables of 16");

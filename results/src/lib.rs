@@ -30,6 +30,7 @@ mod fit_result;
 mod frames_result;
 mod import_result;
 mod matrix;
+mod matrix_diagnosis;
 mod matrix_page;
 mod matrix_result;
 pub mod model_file;

@@ -1,13 +1,14 @@
 //! A measured response matrix fitted and diagnosed: the results of `orbitcal fit` and `orbitcal diagnose`, and their pages.
 
-use measured::{Believed, Folder, Model, Settings, Straightened};
+use measured::{Believed, Diagnosis, Folder, Model, Settings, Straightened};
 use nalgebra::DVector;
 use report::Page;
 use twin::{Hold, Optics};
 
 use crate::error::CommandError;
+use crate::matrix_diagnosis::MatrixDiagnosis;
 use crate::matrix_page::Measured;
-use crate::matrix_result::{Found, MatrixDiagnosis, MatrixFit};
+use crate::matrix_result::MatrixFit;
 
 /// A measured matrix with its cables put right, fitted.
 pub struct FittedMatrix {
@@ -58,12 +59,11 @@ impl DiagnosedMatrix {
     ) -> Result<Self, CommandError> {
         let straightened = Straightened::of(as_measured, &settings, say)?;
         let Straightened { folder, cables, fit: fitted } = &straightened;
-        let diagnosis = measured::diagnose(folder, fitted, &settings, say)?;
+        let diagnosis = Diagnosis::of_fit((folder, cables), fitted, &settings, say)?;
         let against = believed.map(|model| measured::against(as_measured, fitted, model, &settings, say));
         let against = against.transpose()?;
         let fit = result(&straightened, &settings)?;
-        let found = Found { cables, fitted, diagnosis: &diagnosis, against: against.as_ref() };
-        let result = MatrixDiagnosis::of(folder, settings.rf, &found, fit);
+        let result = MatrixDiagnosis::of(folder, fitted, &diagnosis, against.as_ref(), fit);
         Ok(Self { straightened, settings, result })
     }
 
@@ -72,7 +72,7 @@ impl DiagnosedMatrix {
     /// # Errors
     /// As [`FittedMatrix::page`].
     pub fn page(&self) -> Result<Page, CommandError> {
-        Ok(measured_of(&self.straightened, &self.result.fit, &self.settings)?.page_of(&self.result)?)
+        Ok(measured_of(&self.straightened, &self.result.loco, &self.settings)?.page_of(&self.result)?)
     }
 }
 

@@ -6,7 +6,8 @@ use measured::{Fit, Folder, Kind, unknowns};
 use report::{Axes, Band, Figure, Look, Magnet, Map, Page, Reference, Section, Series, Spotted, Strip, Symbol, Table};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Twiss};
 
-use crate::matrix_result::{Comparison, MatrixDiagnosis, MatrixFinding, MatrixFit};
+use crate::matrix_diagnosis::{ImperfectionResult, MatrixDiagnosis, MatrixFinding};
+use crate::matrix_result::{Comparison, MatrixFit};
 
 /// Elements of a matrix up to which each is drawn: more are too small to be seen.
 const DRAWN: usize = 2500;
@@ -314,22 +315,35 @@ impl Measured<'_> {
     }
 }
 
-/// What was found.
+/// What was found, and what an ordinary ring has.
 fn findings(found: &MatrixDiagnosis) -> Section {
+    let size = |amplitude: f64, sigma: f64, unit: &str| match (sigma > 0.0, unit) {
+        (false, _) => String::new(),
+        (true, "1/m") => format!("{amplitude:+.5} ± {sigma:.5} /m"),
+        (true, _) => format!("{amplitude:+.4} ± {sigma:.4}"),
+    };
     let row = |one: &MatrixFinding| {
-        let amplitude = match (one.sigma > 0.0, one.unit) {
-            (false, _) => String::new(),
-            (true, "1/m") => format!("{:.5} ± {:.5} /m", one.amplitude, one.sigma),
-            (true, _) => format!("{:.4} ± {:.4}", one.amplitude, one.sigma),
-        };
-        let gain = one.log_evidence_gain.map_or(String::new(), |gain| format!("{gain:.1}"));
         let at = one.at.as_deref().unwrap_or_default().replace(',', ", ");
-        vec![one.kind.to_owned(), at, amplitude, gain, one.sentence.clone()]
+        let (gain, probability) = (format!("{:.1}", one.log_evidence_gain), format!("{:.3}", one.probability));
+        vec![one.kind.to_owned(), at, size(one.amplitude, one.sigma, one.unit), gain, probability, one.sentence.clone()]
     };
     let table = Table {
-        caption: "Gain: ln Bayes factor [nat]; cables and dead instruments have none, they come first.".into(),
-        header: ["missing", "at", "amplitude", "gain [nat]", "in words"].map(str::to_owned).to_vec(),
+        caption: "What stands out of what its kind does everywhere. Gain: ln Bayes factor [nat]; P: probability beside its alternatives.".into(),
+        header: ["missing", "at", "amplitude", "gain [nat]", "P", "in words"].map(str::to_owned).to_vec(),
         rows: found.findings.iter().map(row).collect(),
+    };
+    let ordinary = |one: &ImperfectionResult| {
+        let number = |value: f64| match one.unit {
+            "1/m" => format!("{value:.5} /m"),
+            _ => format!("{:.2} %", 1e2 * value),
+        };
+        let numbers = [one.mean, one.scatter, one.sigma].map(number);
+        [one.kind.to_owned(), one.at.clone(), one.members.to_string()].into_iter().chain(numbers).collect()
+    };
+    let families = Table {
+        caption: "What an ordinary ring has, family by family: mean and scatter of the members, and the error bar of one (median).".into(),
+        header: ["what", "of", "members", "mean", "scatter", "error bar"].map(str::to_owned).to_vec(),
+        rows: found.imperfections.iter().map(ordinary).collect(),
     };
     let unexplained = Table {
         caption: "Instruments whose residuals are larger than those of the others.".into(),
@@ -340,15 +354,15 @@ fn findings(found: &MatrixDiagnosis) -> Section {
             .map(|one| vec![one.at.clone(), format!("{:.1}", one.rms_um), format!("{:.1}", one.ratio)])
             .collect(),
     };
-    let tables = [table, unexplained].into_iter().filter(|table| !table.rows.is_empty());
-    // a side that is told stands in the lead
-    let text = (!found.left_over.is_told()).then(|| format!("{}.", found.left_over.sentence));
-    Section {
-        heading: "What was found".into(),
-        text: text.into_iter().collect(),
-        tables: tables.collect(),
-        ..Section::default()
-    }
+    let predicted = format!(
+        "Elements held out are predicted within {:.2} um rms by the fit as LOCO has it, within {:.2} um with families and findings: {:.0} ± {:.0} nat.",
+        1e3 * found.fit.before.heldout_rms_mm,
+        1e3 * found.fit.after.heldout_rms_mm,
+        found.fit.elpd_gain,
+        found.fit.elpd_gain_se
+    );
+    let tables = [table, families, unexplained].into_iter().filter(|table| !table.rows.is_empty());
+    Section { heading: "What was found".into(), text: vec![predicted], tables: tables.collect(), ..Section::default() }
 }
 
 /// The report of a comparison.

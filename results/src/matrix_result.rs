@@ -3,15 +3,11 @@
 use core::fmt;
 
 use comfy_table::CellAlignment;
-use measured::believed::{Believed, Departure, Value};
-use measured::diagnose::Diagnosis;
-use measured::sides::{Gain, Sides, Term, Verdict};
-use measured::standing::Standing;
+use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
-use measured::unknowns::name;
-use measured::{Against, Fit, Folder, Kind, Wiring};
+use measured::unknowns::{Groups, Unknown, name};
+use measured::{Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
-use twin::Rf;
 
 use crate::fit_result::{Monitor, Tunes};
 use crate::output::{fill, table};
@@ -53,7 +49,7 @@ pub struct Cable {
     pub at: String,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Clone, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixVar {
     pub name: String,
@@ -129,19 +125,7 @@ impl From<StatedModel> for Believed {
 impl MatrixFit {
     /// Of a fit.
     pub fn of(folder: &Folder, cables: &[Wiring], fit: &Fit, tunes: Option<[f64; 2]>) -> Self {
-        let mut rows: Vec<(usize, usize)> = Vec::new();
-        for (at, unknown) in fit.unknowns.iter().enumerate() {
-            if let Kind::Strength(group) = unknown.kind {
-                rows.extend(fit.groups[0][group].iter().map(|&row| (row, at)));
-            }
-        }
-        rows.sort_unstable();
-        let var = |&(row, at): &(usize, usize)| {
-            let (mean, sigma) = (fit.values[at], fit.sigma(at));
-            let quantile = |deviations: f64| mean + deviations * sigma;
-            let [q025, q16, q84, q975] = [-1.959_964, -0.994_458, 0.994_458, 1.959_964].map(quantile);
-            MatrixVar { name: folder.element(row), index: row, mean, sigma, q025, q16, q84, q975 }
-        };
+        let rows = fitted_rows(&fit.groups, &fit.unknowns);
         // correlations of independent errors
         let independent = &fit.uncertainty.independent;
         let scale = |at: usize| fit.sigma(at) / independent[(at, at)].sqrt();
@@ -160,7 +144,10 @@ impl MatrixFit {
             model: "twin",
             elements: fit.elements,
             rejected_elements: fit.outliers.len(),
-            vars: rows.iter().map(var).collect(),
+            vars: rows
+                .iter()
+                .map(|&(row, at)| MatrixVar::of_row(folder, row, [fit.values[at], fit.sigma(at)]))
+                .collect(),
             covariance: rows.iter().map(between).collect(),
             chi2_per_dof: chi2 / (fit.elements as f64 - fit.unknowns.len() as f64).max(1.0),
             chi2_loco: fit.chi2_loco,
@@ -173,6 +160,27 @@ impl MatrixFit {
             wiring: cables.iter().map(|one| one.named(folder)).map(|(kind, at)| Cable { kind, at }).collect(),
             has_ended: fit.has_ended,
         }
+    }
+}
+
+/// Rows of the lattice whose strengths are fitted, in beam order, with the number of their unknown.
+pub(crate) fn fitted_rows(groups: &Groups, unknowns: &[Unknown]) -> Vec<(usize, usize)> {
+    let mut rows: Vec<(usize, usize)> = Vec::new();
+    for (number, unknown) in unknowns.iter().enumerate() {
+        if let Kind::Strength(group) = unknown.kind {
+            rows.extend(groups[0][group].iter().map(|&row| (row, number)));
+        }
+    }
+    rows.sort_unstable();
+    rows
+}
+
+impl MatrixVar {
+    /// Strength factor of a row, mean and standard deviation.
+    pub(crate) fn of_row(folder: &Folder, row: usize, [mean, sigma]: [f64; 2]) -> Self {
+        let quantile = |deviations: f64| mean + deviations * sigma;
+        let [q025, q16, q84, q975] = [-1.959_964, -0.994_458, 0.994_458, 1.959_964].map(quantile);
+        Self { name: folder.element(row), index: row, mean, sigma, q025, q16, q84, q975 }
     }
 }
 
@@ -213,7 +221,7 @@ fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
     (0..folder.monitors.len()).map(state).collect()
 }
 
-const DOUBT: &str =
+pub(crate) const DOUBT: &str =
     "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units";
 
 impl fmt::Display for MatrixFit {
@@ -367,326 +375,5 @@ impl fmt::Display for Comparison {
             write!(f, "{}{one}", if number == 0 { "\n\n" } else { "\n" })?;
         }
         Ok(())
-    }
-}
-
-/// What a matrix's model lacks. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct MatrixDiagnosis {
-    pub recording: String,
-    pub verdict: &'static str,
-    pub sentence: String,
-    pub findings: Vec<MatrixFinding>,
-    pub unexplained: Vec<UnexplainedResult>,
-    /// Where what is left over lies.
-    pub left_over: LeftOver,
-    pub fit: MatrixFit,
-}
-
-#[derive(Debug, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct MatrixFinding {
-    pub kind: &'static str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub at: Option<String>,
-    pub amplitude: f64,
-    pub sigma: f64,
-    /// Part of `sigma` that the model's own dispersion leaves.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub systematic: Option<f64>,
-    pub unit: &'static str,
-    /// Nat; cables and dead instruments have none, they come first.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub log_evidence_gain: Option<f64>,
-    /// Shuffled patterns that gain as much, and how many were tried.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub as_good_by_chance: Option<[usize; 2]>,
-    pub sentence: String,
-}
-
-#[derive(Debug, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct UnexplainedResult {
-    pub at: String,
-    pub rms_um: f64,
-    pub ratio: f64,
-}
-
-/// What the lattice's side and the instruments' side gain on elements that they were not learnt from.
-#[derive(Debug, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct LeftOver {
-    pub side: &'static str,
-    pub lattice: GainResult,
-    pub skew_gradients: GainResult,
-    pub instruments: GainResult,
-    pub sentence: String,
-}
-
-/// `ln` likelihood [nat] and share of the squares.
-#[derive(Debug, Serialize)]
-#[allow(missing_docs)] // named after what they are
-pub struct GainResult {
-    pub log_likelihood: f64,
-    pub share: f64,
-}
-
-impl From<Gain> for GainResult {
-    fn from(gain: Gain) -> Self {
-        Self { log_likelihood: gain.log_likelihood, share: gain.share }
-    }
-}
-
-impl LeftOver {
-    fn of(sides: &Sides, worst: &[&str]) -> Self {
-        let (lattice, instruments) = (sides.lattice, sides.instruments);
-        let numbers = format!(
-            "errors of their own of instruments gain {:.0} nat, gradients and skew gradients that the lattice lacks {:.0} nat",
-            instruments.log_likelihood, lattice.log_likelihood
-        );
-        let places = if worst.is_empty() { String::new() } else { format!(" at {}", worst.join(", ")) };
-        let (side, sentence) = match sides.verdict() {
-            Verdict::Measurement => {
-                ("measurement", format!("what is left over{places} is of the measurement's side: {numbers}"))
-            }
-            Verdict::Lattice => ("lattice", format!("what is left over is of the lattice: {numbers}")),
-            Verdict::Neither => ("neither", format!("what is left over is of neither side alone: {numbers}")),
-        };
-        Self {
-            side,
-            lattice: lattice.into(),
-            skew_gradients: sides.skew.into(),
-            instruments: instruments.into(),
-            sentence,
-        }
-    }
-
-    /// True where it is of one side.
-    pub fn is_told(&self) -> bool {
-        self.side != "neither"
-    }
-}
-
-/// All that was found of a matrix.
-pub struct Found<'f> {
-    /// Cables that the lattice as written shows to be wrong.
-    pub cables: &'f [Wiring],
-    /// The fit.
-    pub fitted: &'f Fit,
-    /// What its diagnosis found.
-    pub diagnosis: &'f Diagnosis,
-    /// What the matrix says against a model that is believed, if one is.
-    pub against: Option<&'f Against>,
-}
-
-impl MatrixDiagnosis {
-    /// Of a diagnosis, with the fit that it began from; cables first, since nothing else counts before they are right.
-    pub fn of(folder: &Folder, rf: Rf, found: &Found, fit: MatrixFit) -> Self {
-        let diagnosis = found.diagnosis;
-        let mut findings = found.findings(folder);
-        findings.extend(is_other_hold(rf, diagnosis).then(|| share(rf, diagnosis)));
-        let worst: Vec<&str> = diagnosis.unexplained.iter().take(6).map(|one| one.at.as_str()).collect();
-        let left_over = LeftOver::of(&diagnosis.sides, &worst);
-        let coupling = lacks_coupling(found).then(|| coupling(&diagnosis.sides));
-        let more = findings.len().saturating_sub(SAID);
-        // what was found of a fit that did not end is of no ring
-        let doubt = (!fit.has_ended).then(|| DOUBT.to_owned());
-        let said: Vec<String> = (doubt.into_iter().chain(coupling))
-            .chain(findings.iter().take(SAID).map(|one| one.sentence.clone()))
-            .chain((more > 0).then(|| format!("{more} more are listed")))
-            .chain(left_over.is_told().then(|| left_over.sentence.clone()))
-            .collect();
-        let (verdict, sentence) = match (findings.is_empty(), said.is_empty()) {
-            (false, _) if fit.has_ended => ("identified", said.join("; ")),
-            (_, false) => ("unexplained", said.join("; ")),
-            (_, true) => ("consistent", "nothing was found beside the learnt error of the model".into()),
-        };
-        let unexplained = diagnosis.unexplained.iter();
-        let unexplained =
-            unexplained.map(|one| UnexplainedResult { at: one.at.clone(), rms_um: 1e3 * one.rms, ratio: one.ratio });
-        let (recording, unexplained) = (folder.name.clone(), unexplained.collect());
-        Self { recording, verdict, sentence, findings, unexplained, left_over, fit }
-    }
-}
-
-impl Found<'_> {
-    /// Cables and values against the model that is believed; without one, cables against the lattice as written and values that stand out.
-    fn findings(&self, folder: &Folder) -> Vec<MatrixFinding> {
-        let terms = self.diagnosis.sides.terms.iter().map(missing);
-        match self.against {
-            Some(against) => {
-                let cables = against.wiring.iter().map(|one| cable(folder, one));
-                cables.chain(against.departures.iter().map(departure)).chain(terms).collect()
-            }
-            None => {
-                let cables = self.cables.iter().map(|one| cable(folder, one));
-                cables.chain(terms).chain(self.diagnosis.standing.iter().map(stands_out)).collect()
-            }
-        }
-    }
-}
-
-/// Findings that the sentence says.
-const SAID: usize = 6;
-
-/// True where skew gradients explain elements that they were not learnt from, beside the couplings of the instruments, and the model has none.
-fn lacks_coupling(found: &Found) -> bool {
-    let has = |is_it: fn(&Kind) -> bool| found.fitted.unknowns.iter().any(|one| is_it(&one.kind));
-    let couples = has(|kind| matches!(kind, Kind::MonitorCoupling(_)));
-    couples && !has(|kind| matches!(kind, Kind::Skew(_))) && found.diagnosis.sides.lacks_skew()
-}
-
-fn coupling(sides: &Sides) -> String {
-    format!(
-        "coupling in the ring is missing: skew gradients gain {:.0} nat beside the couplings of the instruments",
-        sides.skew.log_likelihood
-    )
-}
-
-/// A finding with an amplitude.
-fn finding(kind: &'static str, at: &str, (amplitude, sigma): (f64, f64), gain: f64, sentence: String) -> MatrixFinding {
-    MatrixFinding {
-        kind,
-        at: Some(at.into()),
-        amplitude,
-        sigma,
-        systematic: None,
-        unit: if kind.ends_with("skew_gradient") || STRAY.contains(&kind) { "1/m" } else { "1" },
-        log_evidence_gain: Some(gain),
-        as_good_by_chance: None,
-        sentence,
-    }
-}
-
-/// Integrated gradients where the lattice has none.
-const STRAY: [&str; 2] = ["stray_gradient", "dipole_gradient"];
-
-fn departure(one: &Departure) -> MatrixFinding {
-    let (kind, at) = (one.kind.word(), &one.at);
-    let (amplitude, sigma) = (one.amplitude, one.sigma);
-    let size = match one.kind {
-        Kind::Skew(_) => format!("{amplitude:+.5} ± {sigma:.5} /m"),
-        _ => format!("{:+.2} ± {:.2} %", 1e2 * amplitude, 1e2 * sigma),
-    };
-    let sentence = format!("{kind} at {at} is off the model by {size}");
-    finding(kind, at, (amplitude, sigma), one.log_evidence_gain, sentence)
-}
-
-fn missing(one: &Term) -> MatrixFinding {
-    let sentence = format!(
-        "{} at {} would explain part of what is left: {:+.5} ± {:.5} /m",
-        one.kind, one.at, one.amplitude, one.sigma
-    );
-    finding(one.kind, &one.at, (one.amplitude, one.sigma), one.log_evidence_gain, sentence)
-}
-
-fn stands_out(one: &Standing) -> MatrixFinding {
-    let (kind, [middle, spread]) = (one.kind.word(), one.others);
-    let sentence = format!(
-        "{kind} at {} stands out: {:.4} ± {:.4}, {:.1} robust standard deviations from the median {middle:.4} ± {spread:.4} of its {}",
-        one.at, one.value, one.sigma, one.off, one.count
-    );
-    let nothing = if matches!(one.kind, Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) | Kind::Skew(_)) {
-        0.0
-    } else {
-        1.0
-    };
-    finding(kind, &one.at, (one.value - nothing, one.sigma), one.log_evidence_gain, sentence)
-}
-
-/// A share of a held frequency is a finding where it is nearer to the other hold than to the one that is believed, and chance gives no like.
-fn is_other_hold(rf: Rf, found: &Diagnosis) -> bool {
-    (found.share.value > 0.5) != (rf == Rf::FixedFrequency) && found.share.as_good == 0
-}
-
-fn cable(folder: &Folder, wiring: &Wiring) -> MatrixFinding {
-    let (kind, at) = wiring.named(folder);
-    let places = match at.rsplit_once(',') {
-        Some((first, last)) => format!("{} and {last}", first.replace(',', ", ")),
-        None => at.clone(),
-    };
-    let sentence = match wiring {
-        Wiring::MonitorsExchanged(_) | Wiring::CorrectorsExchanged(_) => format!("{places} are exchanged"),
-        Wiring::MonitorReversed(_) => format!("{places} reads with the other sign"),
-        Wiring::CorrectorReversed(_) => format!("{places} kicks with the other sign"),
-        Wiring::MonitorsDead(_) => format!("{places}: dead, and left out"),
-        Wiring::CorrectorsDead(_) => format!("{places}: without a kick, and left out"),
-        Wiring::PlaneReversed(_) => format!("all kicks of plane {places} have the other sign, or all its readings"),
-    };
-    MatrixFinding {
-        kind,
-        at: Some(at),
-        amplitude: 1.0,
-        sigma: 0.0,
-        systematic: None,
-        unit: "1",
-        log_evidence_gain: None,
-        as_good_by_chance: None,
-        sentence,
-    }
-}
-
-fn share(rf: Rf, found: &Diagnosis) -> MatrixFinding {
-    let share = &found.share;
-    let (kind, what, amplitude) = match rf {
-        Rf::FixedMomentum => ("fixed_rf_frequency", "the RF frequency is held, not the momentum", share.value),
-        Rf::FixedFrequency => ("fixed_momentum", "the momentum is held, not the RF frequency", 1.0 - share.value),
-    };
-    MatrixFinding {
-        kind,
-        at: None,
-        amplitude,
-        sigma: share.sigma(),
-        systematic: Some(share.systematic),
-        unit: "1",
-        log_evidence_gain: Some(share.gain),
-        as_good_by_chance: Some([share.as_good, share.shuffles]),
-        sentence: format!(
-            "{what}: the term of the path length has {amplitude:.3} of its size, ± {:.3} by the scatter of the residuals, ± {:.3} since the \
-             model's dispersion differs by so much from the measured one",
-            share.scatter, share.systematic
-        ),
-    }
-}
-
-impl fmt::Display for MatrixDiagnosis {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "{}: {}\n\n{}\n", self.recording, self.verdict, fill(&self.sentence))?;
-        let mut rows = table(["missing", "at", "amplitude", "gain / nat", "by chance"]);
-        for one in &self.findings {
-            let chance = one.as_good_by_chance.map_or(String::new(), |[as_good, of]| format!("{as_good} of {of}"));
-            let amplitude = if one.sigma > 0.0 {
-                if one.unit == "1/m" {
-                    format!("{:.5} ± {:.5} /m", one.amplitude, one.sigma)
-                } else {
-                    format!("{:.3} ± {:.3}", one.amplitude, one.sigma)
-                }
-            } else {
-                String::new()
-            };
-            rows.add_row([
-                one.kind.into(),
-                one.at.clone().unwrap_or_default(),
-                amplitude,
-                one.log_evidence_gain.map_or(String::new(), |gain| format!("{gain:.1}")),
-                chance,
-            ]);
-        }
-        if !self.findings.is_empty() {
-            writeln!(f, "{rows}\n")?;
-        }
-        // a side that is told stands in the sentence
-        if !self.left_over.is_told() {
-            writeln!(f, "{}", fill(&self.left_over.sentence))?;
-        }
-        if self.unexplained.is_empty() {
-            return Ok(());
-        }
-        let mut rows = table(["instrument", "residuals / um", "mean square over the others'"]);
-        for one in self.unexplained.iter().take(12) {
-            rows.add_row([one.at.clone(), format!("{:.1}", one.rms_um), format!("{:.1}", one.ratio)]);
-        }
-        write!(f, "{rows}")
     }
 }

@@ -29,3 +29,16 @@ pub fn truth(recording: &str, ring: &Ring) -> Vec<f64> {
     let var = |name: &String| truth["vars"][name].as_f64().expect("a number for every var");
     ring.var_names().iter().map(var).collect()
 }
+
+/// The folder of a measured ring, if there is one: the measurements have no licence and are not part of the repository. They are looked for in
+/// `ORBITCAL_MEASURED`, then in `../shared/recordings/real` beside the checkout; where there is none, that is said.
+pub fn measured_ring(name: &str) -> Option<std::path::PathBuf> {
+    let folder = std::env::var_os("ORBITCAL_MEASURED")
+        .map_or_else(|| repository("../shared/recordings/real"), std::path::PathBuf::from);
+    let folder = folder.join(name);
+    if !folder.is_dir() {
+        eprintln!("{} is absent: not tested", folder.display());
+        return None;
+    }
+    Some(folder)
+}

@@ -8,10 +8,9 @@ use std::path::PathBuf;
 
 use measured::data::Data;
 use measured::departure::beforehand;
-use measured::sides::Verdict;
 use measured::{
     Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Straightened, Wiring, against,
-    compare, conceal, diagnose, fit, straightened,
+    compare, conceal, fit, straightened,
 };
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
@@ -19,20 +18,8 @@ use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use statrs::distribution::{ContinuousCDF, Normal, StudentsT};
-use system_tests::repository;
+use system_tests::{measured_ring as ring, repository};
 use twin::Rf;
-
-/// The folder of a ring, if there is one.
-fn ring(name: &str) -> Option<PathBuf> {
-    let folder =
-        std::env::var_os("ORBITCAL_MEASURED").map_or_else(|| repository("../shared/recordings/real"), PathBuf::from);
-    let folder = folder.join(name);
-    if !folder.is_dir() {
-        eprintln!("{} is absent: not tested", folder.display());
-        return None;
-    }
-    Some(folder)
-}
 
 /// A measurement with its cables put right, what was wrong, and its fit.
 fn fitted_with_cables(as_measured: &Folder, settings: &Settings) -> (Folder, Vec<Wiring>, Fit) {
@@ -60,7 +47,7 @@ fn the_start_matrix_is_that_of_at() {
         let Some(path) = ring(name) else { continue };
         let folder = Folder::read(&path).unwrap();
         let theirs = table(path.join("orm_reference_model_start_mm.csv"));
-        let model = Model::of(&folder, &[Vec::new(), Vec::new()], Rf::FixedFrequency).unwrap();
+        let model = Model::of(&folder, &Default::default(), Rf::FixedFrequency).unwrap();
         let ours = model.as_written().unwrap();
         let used = |uses: Vec<bool>| (0..uses.len()).filter(|&i| uses[i]).collect::<Vec<_>>();
         let rows = used(folder.monitors.iter().map(|one| one.is_used).collect());
@@ -126,43 +113,6 @@ fn a_fit_without_coupling_is_no_worse_either() {
     let fitted = fit(&Folder::read(&path).unwrap(), &settings, &mut |_| ()).unwrap();
     println!("sps_2007 without coupling: {:.2}", fitted.chi2_loco);
     assert!(fitted.chi2_loco <= 5.60, "{}", fitted.chi2_loco);
-}
-
-/// These rings hold their RF frequency. A model that holds the momentum lacks a term, which is found in its size, and no exchange of its
-/// parts among the correctors does as well.
-fn the_held_frequency_is_found(name: &str) {
-    let Some(path) = ring(name) else { return };
-    let settings = Settings { rf: Rf::FixedMomentum, ..Settings::default() };
-    let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
-    let found = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap();
-    let share = &found.share;
-    println!("{name}: {:.3} ± {:.3} ± {:.3}", share.value, share.scatter, share.systematic);
-    assert!((share.value - 1.0).abs() < 3.0 * share.sigma(), "{name}: {share:?}");
-    // whatever the error bar: nearer to 1 than to 0 by a wide margin
-    assert!((share.value - 1.0).abs() < 0.1 && share.as_good == 0, "{name}: {share:?}");
-}
-
-#[test]
-fn the_held_frequency_is_found_at_sps() {
-    the_held_frequency_is_found("sps_2007");
-}
-
-#[test]
-#[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-fn the_held_frequency_is_found_at_spear3() {
-    the_held_frequency_is_found("spear3_example");
-}
-
-#[test]
-#[ignore = "make measured"]
-fn the_held_frequency_is_found_at_pls() {
-    the_held_frequency_is_found("pls_2009");
-}
-
-#[test]
-#[ignore = "make measured"]
-fn the_held_frequency_is_found_at_als() {
-    the_held_frequency_is_found("als_2005_topoff");
 }
 
 /// Cables of PLS that were wrong in 2009: two monitors read each other's vertical orbit, and one of them the horizontal orbit of a third, whose own
@@ -618,34 +568,5 @@ fn hidden_values_are_found_again_at_sps() {
 fn hidden_values_are_found_again_at_larger_rings() {
     for path in ["spear3_example", "pls_2009", "als_2005_topoff"].into_iter().filter_map(ring) {
         hidden_values_are_found_again(path, SQRT_2, 2);
-    }
-}
-
-/// What remains of the SPS is of its monitors and correctors: gradients gain nothing where they were not learnt.
-#[test]
-fn what_remains_at_sps_is_of_the_measurement() {
-    let Some(path) = ring("sps_2007") else { return };
-    let settings = Settings::default();
-    let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
-    let found = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap();
-    println!("sps_2007: {:?}", found.sides);
-    assert_eq!(found.sides.verdict(), Verdict::Measurement, "{:?}", found.sides);
-    // y monitors 1 and 17, counted from 1, and V corrector 3 or 4 are among them
-    let has = |name: String| found.unexplained.iter().any(|one| one.at == name);
-    assert!(has("y_BPM.3".into()) && has("y_BPM.169".into()) && has("V_CORV.58".into()), "{:?}", found.unexplained);
-}
-
-/// What remains of the others is of the lattice: gradients and skew gradients gain thousands of nat where they were not learnt.
-#[test]
-#[ignore = "make measured"]
-fn what_remains_at_larger_rings_is_of_the_lattice() {
-    let settings = Settings::default();
-    for name in ["spear3_example", "pls_2009", "als_2005_topoff"] {
-        let Some(path) = ring(name) else { continue };
-        let (folder, _, fitted) = fitted_with_cables(&Folder::read(&path).unwrap(), &settings);
-        let sides = diagnose(&folder, &fitted, &settings, &mut |_| ()).unwrap().sides;
-        let [lattice, skew, instruments] = [sides.lattice, sides.skew, sides.instruments].map(|one| one.log_likelihood);
-        println!("{name}: lattice {lattice:.0}, of these skew {skew:.0}, instruments {instruments:.0} nat");
-        assert_eq!(sides.verdict(), Verdict::Lattice, "{name}: {lattice} {instruments}");
     }
 }

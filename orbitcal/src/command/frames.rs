@@ -74,7 +74,7 @@ fn read(options: &Frames, rf: Rf) -> Result<(Folder, RawOrbits), CommandError> {
     if let (Some(lattice), Some(monitors), Some(correctors)) = (&options.lattice, options.monitors, options.correctors)
     {
         let folder = Folder::read(lattice)?;
-        let written = Model::of(&folder, &unknowns::groups(&folder).into(), rf)?.as_written()?;
+        let written = Model::of(&folder, &unknowns::groups(&folder), rf)?.as_written()?;
         return Ok(named(&RawOrbits::read(path)?, &folder, &written, [monitors, correctors])?);
     }
     if !Folder::is_one(path) {
