@@ -9,7 +9,7 @@ use inference::Recording;
 use inference::recording::Header;
 use inference::stream::{self, Core, Feedback};
 use results::output::{self, tell};
-use results::{CommandError, Names, Remarked, model_file, recording};
+use results::{CommandError, Names, Remarked, recording};
 use shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer, SetpointWriter};
 use training::rooms::large;
 use twin::Ring;
@@ -183,7 +183,7 @@ fn build(config: &Config) -> Result<(Ring, Core), CommandError> {
     let ring = machine_file.file.as_deref().map_or_else(|| Ok(Ring::booster()), Ring::read)?;
     let recording = calibration(&machine_file.recording, &ring)?;
     let powered = recording.powered(&ring);
-    let tables = model_file::read_or_design(machine_file.model_file.as_deref(), &powered)?;
+    let tables = results::tables(machine_file.model_file.as_deref(), &powered)?;
     let setup = stream::setup(&powered, &recording, config.walk.into())?;
     let core = Core::with_tables(tables, setup)?;
     Ok((ring, core))

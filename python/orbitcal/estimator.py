@@ -160,6 +160,8 @@ class Subscriber:
     """
 
     def __init__(self, service: str = "orbitcal/estimate") -> None:
+        if not hasattr(_orbitcal, "Subscriber"):
+            raise _orbitcal.OrbitcalError("this build of orbitcal reads no shared memory: its feature shared-memory is off")
         self._subscriber = _orbitcal.Subscriber(service)
 
     def wait(self, timeout: float = 1.0) -> list[Estimate]:

@@ -2,10 +2,10 @@
 
 use core::fmt::Display;
 
-use host_bridge::command::CommandError;
 use pyo3::create_exception;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
+use results::CommandError;
 
 create_exception!(
     orbitcal,

@@ -1,9 +1,8 @@
 //! One estimate, from a core in this process or from a daemon.
 
-use host_bridge::record::EstimateRecord;
-use host_bridge::result::word;
 use numpy::{PyArray1, PyArray2, PyArrayMethods};
 use pyo3::prelude::*;
+use results::{EstimateRecord, state_word};
 
 /// An estimate; see `orbitcal.Estimate`.
 #[pyclass(frozen, module = "orbitcal._orbitcal")]
@@ -169,6 +168,6 @@ impl Estimate {
     /// State of each monitor [B].
     #[getter]
     fn monitor_state(&self) -> Vec<&'static str> {
-        self.record.monitor_state.iter().map(|state| word(*state)).collect()
+        self.record.monitor_state.iter().map(|state| state_word(*state)).collect()
     }
 }

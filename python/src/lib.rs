@@ -14,6 +14,7 @@ mod ring;
 mod simulate;
 mod source;
 mod stream;
+#[cfg(feature = "shared-memory")]
 mod subscriber;
 mod task;
 mod work;
@@ -39,6 +40,7 @@ mod _orbitcal {
     use crate::simulate::{Validation, marginals, simulate};
     #[pymodule_export]
     use crate::stream::Core;
+    #[cfg(feature = "shared-memory")]
     #[pymodule_export]
     use crate::subscriber::Subscriber;
     #[pymodule_export]

@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use host_bridge::command::check::CheckResult;
-use measured::import::{
+use lattices::import::{
     Conventions, KickIs, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, agreement, assemble, table_names,
 };
 use measured::lattice::machine;
 use measured::{Folder, MeasuredError};
 use numpy::PyArray2;
 use pyo3::prelude::*;
+use results::CheckResult;
 use serde_json::json;
 use twin::{Plane, Rf};
 
@@ -238,7 +238,7 @@ impl Recording {
     fn write(&self, folder: PathBuf, ring: &Ring) -> PyResult<()> {
         match &self.data {
             Data::Frames(frames) => frames.write(&folder, &ring.ring).map_err(other),
-            Data::Matrix(measured) => measured::import::write(measured, &folder).map_err(input),
+            Data::Matrix(measured) => lattices::import::write(measured, &folder).map_err(input),
         }
     }
 
@@ -258,7 +258,7 @@ impl Recording {
 /// A matrix beside that of its lattice.
 fn of_matrix(folder: &Folder) -> Result<String, MeasuredError> {
     let planes = agreement(folder, Rf::FixedFrequency)?;
-    let one = |one: &measured::import::Agreement| {
+    let one = |one: &lattices::import::Agreement| {
         let plane = if one.plane == Plane::X { "x" } else { "y" };
         json!({"plane": plane, "factor": one.factor, "correlation": one.correlation, "largest_difference_mm": one.largest})
     };

@@ -2,9 +2,9 @@
 
 use core::fmt;
 
-use host_bridge::command::CommandError;
 use pyo3::prelude::*;
 use report::Page;
+use results::{CommandError, output};
 use serde::Serialize;
 
 use crate::error::{other, raised};
@@ -40,7 +40,7 @@ impl Outcome {
     fn report(&self, py: Python<'_>, path: std::path::PathBuf) -> PyResult<()> {
         py.detach(|| {
             let page = (self.page)().map_err(raised)?;
-            host_bridge::output::bytes(&path, page.render().as_bytes()).map_err(other)
+            output::bytes(&path, page.render().as_bytes()).map_err(other)
         })
     }
 }

@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use host_bridge::cli::Format;
-use host_bridge::command::response::by_name;
-use host_bridge::export::{Calibration, Lattice, text};
 use inference::with_priors;
+use lattices::export::{Calibration, Format, Lattice, text};
 use measured::Folder;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use results::factors;
 use twin::{Effect, EffectText, Machine, Rf};
 
 use crate::array::{matrices, matrix};
@@ -145,7 +144,7 @@ impl Ring {
 
     /// The same ring with factors on the gradients of its params, by name; 1 for the others.
     fn with_vars(&self, vars: BTreeMap<String, f64>) -> PyResult<Self> {
-        let factors = by_name(&vars, &self.ring).map_err(input)?;
+        let factors = factors(&vars, &self.ring).map_err(input)?;
         let vars = self.vars.iter().zip(factors).map(|(own, factor)| own * factor).collect();
         Self::of(self.source.clone(), Some(vars), self.width, self.range)
     }
@@ -318,13 +317,8 @@ impl Ring {
 
     /// The ring as a lattice file of another code, with the strengths and findings of a result's JSON if there is one.
     fn export(&self, format: &str, result: Option<&str>) -> PyResult<String> {
-        let format = match format {
-            "madx" => Format::Madx,
-            "bmad" => Format::Bmad,
-            "at" => Format::At,
-            "xsuite" => Format::Xsuite,
-            "pals" => Format::Pals,
-            _ => return Err(input(format!("format: expected madx, bmad, at, xsuite or pals, found {format:?}"))),
+        let Some(format) = Format::ALL.into_iter().find(|one| one.word() == format) else {
+            return Err(input(format!("format: expected madx, bmad, at, xsuite or pals, found {format:?}")));
         };
         let lattice = match result {
             None => Lattice::plain(&self.ring),

@@ -4,12 +4,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use diagnosis::data::DataError;
-use diagnosis::validation::{self, Cases, Class};
-use host_bridge::command::response::by_name;
-use host_bridge::command::{self, CommandError};
 use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
 use inference::{BatchFit, TuneUse};
 use pyo3::prelude::*;
+use results::{CommandError, campaign, factors};
+use validation::{Cases, Class};
 
 use crate::error::{input, other, raised};
 use crate::recording::Recording;
@@ -41,7 +40,7 @@ pub fn simulate(
         let mut next = || seeds.next().expect("seeds do not end");
         let (of_vars, of_noise) = (next(), next());
         let vars = match vars {
-            Some(vars) => by_name(&vars, ring).map_err(input)?,
+            Some(vars) => factors(&vars, ring).map_err(input)?,
             None => simulated::vars(ring, false, of_vars).map_err(other)?,
         };
         let made = if exact {
@@ -61,7 +60,7 @@ pub fn simulate(
 pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult<(Vec<f32>, Vec<f32>)> {
     let frames = recording.frames_of(&ring.ring)?;
     py.detach(|| {
-        let campaign = command::campaign(&ring.ring, frames).map_err(raised)?;
+        let campaign = campaign(&ring.ring, frames).map_err(raised)?;
         let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
         Ok((fit.marginals.iter().map(|one| one.mean).collect(), fit.marginals.iter().map(|one| one.sigma).collect()))
     })

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use measured::import::{Instruments, Lattice, Pattern, bare};
+use lattices::import::{Instruments, Lattice, Pattern, bare};
 use measured::lattice::machine;
 use measured::{Folder, MeasuredError};
 use pyo3::prelude::*;

@@ -3,12 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use host_bridge::record::{EstimateRecord, Names};
 use inference::recording::Row;
 use inference::stream::{self, Feedback};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use results::{EstimateRecord, Names};
 
 use crate::error::input;
 use crate::estimate::Estimate;

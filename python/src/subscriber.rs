@@ -3,7 +3,6 @@
 use core::time::Duration;
 use std::time::Instant;
 
-use host_bridge::sink::shared_memory;
 use pyo3::prelude::*;
 
 use crate::error::other;

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 
-use host_bridge::command::CommandError;
 use pyo3::prelude::*;
+use results::CommandError;
 
 use crate::error::{other, raised};
 

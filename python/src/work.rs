@@ -3,16 +3,16 @@
 use std::sync::Arc;
 
 use diagnosis::Diagnosis;
-use host_bridge::cli::FitModel;
-use host_bridge::command::matrix::{DiagnosedMatrix, FittedMatrix};
-use host_bridge::command::{CommandError, compare as compared, diagnose as diagnosed, fit as fitted};
-use host_bridge::matrix_page::page_of;
 use inference::Draws;
 use inference::nuts::NutsSettings;
 use measured::Settings;
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use results::{
+    CommandError, Comparison, DiagnosedMatrix, DiagnosisResult, FitModel, FittedMatrix, compare_matrices,
+    compare_recordings, comparison_page, diagnosis_page, fit_by_draws, fit_by_steps, fit_page,
+};
 
 use crate::error::input;
 use crate::recording::{Data, Recording};
@@ -52,9 +52,9 @@ pub fn fit(
             expect_no_rf(rf)?;
             let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
             task::run(py, hear, move |progress| {
-                let result = fitted::by_steps(&ring, &frames, |step| progress.step("Gauss-Newton", step))?;
+                let result = fit_by_steps(&ring, &frames, |step| progress.step("Gauss-Newton", step))?;
                 let shown = result.clone();
-                Outcome::of(&result, move || fitted::page(&ring, &frames, &shown))
+                Outcome::of(&result, move || fit_page(&ring, &frames, &shown))
             })
         }
         Data::Matrix(folder) => {
@@ -98,9 +98,9 @@ pub fn sample<'py>(
     let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
     let settings = NutsSettings { chains, warm_up, draws, seed };
     let (outcome, drawn) = task::run(py, hear, move |progress| {
-        let (result, drawn) = fitted::by_draws(&ring, &frames, model, settings, |done| progress.tell("draws", done))?;
+        let (result, drawn) = fit_by_draws(&ring, &frames, model, settings, |done| progress.tell("draws", done))?;
         let shown = result.clone();
-        Ok((Outcome::of(&result, move || fitted::page(&ring, &frames, &shown))?, drawn))
+        Ok((Outcome::of(&result, move || fit_page(&ring, &frames, &shown))?, drawn))
     })?;
     Ok((outcome, arrays(py, &drawn)?))
 }
@@ -167,9 +167,9 @@ pub fn diagnose(
     task::run(py, hear, move |progress| {
         let (first, others) = all.split_first().expect("there is one");
         let diagnosis = Diagnosis::jointly(&ring, first, others, |what| progress.say(what))?;
-        let result = diagnosed::DiagnosisResult::of(&ring, first, &diagnosis)?;
+        let result = DiagnosisResult::of(&ring, first, &diagnosis)?;
         let first = first.clone();
-        Outcome::of(&result, move || diagnosed::page_of(&diagnosis, &first))
+        Outcome::of(&result, move || diagnosis_page(&diagnosis, &first))
     })
 }
 
@@ -190,7 +190,7 @@ pub fn compare(
             let (ring, before, after) = (ring.ring.clone(), Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let step = |step| progress.step("Gauss-Newton", step);
-                with_page(compared::of_recordings(&ring, [&before, &after], step)?, names)
+                with_page(compare_recordings(&ring, [&before, &after], step)?, names)
             })
         }
         (Data::Matrix(before), Data::Matrix(after)) => {
@@ -198,7 +198,7 @@ pub fn compare(
             let (settings, before, after) = (settings(ring, None)?, Arc::clone(before), Arc::clone(after));
             task::run(py, hear, move |progress| {
                 let mut say = |what: &str| progress.say(what);
-                with_page(compared::of_matrices([&before, &after], &settings, &mut say)?, names)
+                with_page(compare_matrices([&before, &after], &settings, &mut say)?, names)
             })
         }
         _ => {
@@ -208,7 +208,7 @@ pub fn compare(
     }
 }
 
-fn with_page(compared: host_bridge::matrix_result::Comparison, names: [String; 2]) -> Result<Outcome, CommandError> {
-    let page = page_of(&compared, [&names[0], &names[1]]);
+fn with_page(compared: Comparison, names: [String; 2]) -> Result<Outcome, CommandError> {
+    let page = comparison_page(&compared, [&names[0], &names[1]]);
     Outcome::of(&compared, move || Ok(page.clone()))
 }

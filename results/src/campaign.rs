@@ -1,13 +1,16 @@
-//! What is said of a recording before anything is made of it.
+//! What commands read, and what is said of a recording before anything is made of it.
 
 use std::path::Path;
 
 use inference::campaign::furthest_stray;
 use inference::recording::BelievedRf;
+use inference::stream::StreamError;
 use inference::{Campaign, Recording};
+use training::Tables;
 use twin::Ring;
 
 use crate::error::CommandError;
+use crate::model_file;
 
 /// A recording of a ring, screened.
 ///
@@ -80,4 +83,15 @@ pub fn recording(path: &Path, ring: &Ring) -> Result<Recording, CommandError> {
         return Err(CommandError::Input(problem));
     }
     Ok(Recording::read(path, ring)?)
+}
+
+/// The core's tables: those of a model file if there is one, or of the ring as designed.
+///
+/// # Errors
+/// [`CommandError::Input`].
+pub fn tables(path: Option<&Path>, ring: &Ring) -> Result<Tables, CommandError> {
+    match path {
+        Some(path) => Ok(model_file::read(path, ring)?),
+        None => Ok(training::green::tables(ring).map_err(StreamError::from)?),
+    }
 }

@@ -38,7 +38,7 @@ pub mod output;
 mod record;
 mod response_result;
 
-pub use campaign::{campaign, expect_modelled, not_modelled, recording, strays};
+pub use campaign::{campaign, expect_modelled, not_modelled, recording, strays, tables};
 pub use check_result::CheckResult;
 pub use compare::{compare_matrices, compare_recordings};
 pub use diagnosis_result::{DiagnosisResult, diagnosis_page};

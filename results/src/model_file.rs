@@ -7,13 +7,11 @@ use std::path::Path;
 
 use estimator::wire::link::UNASKED;
 use estimator::{FrameError, Parcel, ParcelError, Tables as _};
-use inference::stream::StreamError;
 use training::green::{Difference, difference};
 use training::rooms::large::{PACKET, Request};
 use training::{AnyParcel, LINE, Tables, TrainingError};
 use twin::Ring;
 
-use crate::error::CommandError;
 use crate::output::{self, OutputError};
 
 /// Why a file is no model.
@@ -135,17 +133,6 @@ pub fn read(path: &Path, ring: &Ring) -> Result<Tables, ModelFileError> {
     match difference(ring, &tables)? {
         Some(difference) => Err(ModelFileError::Ring { path: name(), machine: machine.clone(), difference }),
         None => Ok(tables),
-    }
-}
-
-/// The tables of a file if there is one, or of the ring as designed.
-///
-/// # Errors
-/// [`CommandError::Input`].
-pub fn read_or_design(path: Option<&Path>, ring: &Ring) -> Result<Tables, CommandError> {
-    match path {
-        Some(path) => Ok(read(path, ring)?),
-        None => Ok(training::green::tables(ring).map_err(StreamError::from)?),
     }
 }
 

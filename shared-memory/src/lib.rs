@@ -12,7 +12,8 @@
 //! let service = format!("orbitcal/example/{}", std::process::id());
 //! let mut subscriber = Subscriber::try_new(&service)?;
 //! let record = EstimateRecord::example(48, 33);
-//! Publisher::try_new(&service, "an example", &record.names)?.publish(&record)?;
+//! let mut publisher = Publisher::try_new(&service, "an example", &record.names)?;
+//! publisher.publish(&record)?;
 //! let heard = subscriber.wait(Duration::from_secs(5))?;
 //! assert_eq!(heard[0].record, record);
 //! # Ok::<(), shared_memory::PublishError>(())

@@ -1,5 +1,11 @@
 //! The cases of the validation: each is fixed by its number and one seed for all.
 
+use diagnosis::data::{Data, DataError};
+use diagnosis::hypothesis::{Term, in_order};
+use diagnosis::scan::candidates;
+use inference::Campaign;
+use inference::recording::Recording;
+use inference::simulate::{self, Beyond, Hardware};
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
@@ -9,12 +15,6 @@ use twin::{Effect, EffectError, EffectKind, Ring};
 use super::imperfect::{Families, Imperfections};
 use super::unmodelled::{Unmodelled, UnmodelledKind};
 use crate::score::{TrueCause, TrueEffect, Truth};
-use diagnosis::data::{Data, DataError};
-use diagnosis::hypothesis::{Term, in_order};
-use diagnosis::scan::candidates;
-use inference::Campaign;
-use inference::recording::Recording;
-use inference::simulate::{self, Beyond, Hardware};
 
 /// Class of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]

@@ -7,15 +7,14 @@
 
 use core::iter;
 
-use inference::simulate::TuneWindow;
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
-use twin::{Effect, Machine, Rf, Ring};
-
 use diagnosis::QUOTED;
 use diagnosis::data::Data;
 use diagnosis::hypothesis::Member;
 use diagnosis::ordinary::Family;
+use inference::simulate::TuneWindow;
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+use twin::{Effect, Machine, Rf, Ring};
 
 /// Every family of imperfections.
 #[derive(Debug, Clone)]
@@ -77,6 +76,7 @@ impl Families {
 
 #[cfg(test)]
 mod tests {
+    use diagnosis::Diagnosis;
     use inference::Campaign;
     use rand::SeedableRng;
     use rand::rngs::StdRng;
@@ -85,7 +85,6 @@ mod tests {
     use super::*;
     use crate::testing::template;
     use crate::{Case, Cases, Class};
-    use diagnosis::Diagnosis;
 
     /// Members of a family share its width, and tunes are near the design's.
     #[test]

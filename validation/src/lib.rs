@@ -30,6 +30,8 @@ mod imperfect;
 mod mixes;
 mod outcome;
 mod score;
+mod share;
+mod stated;
 mod tables;
 #[cfg(test)]
 mod testing;

@@ -7,39 +7,12 @@
 //!
 //! Source of the effective number: L. Kish, Survey Sampling (Wiley, 1965), section 8.2.
 
-use serde::{Deserialize, Serialize};
-
-use crate::tables::Share;
-use crate::{Class, Outcome};
 use diagnosis::search::{ODDS, UNMODELLED};
+use serde::Serialize;
 
-/// What may be the matter: nothing, an effect of the library, or other physics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[allow(missing_docs)] // named after what they are
-pub enum Sort {
-    Nothing,
-    Library,
-    Unknown,
-}
-
-/// Number of sorts.
-const SORTS: usize = 3;
-
-/// The most likely cause of the least certain finding.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Stated {
-    /// Kind and place, `nothing` or `unknown`.
-    pub cause: String,
-    /// Its sort.
-    pub sort: Sort,
-    /// Its probability.
-    pub probability: f64,
-    /// Probability of each sort, beside the other findings.
-    pub of_sorts: [f64; SORTS],
-    /// Whether it is true.
-    pub is_true: bool,
-}
+use crate::outcome::Outcome;
+use crate::share::Share;
+use crate::stated::{SORTS, Sort, Stated};
 
 /// Shares of the sorts of campaigns, which add up to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -80,22 +53,6 @@ pub struct Reliability {
     pub is_true: f64,
     /// See above.
     pub limits: [f64; 2],
-}
-
-impl Stated {
-    pub(super) fn of(cause: String, sort: Sort, probability: f64, of_sorts: [f64; SORTS], is_true: bool) -> Self {
-        Self { cause, sort, probability, of_sorts, is_true }
-    }
-}
-
-impl Sort {
-    fn of(class: Class) -> Self {
-        match class {
-            Class::Empty => Self::Nothing,
-            Class::Single | Class::Pair => Self::Library,
-            Class::Unknown => Self::Unknown,
-        }
-    }
 }
 
 impl Mix {

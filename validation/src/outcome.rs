@@ -2,14 +2,6 @@
 
 use std::time::Instant;
 
-use nalgebra::{DMatrix, DVector};
-use serde::{Deserialize, Serialize};
-use twin::{Effect, EffectKind, Ring};
-
-use crate::case::{Case, Class};
-use crate::mixes::{Sort, Stated};
-use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
-use crate::unmodelled::Unmodelled;
 use diagnosis::alternatives::{Competition, imitating};
 use diagnosis::data::{Data, DataError};
 use diagnosis::fit::Fitted;
@@ -18,6 +10,14 @@ use diagnosis::search::Found;
 use diagnosis::{Diagnosis, Finding, Verdict};
 use inference::Campaign;
 use inference::recording::Recording;
+use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
+use twin::{Effect, EffectKind, Ring};
+
+use crate::case::{Case, Class};
+use crate::score::{Fate, Grade, TrueCause, TrueEffect, Truth};
+use crate::stated::{Sort, Stated};
+use crate::unmodelled::Unmodelled;
 
 /// The result of one case.
 #[derive(Debug, Clone, Serialize, Deserialize)]

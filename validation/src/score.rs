@@ -3,14 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::DVector;
-use serde::{Deserialize, Serialize};
-use twin::{EffectError, EffectKind, Ring};
-
 use diagnosis::alternatives::DECISIVE;
 use diagnosis::average::Vars;
 use diagnosis::hypothesis::Term;
 use diagnosis::{Diagnosis, Finding, Verdict};
+use nalgebra::DVector;
+use serde::{Deserialize, Serialize};
+use twin::{EffectError, EffectKind, Ring};
 
 /// What a recording was made with.
 #[derive(Debug, Clone)]

@@ -36,7 +36,7 @@ use host_bridge::stop::Stop;
 use indicatif::{ProgressBar, ProgressStyle};
 use inference::{Recording, with_priors};
 use results::{
-    CommandError, EstimateRecord, Names, campaign, expect_modelled, model_file, not_modelled, output, recording, strays,
+    CommandError, EstimateRecord, Names, campaign, expect_modelled, not_modelled, output, recording, strays,
 };
 use serde::Serialize;
 use shared_memory::{PublishError, Publisher};
@@ -92,7 +92,7 @@ fn tables(model: CoreModel, ring: &Ring, file: Option<&Path>) -> Result<Tables, 
             "{}: the network has no terms of a model file; leave out --model resnet",
             path.display()
         ))),
-        _ => model_file::read_or_design(file, ring),
+        _ => results::tables(file, ring),
     }
 }
 

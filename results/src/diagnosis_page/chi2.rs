@@ -1,9 +1,10 @@
 //! Chi-square per reading, by monitor, corrector, sign of the kick and time.
 
-use super::residuals::{Residual, Residuals};
-use super::table;
 use diagnosis::data::Data;
 use report::{Axes, Figure, Reference, Section, Series, Table};
+
+use super::residuals::{Residual, Residuals};
+use super::table;
 
 /// Stretches of time.
 const STRETCHES: usize = 8;

@@ -1,7 +1,5 @@
 //! The decisive picture of each finding.
 
-use super::partial::Partial;
-use super::{limits, slope, tunes, unmodelled};
 use diagnosis::alternatives::Cause;
 use diagnosis::error::FitError;
 use diagnosis::fit::Fitted;
@@ -9,6 +7,9 @@ use diagnosis::hypothesis::Term;
 use diagnosis::location::Location;
 use diagnosis::{Diagnosis, Finding};
 use report::Figure;
+
+use super::partial::Partial;
+use super::{limits, slope, tunes, unmodelled};
 
 /// Share of what tells of an effect from which on the tunes decide.
 const DECIDE: f64 = 0.5;

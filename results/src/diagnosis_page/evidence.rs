@@ -1,11 +1,9 @@
 //! The leading candidates of the first search, and the correction for their number.
 
 use diagnosis::error::FitError;
-
-use diagnosis::Diagnosis;
-use diagnosis::discrepancy;
 use diagnosis::scan::scan;
 use diagnosis::search::{correction_of, corrections};
+use diagnosis::{Diagnosis, discrepancy};
 use report::{Axes, Figure, Ranked, Section};
 
 /// Causes shown.

@@ -1,10 +1,10 @@
 //! The undecided causes, and the measurement that would separate them.
 
 use diagnosis::error::FitError;
-
-use super::table;
 use diagnosis::{Diagnosis, Verdict, verdict};
 use report::Section;
+
+use super::table;
 
 /// Alternatives of the leading findings, and the possible measurements.
 pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {

@@ -1,11 +1,11 @@
 //! The findings, each with its alternatives.
 
 use diagnosis::error::FitError;
-
-use super::{decisive, signed, slope, table};
 use diagnosis::verdict::Tested;
 use diagnosis::{Diagnosis, Finding, Verdict};
 use report::Section;
+
+use super::{decisive, signed, slope, table};
 
 /// Alternatives listed below a finding.
 const ALTERNATIVES: usize = 5;

@@ -1,9 +1,10 @@
 //! Predictions of frames that the model was not fitted to.
 
-use super::{signed, table};
 use diagnosis::Diagnosis;
 use diagnosis::heldout::Score;
 use report::{Section, Table};
+
+use super::{signed, table};
 
 /// What is expected within one and two standard deviations.
 const INSIDE: [f64; 2] = [0.6827, 0.9545];

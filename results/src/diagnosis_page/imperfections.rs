@@ -1,9 +1,10 @@
 //! The machine as it is.
 
-use super::table;
 use diagnosis::Diagnosis;
 use diagnosis::imperfection::Imperfection;
 use report::Section;
+
+use super::table;
 
 /// The ordinary imperfections that the recording shows.
 pub fn section(diagnosis: &Diagnosis) -> Section {

@@ -1,9 +1,8 @@
 //! The lattice as figures show it.
 
-use twin::{Class, Kind, Ring};
-
 use diagnosis::{Diagnosis, Finding};
 use report::{Look, Magnet, Spotted, Strip, Symbol};
+use twin::{Class, Kind, Ring};
 
 /// Magnets and instruments; a place of monitors of which none is read is one that is not read.
 pub fn magnets(ring: &Ring) -> Vec<Magnet> {

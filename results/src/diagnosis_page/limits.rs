@@ -1,11 +1,11 @@
 //! What the recording would have shown: the decisive picture where nothing was found.
 
-use twin::EffectKind;
-
-use super::lattice::{STRIP, strip};
 use diagnosis::Diagnosis;
 use diagnosis::limits::{Limits, SEEN, at_places};
 use report::{Axes, Figure, Range, Series};
+use twin::EffectKind;
+
+use super::lattice::{STRIP, strip};
 
 /// Limits of all kinds, and those of gradients along the ring.
 pub fn figures(diagnosis: &Diagnosis) -> Vec<(String, Figure)> {

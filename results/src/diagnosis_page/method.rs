@@ -1,12 +1,13 @@
 //! How the numbers of the page are made.
 
-use super::table;
 use diagnosis::Diagnosis;
 use diagnosis::alternatives::{DECISIVE, SUSPICIOUS};
 use diagnosis::error::FitError;
 use diagnosis::heldout::{CHANCE, SUPPORTED, VALIDATED};
 use inference::recording::Recording;
 use report::Section;
+
+use super::table;
 
 /// The foot of the page.
 ///

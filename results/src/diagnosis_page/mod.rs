@@ -24,12 +24,12 @@ mod tunes;
 mod unmodelled;
 mod vars;
 
-use diagnosis::error::FitError;
-
 use diagnosis::data::Data;
+use diagnosis::error::FitError;
 use diagnosis::{Diagnosis, Verdict};
 use inference::recording::Recording;
 use report::{Page, Section};
+
 use residuals::Residuals;
 
 /// The page of a diagnosis.

@@ -1,10 +1,10 @@
 //! Faulty monitors.
 
+use diagnosis::Diagnosis;
 use estimator::MonitorState;
+use report::Section;
 
 use super::table;
-use diagnosis::Diagnosis;
-use report::Section;
 
 /// State, noise and rejected readings.
 pub fn section(diagnosis: &Diagnosis) -> Section {

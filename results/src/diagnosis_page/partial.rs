@@ -2,13 +2,12 @@
 
 use core::ops::RangeInclusive;
 
-use nalgebra::{DMatrix, DVector};
-
-use super::tunes;
 use diagnosis::data::Data;
 use diagnosis::error::FitError;
-use diagnosis::fit::{self, Fitted};
+use diagnosis::fit::{self, Fitted, predicted};
 use diagnosis::hypothesis::{Hypothesis, Term};
+use nalgebra::{DMatrix, DVector};
+use twin::{Drives, EffectError, Machine};
 
 /// Some effects of a fit.
 pub struct Partial<'f> {
@@ -44,7 +43,7 @@ impl<'f> Partial<'f> {
         let measured = data.residual(&fit::predicted_by(data, less, 0, &u)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
         let of_element = fit::of_element(data, less, 0, (&machine, &drives), &u)?.map_or([0.0; 2], |own| own.tunes);
-        let ends = tunes::ends(&machine, &drives)?;
+        let ends = ends(&machine, &drives)?;
         let tunes = [0, 1].map(|plane| {
             let (ends, moved) = (&ends[plane], of_element[plane]);
             ends.start() + moved..=ends.end() + moved
@@ -82,4 +81,14 @@ impl<'f> Partial<'f> {
             .sum();
         Ok(tunes / seen.norm_squared().max(f64::MIN_POSITIVE))
     }
+}
+
+/// Tunes of a machine on the orbit without kicks at the start of the campaign and at its end.
+///
+/// # Errors
+/// [`EffectError`].
+pub fn ends(machine: &Machine, drives: &Drives) -> Result<[RangeInclusive<f64>; 2], EffectError> {
+    let still = predicted(machine, &drives.still())?;
+    let (first, last) = (drives.time.imin(), drives.time.imax());
+    Ok([0, 1].map(|plane| still.tune(plane, first)..=still.tune(plane, last)))
 }

@@ -1,13 +1,13 @@
 //! Place scans of normal and skew gradients.
 
-use twin::{Element, Ring, Thin};
-
-use super::lattice::{STRIP, strip};
-use super::signed;
 use diagnosis::error::FitError;
 use diagnosis::place_scan::{Interval, PlaceScan};
 use diagnosis::{Diagnosis, Finding, Verdict};
 use report::{Axes, Figure, Reference, Section, Series};
+use twin::{Element, Ring, Thin};
+
+use super::lattice::{STRIP, strip};
+use super::signed;
 
 /// Share of the posterior that an interval holds.
 const SHARE: f64 = 0.95;

@@ -1,11 +1,12 @@
 //! The probabilities of the causes: bars that add up to 1.
 
-use super::slope::name;
 use diagnosis::alternatives::{Alternative, Cause, Competition};
 use diagnosis::data::Data;
 use diagnosis::verdict::capitalised;
 use diagnosis::{Diagnosis, Finding};
 use report::{Axes, Figure, Ranked, Section};
+
+use super::slope::name;
 
 /// Causes with a bar of their own.
 const SHOWN: usize = 6;

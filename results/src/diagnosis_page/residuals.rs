@@ -1,15 +1,15 @@
 //! Residuals of the readings, setting by setting.
 
-use nalgebra::{DMatrix, DVector};
-use twin::Plane;
-
-use super::partial::Partial;
 use diagnosis::Diagnosis;
 use diagnosis::data::Data;
 use diagnosis::error::FitError;
 use diagnosis::fit::Fitted;
 use diagnosis::settings::Settings;
+use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Map, Section};
+use twin::Plane;
+
+use super::partial::Partial;
 
 /// One reading less its prediction.
 #[derive(Debug, Clone, Copy)]

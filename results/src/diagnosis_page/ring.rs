@@ -1,13 +1,13 @@
 //! The ring with the findings marked.
 
+use diagnosis::Diagnosis;
+use diagnosis::data::Data;
 use estimator::MonitorState;
+use report::{Figure, Look, RingMap, Section, Spotted};
 use twin::{Parameter, Ring};
 
 use super::lattice::{magnets, positions};
 use super::monitors::word;
-use diagnosis::Diagnosis;
-use diagnosis::data::Data;
-use report::{Figure, Look, RingMap, Section, Spotted};
 
 /// Alternatives that are marked for each finding.
 const ALTERNATIVES: usize = 4;

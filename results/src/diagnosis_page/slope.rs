@@ -7,13 +7,14 @@
 
 use std::collections::BTreeMap;
 
-use super::partial::Partial;
-use super::signed;
 use diagnosis::Finding;
 use diagnosis::settings::Settings;
 use diagnosis::transients::Shown;
 use diagnosis::verdict::capitalised;
 use report::{Axes, Figure, Series};
+
+use super::partial::Partial;
+use super::signed;
 
 /// Share of the largest signature below which a setting tells nothing by itself.
 const TELLS: f64 = 0.02;

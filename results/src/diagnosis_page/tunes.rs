@@ -2,15 +2,15 @@
 
 use core::ops::RangeInclusive;
 
-use super::partial::Partial;
 use diagnosis::Finding;
 use diagnosis::data::Data;
 use diagnosis::error::FitError;
-use diagnosis::fit::{Fitted, predicted};
+use diagnosis::fit::Fitted;
 use diagnosis::verdict::capitalised;
 use inference::campaign::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
-use twin::{Drives, EffectError, Machine};
+
+use super::partial::{Partial, ends};
 
 /// Stretches of time.
 const STRETCHES: usize = 8;
@@ -44,16 +44,6 @@ pub fn of_model(data: &Data, fitted: &Fitted, what: &str) -> Result<Vec<(String,
     let ends = ends(&machine, &drives)?;
     let of_plane = |plane: usize| figure(data, fitted, plane, &[Predicted("model".into(), ends[plane].clone())], what);
     [0, 1].into_iter().filter_map(|plane| of_plane(plane).transpose()).collect()
-}
-
-/// Tunes of a machine on the orbit without kicks at the start of the campaign and at its end.
-///
-/// # Errors
-/// [`EffectError`].
-pub fn ends(machine: &Machine, drives: &Drives) -> Result<[RangeInclusive<f64>; 2], EffectError> {
-    let still = predicted(machine, &drives.still())?;
-    let (first, last) = (drives.time.imin(), drives.time.imax());
-    Ok([0, 1].map(|plane| still.tune(plane, first)..=still.tune(plane, last)))
 }
 
 fn figure(

@@ -1,19 +1,19 @@
 //! The decisive picture of an unmodelled discrepancy: the residuals at its place.
 
-use nalgebra::DVector;
-use twin::{Hold, Optics, Plane, Signatures};
-
-use super::lattice::{STRIP, strip};
-use super::partial::Partial;
-use super::residuals::Residual;
-use super::{slope, tunes};
 use diagnosis::Diagnosis;
 use diagnosis::discrepancy::{Discrepancy, steering};
 use diagnosis::error::FitError;
 use diagnosis::location::Location;
 use diagnosis::settings::Settings;
 use diagnosis::verdict::capitalised;
+use nalgebra::DVector;
 use report::{Axes, Figure, Map, Reference, Series};
+use twin::{Hold, Optics, Plane, Signatures};
+
+use super::lattice::{STRIP, strip};
+use super::partial::Partial;
+use super::residuals::Residual;
+use super::{slope, tunes};
 
 /// Stretches of time.
 const STRETCHES: usize = 8;

@@ -1,9 +1,8 @@
 //! The quadrupoles' strength factors without and with the effects.
 
-use nalgebra::DVector;
-
 use diagnosis::Diagnosis;
 use diagnosis::average::Vars;
+use nalgebra::DVector;
 use report::{Axes, Band, Figure, Reference, Section};
 
 /// Standard deviations of the 95 % interval.

@@ -1,12 +1,12 @@
 //! What physics outside the library does to the ring, to the cycles and to the readings.
 
+use inference::simulate::Beyond;
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use twin::{Cycle, Element, Kind, Ring, Site};
 
 use super::{Unmodelled, UnmodelledKind, girder_end};
-use inference::simulate::Beyond;
 
 /// What a corrector kicks at its nominal setting [rad].
 const FULL_KICK: f64 = 2e-4;

@@ -368,13 +368,13 @@ fn index(ring: &Ring, site: Site) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use inference::recording::Recording;
+    use inference::simulate::{Beyond, Truth, campaign};
     use nalgebra::DMatrix;
+    use twin::{Hold, Optics, Place};
 
     use super::*;
     use crate::testing::{ideal, readings, template};
-    use inference::recording::Recording;
-    use inference::simulate::{Beyond, Truth, campaign};
-    use twin::{Hold, Optics, Place};
 
     /// Readings with the unknown less those without, rows frames.
     fn change(unknown: &Unmodelled, ring: &Ring, recording: &Recording) -> DMatrix<f64> {
