@@ -99,7 +99,7 @@ pub struct Finding {
     pub at: String,
     /// Path length [m].
     pub s: Option<f64>,
-    /// Distance from the mean of its family, share of a hold, 1 of a cable.
+    /// Distance from the mean of its family ([`Hierarchy::scale_of`]), share of a hold, 1 of a cable.
     pub amplitude: f64,
     /// Its standard deviation.
     pub sigma: f64,
@@ -184,9 +184,11 @@ impl Diagnosis {
         let refitted = share.other().map(|_| fit(folder, &settings, progress)).transpose()?;
         let fitted = refitted.as_ref().unwrap_or(fitted);
         let hierarchy = Hierarchy::of_fit(folder, fitted, &settings, progress)?;
-        let (hierarchy, found) = released(hierarchy, folder, fitted, &settings, progress)?;
+        let (mut hierarchy, found) = released(hierarchy, folder, fitted, &settings, progress)?;
         progress("elements held out");
         let held_out = [as_loco(folder, fitted, &settings)?, with_families(&hierarchy, fitted)?];
+        // parts of the matrix that tell a value differently bear out no smaller error
+        hierarchy.uncertainty.sigma.zip_apply(&held_out[1].jackknife, |sigma, scatter| *sigma = sigma.max(scatter));
         let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
         let members = found.outliers.iter().map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
         let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
@@ -249,6 +251,7 @@ fn verdict(fitted: &Fit, findings: &[Finding], [before, after]: &[HeldOut; 2]) -
 impl Finding {
     fn of_outlier(folder: &Folder, hierarchy: &Hierarchy, outlier: &Outlier) -> Self {
         let kind = hierarchy.unknowns[outlier.unknown].kind;
+        let scale = hierarchy.scale_of(outlier.unknown);
         let alternative = |rival: &Rival| {
             let kind = hierarchy.unknowns[rival.unknown].kind;
             let (word, at) = (word(folder, &hierarchy.groups, kind), name(folder, &hierarchy.groups, kind));
@@ -263,8 +266,8 @@ impl Finding {
             },
             at: name(folder, &hierarchy.groups, kind),
             s: Some(path_length(folder, &hierarchy.groups, kind)),
-            amplitude: hierarchy.off_family(outlier.unknown),
-            sigma: hierarchy.uncertainty.sigma[outlier.unknown],
+            amplitude: hierarchy.off_family(outlier.unknown) / scale,
+            sigma: hierarchy.uncertainty.sigma[outlier.unknown] / scale.abs(),
             gain: outlier.gain,
             probability: outlier.probability,
             alternatives: outlier.alternatives.iter().map(alternative).collect(),
@@ -346,11 +349,12 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
 fn limits(folder: &Folder, hierarchy: &Hierarchy, found: &Search) -> Vec<Limit> {
     let limit = |&(unknown, [amplitude, sigma]): &(usize, [f64; 2])| {
         let kind = hierarchy.unknowns[unknown].kind;
+        let scale = hierarchy.scale_of(unknown).abs();
         Limit {
             word: word(folder, &hierarchy.groups, kind),
             at: name(folder, &hierarchy.groups, kind),
-            amplitude,
-            sigma,
+            amplitude: amplitude / scale,
+            sigma: sigma / scale,
         }
     };
     found.limits.iter().map(limit).collect()

@@ -21,6 +21,19 @@ pub struct HeldOut {
     pub rms: f64,
     /// Sum of squares over the stated noise per element.
     pub chi2: f64,
+    /// Standard deviation of each unknown by the fits without one part: `sqrt((n - 1)/n sum (p_i - mean)^2)` of `n` parts.
+    ///
+    /// Source: B. Efron and C. Stein, Ann. Stat. 9 (1981) 586, the jackknife.
+    pub jackknife: DVector<f64>,
+}
+
+/// Scatter of the steps of fits without one part each.
+fn jackknife(steps: &[DVector<f64>]) -> DVector<f64> {
+    let parts = steps.len() as f64;
+    let mean = steps.iter().fold(DVector::zeros(steps[0].len()), |sum, step| sum + step) / parts;
+    let squares = steps.iter().map(|step| (step - &mean).map(|off| off * off));
+    let sum = squares.fold(DVector::zeros(mean.len()), |sum, square| sum + square);
+    sum.map(|sum| ((parts - 1.0) / parts * sum).sqrt())
 }
 
 /// A fit about which elements are left out.
@@ -57,12 +70,13 @@ impl HeldOut {
         let normals: Vec<Normal> = parts.iter().map(normal).collect();
         let whole = normals.iter().fold(DMatrix::zeros(n, n), |sum, one| sum + &one.matrix);
         let slope = normals.iter().fold(DVector::zeros(n), |sum, one| sum + &one.slope);
-        let mut left = residual.clone();
+        let (mut left, mut steps) = (residual.clone(), Vec::new());
         for ([rows, columns], normal) in parts.iter().zip(&normals) {
             let matrix = times(&whole - &normal.matrix, width) + *precision;
             let slope = (&slope - &normal.slope).component_mul(width) - *pull;
             let step = Cholesky::new(matrix).ok_or(MeasuredError::Singular(0))?.solve(&slope).component_mul(width);
             let moved = places.forward(prediction, &step);
+            steps.push(step);
             for &column in columns {
                 rows.iter()
                     .filter(|&&row| weight[(row, column)] > 0.0)
@@ -82,6 +96,7 @@ impl HeldOut {
             log_density: (0..columns).map(density).collect(),
             rms: (left.norm_squared() / elements).sqrt(),
             chi2: left.component_mul(&left).dot(&data.stated()) / elements,
+            jackknife: jackknife(&steps),
         })
     }
 

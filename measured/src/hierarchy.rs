@@ -164,6 +164,26 @@ impl Hierarchy {
         self.families.iter().find(|family| family.is_learnt() && family.claims(kind, class))
     }
 
+    /// What a distance from the mean of a family is told in shares of: gains and strengths of the mean of their family, couplings of the mean gain in the other
+    /// plane, which the orbits that they see or make are of, since monitors and kicks of a plane have a common scale that no matrix tells; 1 of anything else.
+    pub fn scale_of(&self, unknown: usize) -> f64 {
+        let mean = |unknown: usize| {
+            let Unknown { mean, width, .. } = self.unknowns[unknown];
+            mean + self.family_of(unknown).map_or(0.0, |family| family.mean) * width
+        };
+        let other_plane = |gain: &str| {
+            let class = &self.classes[unknown];
+            let of_gain = |&number: &usize| self.unknowns[number].kind.word() == gain && self.classes[number] != *class;
+            (0..self.unknowns.len()).find(of_gain).map_or(1.0, mean)
+        };
+        match self.unknowns[unknown].kind {
+            Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::Strength(_) => mean(unknown),
+            Kind::MonitorCoupling(_) => other_plane("bpm_gain"),
+            Kind::CorrectorCoupling(_) => other_plane("corrector_gain"),
+            _ => 1.0,
+        }
+    }
+
     /// Distance of a value from the mean of the family that it is of, whether it is released or not.
     pub fn off_family(&self, unknown: usize) -> f64 {
         let Unknown { mean, width, .. } = self.unknowns[unknown];

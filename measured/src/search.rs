@@ -25,8 +25,8 @@ use crate::unknowns::Kind;
 
 /// Members that are released in one search at most.
 const MOST: usize = 64;
-/// A member is released where it is this much more probable than that nothing stands out.
-const RELEASED: f64 = 1.0;
+/// A member is released where it is this much more probable than that nothing stands out: it is then named, or one of its alternatives is as probable.
+const RELEASED: f64 = NAMED / (1.0 - NAMED);
 /// Gains of alternatives are within this of the best [nat].
 const NEAR: f64 = 10.0;
 /// And at least this, or they explain nothing [nat].
@@ -373,7 +373,6 @@ mod tests {
             let found = diagnosed(&wrong);
             let mut named: Vec<_> = found.findings.iter().map(|one| (one.word, one.at.clone())).collect();
             named.sort();
-            // the coupling of both is by the gain, and falls with it
             let expected = [("bpm_gain", wrong.monitor(row)), ("corrector_gain", wrong.corrector(5))];
             assert_eq!(named, expected, "{seed}");
         }
