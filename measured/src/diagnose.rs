@@ -229,6 +229,7 @@ fn released(
         hierarchy = hierarchy.with_released(folder, (&fitted.data, settings), released, progress)?;
     }
     found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
+    found.outliers.retain(Outlier::stands_out);
     Ok((hierarchy, found))
 }
 
@@ -339,7 +340,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             class: family.class.clone(),
             count: family.members.len(),
             mean: family.mean * width,
-            scatter: family.scale * width,
+            scatter: family.variance().sqrt() * width,
             sigma: sigma[sigma.len() / 2],
         }
     });

@@ -35,6 +35,8 @@ const START: f64 = 0.1;
 const ORDINARY: f64 = 2.0;
 /// Degrees of freedom of a family's distribution.
 const TAILS: f64 = 4.0;
+/// Variance of normal members over the square of the scale that this distribution gives them, the `r` of `E (nu + 1) r x^2/(nu + r x^2) = 1`.
+const NORMAL: f64 = 1.48;
 /// What a mean may be off about one linearisation, in widths of the prior.
 const FREEDOM: f64 = 0.1;
 
@@ -127,6 +129,11 @@ impl Family {
     /// True where the members are about a mean of their own.
     fn has_mean(&self) -> bool {
         self.is_learnt() && !self.kind.contains("skew") && !self.kind.contains("stray")
+    }
+
+    /// Variance of the members in squares of the prior's width.
+    pub fn variance(&self) -> f64 {
+        if self.is_learnt() { NORMAL * self.scale * self.scale } else { self.scale * self.scale }
     }
 
     /// Begin with the mean of some values.
@@ -226,6 +233,18 @@ mod tests {
         // members of one size have tails that are lighter than Student's with four degrees of freedom: a scale of 0.2 where they weigh 1
         assert!((family.scale - 0.2).abs() < 0.03, "{}", family.scale);
         assert!(family.weights[7] < 0.05 && family.weights[6] > 0.9, "{:?}", family.weights);
+    }
+
+    #[test]
+    fn the_variance_is_that_of_normal_members() {
+        let mut random = crate::testing::normal(5);
+        let mut family = Family { weights: vec![1.0; 4000], ..family("skew_gradient", 4000, 0.3) };
+        let values = DVector::from_fn(4000, |_, _| 0.2 * random());
+        for _ in 0..50 {
+            family.learn(&family.deviations(&values, &DMatrix::zeros(4000, 4000)));
+        }
+        // 4000 squares are known to 2.2 %; four times that
+        assert!((family.variance() / 0.04 - 1.0).abs() < 0.09, "{}", family.variance());
     }
 
     #[test]

@@ -25,8 +25,9 @@ use crate::unknowns::Kind;
 
 /// Members that are released in one search at most.
 const MOST: usize = 64;
-/// A member is released where it is this much more probable than that nothing stands out: it is then named, or one of its alternatives is as probable.
-const RELEASED: f64 = NAMED / (1.0 - NAMED);
+/// A member is released where it is this much more probable than that nothing stands out: of several that widen one family each shows when the others are
+/// released.
+const RELEASED: f64 = 1.0;
 /// Gains of alternatives are within this of the best [nat].
 const NEAR: f64 = 10.0;
 /// And at least this, or they explain nothing [nat].
@@ -54,6 +55,11 @@ pub struct Outlier {
 }
 
 impl Outlier {
+    /// True where it is so much more probable than nothing that it is named, or one of its alternatives is.
+    pub fn stands_out(&self) -> bool {
+        self.gain + self.prior > (NAMED / (1.0 - NAMED)).ln()
+    }
+
     /// The same by a fit in which it is released, and the scatter of its family is that of the others alone.
     pub fn confirmed(mut self, hierarchy: &Hierarchy) -> Self {
         let unknown = self.unknown;
@@ -62,7 +68,7 @@ impl Outlier {
         let posterior = (hierarchy.uncertainty.sigma[unknown] / width).powi(2);
         let error = 1.0 / (1.0 / posterior - FREE.powi(-2)).max(f64::EPSILON);
         let estimate = hierarchy.off_family(unknown) / width * error / posterior;
-        let gain = log_bayes_factor(estimate, error, family.scale * family.scale, family.members.len());
+        let gain = log_bayes_factor(estimate, error, family.variance(), family.members.len());
         if gain > self.gain {
             let rivals: f64 = self.alternatives.iter().map(|rival| rival.probability / self.probability).sum();
             self.probability = 1.0 / (1.0 + rivals + (-gain - self.prior).exp());
@@ -114,7 +120,7 @@ struct Members {
     /// Slope and curvature of the further amplitudes.
     slope: DVector<f64>,
     curvature: DMatrix<f64>,
-    /// Weighted squares of the deviations, expected by the posterior.
+    /// Weighted squares of the deviations, expected by the posterior, whose mean is the variance of the family.
     squares: Vec<f64>,
     /// Variance that each has as a member of its family.
     scatter: Vec<f64>,
@@ -197,7 +203,8 @@ impl Members {
                 family.extend(one.members.iter().map(|_| number));
                 let squared =
                     deviations.value.iter().zip(&deviations.variance).map(|(value, variance)| value * value + variance);
-                squares.extend(squared.zip(&one.weights).map(|(square, weight)| square * weight));
+                let normal = one.variance() / one.scale.powi(2);
+                squares.extend(squared.zip(&one.weights).map(|(square, weight)| normal * square * weight));
                 scatter.extend(one.members.iter().map(|_| one.scale * one.scale));
             }
         }
