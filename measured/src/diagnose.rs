@@ -36,7 +36,7 @@ const PREDICTS: f64 = 2.0;
 pub struct Diagnosis {
     /// Of the held frequency.
     pub share: Share,
-    /// What stands out, the largest gain first.
+    /// What was found: of the whole ring, then the largest gain first.
     pub findings: Vec<Finding>,
     /// What is ordinary: families with their means and scatters.
     pub imperfections: Vec<Imperfection>,
@@ -192,7 +192,9 @@ impl Diagnosis {
         let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
         let members = found.outliers.iter().map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
         let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
-        findings.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        // what the whole ring does before what stands at a place
+        let is_local = |finding: &Finding| !matches!(finding.what, What::Hold(_));
+        findings.sort_by(|a, b| is_local(a).cmp(&is_local(b)).then(b.gain.total_cmp(&a.gain)));
         let verdict = verdict(fitted, &findings, &held_out);
         Ok(Self {
             imperfections: imperfections(&hierarchy),

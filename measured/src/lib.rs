@@ -1,7 +1,8 @@
 //! Measured orbit response matrices of any ring: read, fitted, compared.
 //!
 //! A measurement is a folder of tables ([`Folder`]); [`lattice`] makes the ring of the twin from it, [`Model`] predicts its matrix, and
-//! [`fit`] finds the magnets and the instruments that explain it, as LOCO does, with an error of the model whose size is learnt.
+//! [`fit`] finds the magnets and the instruments that explain it, as LOCO does, with an error of the model whose size is learnt. [`Diagnosis`] adds what an
+//! ordinary ring has besides, family by family, and names what stands out of its family.
 //! [`compare`] says what changed from one measurement to the next, [`against`] what a measurement says against a model that is believed.
 //!
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).

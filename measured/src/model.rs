@@ -8,7 +8,7 @@
 //! dispersion was measured, is the change of the orbit with the RF frequency.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Place, Plane, Rf, Ring, Source};
+use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Plane, Rf, Ring, Source};
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
@@ -158,38 +158,6 @@ impl Model {
         }
     }
 
-    /// Derivatives of the matrix by an integrated gradient, and by an integrated skew gradient [1/m], at some path lengths [m].
-    ///
-    /// # Errors
-    /// [`MeasuredError::Orbit`].
-    pub fn by_thin_gradients(
-        &self,
-        unknowns: &[Unknown],
-        values: &DVector<f64>,
-        places: &[f64],
-    ) -> Result<[Vec<DMatrix<f64>>; 2], MeasuredError> {
-        let ring = self.at(unknowns, values);
-        let instruments = self.instruments(unknowns, values);
-        let hold = match self.rf {
-            Rf::FixedMomentum => Hold::Momentum { delta: 0.0 },
-            Rf::FixedFrequency => Hold::Frequency { offset: 0.0 },
-        };
-        let optics = Optics::of(&ring, hold)?;
-        let (read, kicked) =
-            (self.observers(&optics, &instruments.monitors), self.sources(&optics, &instruments.correctors));
-        let place = |&s: &f64| {
-            let element = ring.elements.iter().rposition(|one| one.s <= s).unwrap_or(0);
-            let one = &ring.elements[element];
-            Place { element, depth: (s - one.s).min(one.length) }
-        };
-        let places: Vec<Place> = places.iter().map(place).collect();
-        let by = |gradient: &dyn Fn(Place) -> Gradient| {
-            let gradients = places.iter().map(|&place| vec![gradient(place)]);
-            gradients.map(|one| self.by_gradients(&optics, (&read, &kicked), instruments.rf, &one)).collect()
-        };
-        Ok([by(&|place| optics.thin_gradient(place)), by(&|place| optics.thin_skew_gradient(place))])
-    }
-
     /// Monitors with what each reads of both planes.
     fn observers(&self, optics: &Optics, weights: &[[f64; 2]]) -> Vec<Observer> {
         let places = self.monitors.iter().zip(weights);
@@ -321,15 +289,16 @@ mod tests {
     #[test]
     fn thin_gradients_are_those_of_short_magnets() {
         let folder = ring();
-        let (model, unknowns, values) = machine(&folder, 4);
-        let at = model.predict(&unknowns, &values).unwrap();
-        let rows: Vec<usize> = (0..24).map(|group| crate::unknowns::groups(&folder)[0][group][0]).collect();
-        let places: Vec<f64> =
-            rows.iter().map(|&row| folder.lattice[row].s + folder.lattice[row].length / 2.0).collect();
-        let [thin, _] = model.by_thin_gradients(&unknowns, &values, &places).unwrap();
-        for ((thin, thick), row) in thin.iter().zip(&at.by_machine).zip(rows) {
-            let one = &folder.lattice[row];
-            let spread = thick / (one.k1 * one.length);
+        let groups = crate::unknowns::groups(&folder);
+        let rows: Vec<usize> = groups[0].iter().map(|group| group[0]).collect();
+        let each: Vec<Vec<usize>> = rows.iter().map(|&row| vec![row]).collect();
+        let (_, unknowns, values) = machine(&folder, 4);
+        let model = Model::of(&folder, &[groups[0].clone(), groups[1].clone(), each], Rf::FixedFrequency).unwrap();
+        let by_machine = model.predict(&unknowns, &values).unwrap().by_machine;
+        let thin = &by_machine[groups[0].len() + groups[1].len()..];
+        for ((thin, thick), row) in thin.iter().zip(&by_machine).zip(rows) {
+            let magnet = &folder.lattice[row];
+            let spread = thick / (magnet.k1 * magnet.length);
             // the focusing angle of a quadrupole is 0.6: second order of its half, 0.3^2/3
             assert!((&spread - thin).norm() < 0.06 * thin.norm(), "{row}: {}", (&spread - thin).norm() / thin.norm());
         }
@@ -338,7 +307,15 @@ mod tests {
     #[test]
     fn derivatives_are_those_of_differences() {
         let folder = ring();
-        let (model, mut unknowns, values) = machine(&folder, 3);
+        let (_, mut unknowns, mut values) = machine(&folder, 3);
+        // a further gradient and a skew gradient in a dipole and in a quadrupole
+        let [strengths, skews, _] = crate::unknowns::groups(&folder);
+        let place = strengths.len() + skews.len();
+        let model = Model::of(&folder, &[strengths, skews, vec![vec![4], vec![2]]], Rf::FixedFrequency).unwrap();
+        for group in [1, 0] {
+            unknowns.insert(place, Unknown { kind: Kind::Gradient(group), mean: 0.0, width: 0.01 });
+            values = values.insert_row(place, 0.004);
+        }
         let magnets = unknowns
             .iter()
             .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_)))
