@@ -143,7 +143,7 @@ impl Alternative {
 }
 
 /// Probability of what looks like one of some effects, from the sum of theirs.
-pub(super) fn imitating(library: f64) -> f64 {
+pub fn imitating(library: f64) -> f64 {
     library * IMITATED / (1.0 - IMITATED)
 }
 
@@ -205,7 +205,7 @@ impl Competition {
     }
 
     /// True if an effect is likely to be needed.
-    pub fn is_suspicious(&self) -> bool {
+    pub(crate) fn is_suspicious(&self) -> bool {
         1.0 - self.nothing - self.too_small > SUSPICIOUS
     }
 
@@ -225,7 +225,7 @@ impl Competition {
     }
 
     /// The same without what is too small to be seen, which is no evidence of anything.
-    pub fn unknown_seen(&self) -> f64 {
+    pub(crate) fn unknown_seen(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
         self.imitating() + listed.map(|a| a.probability).sum::<f64>()
     }

@@ -38,7 +38,7 @@ impl Vars {
     }
 
     /// The vars averaged over the alternatives of the least certain finding.
-    pub fn averaged(found: &Found) -> Self {
+    pub(crate) fn averaged(found: &Found) -> Self {
         let certainty = |competition: &&Competition| {
             competition.alternatives.first().map_or(competition.nothing, |a| a.probability)
         };
@@ -50,7 +50,7 @@ impl Vars {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn widened(self, found: &Found) -> Result<Self, FitError> {
+    pub(crate) fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let (step, wide) = best.widened(data, &best.hypothesis.unseen(data), &Family::hidden(data))?;
         Ok(Self { mean: self.mean + step, covariance: self.covariance + wide - best.covariance() })

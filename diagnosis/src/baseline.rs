@@ -91,7 +91,7 @@ impl Baseline {
     ///
     /// # Errors
     /// [`OrbitError`] if the machine has no orbit.
-    pub fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
+    pub(crate) fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
         let own = machine.orbit()?;
         let ring = machine.ring_mut();
         let less = |(read, monitor): (&Option<f64>, Monitor)| {

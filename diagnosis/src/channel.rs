@@ -121,7 +121,7 @@ impl Channel {
     }
 
     /// The same in place.
-    pub fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
+    pub(crate) fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
         self.root.whiten(columns.as_view_mut());
         // column by column, since there are few factors
         for mut column in columns.column_iter_mut() {
@@ -131,7 +131,7 @@ impl Channel {
     }
 
     /// The same of one column.
-    pub fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
+    pub(crate) fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
         let rows = column.len();
         self.whiten_mut(DMatrixViewMut::from_slice(column.as_mut_slice(), rows, 1));
     }

@@ -51,7 +51,7 @@ impl<'d> Choice<'d> {
     }
 
     /// `ln` weight of each over that of none, by some scores.
-    pub fn log_weights<'c>(
+    pub(crate) fn log_weights<'c>(
         &'c self,
         scores: impl Iterator<Item = SignatureScore> + 'c,
     ) -> impl Iterator<Item = f64> + 'c {

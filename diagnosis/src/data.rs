@@ -332,7 +332,7 @@ impl Data {
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
+    pub(crate) fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
         let frames = Drives { orbit: orbit.to_vec(), ..self.frames.drives.clone() };
         let means = Drives { orbit: orbit.to_vec(), ..self.drives.clone() };
         let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&means)?.0);
@@ -384,7 +384,7 @@ impl Data {
     }
 
     /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
-    pub fn drifting(&self, amplitude: f64) -> Self {
+    pub(crate) fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
         data.drift = amplitude;
         data.prepare();
@@ -402,7 +402,7 @@ impl Data {
     }
 
     /// The same recordings where one monitor wanders in one of them.
-    pub fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
+    pub(crate) fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
         let mut data = self.clone();
         let own = data.campaign_mut(campaign);
         own.noise.wandering.push((monitor, walk));
@@ -411,7 +411,7 @@ impl Data {
     }
 
     /// A hypothetical campaign with other drives, by itself; its readings are ignored.
-    pub fn driven_by(&self, drives: &Drives) -> Self {
+    pub(crate) fn driven_by(&self, drives: &Drives) -> Self {
         let mut data = Self { drives: drives.clone(), others: Vec::new(), ..self.clone() };
         data.noise.levels = Levels::CONSTANT;
         data.prepare();
@@ -555,7 +555,7 @@ impl Data {
     }
 
     /// `ln` of the determinant of the covariance.
-    pub fn log_det(&self) -> f64 {
+    pub(crate) fn log_det(&self) -> f64 {
         // the tune meter's noise is not compared
         self.channels[..self.monitors()].iter().map(|c| c.log_det).sum::<f64>() + self.mixing.log_det()
     }
@@ -600,7 +600,7 @@ impl Data {
     ///
     /// # Errors
     /// The first among the signatures.
-    pub fn signatures<E>(
+    pub(crate) fn signatures<E>(
         &self,
         count: usize,
         signatures: impl Iterator<Item = Result<Option<Signature>, E>>,
@@ -656,7 +656,7 @@ impl Data {
 
     /// Whitened numbers, one set a column, with the noise in common taken out once more: the product of what only one monitor would read
     /// with them is then that with all that it would leave in the others.
-    pub fn taken_back(&self, whitened: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn taken_back(&self, whitened: &DMatrix<f64>) -> DMatrix<f64> {
         let mut back = whitened.clone();
         if self.mixing.is_none() {
             return back;
@@ -737,13 +737,13 @@ impl Data {
     }
 
     /// Whiten columns over all pools as readings of one channel.
-    pub fn whiten_columns(&self, c: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn whiten_columns(&self, c: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let channel = &self.channels[c];
         channel.whiten(columns.select_rows(&channel.rows) / channel.sigma)
     }
 
     /// What a monitor's readings tell beside those of the others in the same frames, as a share of what they tell alone, on average.
-    pub fn own_share(&self, b: usize) -> f64 {
+    pub(crate) fn own_share(&self, b: usize) -> f64 {
         let rows = &self.channels[b].rows;
         if self.mixing.is_none() || rows.is_empty() || b >= self.monitors() {
             return 1.0;
@@ -753,13 +753,13 @@ impl Data {
 
     /// What a pattern over some monitors [m] has to be multiplied by, monitor by monitor, with [`Data::own_share`]: itself with what it leaves
     /// in each by the noise in common.
-    pub fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
+    pub(crate) fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
         let row = DMatrix::from_rows(&[pattern.transpose()]);
         self.accompanied_at(&[1.0], monitors, &row).row(0).transpose()
     }
 
     /// The same in every run of a setting: rows pools.
-    pub fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
         self.accompanied_at(&self.levels_of_pools(), monitors, patterns)
     }
 
@@ -777,7 +777,7 @@ impl Data {
     }
 
     /// Signatures that step with time, whitened: of each signature all steps, rows pools, one a column.
-    pub fn stepping(&self, signatures: &[Signature], steps: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn stepping(&self, signatures: &[Signature], steps: &DMatrix<f64>) -> DMatrix<f64> {
         let each = signatures.iter().flat_map(|signature| steps.column_iter().map(move |step| (signature, step)));
         let mut all = DMatrix::zeros(self.size(), signatures.len() * steps.ncols());
         for (mut column, (signature, step)) in all.column_iter_mut().zip(each) {
@@ -789,7 +789,7 @@ impl Data {
 
     /// `E^T S^-1 E` of a monitor's readings for groups of pools, of which `group` names that of each pool, as if the noise were white:
     /// `diag(alone) - common common^T`, the latter of their common terms. Returns both, [groups] and [groups][factors].
-    pub fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
+    pub(crate) fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
         let channel = &self.channels[b];
         let (share, per) = (self.own_share(b), channel.sigma.powi(-2));
         let taken = channel.taken() * (share.sqrt() / channel.sigma);
@@ -808,7 +808,7 @@ impl Data {
     }
 
     /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
-    pub fn is_aside(&self, frame: usize, b: usize) -> bool {
+    pub(crate) fn is_aside(&self, frame: usize, b: usize) -> bool {
         !self.frames.recorded[(frame, b)].is_nan() && !self.screened.accepted[(frame, b)]
     }
 
@@ -827,12 +827,12 @@ impl Data {
     }
 
     /// True if a monitor's noise remembers the frames before.
-    pub fn remembers(&self, b: usize) -> bool {
+    pub(crate) fn remembers(&self, b: usize) -> bool {
         !self.noise.memory(b).is_none()
     }
 
     /// `ln` of the determinant of what monitors have in common in some pools, in units of their own noise.
-    pub fn mixed_log_det(&self, pools: &[usize]) -> f64 {
+    pub(crate) fn mixed_log_det(&self, pools: &[usize]) -> f64 {
         pools.iter().map(|&pool| self.mixing.log_det_of(pool)).sum()
     }
 

@@ -16,7 +16,7 @@
 //!
 //! Source: M. C. Kennedy and A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, a model's discrepancy; variance components.
 
-pub(crate) mod gradient;
+mod gradient;
 
 use core::ops::Range;
 
@@ -31,6 +31,7 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::location::Location;
 use super::settings::Settings;
+pub use gradient::steering;
 use gradient::{Changing, Runs, Where};
 
 /// Free amplitudes at one place, and their evidence.

@@ -116,7 +116,7 @@ impl Element {
     }
 
     /// The forms at a quadrupole that a recording shows, with their signatures.
-    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<(Form, Signature)> {
+    pub(crate) fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<(Form, Signature)> {
         let mut all: Vec<_> = Form::all().map(|form| (form, form.signature(signatures, ring, quadrupole))).collect();
         let largest = all.iter().map(|(_, signature)| signature.rms()).fold(0.0, f64::max);
         all.retain(|(_, signature)| signature.rms() > SHOWN * largest);
@@ -124,7 +124,7 @@ impl Element {
     }
 
     /// True for the same thing at the same place, whatever its size.
-    pub fn is_like(&self, other: &Self) -> bool {
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.quadrupole == other.quadrupole && self.does == other.does
     }
 

@@ -118,7 +118,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
+    pub(crate) fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
         let u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
         let problem = Problem::new(data, hypothesis, &u)?;
         let (cost, residual) = problem.evaluate(&u)?;
@@ -189,7 +189,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
-    pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+    pub(crate) fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
         let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
         let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
@@ -224,7 +224,7 @@ impl Fitted {
     }
 
     /// Angle by which its unknown element turns the planes [rad], if that is what it does.
-    pub fn turned(&self, data: &Data) -> Option<Measured> {
+    pub(crate) fn turned(&self, data: &Data) -> Option<Measured> {
         let turns = |(i, unknown): (usize, &Unknown)| match unknown {
             Unknown::Form(_, Form::Rotation, sigma) => Some((self.params.len() + i, *sigma)),
             _ => None,
@@ -269,7 +269,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+    pub(crate) fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
         self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
@@ -286,7 +286,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
+    pub(crate) fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
@@ -309,7 +309,7 @@ impl Fitted {
     }
 
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
-    pub fn is_stable(&self, data: &Data) -> bool {
+    pub(crate) fn is_stable(&self, data: &Data) -> bool {
         let keeps = |campaign: usize| {
             self.machine_in(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
         };
@@ -328,7 +328,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
+    pub(crate) fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
         Ok(self.predicted_at(data, campaign, &self.u)?.by_frame())
     }
 
@@ -365,7 +365,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn widened(
+    pub(crate) fn widened(
         &self,
         data: &Data,
         other: &Hypothesis,
@@ -506,7 +506,7 @@ fn machine_at(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn predicted_by(
+pub fn predicted_by(
     data: &Data,
     hypothesis: &Hypothesis,
     campaign: usize,
@@ -524,7 +524,7 @@ pub(super) fn predicted_by(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn of_element(
+pub fn of_element(
     data: &Data,
     hypothesis: &Hypothesis,
     campaign: usize,
@@ -555,7 +555,7 @@ pub(super) fn of_element(
 ///
 /// # Errors
 /// [`EffectError`].
-pub(super) fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
+pub fn predicted(machine: &Machine, drives: &Drives) -> Result<Signature, EffectError> {
     let (readings, tunes, tune_changes) = machine.readings(drives)?;
     Ok(Signature { readings, tunes: [tunes.x, tunes.y], tune_changes })
 }

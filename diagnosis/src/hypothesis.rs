@@ -80,7 +80,7 @@ impl Member {
     }
 
     /// True if it acts in a recording.
-    pub fn is_in(&self, campaign: usize) -> bool {
+    pub(crate) fn is_in(&self, campaign: usize) -> bool {
         self.campaign.is_none_or(|own| own == campaign)
     }
 }
@@ -101,12 +101,12 @@ pub enum Identity<'u> {
 impl Unknown {
     /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
     /// evaluated for the same machine.
-    pub fn is_of_first_order(&self) -> bool {
+    pub(crate) fn is_of_first_order(&self) -> bool {
         matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
     }
 
     /// The least that it is where a fit is linearised about it, in prior standard deviations.
-    pub fn least_start(&self) -> f64 {
+    pub(crate) fn least_start(&self) -> f64 {
         match self {
             Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,
             _ => f64::NEG_INFINITY,
@@ -148,7 +148,7 @@ impl Term {
     }
 
     /// True of two exchanged instruments.
-    pub fn is_exchange(self) -> bool {
+    pub(crate) fn is_exchange(self) -> bool {
         self.kind.is_switch() && self.site.is_pair()
     }
 
@@ -189,7 +189,7 @@ impl Hypothesis {
     }
 
     /// The same with one of its effects gross; none for a field, which iron and alignment bound.
-    pub fn with_gross(&self, index: usize) -> Option<Self> {
+    pub(crate) fn with_gross(&self, index: usize) -> Option<Self> {
         let term = self.terms[index];
         let kind = term.kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector() || kind == EffectKind::RfStep;
@@ -208,7 +208,7 @@ impl Hypothesis {
 
     /// `ln` prior of the widths that its unknowns have: of vars relative to that of their prior, of ordinary families to none, of gross effects to usual
     /// ones.
-    pub fn log_prior(&self) -> f64 {
+    pub(crate) fn log_prior(&self) -> f64 {
         let of_families: f64 = self.ordinary.iter().map(Family::log_prior).sum();
         self.scatter.log_prior() + of_families + self.gross.len() as f64 * GROSS.ln()
     }
@@ -279,7 +279,7 @@ impl Hypothesis {
     ///
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
-    pub fn machine_in(
+    pub(crate) fn machine_in(
         &self,
         data: &Data,
         campaign: usize,

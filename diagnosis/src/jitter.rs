@@ -110,7 +110,7 @@ impl Differences {
     }
 
     /// Crates, beside known modes, and what the recording allows of one more, whose neighbours are in one of some `orders`.
-    pub fn crates(&self, others: &DMatrix<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
+    pub(crate) fn crates(&self, others: &DMatrix<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
         let correlation = self.correlation(others);
         let strength = |group: &&[usize]| strength(&correlation, group);
         let mut groups = groups(orders);

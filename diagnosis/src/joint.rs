@@ -23,7 +23,7 @@ impl Data {
     ///
     /// # Errors
     /// [`DataError::Apart`] where they are not of one machine.
-    pub fn joined_with(mut self, others: Vec<Self>) -> Result<Self, DataError> {
+    pub(crate) fn joined_with(mut self, others: Vec<Self>) -> Result<Self, DataError> {
         for other in &others {
             let same = [
                 ("machine", self.ring.name == other.ring.name),
@@ -75,7 +75,7 @@ impl Data {
     }
 
     /// Rigidity of the beam, of one elementary charge [T m].
-    pub fn rigidity(&self) -> f64 {
+    pub(crate) fn rigidity(&self) -> f64 {
         self.momentum / PER_RIGIDITY
     }
 
@@ -104,12 +104,12 @@ impl Data {
     }
 
     /// Pools of each among those of all.
-    pub fn pools_of_each(&self) -> Vec<Range<usize>> {
+    pub(crate) fn pools_of_each(&self) -> Vec<Range<usize>> {
         following(self.campaigns().map(|one| one.pools.count))
     }
 
     /// Number of whitened numbers of all.
-    pub fn whole_size(&self) -> usize {
+    pub(crate) fn whole_size(&self) -> usize {
         self.campaigns().map(Self::size).sum()
     }
 
@@ -117,7 +117,7 @@ impl Data {
     ///
     /// # Errors
     /// Those of `of`.
-    pub fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
+    pub(crate) fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
         let mut all = DVector::zeros(self.whole_size());
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
             all.rows_range_mut(rows).copy_from(&of(index, one)?);
@@ -129,7 +129,7 @@ impl Data {
     ///
     /// # Errors
     /// Those of `of`.
-    pub fn stacked_columns<E>(
+    pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,
         of: impl Fn(usize, &Self) -> Result<DMatrix<f64>, E>,
@@ -143,7 +143,7 @@ impl Data {
     }
 
     /// `ln` of the determinant of the covariance of all.
-    pub fn whole_log_det(&self) -> f64 {
+    pub(crate) fn whole_log_det(&self) -> f64 {
         self.campaigns().map(Self::log_det).sum()
     }
 
@@ -151,7 +151,7 @@ impl Data {
     ///
     /// # Errors
     /// [`EffectError`]; all are then as they were.
-    pub fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
+    pub(crate) fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
         let mut others = self.others.clone();
         let mut moved = 0.0;
         for (other, (machine, drives)) in others.iter_mut().zip(&machines[1..]) {
@@ -164,7 +164,7 @@ impl Data {
     }
 
     /// [`Data::trim`] of each recording by the residuals of all.
-    pub fn trim_each(&mut self, residual: &DVector<f64>) -> bool {
+    pub(crate) fn trim_each(&mut self, residual: &DVector<f64>) -> bool {
         let parts = self.parts();
         let part = |index: usize| residual.rows_range(parts[index].clone()).into_owned();
         let mut trimmed = self.trim(&part(0));

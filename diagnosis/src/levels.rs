@@ -156,7 +156,7 @@ impl Levels {
     }
 
     /// True if it is the same in all frames.
-    pub fn is_constant(&self) -> bool {
+    pub(crate) fn is_constant(&self) -> bool {
         self.parts.is_empty()
     }
 }

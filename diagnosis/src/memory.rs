@@ -54,18 +54,18 @@ impl Memory {
     }
 
     /// What is left of slow noise after some frames.
-    pub fn decay(self, frames: usize) -> f64 {
+    pub(crate) fn decay(self, frames: usize) -> f64 {
         (-(frames as f64) / self.time).exp()
     }
 
     /// Covariance of white and slow noise in two frames so far apart, at the ordinary level.
-    pub fn stationary(self, apart: usize) -> f64 {
+    pub(crate) fn stationary(self, apart: usize) -> f64 {
         let white = if apart == 0 { 1.0 - self.share } else { 0.0 };
         white + self.share * self.decay(apart)
     }
 
     /// Covariance of the walk in two frames, counted from where it begins.
-    pub fn walked(self, one: usize, other: usize) -> f64 {
+    pub(crate) fn walked(self, one: usize, other: usize) -> f64 {
         self.steps * self.steps * one.min(other) as f64
     }
 
@@ -115,7 +115,7 @@ impl Filter {
     }
 
     /// The same of every column.
-    pub fn whiten_columns(&self, columns: &mut DMatrix<f64>) {
+    pub(crate) fn whiten_columns(&self, columns: &mut DMatrix<f64>) {
         columns.column_iter_mut().for_each(|mut column| self.whiten(column.iter_mut()));
     }
 }

@@ -31,7 +31,7 @@ struct Mixed {
 
 impl Modes {
     /// None, of so many monitors.
-    pub fn none(monitors: usize) -> Self {
+    pub(crate) fn none(monitors: usize) -> Self {
         Self { factors: DMatrix::zeros(monitors, 0) }
     }
 
@@ -77,12 +77,12 @@ impl Mixing {
     }
 
     /// `ln` of the determinant of the covariances.
-    pub fn log_det(&self) -> f64 {
+    pub(crate) fn log_det(&self) -> f64 {
         (0..self.frames.len()).map(|frame| self.log_det_of(frame)).sum()
     }
 
     /// The same of one frame.
-    pub fn log_det_of(&self, frame: usize) -> f64 {
+    pub(crate) fn log_det_of(&self, frame: usize) -> f64 {
         let of = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
         self.frames.get(frame).map_or(0.0, of)
     }

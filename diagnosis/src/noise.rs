@@ -322,7 +322,7 @@ impl Noise {
     }
 
     /// What varies from frame to frame and is not ordinary, with its probability.
-    pub fn unordinary(&self) -> Option<(&FrameToFrame, f64)> {
+    pub(crate) fn unordinary(&self) -> Option<(&FrameToFrame, f64)> {
         let one = self.frame_to_frame.as_ref()?;
         let odds = one.log_bayes - correction_of_sort();
         let probability = 1.0 / (1.0 + (-odds).exp());
@@ -398,15 +398,6 @@ impl Noise {
         Slow { walk, ..self.slow }.memory(self.own[b])
     }
 
-    /// True if everything is as the header says.
-    pub fn is_as_stated(&self) -> bool {
-        self.levels.is_constant()
-            && self.slow.is_none()
-            && self.wandering.is_empty()
-            && self.modes.is_none()
-            && self.scale.iter().all(|scale| *scale == 1.0)
-    }
-
     /// The rows of a table; `names` of the monitors.
     pub fn rows(&self, names: &[String]) -> Vec<Imperfection> {
         let off = Measured { value: self.common_scale.value - 1.0, ..self.common_scale };
@@ -445,7 +436,7 @@ impl Noise {
     }
 
     /// Those of parts of one of several recordings and of its monitors that wander by themselves.
-    pub fn of_parts(&self, recording: &str, names: &[String]) -> Vec<Imperfection> {
+    pub(crate) fn of_parts(&self, recording: &str, names: &[String]) -> Vec<Imperfection> {
         let row = |part: &Part| {
             let row = part.row();
             Imperfection { at: format!("{} of {recording}", row.at), ..row }
@@ -598,7 +589,10 @@ mod tests {
             let made = Coloured::white(&ring, &recording, 40 + seed).campaign(&ring, &recording, &[]);
             let campaign = Campaign::of(&ring, &made).unwrap();
             let data = Data::of(&campaign).unwrap();
-            assert!(data.noise.is_as_stated(), "{:?}", data.noise);
+            let Noise { levels, slow, wandering, modes, scale, .. } = &data.noise;
+            let is_ordinary = slow.is_none() && wandering.is_empty() && modes.is_none();
+            let is_of_header = levels.is_constant() && scale.iter().all(|scale| *scale == 1.0);
+            assert!(is_ordinary && is_of_header, "{:?}", data.noise);
             (0..campaign.monitors()).for_each(|b| assert_eq!(data.noise.own[b], campaign.noise(b), "monitor {b}"));
         }
     }

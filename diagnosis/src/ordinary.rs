@@ -233,7 +233,7 @@ impl Family {
     }
 
     /// `ln` prior of its width, relative to that of none.
-    pub fn log_prior(&self) -> f64 {
+    pub(crate) fn log_prior(&self) -> f64 {
         if self.is_learnt() { -0.5 * (self.width / self.tolerance).powi(2) } else { 0.0 }
     }
 }

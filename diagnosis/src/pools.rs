@@ -76,7 +76,7 @@ impl Pools {
     }
 
     /// Rows of pools as those of their frames.
-    pub fn by_frame(&self, of_pools: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn by_frame(&self, of_pools: &DMatrix<f64>) -> DMatrix<f64> {
         of_pools.select_rows(&self.of_frame)
     }
 }

@@ -123,7 +123,7 @@ impl Repeats {
 
     /// With the level of the noise in each frame.
     #[must_use]
-    pub fn at_levels(mut self, levels: &Levels) -> Self {
+    pub(crate) fn at_levels(mut self, levels: &Levels) -> Self {
         self.readings.iter_mut().for_each(|reading| reading.level = levels.at(reading.frame));
         self
     }
@@ -147,7 +147,7 @@ impl Repeats {
     }
 
     /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none where there are few.
-    pub fn of_neighbours(&self) -> Option<f64> {
+    pub(crate) fn of_neighbours(&self) -> Option<f64> {
         let repeated = |pair: &&[Repeat]| {
             let [one, other] = [pair[0], pair[1]];
             other.frame == one.frame + 1 && (other.run == Run::Same || (one.run == Run::Base && other.run == Run::Base))
@@ -175,7 +175,7 @@ impl Repeats {
     }
 
     /// What they say of a memory.
-    pub fn weigh(&self, memory: Memory) -> Weighed {
+    pub(crate) fn weigh(&self, memory: Memory) -> Weighed {
         let mut weighed = Weighed { count: -self.fitted, ..Weighed::default() };
         for (_, innovation, variance) in self.differences(memory) {
             weighed.count += 1.0;

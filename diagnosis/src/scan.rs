@@ -126,7 +126,7 @@ impl Projection {
     }
 
     /// `d_i P d_j` of whitened signatures, one a column.
-    pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
         columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
     }
@@ -151,12 +151,12 @@ impl SignatureScore {
     }
 
     /// Of a bound: an exchange is less likely than nothing.
-    pub fn is_below_half_of_least(self) -> bool {
+    pub(crate) fn is_below_half_of_least(self) -> bool {
         self.pull < 0.5 * self.least()
     }
 
     /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
-    pub fn of_amplitude(self) -> (f64, f64) {
+    pub(crate) fn of_amplitude(self) -> (f64, f64) {
         let Evidence { amplitude, log_bayes_factor, .. } = Evidence::from_score(self.pull, self.power, 1.0);
         (amplitude, log_bayes_factor)
     }
@@ -167,7 +167,7 @@ impl SignatureScore {
     }
 
     /// The same for an effect without an amplitude.
-    pub fn of_switch(self) -> (f64, f64) {
+    pub(crate) fn of_switch(self) -> (f64, f64) {
         (1.0, self.pull - 0.5 * self.power)
     }
 }

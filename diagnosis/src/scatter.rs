@@ -33,7 +33,7 @@ impl Scatter {
     }
 
     /// `ln` prior, relative to that of the prior's own width.
-    pub fn log_prior(self) -> f64 {
+    pub(crate) fn log_prior(self) -> f64 {
         -COUNTS * (self.0.ln() + 0.5 * (self.0.powi(-2) - 1.0))
     }
 }

@@ -35,15 +35,15 @@ use super::slow::OWN;
 use inference::bounded::softplus;
 
 /// Prior odds of one (more) effect.
-pub(super) const ODDS: f64 = 1.0;
+pub const ODDS: f64 = 1.0;
 const ODDS_FURTHER: f64 = 0.25;
 /// Prior probability of physics that the library does not hold.
-pub(super) const UNMODELLED: f64 = 0.15;
+pub const UNMODELLED: f64 = 0.15;
 /// Share of it that is too small to be seen. Nothing is known of its size, so that it is taken to hide as often as the library's effects do: these are 0.43 times
 /// as likely as before where nothing is found, on average of 1186 simulated empty campaigns.
 const TOO_SMALL: f64 = 0.4;
 /// Prior probability of what can be seen of it.
-pub(super) const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
+pub const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
 /// Rounds over all competitions, and the gain of `ln` posterior that calls for another round.
 const ROUNDS: usize = 3;
 const BETTER: f64 = 0.1;

@@ -46,7 +46,7 @@ impl Settings {
     }
 
     /// Rows frames, columns settings.
-    pub fn indicator(&self) -> DMatrix<f64> {
+    pub(crate) fn indicator(&self) -> DMatrix<f64> {
         let mut indicator = DMatrix::zeros(self.of_frame.len(), self.powered.len());
         self.of_frame.iter().enumerate().for_each(|(frame, &setting)| indicator[(frame, setting)] = 1.0);
         indicator

@@ -110,7 +110,7 @@ impl Slow {
     }
 
     /// The memory of a monitor of some noise [m].
-    pub fn memory(&self, sigma: f64) -> Memory {
+    pub(crate) fn memory(&self, sigma: f64) -> Memory {
         if self.is_none() {
             return Memory::NONE;
         }

@@ -43,7 +43,7 @@ impl Units {
     }
 
     /// The same of a prior whose standard deviations are so many times as large, within the same range.
-    pub fn scaled(&self, by: f64) -> Self {
+    pub(crate) fn scaled(&self, by: f64) -> Self {
         let range = self.range.iter().map(|range| range.map(|bound| bound / by)).collect();
         Self { sigma: &self.sigma * by, range, ..self.clone() }
     }

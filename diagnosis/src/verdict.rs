@@ -77,7 +77,7 @@ impl Verdict {
 
     /// The same beside noise that is not ordinary.
     #[must_use]
-    pub fn with_noise(self, data: &Data) -> Self {
+    pub(crate) fn with_noise(self, data: &Data) -> Self {
         if data.campaigns().any(|one| one.noise.unordinary().is_some()) { Self::Unexplained } else { self }
     }
 
@@ -126,7 +126,7 @@ pub struct Tested {
 impl Tested {
     /// True if held-out readings are predicted better by more than the standard errors asked for, and by the choice too; of an instrument beside the scatter of
     /// its like, if they are not predicted worse and chance is excluded.
-    pub fn is_passed(&self) -> bool {
+    pub(crate) fn is_passed(&self) -> bool {
         let (gain, error) = self.gain;
         let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
         match (self.chance.is_some_and(|chance| chance <= CHANCE), self.is_of_family) {
@@ -303,7 +303,7 @@ impl Finding {
     }
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
-    pub fn is_validated(&self) -> bool {
+    pub(crate) fn is_validated(&self) -> bool {
         self.tested.is_some_and(|tested| tested.is_passed())
     }
 
@@ -596,7 +596,7 @@ fn power(found: &Found) -> String {
 }
 
 /// A clause as the beginning of a sentence.
-pub(super) fn capitalised(text: &str) -> String {
+pub fn capitalised(text: &str) -> String {
     let mut characters = text.chars();
     characters.next().map_or_else(String::new, |first| first.to_uppercase().chain(characters).collect())
 }

@@ -139,11 +139,6 @@ impl Miswired {
         designs.at_other_tunes(&measured);
         Ok(measured.judged(&designs))
     }
-
-    /// The likely wirings, most likely first.
-    pub fn wirings(&self) -> &[Wiring] {
-        &self.0
-    }
 }
 
 /// Every wrong wiring.
@@ -648,7 +643,7 @@ mod tests {
             for (recording, columns, fault) in cases.into_iter().chain([moved(1), moved(-1)]) {
                 let found = judge(&ring, &recording).unwrap_or_else(|| panic!("{name}: {columns:?} {fault:?} missed"));
                 let is_it = |one: &Wiring| one.columns == columns && one.fault == fault;
-                assert!(found.wirings().iter().any(is_it), "{name}: {columns:?} {fault:?}: {found}");
+                assert!(found.0.iter().any(is_it), "{name}: {columns:?} {fault:?}: {found}");
             }
         }
     }

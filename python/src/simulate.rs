@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use diagnosis::validation::{self, Cases, Class};
 use host_bridge::command::response::by_name;
 use host_bridge::command::{self, CommandError};

@@ -1,8 +1,7 @@
 //! Rings that are not the Booster, simulated by pyAT: ten cells with two families, and eight with three families whose
 //! monitors and correctors act in both planes (`tests/peers/three_families.py`).
 
-use diagnosis::score::{Grade, Truth};
-use diagnosis::{Diagnosis, Verdict};
+use diagnosis::{Diagnosis, Grade, Truth, Verdict};
 use estimator::Walk;
 use inference::{BatchFit, Campaign, Recording, TuneUse, simulate, stream};
 use system_tests::repository;

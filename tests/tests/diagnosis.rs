@@ -3,13 +3,10 @@
 
 use std::collections::BTreeSet;
 
-use diagnosis::fit::Fitted;
-use diagnosis::hypothesis::{Hypothesis, Term};
-use diagnosis::imperfection::{Imperfection, Measure};
-use diagnosis::scan::{candidates, scan};
-use diagnosis::score::{Grade, Truth};
 use diagnosis::validation::{Cases, Class, Unmodelled, UnmodelledKind};
-use diagnosis::{Diagnosis, Verdict, data::Data, sample};
+use diagnosis::{
+    Data, Diagnosis, Fitted, Grade, Hypothesis, Imperfection, Measure, Term, Truth, Verdict, candidates, sample, scan,
+};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Recording};
@@ -325,7 +322,7 @@ fn the_amplitude_is_that_of_nuts() {
         let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
         let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
-        let run = sample::sample(&data, &fitted, settings).unwrap();
+        let run = sample(&data, &fitted, settings).unwrap();
         // in open-08 vars lie at their bound, where a step adapted in so few draws is sometimes too long: 1 to 6 of 400 draws with
         // six seeds and warm-ups, 3.5 on average; a Poisson number of that mean exceeds 12 once in 30,000 runs. What they leave out
         // would show in the amplitude below

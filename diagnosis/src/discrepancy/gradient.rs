@@ -34,7 +34,7 @@ pub(super) struct Changing {
 }
 
 /// What `ln` of each quadrupole's gradient does, with the kick that it gives to an orbit (x, y) at every element [m].
-pub(crate) fn steering(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]]) -> Vec<Signature> {
+pub fn steering(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]]) -> Vec<Signature> {
     let with_kick = |(q, mut gradient): (usize, Signature)| {
         gradient += kick(signatures, ring, q, orbit[ring.quadrupoles[q].element]);
         gradient
@@ -150,7 +150,7 @@ pub(super) struct Where<'d> {
 
 impl Where<'_> {
     /// Of patterns that step with time, by whole whitened frames.
-    pub fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
+    pub(crate) fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
         let patterns: Vec<Signature> = patterns.iter().map(|one| at_monitors(one, self.monitors)).collect();
         Sums::whole(&self.data.stepping(&patterns, steps), self.own)
     }

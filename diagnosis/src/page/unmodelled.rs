@@ -9,7 +9,7 @@ use super::residuals::Residual;
 use super::{slope, tunes};
 use crate::Diagnosis;
 use crate::discrepancy::Discrepancy;
-use crate::discrepancy::gradient::steering;
+use crate::discrepancy::steering;
 use crate::error::FitError;
 use crate::location::Location;
 use crate::settings::Settings;

@@ -121,7 +121,7 @@ impl Differences {
     }
 
     /// An orbit [m] that is added to every frame, over the noise and without the direction of the dispersion, rows frames; 0 where nothing counts.
-    pub fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
+    pub(crate) fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
         let mut all = self.counts.map_with_location(|_, b, counts| if counts { orbit[b] / self.sigma[b] } else { 0.0 });
         self.runs.iter().flat_map(Clone::clone).for_each(|frame| self.without_momentum(&mut all, frame));
         all
@@ -138,7 +138,7 @@ impl Differences {
     }
 
     /// True for a monitor with readings that count.
-    pub fn sees(&self, b: usize) -> bool {
+    pub(crate) fn sees(&self, b: usize) -> bool {
         self.counts.column(b).iter().any(|counts| *counts)
     }
 }

@@ -56,7 +56,7 @@ impl<'c> Signals<'c> {
     }
 
     /// What all monitors read while the machine keeps its whole former orbit for the first frame of a setting [m].
-    pub fn of_former_orbit(&self) -> DMatrix<f64> {
+    pub(crate) fn of_former_orbit(&self) -> DMatrix<f64> {
         let columns: Vec<DVector<f64>> = (0..self.orbit.ncols()).map(|b| self.coming(b)).collect();
         DMatrix::from_columns(&columns)
     }

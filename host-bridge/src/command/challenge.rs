@@ -4,8 +4,7 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use diagnosis::score::{Grade, Truth};
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{Diagnosis, Finding, Grade, Truth, Verdict};
 use serde::Serialize;
 use twin::Ring;
 

@@ -4,8 +4,7 @@ use core::fmt;
 use estimator::Walk;
 
 use comfy_table::CellAlignment;
-use diagnosis::data::DataError;
-use diagnosis::wiring::Miswired;
+use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
 use inference::{Campaign, Lack, Recording};
 use serde::Serialize;
@@ -18,7 +17,7 @@ use crate::output::{lines, table};
 use crate::result::{Monitor, TunesMeasured, faults, lack, monitors};
 
 /// Fewest monitors with readings, and correctors that were moved, for a diagnosis.
-const LEAST: usize = diagnosis::data::LEAST;
+const LEAST: usize = diagnosis::LEAST;
 /// Rate of a device's serial line where none is given [baud], and bits of a byte on it.
 const LINE: (f64, f64) = (921_600.0, 10.0);
 

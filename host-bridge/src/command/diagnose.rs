@@ -4,12 +4,7 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 
 use comfy_table::ColumnConstraint;
-use diagnosis::average::Vars;
-use diagnosis::beyond::Beyond;
-use diagnosis::data::DataError;
-use diagnosis::heldout::Score;
-use diagnosis::imperfection::{Imperfection, Measure};
-use diagnosis::{Diagnosis, Finding, page};
+use diagnosis::{Beyond, DataError, Diagnosis, Finding, Fitted, Imperfection, Measure, Score, Vars, page};
 use inference::Recording;
 use measured::Folder;
 use report::Page;
@@ -299,7 +294,7 @@ impl DiagnosisResult {
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;
         let (gain, error) = diagnosis.gain();
-        let fit = |fitted: &diagnosis::fit::Fitted, score: &Score| -> Result<FitResult, CommandError> {
+        let fit = |fitted: &Fitted, score: &Score| -> Result<FitResult, CommandError> {
             Ok(FitResult {
                 chi2_per_dof: fitted.chi2_per_dof(data).map_err(failed)?,
                 heldout_rms_mm: score.rms * 1e3,

@@ -7,7 +7,7 @@ use std::io::Write;
 use std::path::Path;
 use std::sync::Mutex;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use diagnosis::validation::tables::Tables;
 use diagnosis::validation::{self, Case, Cases, Class, Outcome, UnmodelledKind};
 use inference::{Campaign, Recording};
