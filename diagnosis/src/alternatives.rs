@@ -5,17 +5,11 @@ use nalgebra::DVector;
 use super::data::Data;
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::location::Location;
 use super::noise::Noise;
+use super::odds::{SUSPICIOUS, UNMODELLED};
 use super::scan::Candidate;
-use super::search::UNMODELLED;
-
-/// Probability at which a cause counts as decided.
-pub const DECISIVE: f64 = 0.95;
-/// Probability of missing physics that can be seen above which a recording is not consistent. A lower limit would call too many recordings without
-/// missing physics ambiguous.
-pub const SUSPICIOUS: f64 = 0.6;
+use super::term::Term;
 
 /// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in two validations 11 of 171
 /// that could be seen.

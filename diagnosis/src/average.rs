@@ -6,13 +6,14 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::alternatives::{Cause, Competition, DECISIVE};
+use super::alternatives::{Cause, Competition};
 use super::discrepancy::Discrepancy;
 use super::error::FitError;
+use super::family::Family;
 use super::fit::Fitted;
 #[cfg(doc)]
 use super::hypothesis::Hypothesis;
-use super::ordinary::Family;
+use super::odds::DECISIVE;
 use super::search::Found;
 
 /// `ln` of the vars.

@@ -53,8 +53,9 @@ mod tests {
     use super::*;
     use crate::data::Data;
     use crate::heldout::{gain_of_choice, reduced};
+    use crate::odds::corrections;
     use crate::scan::candidates;
-    use crate::search::{Found, Search, corrections};
+    use crate::search::{Found, Search};
     use crate::testing::{Coloured, template};
     use twin::{Effect, EffectKind};
 

@@ -6,8 +6,8 @@ use nalgebra::DMatrix;
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::scan::{Projection, Scored, SignatureScore, signatures};
+use super::term::Term;
 
 /// Candidates beside a fit, to first order.
 pub struct Choice<'d> {

@@ -10,9 +10,7 @@ use core::f64::consts::TAU;
 use core::fmt;
 
 use nalgebra::DMatrix;
-use twin::{EffectKind, Machine, OrbitError, Plane};
-
-use super::ordinary::Family;
+use twin::{Machine, OrbitError, Plane};
 
 /// The tunes of a recording that are too close.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,6 +21,8 @@ pub struct CloseTunes {
     pub approach: f64,
 }
 
+/// Ordinary roll of a quadrupole, as surveys leave it [rad].
+pub const ROLL: f64 = 0.001;
 /// Closest approaches that tunes have to be apart.
 const APART: f64 = 3.0;
 
@@ -39,13 +39,9 @@ impl CloseTunes {
         }
         let (distance, optics) = (distances.iter().sum::<f64>() / distances.len() as f64, machine.optics()?);
         let ring = machine.ring();
-        let roll = Family::of_machine()
-            .iter()
-            .find(|family| family.kind == EffectKind::QuadRoll)
-            .map_or(0.0, |one| one.tolerance);
         let by_roll = ring.quadrupoles.iter().zip(ring.integrated_gradients()).map(|(quadrupole, k1l)| {
             let [x, y] = [Plane::X, Plane::Y].map(|plane| optics.beta(quadrupole.element, plane));
-            2.0 * roll * k1l * (x * y).sqrt() / TAU
+            2.0 * ROLL * k1l * (x * y).sqrt() / TAU
         });
         let approach = by_roll.map(|one| one * one).sum::<f64>().sqrt().hypot(optics.closest_tune_approach()?);
         Ok((distance < APART * approach).then_some(Self { distance, approach }))

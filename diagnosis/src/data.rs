@@ -31,7 +31,6 @@ use super::close_tunes::CloseTunes;
 use super::error::FitError;
 use super::exact::Exact;
 use super::frame_to_frame::Shape;
-use super::joint::following;
 use super::levels::Levels;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
@@ -914,4 +913,14 @@ pub(super) fn drives_of(campaign: &Campaign) -> Drives {
         nominal_kick: campaign.recording.nominal_kick(),
         orbit: vec![[0.0; 2]; campaign.ring.elements.len()],
     }
+}
+/// Ranges of some lengths, one after the other.
+pub fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
+    lengths
+        .scan(0, |end, length| {
+            let start = *end;
+            *end += length;
+            Some(start..*end)
+        })
+        .collect()
 }

@@ -12,7 +12,7 @@
 
 use twin::{Ring, Signature, Signatures};
 
-use super::hypothesis::Term;
+use super::term::Term;
 
 /// Share of the largest change of the readings by a form below which another one is not seen.
 const SHOWN: f64 = 1e-3;

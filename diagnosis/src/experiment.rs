@@ -9,8 +9,8 @@ use twin::{Drives, Machine, Quadrupole, Signatures};
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::scan::Rivals;
+use super::term::Term;
 
 /// What a possible measurement changes of the present one.
 #[derive(Debug, Clone, PartialEq)]

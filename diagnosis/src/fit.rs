@@ -16,9 +16,11 @@ use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signat
 use super::data::Data;
 use super::element::Form;
 use super::error::FitError;
-use super::hypothesis::{Hypothesis, Member, Term, Unknown};
-use super::ordinary::Family;
+use super::family::Family;
+use super::hypothesis::Hypothesis;
+use super::term::Term;
 use super::units::{Units, Within};
+use super::unknown::{Member, Unknown};
 use evidence::{Factor, gram};
 use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
@@ -247,7 +249,7 @@ impl Fitted {
     pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
         let own = self.hypothesis.unknowns(data);
         let value = |unknown: &Unknown| {
-            let same = |(_, one): &(usize, &Unknown)| one.is_of(&self.hypothesis) == unknown.is_of(other);
+            let same = |(_, one): &(usize, &Unknown)| self.hypothesis.identity(one) == other.identity(unknown);
             let (i, one) = own.iter().enumerate().find(same)?;
             Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
         };

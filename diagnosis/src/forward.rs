@@ -7,8 +7,9 @@ use twin::{Effect, EffectError, EffectKind, Machine, Rf, Ring, Signatures, Site}
 
 use crate::data::Data;
 use crate::fit::Fitted;
-use crate::hypothesis::{Hypothesis, Term};
+use crate::hypothesis::Hypothesis;
 use crate::scan::{Projection, candidates, scan};
+use crate::term::Term;
 use crate::testing::template;
 use inference::Campaign;
 use inference::recording::Recording;

@@ -323,7 +323,7 @@ mod tests {
     use crate::location::Location;
     use crate::noise::Noise;
     use crate::period::Recurs;
-    use crate::search::correction_of_sort;
+    use crate::odds::correction_of_sort;
     use crate::testing::{Coloured, template};
     use crate::verdict::Verdict;
 

@@ -13,7 +13,7 @@ use estimator::{Health, MonitorState};
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine};
 
-use super::data::{Data, DataError};
+use super::data::{Data, DataError, following};
 
 /// Momentum of a particle of one elementary charge over its rigidity [GeV/c per T m].
 const PER_RIGIDITY: f64 = 0.299_792_458;
@@ -175,17 +175,6 @@ impl Data {
     }
 }
 
-/// Ranges of some lengths, one after the other.
-pub(super) fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
-    lengths
-        .scan(0, |end, length| {
-            let start = *end;
-            *end += length;
-            Some(start..*end)
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use inference::Campaign;
@@ -194,8 +183,9 @@ mod tests {
 
     use super::*;
     use crate::fit::Fitted;
-    use crate::hypothesis::{Hypothesis, Term};
+    use crate::hypothesis::Hypothesis;
     use crate::scan::signatures;
+    use crate::term::Term;
     use crate::testing::{Coloured, template};
     use crate::{Diagnosis, Verdict};
 

@@ -5,8 +5,8 @@
 
 use twin::EffectKind;
 
-use super::hypothesis::Term;
 use super::scan::Candidate;
+use super::term::Term;
 
 /// `ln` Bayes factor at the limit.
 pub const SEEN: f64 = 12.0;

@@ -15,19 +15,17 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
-use super::alternatives::SUSPICIOUS;
 use super::frame_to_frame::{self, Found, FrameToFrame, Known, Like, Shape};
-use super::imperfection::{Imperfection, Measure};
+use super::imperfection::{Imperfection, Measure, POSITION};
 use super::jitter::{CRATE, Crate, Differences, beside, groups, with_crates};
 use super::levels::{Levels, Part};
 use super::memory::Memory;
 use super::modes::Modes;
+use super::odds::{SUSPICIOUS, correction_of_sort};
 use super::period::Period;
 use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
-use super::search::correction_of_sort;
 use super::slow::{SHARE, Slow, steps};
-use super::verdict::UNMODELLED;
 use inference::Campaign;
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
@@ -415,7 +413,7 @@ impl Noise {
             ..row(what, measured, unit, ordinary)
         };
         let varying = self.frame_to_frame.iter().filter(|one| one.patterns.ncols() > 0);
-        let varying = varying.map(|one| row((one.name(), "frame_to_frame"), one.rms, UNMODELLED, 0.0));
+        let varying = varying.map(|one| row((one.name(), "frame_to_frame"), one.rms, POSITION, 0.0));
         let mut rows = vec![
             mean(("noise over the header's, less 1", "noise"), off, Unit::PERCENT, QUOTED),
             row(("noise of single monitors", "noise"), self.scatter, Unit::PERCENT, ALIKE),

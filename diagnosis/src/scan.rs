@@ -15,8 +15,9 @@ use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
 use super::data::Data;
 use super::error::FitError;
+use super::family::members;
 use super::fit::Fitted;
-use super::hypothesis::{Term, members};
+use super::term::Term;
 
 /// One candidate.
 #[derive(Debug, Clone)]

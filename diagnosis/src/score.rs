@@ -7,9 +7,9 @@ use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 use twin::{EffectError, EffectKind, Ring};
 
-use crate::alternatives::DECISIVE;
 use crate::average::Vars;
-use crate::hypothesis::Term;
+use crate::odds::DECISIVE;
+use crate::term::Term;
 use crate::{Diagnosis, Finding, Verdict};
 
 /// What a recording was made with.

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
-use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
+use super::alternatives::{Alternative, Cause, Competition};
 use super::aside::Aside;
 use super::beyond::Beyond;
 use super::chance;
@@ -11,17 +11,21 @@ use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
-use super::heldout::{Block, CHANCE, SUPPORTED, Score, VALIDATED, gain_of_choice, lessened, reduced};
-use super::hypothesis::Term;
-use super::imperfection::Imperfection;
+use super::family::family_of;
+use super::heldout::{Block, Score, gain_of_choice, lessened, reduced};
+use super::imperfection::{Imperfection, POSITION};
 use super::limits::Limits;
 use super::location::Location;
+use super::odds::corrections;
+use super::odds::{DECISIVE, SUSPICIOUS};
 use super::ordinary;
 use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
 use super::scan::separations;
-use super::search::{Found, corrections};
+use super::search::Found;
 use super::stuck::Stuck;
+use super::term::Term;
+use super::tested::Tested;
 use super::transients::Transient;
 
 /// The result of a diagnosis.
@@ -38,8 +42,6 @@ pub enum Verdict {
     Unexplained,
 }
 
-/// Unit of an unmodelled discrepancy [m], shown in mm.
-pub(super) const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 /// An effect in the model that something else explains better is no finding below this probability.
@@ -104,35 +106,6 @@ impl Verdict {
             Self::Identified
         } else {
             Self::Ambiguous
-        }
-    }
-}
-
-/// How an effect predicts what it was not chosen by, and how often chance would find as much.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tested {
-    /// Gain of held-out log predictive density with the amplitude fitted to the rest, and its standard error.
-    pub gain: (f64, f64),
-    /// The same where kind and place are chosen by the rest too; none beside a fit that is poor without the effect, about which nothing is of
-    /// first order, and of an unknown element, whose place and form all readings have chosen.
-    pub of_choice: Option<f64>,
-    /// Probability of as good a candidate were nothing there.
-    pub chance: Option<f64>,
-    /// True of an instrument, if the fit without it has a learnt scatter of its kind: once one run shows it, that scatter predicts the other runs nearly as well, so
-    /// that held-out readings tell little.
-    pub is_of_family: bool,
-}
-
-impl Tested {
-    /// True if held-out readings are predicted better by more than the standard errors asked for, and by the choice too; of an instrument beside the scatter of
-    /// its like, if they are not predicted worse and chance is excluded.
-    pub(crate) fn is_passed(&self) -> bool {
-        let (gain, error) = self.gain;
-        let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
-        match (self.chance.is_some_and(|chance| chance <= CHANCE), self.is_of_family) {
-            (true, true) => gain > 0.0,
-            (true, false) => of_choice > 0.0 && gain > SUPPORTED * error,
-            (false, _) => of_choice > 0.0 && gain > VALIDATED * error,
         }
     }
 }
@@ -299,7 +272,7 @@ impl Finding {
 
     /// Unit of the amplitude; for an unmodelled discrepancy that of its rms in the readings.
     pub fn unit(&self) -> Unit {
-        self.term().map_or(UNMODELLED, |term| term.kind.unit())
+        self.term().map_or(POSITION, |term| term.kind.unit())
     }
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
@@ -346,7 +319,7 @@ pub fn tests(
         }
         let kind = found.best.hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
-        let own = ordinary::family_of(kind);
+        let own = family_of(kind);
         let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == own);
         let choice = Choice::of(data, without, candidates, penalty)?;
         let is_of_family = is_of_an_instrument && is_learnt;

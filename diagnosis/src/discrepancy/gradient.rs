@@ -12,7 +12,9 @@
 use nalgebra::{DMatrix, DVector};
 use twin::{Place, Ring, Signature, Signatures};
 
-use super::{Adapted, Data, Discrepancy, Linearised, Seen, Sums, at_monitors};
+use super::marginal::{Adapted, Discrepancy, Linearised};
+use super::sums::{Seen, Sums, at_monitors};
+use crate::data::Data;
 use crate::location::Location;
 
 /// Amplitudes of a gradient over those of other places, 2.5 um to 0.32 mm rms at the monitors: the tunes show one that moves the readings by far less than their noise.
@@ -116,24 +118,6 @@ impl Runs {
         }
         // the other half is its transpose
         all.gram.fill_lower_triangle_with_upper_triangle();
-        all
-    }
-}
-
-impl Sums {
-    /// Of amplitudes that are sums of some, block by block: `steps`, rows those of a block.
-    pub(super) fn through(&self, steps: &DMatrix<f64>) -> Self {
-        let (from, to) = steps.shape();
-        let blocks = self.pull.len() / from;
-        let mut all = Self::none(blocks * to, self.cross.ncols());
-        for i in 0..blocks {
-            for j in 0..blocks {
-                let block = self.gram.view((i * from, j * from), (from, from));
-                all.gram.view_mut((i * to, j * to), (to, to)).copy_from(&(steps.transpose() * block * steps));
-            }
-            all.cross.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.cross.rows(i * from, from)));
-            all.pull.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.pull.rows(i * from, from)));
-        }
         all
     }
 }

@@ -5,8 +5,8 @@ use super::{limits, slope, tunes, unmodelled};
 use crate::alternatives::Cause;
 use crate::error::FitError;
 use crate::fit::Fitted;
-use crate::hypothesis::Term;
 use crate::location::Location;
+use crate::term::Term;
 use crate::{Diagnosis, Finding};
 use report::Figure;
 
@@ -24,7 +24,7 @@ pub fn figures(diagnosis: &Diagnosis) -> Result<Vec<(String, Figure)>, FitError>
     }
     let mut all = Vec::new();
     for finding in &diagnosis.findings {
-        if let Some(passing) = diagnosis.transients.iter().find(|one| one.is_of(finding)) {
+        if let Some(passing) = diagnosis.transients.iter().find(|one| one.is_of(&finding.cause)) {
             let is_unsteady =
                 matches!(&finding.cause, Cause::Unmodelled(one) if matches!(one.at, Location::UnsteadyCorrector(_)));
             let figure = if is_unsteady { slope::of_each_frame } else { slope::of_first_frames };

@@ -4,8 +4,9 @@ use crate::error::FitError;
 
 use crate::Diagnosis;
 use crate::discrepancy;
+use crate::odds::corrections;
 use crate::scan::scan;
-use crate::search::{correction_of, corrections};
+use crate::search::correction_of;
 use report::{Axes, Figure, Ranked, Section};
 
 /// Causes shown.

@@ -24,7 +24,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         section.tables.push(table(&caption, ["second campaign", "expected ln Bayes factor [nat]"], rows));
     }
     let mut rows = Vec::new();
-    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < crate::alternatives::DECISIVE) {
+    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < crate::odds::DECISIVE) {
         for one in core::iter::once(finding).chain(&finding.alternatives) {
             rows.push([
                 one.phrase.clone(),

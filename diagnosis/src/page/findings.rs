@@ -3,7 +3,7 @@
 use crate::error::FitError;
 
 use super::{decisive, signed, slope, table};
-use crate::verdict::Tested;
+use crate::tested::Tested;
 use crate::{Diagnosis, Finding, Verdict};
 use report::Section;
 

@@ -2,9 +2,9 @@
 
 use super::table;
 use crate::Diagnosis;
-use crate::alternatives::{DECISIVE, SUSPICIOUS};
 use crate::error::FitError;
 use crate::heldout::{CHANCE, SUPPORTED, VALIDATED};
+use crate::odds::{DECISIVE, SUSPICIOUS};
 use inference::recording::Recording;
 use report::Section;
 

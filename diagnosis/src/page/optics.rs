@@ -12,7 +12,7 @@ use crate::Diagnosis;
 use crate::data::Data;
 use crate::error::FitError;
 use crate::fit::Fitted;
-use crate::hypothesis::Unknown;
+use crate::unknown::Unknown;
 use report::{Axes, Figure, Reference, Section, Series};
 
 /// Step of an unknown for a derivative, in prior standard deviations.

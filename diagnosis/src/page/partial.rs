@@ -8,7 +8,8 @@ use super::tunes;
 use crate::data::Data;
 use crate::error::FitError;
 use crate::fit::{self, Fitted};
-use crate::hypothesis::{Hypothesis, Term};
+use crate::hypothesis::Hypothesis;
+use crate::term::Term;
 
 /// Some effects of a fit.
 pub struct Partial<'f> {

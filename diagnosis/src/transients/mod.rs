@@ -14,6 +14,7 @@
 //! predicted by the others.
 
 mod differences;
+mod shown;
 mod signals;
 mod unsteady;
 
@@ -26,17 +27,20 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use twin::{EffectKind, Hold, Optics, OrbitError, Ring, Signatures, Site};
 
-use super::alternatives::{Alternative, Cause, SUSPICIOUS, Weighed};
+use super::alternatives::{Alternative, Cause, Weighed};
 use super::data::{drives_of, rippled};
 use super::discrepancy::Discrepancy;
 use super::heldout::VALIDATED;
-use super::hypothesis::Term;
-use super::location::{Location, SORTS};
-use super::search::{ODDS, UNMODELLED, UNMODELLED_SEEN};
-use super::verdict::{Finding, Tested};
+use super::location::Location;
+use super::odds::SORTS;
+use super::odds::SUSPICIOUS;
+use super::odds::{ODDS, UNMODELLED, UNMODELLED_SEEN};
+use super::term::Term;
+use super::tested::Tested;
 use differences::{Differences, median, run_means};
 use inference::Campaign;
 use inference::recording::Recording;
+pub use shown::Shown;
 use signals::Signals;
 use unsteady::Unsteady;
 
@@ -59,17 +63,6 @@ pub struct Transient {
     /// Readings of the frames after a change less the later ones of their run, against what the leading cause should make of them, per unit of its
     /// amplitude [m]; of an unsteady corrector those of every frame less the mean of their run.
     pub shown: Vec<Shown>,
-}
-
-/// One reading of a frame, after a change or of a corrector that is unsteady.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Shown {
-    /// Predicted difference [m], per unit of the amplitude of a cause that has one.
-    pub predicted: f64,
-    /// The difference [m].
-    pub measured: f64,
-    /// Its noise [m].
-    pub sigma: f64,
 }
 
 /// Share of the nominal kick above which a corrector was moved.
@@ -95,9 +88,9 @@ const RARE: f64 = 0.01;
 const SEED: u64 = 1;
 
 impl Transient {
-    /// True for the finding that states it.
-    pub fn is_of(&self, finding: &Finding) -> bool {
-        self.alternatives[0].cause.is(&finding.cause)
+    /// True for the cause of the finding that states it.
+    pub fn is_of(&self, cause: &Cause) -> bool {
+        self.alternatives[0].cause.is(cause)
     }
 }
 

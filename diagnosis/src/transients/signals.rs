@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Site};
 
 use super::differences::run_means;
-use crate::hypothesis::Term;
+use crate::term::Term;
 use inference::Campaign;
 
 /// What the signals are made of.

@@ -14,8 +14,8 @@ use core::ops::Range;
 use evidence::log_bayes_factor_of_alike;
 use nalgebra::{DMatrix, DVector};
 
-use super::Shown;
 use super::differences::Differences;
+use super::shown::Shown;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
@@ -72,7 +72,7 @@ impl<'d> Unsteady<'d> {
         let variance = (of_others.along / of_others.count).max(1.0) * louder.max(1.0);
         let of = |runs: &[Sums]| {
             let logs = SIZES.map(|size| runs.iter().map(|run| run.log_bayes(size, variance)).sum());
-            Discrepancy::of(Location::UnsteadyCorrector(corrector), logs, sites)
+            Discrepancy::averaged(Location::UnsteadyCorrector(corrector), logs, sites)
         };
         let found = of(&each);
         let telling = each.iter_mut().max_by(|one, other| one.most.total_cmp(&other.most))?;

@@ -13,9 +13,9 @@ use rand_distr::{Distribution, StandardNormal};
 use twin::{Effect, Machine, Rf, Ring};
 
 use crate::data::Data;
-use crate::hypothesis::Member;
-use crate::ordinary::Family;
+use crate::family::Family;
 use crate::scale::QUOTED;
+use crate::unknown::Member;
 
 /// Every family of imperfections.
 #[derive(Debug, Clone)]

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::tables::Share;
 use super::{Class, Outcome};
-use crate::search::{ODDS, UNMODELLED};
+use crate::odds::{ODDS, UNMODELLED};
 
 /// What may be the matter: nothing, an effect of the library, or other physics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

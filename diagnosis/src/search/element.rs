@@ -6,27 +6,25 @@
 
 use twin::Signatures;
 
-use super::{BEHIND, BEHIND_SHARE, Found, Search, WORTH, relearnt};
-use crate::alternatives::{Alternative, Cause, SUSPICIOUS};
+use super::found::Found;
+use super::refit::{BEHIND, BEHIND_SHARE, WORTH, relearnt};
+use crate::alternatives::{Alternative, Cause};
 use crate::data::Data;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::element::Element;
 use crate::error::FitError;
 use crate::fit::Fitted;
-use crate::heldout::lessened;
 use crate::hypothesis::Hypothesis;
-use crate::linearise;
 use crate::location::Location;
+use crate::odds::SUSPICIOUS;
 
-/// Places of an unknown element that are tried in the model, where the next search finds it elsewhere.
-const PLACES: usize = 3;
 /// Unknown elements that are weighed by exact fits, and what ordinary imperfections may have taken from them besides the distance of a candidate [nat].
 const TRIED: usize = 2;
 const TAKEN: f64 = 10.0;
 
 impl Found {
     /// An unknown linear element, where what is left is physics that the library does not hold, and such an element its most likely form.
-    fn unknown_element(&self) -> Result<Option<Element>, FitError> {
+    pub fn unknown_element(&self) -> Result<Option<Element>, FitError> {
         let leader = self.next.alternatives.iter().find(|one| !one.is_of_library());
         let leader = leader.filter(|_| self.next.unknown_seen() > SUSPICIOUS);
         let Some(Cause::Unmodelled(one)) = leader.map(|one| &one.cause) else { return Ok(None) };
@@ -45,11 +43,7 @@ fn element_of(data: &Data, without: &Fitted, one: &Discrepancy) -> Result<Option
 /// Weigh the leading unknown elements among some causes by exact fits, in which what is ordinary is learnt beside them, as it is beside the effects of the
 /// library: rolls of quadrupoles that had taken a part of what a solenoid of 4 mrad does cost it 13 nat. The fit has one size, the best of the equally likely
 /// ones. Its share of their mean is a lower limit, so that it counts only where it is above the first order's.
-pub(super) fn weigh_elements(
-    data: &Data,
-    without: &Fitted,
-    weights: &mut [(Alternative, f64)],
-) -> Result<(), FitError> {
+pub fn weigh_elements(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) -> Result<(), FitError> {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
     if best < 0.0 || without.hypothesis.element.is_some() {
         return Ok(());
@@ -83,71 +77,12 @@ pub(super) fn weigh_elements(
     Ok(())
 }
 
-impl Search {
-    /// The search beside an unknown element, where there is one. None where, beside what was then found, it is no longer the most likely of what is left:
-    /// the first search is as good.
-    pub(super) fn beside_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
-        let Some(element) = found.unknown_element()? else { return Ok(None) };
-        self.held.set(0);
-        let whole = self.without_parts(found, &element)?;
-        let Some(mut element) = whole.unknown_element()? else { return Ok(None) };
-        for _ in 0..PLACES {
-            let Some(beside) = self.beside(&whole, element.clone())? else { return Ok(None) };
-            if beside.best.hypothesis.element.is_none() {
-                // a monitor wanders, and all was begun anew
-                return Ok(Some(self.beside_element(&beside)?.unwrap_or(beside)));
-            }
-            let data = &beside.data;
-            let rest = relearnt(data, lessened(data, &beside.best, beside.best.hypothesis.without_element())?);
-            let next = self.one_more(rest.data(data), &rest)?;
-            let beside = Found { next, ..beside };
-            match beside.unknown_element()? {
-                Some(leading) if leading.is_like(&element) => return Ok(Some(beside)),
-                Some(leading) => element = leading,
-                None => return Ok(None),
-            }
-        }
-        // its place is not decided, so that none is in the model
-        Ok(Some(whole))
-    }
-
-    /// With an unknown element in the model, and what else shows beside it; none where the machine keeps no beam.
-    fn beside(&self, whole: &Found, element: Element) -> Result<Option<Found>, FitError> {
-        let Found { data, null, best, .. } = whole;
-        let less = best.hypothesis.without_terms(|term| element.holds(term, &data.ring));
-        let hypothesis = Hypothesis { element: Some(element), ..less };
-        let with = relearnt(data, Fitted::of(data, &hypothesis, &best.guess(data, &hypothesis))?);
-        if !with.is_stable(data) {
-            return Ok(None);
-        }
-        let (best, competitions) = self.settle(data, with, None)?;
-        let next = self.one_more(data, &best)?;
-        Ok(Some(self.grown(Found { data: data.clone(), null: null.clone(), best, competitions, next })?))
-    }
-
-    /// The same without the effects that are parts of an unknown element.
-    fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
-        let (best, ring) = (&found.best, &found.data.ring);
-        let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
-        let mut data = found.data.clone();
-        if hypothesis.terms.len() == best.hypothesis.terms.len() {
-            return Ok(found.clone());
-        }
-        if hypothesis.terms.is_empty() {
-            return self.without_effects(data);
-        }
-        let less = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
-        let less = relearnt(&data, less);
-        self.about_effects(found, data, less)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use twin::{Effect, EffectKind, Kind, Ring};
 
     use super::*;
-    use crate::hypothesis::Term;
+    use crate::term::Term;
     use crate::{Diagnosis, Verdict};
     use inference::Recording;
     use inference::simulate::{self, Beyond, Hardware};
