@@ -26,10 +26,10 @@ const NAMED: usize = 4;
 impl Aside {
     /// Of each recording that has some.
     pub fn all(data: &Data) -> Vec<Self> {
-        data.campaigns().filter_map(Self::of).collect()
+        data.campaigns().filter_map(Self::in_campaign).collect()
     }
 
-    fn of(own: &Data) -> Option<Self> {
+    fn in_campaign(own: &Data) -> Option<Self> {
         let sound = |b: &usize| own.health()[*b].state == MonitorState::Ok;
         let monitors: Vec<usize> = own.active_monitors().into_iter().filter(sound).collect();
         let is_one = |frame: &usize| {
@@ -60,7 +60,7 @@ mod tests {
     #[test]
     fn a_trip_and_a_lost_beam_are_told() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
         assert_eq!(Aside::all(&data(&recording)), []);
         let mut broken = recording.clone();
         // the orbit of another setting, and none

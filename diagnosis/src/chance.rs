@@ -63,12 +63,12 @@ mod tests {
     fn tested(effects: &[Effect], seed: u64) -> (f64, f64) {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, seed).campaign(&ring, &recording, effects);
-        let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let terms = candidates(&data, None);
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
         let fitted = if best.hypothesis.terms.is_empty() { null } else { reduced(&data, &best, 0).unwrap() };
         let penalty = corrections(&terms);
-        let choice = Choice::of(&data, &fitted, &terms, &penalty).unwrap();
+        let choice = Choice::from_terms(&data, &fitted, &terms, &penalty).unwrap();
         (of_search(&choice).unwrap(), gain_of_choice(&choice).unwrap())
     }
 

@@ -34,9 +34,9 @@ impl<'d> Choice<'d> {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
+    pub fn from_terms(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
         let columns = signatures(data, without, terms)?;
-        let projection = Projection::of(without);
+        let projection = Projection::from_fit(without);
         let bounds = projection.bounds(&columns);
         let is_open = |&i: &usize| {
             let bound = bounds[i];

@@ -31,7 +31,7 @@ impl CloseTunes {
     ///
     /// # Errors
     /// [`OrbitError`] if the machine keeps no beam.
-    pub fn of(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
+    pub fn find(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
         let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
         if distances.is_empty() {
@@ -70,7 +70,7 @@ mod tests {
     #[test]
     fn tunes_that_coupling_mixes_are_left_out_and_told() {
         let (ring, mut recording) = template();
-        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
         let apart = data(&recording);
         assert!(apart.close_tunes.is_none() && apart.tune_noise(0).is_some());
         // as a meter reads two modes next to each other
@@ -94,7 +94,7 @@ mod tests {
             let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &effects).unwrap();
             let own = machine.optics().unwrap().closest_tune_approach().unwrap();
             let tunes = DMatrix::from_row_slice(2, 2, &[0.7, 0.699, f64::NAN, 0.7]);
-            (CloseTunes::of(&machine, &tunes).unwrap().unwrap(), own)
+            (CloseTunes::find(&machine, &tunes).unwrap().unwrap(), own)
         };
         let ((plain, none), (coupled, own)) = (of(&[]), of(&["stray_skew_gradient@SLOT_F6=0.02"]));
         assert!(none < 1e-6 && (plain.distance - 1e-3).abs() < 1e-12);

@@ -120,7 +120,7 @@ struct Displaced {
 impl Displaced {
     /// `off`: by how much the orbit at each element is off the estimated one (x, y) [m], where a fit moves it at a sextupole or an octupole. The field is
     /// displaced against the orbit instead.
-    fn of(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
+    fn from_machine(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
         let machine = machine.without_memory();
         let mut displaced = machine.clone();
         baseline.displace(&mut displaced)?;
@@ -253,7 +253,7 @@ impl Data {
     ///
     /// # Errors
     /// [`DataError`].
-    pub fn of(campaign: &Campaign) -> Result<Self, DataError> {
+    pub fn from_campaign(campaign: &Campaign) -> Result<Self, DataError> {
         if campaign.times.count() > 1 {
             let (recording, found) = (campaign.recording.name.clone(), campaign.times.to_string());
             return Err(DataError::Times { recording, found });
@@ -268,9 +268,11 @@ impl Data {
             if of_momentum(i, plane) { campaign.tunes[(i, plane)] } else { f64::NAN }
         });
         let kicked_off = recorded - design.readings(&drives)?.0;
-        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
+        let (orbit, baseline) =
+            Baseline::from_readings(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
-        let close_tunes = CloseTunes::of(&Displaced::of(&design, &baseline, &[])?.displaced, &recorded_tunes)?;
+        let close_tunes =
+            CloseTunes::find(&Displaced::from_machine(&design, &baseline, &[])?.displaced, &recorded_tunes)?;
         if close_tunes.is_some() {
             recorded_tunes.fill(f64::NAN);
         }
@@ -284,14 +286,14 @@ impl Data {
         let accepted = &screened.accepted;
         let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
-        let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
+        let pools = Pools::from_settings(&campaign.settings.of_frame, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
             others: Vec::new(),
             momentum: ring.particle.momentum() * ramped.map_or(1.0, |at| at.momentum),
             ring: ring.clone(),
-            units: Units::of(&campaign.prior.reaching(REACH)),
+            units: Units::from_prior(&campaign.prior.reaching(REACH)),
             screened,
             supplies: supplies.clone(),
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
@@ -337,8 +339,8 @@ impl Data {
         let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&means)?.0);
         let off: Vec<[f64; 2]> =
             orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
-        let displaced = Displaced::of(machine, &self.baseline, &off)?;
-        let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
+        let displaced = Displaced::from_machine(machine, &self.baseline, &off)?;
+        let exact = Exact::from_machine(&displaced.displaced, &self.frames.drives)?;
         let higher = displaced.higher_orders(&exact, &self.frames.drives.time)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
@@ -433,7 +435,7 @@ impl Data {
             self.channels.push(channel);
         }
         let count = self.pools.counts(monitors, |frame, b| self.counts(frame, b));
-        self.mixing = Mixing::of(&self.noise.modes, &self.levels_of_pools(), |pool, b| count[(pool, b)] > 0.0);
+        self.mixing = Mixing::from_modes(&self.noise.modes, &self.levels_of_pools(), |pool, b| count[(pool, b)] > 0.0);
         if !self.mixing.is_none() {
             let mean = |c: usize| {
                 let rows = &self.channels[c].rows;
@@ -461,12 +463,12 @@ impl Data {
             None => {
                 let common = self.common(c, &rows, &frames);
                 let Noise { own, levels, .. } = &self.noise;
-                Channel::of(rows, &frames, (own[c], self.noise.memory(c), levels), common)
+                Channel::from_frames(rows, &frames, (own[c], self.noise.memory(c), levels), common)
             }
             Some(plane) => {
                 let common = DMatrix::from_element(rows.len(), 1, TUNE_CALIBRATION);
                 let noise = self.frames.tune_noise[plane].unwrap_or(TUNE_CALIBRATION);
-                Channel::of(rows, &frames, (noise, Memory::NONE, &Levels::CONSTANT), common)
+                Channel::from_frames(rows, &frames, (noise, Memory::NONE, &Levels::CONSTANT), common)
             }
         }
     }
@@ -487,7 +489,7 @@ impl Data {
         let readings = DVector::from_iterator(each.len(), readings).component_div(&noise);
         let terms =
             DMatrix::from_fn(each.len(), all.ncols(), |i, k| (all[(each[i].1, k)] - means[(each[i].0, k)]) / noise[i]);
-        let within = Within::of(&readings, &terms);
+        let within = Within::from_differences(&readings, &terms);
         let told = &means * within.mean;
         rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
         self.drifting_with(b, rows, &self.drives, means * within.root)
@@ -717,7 +719,7 @@ impl Data {
             }
         }
         let levels: Vec<f64> = (0..frames).map(|frame| self.noise.levels.at(frame)).collect();
-        Mixing::of(&self.noise.modes, &levels, |frame, b| self.counts(frame, b)).apply(&mut values);
+        Mixing::from_modes(&self.noise.modes, &levels, |frame, b| self.counts(frame, b)).apply(&mut values);
         let is_ok = |b: &usize| self.health()[*b].state == MonitorState::Ok;
         let mut sums = (0.0, 0.0);
         for b in self.active_monitors().into_iter().filter(is_ok) {
@@ -726,7 +728,7 @@ impl Data {
             let mut terms = self.drifting_with(b, &rows, &self.frames.drives, shared) / self.channels[b].sigma;
             terms.column_mut(0).fill(1.0);
             let mut residual = values.select_rows(&rows).columns(b, 1).into_owned();
-            let filter = Filter::of(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
+            let filter = Filter::from_frames(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
             filter.whiten_columns(&mut terms);
             filter.whiten_columns(&mut residual);
             let (chi2, freedom) = chi_square(&residual.column(0).into_owned(), &terms.transpose(), 1, 1.0);
@@ -767,7 +769,7 @@ impl Data {
         if self.mixing.is_none() {
             return patterns.clone();
         }
-        let mixing = Mixing::of(&self.noise.modes, levels, |_, b| monitors.contains(&b));
+        let mixing = Mixing::from_modes(&self.noise.modes, levels, |_, b| monitors.contains(&b));
         let mut all = DMatrix::zeros(patterns.nrows(), patterns.ncols());
         monitors.iter().for_each(|&b| all.set_column(b, &(patterns.column(b) / self.channels[b].sigma)));
         mixing.apply(&mut all);

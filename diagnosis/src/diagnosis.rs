@@ -56,7 +56,7 @@ impl Diagnosis {
     ///
     /// # Errors
     /// [`DataError`].
-    pub fn of(ring: &Ring, recording: &Recording, progress: impl FnMut(&str)) -> Result<Self, DataError> {
+    pub fn from_recording(ring: &Ring, recording: &Recording, progress: impl FnMut(&str)) -> Result<Self, DataError> {
         Self::jointly(ring, recording, &[], progress)
     }
 
@@ -73,7 +73,7 @@ impl Diagnosis {
         let recordings: Vec<&Recording> = core::iter::once(first).chain(others).collect();
         progress("reading");
         for recording in &recordings {
-            if let Some(wiring) = Miswired::of(&at_energy(ring, recording.header.kinetic_energy), recording)? {
+            if let Some(wiring) = Miswired::find(&at_energy(ring, recording.header.kinetic_energy), recording)? {
                 return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
             }
         }
@@ -84,9 +84,9 @@ impl Diagnosis {
         let (mut transients, mut joined) = (Vec::new(), Vec::new());
         for (index, recording) in recordings.iter().enumerate() {
             let ring = at_energy(ring, recording.header.kinetic_energy);
-            let Transients { found, campaign } = Transients::of(&ring, recording)?;
+            let Transients { found, campaign } = Transients::find(&ring, recording)?;
             transients::join(&mut transients, found, index);
-            joined.push(Data::of(&campaign)?);
+            joined.push(Data::from_campaign(&campaign)?);
         }
         let data = joined.remove(0).joined_with(joined)?;
         let candidates = scan::candidates(&data, first.header.radial_loop_monitors.as_ref());
@@ -96,18 +96,18 @@ impl Diagnosis {
         progress("held-out frames");
         let blocks = heldout::by_pool(data);
         let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
-        let before = Score::of(data, &bare, &blocks)?;
-        let after = if found.has_more() { Score::of(data, &found.best, &blocks)? } else { before.clone() };
+        let before = Score::from_blocks(data, &bare, &blocks)?;
+        let after = if found.has_more() { Score::from_blocks(data, &found.best, &blocks)? } else { before.clone() };
         let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
-        let of_means = Verdict::of(&found, &tests);
-        let verdict = of_means.beside(&transients).with_noise(data);
+        let of_means = Verdict::from_tests(&found, &tests);
+        let verdict = of_means.with_transients(&transients).with_noise(data);
         let of_element = verdict::test_of_element(data, &found, &before, &after, &blocks)?;
         let findings = verdict::findings(data, &found, &transients, &tests, of_element, of_means)?;
         progress("held-out correctors");
         let whole = found.has_more() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
         let blocks = heldout::by_corrector(data);
         let correctors = if whole && !blocks.is_empty() {
-            let scored = |fitted| Score::of(data, fitted, &blocks).ok();
+            let scored = |fitted| Score::from_blocks(data, fitted, &blocks).ok();
             scored(&bare).zip(scored(&found.best))
         } else {
             None
@@ -115,7 +115,7 @@ impl Diagnosis {
         progress("what to measure next");
         // the proposal is no part of the verdict, so its failure is not one of the diagnosis
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
-        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
+        let (vars_before, vars_after) = (Vars::from_fit(&found.null), Vars::averaged(&found).widened(&found)?);
         // a poor fit says nothing of single vars
         let beyond = if found.best.is_poor() { Vec::new() } else { Beyond::all(&data.ring, &vars_after) };
         let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
@@ -207,7 +207,7 @@ mod tests {
         let gain = Effect::parse("bpm_gain@x_E6=0.15", &ring).unwrap();
         for (effects, verdict) in [(vec![], Verdict::Consistent), (vec![gain], Verdict::Identified)] {
             let made = noise.campaign(&ring, &recording, &effects);
-            let found = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &made, |_| ()).unwrap();
             assert_eq!(found.verdict, verdict, "{}", found.sentence);
             assert_eq!(found.wandering(), ["y_D5"]);
             assert!(found.sentence.contains("monitor y_D5 wanders"), "{}", found.sentence);
@@ -225,9 +225,9 @@ mod tests {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
         let ring = Ring::read(&folder.join("ring.json")).unwrap();
         let mut recording = Recording::read(&folder.join("gain"), &ring).unwrap();
-        let named = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let named = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         recording.rows.iter_mut().for_each(|row| row.correctors.clear());
-        let unnamed = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let unnamed = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let of_correctors = |diagnosis: &Diagnosis| {
             let (before, after) = diagnosis.correctors.as_ref().unwrap();
             after.gain_over(before).0

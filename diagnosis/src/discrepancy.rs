@@ -58,13 +58,13 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
 /// Every place in one of several recordings.
 fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = all.campaign(campaign);
-    let linearised = Linearised::of(fitted);
-    let own = Seen::by(fitted, all.parts().swap_remove(campaign));
-    let settings = Settings::of(&data.drives);
+    let linearised = Linearised::from_fit(fitted);
+    let own = Seen::from_fit(fitted, all.parts().swap_remove(campaign));
+    let settings = Settings::from_drives(&data.drives);
     let monitors = data.monitors();
-    let seen = Seen::of(data, &own);
+    let seen = Seen::taken_back(data, &own);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
-    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::of(data, b, &settings, &sums[b])).collect();
+    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::from_sums(data, b, &settings, &sums[b])).collect();
     let stretches = stretches(data);
     let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &stretches)).collect();
     // faulty monitors scatter by themselves
@@ -111,7 +111,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         let forms = Element::signatures(&signatures, &data.ring, q);
         let of_rms_1 = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
         let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(of_rms_1))?;
-        let of_all = Sums::whole(&columns, &own);
+        let of_all = Sums::from_columns(&columns, &own);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
             found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
@@ -119,7 +119,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     }
     let changing = Changing::all(&signatures, machine.ring(), &drives.orbit, &data.baseline.sigma);
     let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
-    let at = Where { data, own: &own, monitors: &active, runs: Runs::of(data, &seen, &active), stretches };
+    let at = Where { data, own: &own, monitors: &active, runs: Runs::from_readings(data, &seen, &active), stretches };
     found.extend(linearised.changing(&at, &changing));
     found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
     found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));
@@ -187,7 +187,7 @@ fn kicked(machine: &twin::Machine) -> Result<Vec<(usize, Plane, DVector<f64>)>, 
 fn weighted(data: &Data, sums: &[Sums], monitors: &[usize], pattern: &DVector<f64>) -> Sums {
     let first = &sums[monitors[0]];
     let all = data.accompanied(monitors, pattern);
-    let mut sum = Sums::none(first.cross.nrows(), first.cross.ncols());
+    let mut sum = Sums::zero(first.cross.nrows(), first.cross.ncols());
     for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
         sum.gram += &sums[b].gram * (pattern[b] * all[b]);
         sum.cross += &sums[b].cross * pattern[b];
@@ -198,7 +198,7 @@ fn weighted(data: &Data, sums: &[Sums], monitors: &[usize], pattern: &DVector<f6
 
 /// One amplitude for each pattern over the monitors (one a column), in proportion to `setting`.
 fn patterned(data: &Data, sums: &[Sums], monitors: &[usize], setting: &DVector<f64>, patterns: &DMatrix<f64>) -> Sums {
-    let mut sum = Sums::none(patterns.ncols(), sums[monitors[0]].cross.ncols());
+    let mut sum = Sums::zero(patterns.ncols(), sums[monitors[0]].cross.ncols());
     let mut all = patterns.clone();
     all.column_iter_mut()
         .for_each(|mut pattern| pattern.copy_from(&data.accompanied(monitors, &pattern.clone_owned())));
@@ -225,20 +225,20 @@ mod tests {
     use crate::{Diagnosis, Verdict};
 
     fn seen_of(data: &Data, fitted: &Fitted) -> Seen {
-        Seen::of(data, &Seen::by(fitted, 0..fitted.residual.len()))
+        Seen::taken_back(data, &Seen::from_fit(fitted, 0..fitted.residual.len()))
     }
 
     #[test]
     fn the_evidence_taken_monitor_by_monitor_is_that_of_one_large_matrix() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
-        let (linearised, settings) = (Linearised::of(&fitted), Settings::of(&data.drives));
+        let (linearised, settings) = (Linearised::from_fit(&fitted), Settings::from_drives(&data.drives));
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
         let each = sums.each_ref().map(|sums| sums.select(&some));
-        let apart = [0, 1, 2].map(|i| Apart::of(&data, monitors[i], &settings, &sums[i]).select(&some));
+        let apart = [0, 1, 2].map(|i| Apart::from_sums(&data, monitors[i], &settings, &sums[i]).select(&some));
         for (sums, apart) in each.iter().zip(&apart) {
             let gram = DMatrix::from_diagonal(&apart.alone) - &apart.common * apart.common.transpose();
             assert!((gram - &sums.gram).amax() < 1e-9 * sums.gram.amax(), "rounding");
@@ -261,7 +261,7 @@ mod tests {
         let beyond: &[&dyn Beyond] = &[&drift];
         let truth = simulate::Truth { vars: &vars, effects: &[], beyond };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 10_397_415_869_173_073_767).unwrap();
-        let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
         let off = found.vars_after.nees(&DVector::from_vec(vars).map(f64::ln));
         println!("{off}");
@@ -275,18 +275,19 @@ mod tests {
         let (ring, recording) = template();
         let white = Coloured::white(&ring, &recording, 5);
         let noise = Coloured { slow: (0.2, 10.0), momentum: 6e-5, crate_share: 0.2, ..white };
-        let data = Data::of(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
         assert!(data.noise.momentum.value > 0.0 && data.noise.crates.len() == 1 && !data.noise.slow.is_none());
-        let fitted = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
-        let (linearised, seen) = (Linearised::of(&fitted), seen_of(&data, &fitted));
-        let own = Seen::by(&fitted, 0..fitted.residual.len());
+        let fitted = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
+        let (linearised, seen) = (Linearised::from_fit(&fitted), seen_of(&data, &fitted));
+        let own = Seen::from_fit(&fitted, 0..fitted.residual.len());
         let columns_of = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
             let readings = DMatrix::from_fn(data.pools.count, pattern.len(), |_, b| pattern[b]);
             let all = Signature { readings, tunes: [0.0; 2], tune_changes: MatrixXx2::zeros(data.pools.count) };
             data.stepping(&[all], indicator)
         };
-        let whole =
-            |pattern: &DVector<f64>, indicator: &DMatrix<f64>| Sums::whole(&columns_of(pattern, indicator), &own);
+        let whole = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
+            Sums::from_columns(&columns_of(pattern, indicator), &own)
+        };
         let evidence = |sums: &Sums| linearised.judge(Location::Time, sums, 1).log_bayes;
         let (monitors, mut largest) = (data.active_monitors(), 0.0_f64);
         let stretches = stretches(&data);
@@ -295,7 +296,7 @@ mod tests {
             let (near, exact) = (evidence(&data.sums(b, &seen, &stretches)), evidence(&whole(&alone, &stretches)));
             largest = largest.max((near - exact).abs());
         }
-        let indicator = Settings::of(&data.drives).indicator();
+        let indicator = Settings::from_drives(&data.drives).indicator();
         let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
         let (machine, drives) = fitted.machine(&data).unwrap();
         let read = |pattern: &DVector<f64>| {
@@ -310,7 +311,7 @@ mod tests {
         }
         let machine = machine.on_orbit(&drives.orbit);
         let signatures = Signatures::of(&machine, &drives).unwrap();
-        let (runs, mut of_quadrupoles) = (Runs::of(&data, &seen, &monitors).unwrap(), 0.0_f64);
+        let (runs, mut of_quadrupoles) = (Runs::from_readings(&data, &seen, &monitors).unwrap(), 0.0_f64);
         let at = Where { data: &data, own: &own, monitors: &monitors, runs: None, stretches };
         let changing = Changing::all(&signatures, machine.ring(), &drives.orbit, &data.baseline.sigma);
         let each = DMatrix::identity(data.pools.count, data.pools.count);

@@ -109,7 +109,7 @@ pub struct Element {
 impl Element {
     /// One whose forms each change the readings by `size` (rms); those that change them by much less than others do, such as those of a plane in which
     /// nothing was kicked, are left out.
-    pub fn of(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
+    pub fn with_size(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
         let all = Self::signatures(signatures, ring, quadrupole);
         let some = all.into_iter().filter(|(form, _)| does.has(*form));
         Self { quadrupole, does, forms: some.map(|(form, signature)| (form, size / signature.rms())).collect() }

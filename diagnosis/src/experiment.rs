@@ -64,12 +64,17 @@ impl Menu {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
+    pub fn from_causes(
+        data: &Data,
+        fitted: &Fitted,
+        one: (&Term, f64),
+        other: Option<&Term>,
+    ) -> Result<Self, FitError> {
         let sigma = &fitted.units.sigma;
         let of_recording = |campaign: usize| {
             let (machine, drives) = fitted.machine_in(data, campaign)?;
             let weight = data.momentum / data.campaign(campaign).momentum;
-            Derivatives::of(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
+            Derivatives::from_machine(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
         };
         let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
         let (machine, drives) = fitted.machine(data)?;
@@ -78,7 +83,7 @@ impl Menu {
         let mut proposals = Vec::new();
         for Scenario { what, change, machine, drives, weight } in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is not proposed
-            let new = Derivatives::of(data, (&machine, &drives), sigma, (one.0, other), weight);
+            let new = Derivatives::from_machine(data, (&machine, &drives), sigma, (one.0, other), weight);
             let Ok(new) = new else { continue };
             let both: Vec<&Derivatives> = present.iter().chain([&new]).collect();
             proposals.push(Proposal { what, change, separation: separation(&both, amplitude, free) });
@@ -90,7 +95,7 @@ impl Menu {
 
 impl Derivatives {
     /// `sigma`: standard deviations of the vars; `weight`: size of the cause over its present size.
-    fn of(
+    fn from_machine(
         data: &Data,
         (machine, drives): (&Machine, &Drives),
         sigma: &DVector<f64>,

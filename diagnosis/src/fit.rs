@@ -92,7 +92,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, FitError> {
+    pub fn from_guess(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, FitError> {
         Self::against(data, hypothesis, guess, f64::INFINITY)
     }
 
@@ -126,7 +126,7 @@ impl Fitted {
         let (cost, residual) = problem.evaluate(&u)?;
         let (quadratic, slopes) = problem.linearise(&u, &residual)?;
         let factor = quadratic.factor().ok_or(FitError::Degenerate)?;
-        Self::at(&problem, Point { u, residual, cost }, factor, slopes)
+        Self::from_point(&problem, Point { u, residual, cost }, factor, slopes)
     }
 
     /// The data as this fit has them.
@@ -141,7 +141,7 @@ impl Fitted {
 
     /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
     #[must_use]
-    pub(super) fn to(self, data: &Data) -> Self {
+    pub(super) fn keeping(self, data: &Data) -> Self {
         Self { own: self.own.or_else(|| Some(Box::new(data.clone()))), ..self }
     }
 
@@ -157,15 +157,15 @@ impl Fitted {
         })?;
         let factor = found.quadratic.factor().ok_or(FitError::Degenerate)?;
         let here = Point { u: found.x, residual: found.point, cost: found.cost };
-        Self::at(&problem, here, factor, found.slopes)
+        Self::from_point(&problem, here, factor, found.slopes)
     }
 
-    fn at(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
+    fn from_point(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
         let jacobian = problem.ordinary.beside(slopes);
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
-        let within = Within::of(&factor, &here.u, slope, &units);
+        let within = Within::from_precision(&factor, &here.u, slope, &units);
         let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let log_prior = problem.hypothesis.log_prior();
         let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
@@ -660,7 +660,7 @@ mod tests {
     #[test]
     fn the_derivative_of_a_gain_is_right_about_a_gain() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let beside = [
             "",
             "bpm_swap@y_C5,y_D5=1",
@@ -682,7 +682,7 @@ mod tests {
     #[test]
     fn one_more_effect_is_scored_as_it_is_fitted() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let term = |text: &str| Term::from(twin::Effect::parse(&format!("{text}=1"), &ring).unwrap());
         let (monitors, correctors) = ("bpm_swap@y_C5,y_D5", "corrector_swap@V_D3,V_D7");
         let after = [

@@ -217,7 +217,7 @@ mod tests {
 
     fn data_of(ring: &Ring, recording: &Recording) -> Data {
         let ring = at_energy(ring, recording.header.kinetic_energy);
-        Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap()
+        Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap()
     }
 
     /// About the same machine chi-square and information are sums; a stray field counts by the rigidity, a magnet's error does not.
@@ -264,7 +264,7 @@ mod tests {
         let (ring, [first, second]) = pair(gradient, 40);
         for alone in [&first, &second] {
             let ring = at_energy(&ring, alone.header.kinetic_energy);
-            assert_ne!(Diagnosis::of(&ring, alone, |_| ()).unwrap().verdict, Verdict::Identified);
+            assert_ne!(Diagnosis::from_recording(&ring, alone, |_| ()).unwrap().verdict, Verdict::Identified);
         }
         let joint = Diagnosis::jointly(&ring, &first, core::slice::from_ref(&second), |_| ()).unwrap();
         println!("{}", joint.sentence);

@@ -1,7 +1,7 @@
 //! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
 //! better.
 //!
-//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused (`wiring.rs`), and read-backs that are not
+//! [`Diagnosis::from_recording`] is the path from top to bottom: columns that are not what the header says are refused (`wiring.rs`), and read-backs that are not
 //! the settings are told (`readback.rs`); what passes within a
 //! setting is found by the differences of its frames and taken out (`transients.rs`); the recording is
 //! whitened (`data.rs`), fitted by the exact twin without any

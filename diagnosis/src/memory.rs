@@ -87,7 +87,7 @@ impl Memory {
 
 impl Filter {
     /// Over some frames in rising order, the walk counted from `origin`.
-    pub fn of(memory: Memory, levels: &Levels, origin: usize, frames: &[usize]) -> Self {
+    pub fn from_frames(memory: Memory, levels: &Levels, origin: usize, frames: &[usize]) -> Self {
         let (mut at, mut after) = (origin, Matrix2::new(memory.share, 0.0, 0.0, 0.0));
         let step = |&frame: &usize| {
             let (carried, before) = memory.carry(&after, frame - at);
@@ -148,7 +148,7 @@ mod tests {
                 let factor = dense(memory, &levels, 2).cholesky().unwrap();
                 let noise = some_noise(FRAMES.len());
                 let expected = factor.l().solve_lower_triangular(&noise).unwrap();
-                let filter = Filter::of(memory, &levels, 2, &FRAMES);
+                let filter = Filter::from_frames(memory, &levels, 2, &FRAMES);
                 let mut found = noise;
                 filter.whiten(found.iter_mut());
                 assert!((found - expected).amax() < 1e-12, "rounding");
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn white_noise_stays_as_it_is_to_the_bit() {
         let noise = some_noise(FRAMES.len());
-        let filter = Filter::of(Memory::NONE, &Levels::CONSTANT, 0, &FRAMES);
+        let filter = Filter::from_frames(Memory::NONE, &Levels::CONSTANT, 0, &FRAMES);
         let mut found = noise.clone();
         filter.whiten(found.iter_mut());
         assert_eq!(found, noise);

@@ -76,7 +76,7 @@ struct Widths {
 }
 
 impl Widths {
-    fn of(&self, whose: Whose) -> f64 {
+    fn width_of(&self, whose: Whose) -> f64 {
         match whose {
             Whose::Vars => self.vars.0,
             Whose::Family(f) => self.families[f],
@@ -92,7 +92,7 @@ impl Widths {
 
 impl Projected {
     /// From the normal matrix of a fit, of which the vars are the first unknowns and the members the last.
-    fn of(data: &Data, fitted: &Fitted) -> Option<Self> {
+    fn from_fit(data: &Data, fitted: &Fitted) -> Option<Self> {
         let Hypothesis { ordinary, scatter, .. } = &fitted.hypothesis;
         let sized = |(f, family): (usize, &Family)| {
             let scale = family.tolerance / family.width;
@@ -126,7 +126,7 @@ impl Projected {
     }
 
     fn posterior(&self, widths: &Widths) -> Option<Posterior> {
-        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.of(whose)));
+        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.width_of(whose)));
         let mut matrix = self.gram.clone();
         matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
         (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
@@ -171,7 +171,7 @@ impl Projected {
             };
             let (squares, known) = self.scatter(&posterior);
             let next = Widths {
-                vars: Scatter::of(squares * widths.vars.0.powi(2), known),
+                vars: Scatter::from_squares(squares * widths.vars.0.powi(2), known),
                 families: widths.families.iter().enumerate().map(of_family).collect(),
             };
             let moved = next.moved(&widths);
@@ -187,7 +187,7 @@ impl Projected {
 /// The hypothesis of a fit with the widths that its recording shows, of vars and families; families that it shows none of are left out.
 pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
     let mut hypothesis = fitted.hypothesis.clone();
-    let Some(projected) = Projected::of(data, fitted) else { return hypothesis };
+    let Some(projected) = Projected::from_fit(data, fitted) else { return hypothesis };
     let families = &mut hypothesis.ordinary;
     let of_families = families.iter().map(|family| family.width / family.tolerance).collect();
     let is_learnt: Vec<bool> = families.iter().map(Family::is_learnt).collect();
@@ -322,10 +322,11 @@ mod tests {
             let power = if seed % 2 == 0 { 0.5 } else { 1.0 };
             made.vars.iter_mut().for_each(|var| *var = var.powf(power));
             let rms = (made.vars.iter().map(|var| var.ln().powi(2)).sum::<f64>() / made.vars.len() as f64).sqrt();
-            let data = Data::of(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
-            let first = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
+            let data =
+                Data::from_campaign(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+            let first = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
             let hypothesis = learnt(&data, &first);
-            let fitted = Fitted::of(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
             let row = rows(&data, &fitted).into_iter().find(|row| row.kind == "var").unwrap().measured;
             println!("{rms:.4} {:.4} {:.4}", row.value, row.sigma);
             assert!(row.sigma < 0.15 * row.value);
@@ -339,7 +340,7 @@ mod tests {
     #[test]
     fn families_hold_every_instrument_once() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
         assert_eq!(of("gains of monitors").len(), 33);
         let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
@@ -356,10 +357,10 @@ mod tests {
     #[test]
     fn ordinary_imperfections_are_of_first_order() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let plain = Hypothesis::plain();
-        let first = Fitted::of(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
-        let second = Fitted::of(&data, &plain, &first.u).unwrap();
+        let first = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
+        let second = Fitted::from_guess(&data, &plain, &first.u).unwrap();
         let off = |fitted: &Fitted| (fitted.residual_of(&data).unwrap() - &fitted.residual).norm();
         let (first, second) = (off(&first), off(&second));
         println!("{first} {second}");

@@ -58,9 +58,10 @@ impl PlaceScan {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
+    pub fn from_fit(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
-        let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
+        let projection =
+            unknown.map_or_else(|| Ok(Projection::from_fit(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
         let machines = fitted.machines_on_orbit(data)?;
         let signatures = of_each(&machines)?;
@@ -197,13 +198,13 @@ mod tests {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
             let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
             let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
-            let mut data = Data::of(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = Data::from_campaign(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
-            let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let (machine, drives) = fitted.machine(&data).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
-            let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
-            let scan = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
+            let scan = PlaceScan::from_fit(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
             let peak = scan.peak();
             let credible = scan.credible(0.95);

@@ -74,7 +74,7 @@ struct State {
 
 impl Run {
     /// Of every frame, from the setting of each.
-    pub fn of(settings: &[Option<usize>]) -> Vec<Self> {
+    pub fn from_settings(settings: &[Option<usize>]) -> Vec<Self> {
         let mut count = std::collections::BTreeMap::<usize, usize>::new();
         settings.iter().flatten().for_each(|setting| *count.entry(*setting).or_default() += 1);
         let base = count.into_iter().max_by_key(|(_, frames)| *frames).map(|(setting, _)| setting);
@@ -90,7 +90,7 @@ impl Run {
 
 impl Repeats {
     /// From the frames that count, in rising order, and their readings less predictions [m].
-    pub fn of(frames: &[usize], values: &[f64], runs: &[Run]) -> Self {
+    pub fn from_frames(frames: &[usize], values: &[f64], runs: &[Run]) -> Self {
         let first = values.first().copied().unwrap_or(0.0);
         let mut readings: Vec<Repeat> = Vec::new();
         for (&frame, &value) in frames.iter().zip(values) {
@@ -103,7 +103,7 @@ impl Repeats {
         Self { readings, fitted: 0.0 }
     }
 
-    /// Without what follows known drives, rows frames (those given to [`Repeats::of`]), columns drives, in prior standard deviations [m]: the
+    /// Without what follows known drives, rows frames (those given to [`Repeats::from_frames`]), columns drives, in prior standard deviations [m]: the
     /// orbit follows the supplies by unknown factors. `sigma`: noise [m].
     #[must_use]
     pub fn without(mut self, following: &DMatrix<f64>, sigma: f64) -> Self {
@@ -267,7 +267,7 @@ mod tests {
     #[test]
     fn the_filter_gives_the_likelihood_of_contrasts_within_settings() {
         let settings = [0, 0, 1, 1, 1, 2, 2, 0, 0, 0, 3, 3, 0, 0].map(Some);
-        let runs = Run::of(&settings);
+        let runs = Run::from_settings(&settings);
         // frame 5 does not count, so that its run begins a frame later
         let frames: Vec<usize> = (0..settings.len()).filter(|frame| *frame != 5).collect();
         let y = DVector::from_fn(frames.len(), |i, _| (2.1 * (i * i) as f64).sin() + 30.0);
@@ -275,7 +275,7 @@ mod tests {
             let setting = settings[frames[i]].unwrap();
             if k == 0 || k == setting { 1.0 } else { 0.0 }
         });
-        let repeats = Repeats::of(&frames, y.as_slice(), &runs);
+        let repeats = Repeats::from_frames(&frames, y.as_slice(), &runs);
         let larger = Levels::some(3..9, 2.0);
         let both_at = |memory: Memory, levels: &Levels| {
             let (square, log_det) = restricted(memory, levels, &frames, &y, &x);
@@ -296,12 +296,12 @@ mod tests {
     #[test]
     fn a_change_of_the_setting_by_any_physics_changes_nothing() {
         let settings = [0, 0, 1, 1, 1, 0, 0, 2, 2, 0].map(Some);
-        let runs = Run::of(&settings);
+        let runs = Run::from_settings(&settings);
         let frames: Vec<usize> = (0..10).collect();
         let weigh = |change: f64| {
             let value = |i: usize| (1.7 * (i * i) as f64).sin() + change * settings[i].unwrap() as f64;
             let values: Vec<f64> = (0..10).map(value).collect();
-            Repeats::of(&frames, &values, &runs).weigh(Memory { share: 0.2, time: 5.0, steps: 0.1 }).square
+            Repeats::from_frames(&frames, &values, &runs).weigh(Memory { share: 0.2, time: 5.0, steps: 0.1 }).square
         };
         assert!((weigh(0.0) / weigh(50.0) - 1.0).abs() < 1e-4, "the diffuse variance is 1e8");
     }

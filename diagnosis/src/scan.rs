@@ -70,7 +70,7 @@ pub struct Scored {
 
 impl Projection {
     /// About a fit at its best.
-    pub fn of(fitted: &Fitted) -> Self {
+    pub fn from_fit(fitted: &Fitted) -> Self {
         Self {
             residual: fitted.residual.clone(),
             back: fitted.jacobian.transpose(),
@@ -221,7 +221,7 @@ fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64>
 /// # Errors
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
-    let (data, projection) = (fitted.data(data), Projection::of(fitted));
+    let (data, projection) = (fitted.data(data), Projection::from_fit(fitted));
     let machines = fitted.machines_on_orbit(data)?;
     let of_each = of_each(&machines)?;
     // all at once would be gigabytes for a ring of 150 monitors
@@ -269,7 +269,7 @@ pub fn separations(
     others: &[&Term],
 ) -> Result<Vec<f64>, FitError> {
     let all: Vec<Term> = core::iter::once(term).chain(others.iter().copied()).copied().collect();
-    let gram = Projection::of(fitted).gram(&signatures(data, fitted, &all)?);
+    let gram = Projection::from_fit(fitted).gram(&signatures(data, fitted, &all)?);
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let of = |(i, other): (usize, &&Term)| {
         let free = [term, other].map(|term| !term.kind.is_switch());

@@ -28,7 +28,7 @@ impl Default for Scatter {
 
 impl Scatter {
     /// From the sum of squares of the vars, in prior widths, and how many of them are known.
-    pub fn of(squares: f64, known: f64) -> Self {
+    pub fn from_squares(squares: f64, known: f64) -> Self {
         Self(((squares + COUNTS) / (known + COUNTS)).sqrt())
     }
 
@@ -47,11 +47,11 @@ mod tests {
     fn the_scatter_is_the_most_likely_one() {
         let (squares, known) = (12.0, 30.0);
         let log_density = |s: f64| Scatter(s).log_prior() - known * s.ln() - 0.5 * squares / s.powi(2);
-        let Scatter(best) = Scatter::of(squares, known);
+        let Scatter(best) = Scatter::from_squares(squares, known);
         assert!((best - (14.0_f64 / 32.0).sqrt()).abs() < 1e-12);
         assert!(log_density(best) > log_density(1.01 * best) && log_density(best) > log_density(0.99 * best));
         assert_eq!(Scatter::default().log_prior(), 0.0);
         // one that the recording shows nothing of is as the prior says
-        assert_eq!(Scatter::of(0.0, 0.0), Scatter::default());
+        assert_eq!(Scatter::from_squares(0.0, 0.0), Scatter::default());
     }
 }

@@ -62,7 +62,7 @@ fn not_needed(found: &Found, further: &Found) -> Option<Competition> {
     let [(added, _)] = new[..] else { return None };
     let is_one_more = further.competitions.len() == found.competitions.len() + 1;
     let is_idle = is_one_more && !added.is_suspicious() && !further.next.is_suspicious();
-    is_idle.then(|| added.clone().to(&further.data))
+    is_idle.then(|| added.clone().keeping(&further.data))
 }
 
 /// Correction of a first search for an unmodelled discrepancy: the `ln` Bayes factor that gives even odds.
@@ -93,7 +93,7 @@ impl Search {
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let found = self.grown(self.with_noise(self.without_effects(data)?)?)?;
         // where that fails the search stands as it is
-        let beside = self.beside_element(&found).unwrap_or(None);
+        let beside = self.searched_with_element(&found).unwrap_or(None);
         Ok(beside.unwrap_or(found))
     }
 
@@ -264,7 +264,7 @@ impl Search {
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
         let rest = relearnt(data, reduced(data, fitted, term)?);
         // the others are fitted to the readings of the rest
-        let present = if data.is_about_effects { fitted.clone().to(data) } else { fitted.clone() };
+        let present = if data.is_about_effects { fitted.clone().keeping(data) } else { fitted.clone() };
         let present = Alternative::exact(data, &rest, present, term);
         self.competition(rest.data(data), &rest, Some(present))
     }
@@ -292,7 +292,7 @@ impl Search {
             let known = present.as_ref().filter(|present| present.term() == Some(&candidate.term));
             let alternative = match leaders.contains(&i) {
                 true => refit(data, fitted, candidate, least),
-                false => Alternative::of(candidate),
+                false => Alternative::from_candidate(candidate),
             };
             // it has been fitted to readings that are linearised about it
             let better = known.filter(|known| data.is_about_effects || known.log_gain > alternative.log_gain).cloned();
@@ -311,7 +311,7 @@ impl Search {
             weights.push((Alternative::unmodelled(discrepancy), weight));
         }
         weigh_elements(data, fitted, &mut weights)?;
-        Ok(Competition::of(weights, TOO_SMALL * UNMODELLED * odds, fitted.clone(), scanned))
+        Ok(Competition::from_log_weights(weights, TOO_SMALL * UNMODELLED * odds, fitted.clone(), scanned))
     }
 
     /// The candidates for an exact fit. Where the fit is poor its vars are strongly biased, and so is a scan about them: the leaders of a
@@ -341,16 +341,16 @@ impl Search {
 
     /// The search beside an unknown element, where there is one. None where, beside what was then found, it is no longer the most likely of what is left:
     /// the first search is as good.
-    fn beside_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
+    fn searched_with_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
         let Some(element) = found.unknown_element()? else { return Ok(None) };
         self.held.set(0);
         let whole = self.without_parts(found, &element)?;
         let Some(mut element) = whole.unknown_element()? else { return Ok(None) };
         for _ in 0..PLACES {
-            let Some(beside) = self.beside(&whole, element.clone())? else { return Ok(None) };
+            let Some(beside) = self.with_element(&whole, element.clone())? else { return Ok(None) };
             if beside.best.hypothesis.element.is_none() {
                 // a monitor wanders, and all was begun anew
-                return Ok(Some(self.beside_element(&beside)?.unwrap_or(beside)));
+                return Ok(Some(self.searched_with_element(&beside)?.unwrap_or(beside)));
             }
             let data = &beside.data;
             let rest = relearnt(data, lessened(data, &beside.best, beside.best.hypothesis.without_element())?);
@@ -367,11 +367,11 @@ impl Search {
     }
 
     /// With an unknown element in the model, and what else shows beside it; none where the machine keeps no beam.
-    fn beside(&self, whole: &Found, element: Element) -> Result<Option<Found>, FitError> {
+    fn with_element(&self, whole: &Found, element: Element) -> Result<Option<Found>, FitError> {
         let Found { data, null, best, .. } = whole;
         let less = best.hypothesis.without_terms(|term| element.holds(term, &data.ring));
         let hypothesis = Hypothesis { element: Some(element), ..less };
-        let with = relearnt(data, Fitted::of(data, &hypothesis, &best.guess(data, &hypothesis))?);
+        let with = relearnt(data, Fitted::from_guess(data, &hypothesis, &best.guess(data, &hypothesis))?);
         if !with.is_stable(data) {
             return Ok(None);
         }

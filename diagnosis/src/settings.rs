@@ -18,7 +18,7 @@ const SAME_OFFSET: f64 = 1e-8;
 
 impl Settings {
     /// Group the frames.
-    pub fn of(drives: &Drives) -> Self {
+    pub fn from_drives(drives: &Drives) -> Self {
         let (mut known, mut powered) = (BTreeMap::new(), Vec::new());
         let mut setting = |frame: usize| {
             let fifths = drives.kick.row(frame).map(|kick| (5.0 * kick / drives.nominal_kick).round() as i64);

@@ -83,7 +83,7 @@ impl Slow {
     };
 
     /// Learn from repeats of monitors whose noise is about `sigma` each [m], in a recording of so many frames.
-    pub fn of(repeats: &[Repeats], sigma: &[f64], frames: usize) -> Self {
+    pub fn learn(repeats: &[Repeats], sigma: &[f64], frames: usize) -> Self {
         if repeats.is_empty() {
             return Self::NONE;
         }
@@ -91,7 +91,7 @@ impl Slow {
         let mut relative: Vec<f64> = sigma.iter().map(|sigma| sigma / mean).collect();
         let mut found = Self::NONE;
         for _ in 0..PASSES {
-            let learner = Learner::of(repeats, relative.clone(), frames);
+            let learner = Learner::from_repeats(repeats, relative.clone(), frames);
             found = learner.learn(mean);
             let memory = |b: usize| found.memory(relative[b] * mean);
             relative = (0..repeats.len())
@@ -119,7 +119,7 @@ impl Slow {
 }
 
 impl<'r> Learner<'r> {
-    fn of(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
+    fn from_repeats(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
         let of = |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
         let white: Vec<f64> = (0..repeats.len()).map(|b| of(Common::NONE, b)).collect();
         let frames = frames as f64;
@@ -164,7 +164,7 @@ impl<'r> Learner<'r> {
                 self.likelihood(common) + self.log_prior(common, free)
             };
             let least = best.as_ref().map_or(nothing, |(_, peak)| peak.log_integral);
-            let peak = Peak::of(density, &start.coordinates(free), &self.bounds(free));
+            let peak = Peak::find(density, &start.coordinates(free), &self.bounds(free));
             best = peak.filter(|peak| peak.log_integral > least).map(|peak| (free, peak)).or(best);
         }
         let (common, sigma) = best.map_or((Common::NONE, [0.0; 3]), |(free, peak)| Common::measured(&peak, free));
@@ -189,7 +189,7 @@ impl<'r> Learner<'r> {
 
     /// Root mean square, by its posterior, of what is not needed.
     fn range(&self, common: &dyn Fn(f64) -> Common, width: f64) -> f64 {
-        HalfNormal::of(|size| self.likelihood(common(size.min(MOST))), width, RANGE).square.sqrt()
+        HalfNormal::from_log_likelihood(|size| self.likelihood(common(size.min(MOST))), width, RANGE).square.sqrt()
     }
 
     fn bounds(&self, free: Free) -> Vec<[f64; 2]> {

@@ -31,7 +31,7 @@ pub struct Units {
 
 impl Units {
     /// Of a prior that has a width.
-    pub fn of(prior: &Prior) -> Self {
+    pub fn from_prior(prior: &Prior) -> Self {
         let sigma = prior.precision.map(|precision| precision.sqrt().recip());
         let range = |(i, range): (usize, &[f64; 2])| range.map(|bound| (bound - prior.mean[i]) / sigma[i]);
         Self {
@@ -106,7 +106,12 @@ pub struct Within {
 impl Within {
     /// Of the factor of a precision and the slope at `u`, the first of which are params and have a range; none if the precision is not
     /// positive.
-    pub fn of(precision: &Factor, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Option<Self> {
+    pub fn from_precision(
+        precision: &Factor,
+        u: &DVector<f64>,
+        mut slope: DVector<f64>,
+        units: &Units,
+    ) -> Option<Self> {
         let vars = units.len();
         let against = |&i: &usize| {
             let [lower, upper] = units.range[i];

@@ -64,7 +64,7 @@ impl Verdict {
 
     /// The same with what passes within settings.
     #[must_use]
-    pub fn beside(self, transients: &[Transient]) -> Self {
+    pub fn with_transients(self, transients: &[Transient]) -> Self {
         let decided = |one: &Transient| {
             one.alternatives[0].probability >= DECISIVE && one.tested.is_some_and(|tested| tested.is_passed())
         };
@@ -84,7 +84,7 @@ impl Verdict {
     }
 
     /// From the competition of each effect, and how it stood its tests.
-    pub fn of(found: &Found, tests: &[Tested]) -> Self {
+    pub fn from_tests(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
         if next.unknown_seen() > SUSPICIOUS || found.best.is_poor() {
             return Self::Unexplained;
@@ -120,7 +120,7 @@ pub struct Fixed {
 }
 
 impl Fixed {
-    fn of(data: &Data, alternative: &Alternative) -> Option<Self> {
+    fn from_alternative(data: &Data, alternative: &Alternative) -> Option<Self> {
         let kind = alternative.term()?.kind;
         let is_fixed = data.is_joint() && kind.is_stray() && kind.thin().is_some();
         let (value, sigma) = alternative.amplitude;
@@ -166,7 +166,7 @@ pub struct Finding {
 }
 
 impl Finding {
-    fn of(data: &Data, alternative: &Alternative) -> Self {
+    fn from_alternative(data: &Data, alternative: &Alternative) -> Self {
         let (amplitude, sigma) = alternative.amplitude;
         let ring = &data.ring;
         let (at, s, phrase) = match &alternative.cause {
@@ -182,7 +182,7 @@ impl Finding {
                 (one.at.label(own), one.at.position(own), phrase)
             }
         };
-        let fixed = Fixed::of(data, alternative);
+        let fixed = Fixed::from_alternative(data, alternative);
         let phrase = fixed.map_or_else(|| phrase.clone(), |fixed| phrase.clone() + &fixed.phrase());
         Self {
             fixed,
@@ -207,8 +207,8 @@ impl Finding {
         let others = transient.alternatives[1..].iter().filter(listed);
         Self {
             tested: transient.tested,
-            alternatives: others.map(|one| Self::of(data, one)).collect(),
-            ..Self::of(data, &transient.alternatives[0])
+            alternatives: others.map(|one| Self::from_alternative(data, one)).collect(),
+            ..Self::from_alternative(data, &transient.alternatives[0])
         }
     }
 
@@ -217,8 +217,8 @@ impl Finding {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
         let others: Vec<&Alternative> =
             competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
-        let finding = Self::of(data, &competition.alternatives[first]);
-        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
+        let finding = Self::from_alternative(data, &competition.alternatives[first]);
+        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::from_alternative(data, a)).collect();
         if let Cause::Effect(term) = &competition.alternatives[first].cause {
             let effects: Vec<(usize, &Term)> =
                 others.iter().enumerate().filter_map(|(i, a)| Some((i, a.term()?))).collect();
@@ -312,7 +312,7 @@ pub fn tests(
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let without = &reduced(data, &found.best, i)?;
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
-        let rival = if is_all { before } else { &Score::of(data, without, blocks)? };
+        let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
             return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
@@ -321,7 +321,7 @@ pub fn tests(
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
         let own = family_of(kind);
         let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == own);
-        let choice = Choice::of(data, without, candidates, penalty)?;
+        let choice = Choice::from_terms(data, without, candidates, penalty)?;
         let is_of_family = is_of_an_instrument && is_learnt;
         let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
         Ok(Tested { gain, of_choice, chance, is_of_family })
@@ -344,7 +344,7 @@ pub fn test_of_element(
         return Ok(None);
     }
     let without = || lessened(data, &found.best, found.best.hypothesis.without_element());
-    let rival = if found.competitions.is_empty() { before } else { &Score::of(data, &without()?, blocks)? };
+    let rival = if found.competitions.is_empty() { before } else { &Score::from_blocks(data, &without()?, blocks)? };
     Ok(Some(Tested { gain: after.gain_over(rival), of_choice: None, chance: None, is_of_family: false }))
 }
 
@@ -371,7 +371,7 @@ pub fn findings(
         let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
             // if the scan fails there is no interval, but the finding stands
-            Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)
+            Some(kind) => PlaceScan::from_fit(data, &found.best, Some(index), kind)
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
@@ -414,7 +414,9 @@ pub fn findings(
     }
     all.extend(unmodelled);
     for (index, campaign) in data.campaigns().enumerate() {
-        all.extend(Alternative::from_frame_to_frame(&campaign.noise, index).map(|one| Finding::of(data, &one)));
+        all.extend(
+            Alternative::from_frame_to_frame(&campaign.noise, index).map(|one| Finding::from_alternative(data, &one)),
+        );
     }
     Ok(all)
 }
@@ -443,7 +445,7 @@ pub fn sentence(
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => unexplained(found, findings),
     };
-    let contradicted = contradictions.iter().map(|one| within(data, &one.recording, one.to_string()));
+    let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
     let mut said: Vec<String> = contradicted.chain(beyond.iter().map(Beyond::to_string)).collect();
     // these are no missing physics, and a consistent recording's sentence begins with them
     if verdict == Verdict::Consistent && !said.is_empty() {
@@ -456,7 +458,7 @@ pub fn sentence(
 }
 
 /// What is said of one of several recordings.
-fn within(data: &Data, recording: &str, said: String) -> String {
+fn in_recording(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
 }
 
@@ -469,12 +471,12 @@ fn remarks(data: &Data, found: &Found) -> Vec<String> {
         remarks.push(format!("larger than ordinary: {}", large.join(", ")));
     }
     for own in data.campaigns() {
-        remarks.extend(own.close_tunes.iter().map(|one| within(data, &own.name, one.to_string())));
-        remarks.extend(own.noise.remarks().into_iter().map(|said| within(data, &own.name, said)));
-        remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
+        remarks.extend(own.close_tunes.iter().map(|one| in_recording(data, &own.name, one.to_string())));
+        remarks.extend(own.noise.remarks().into_iter().map(|said| in_recording(data, &own.name, said)));
+        remarks.extend(wandering(own).into_iter().map(|said| in_recording(data, &own.name, said)));
     }
-    remarks.extend(Stuck::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
-    remarks.extend(Aside::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
+    remarks.extend(Stuck::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
+    remarks.extend(Aside::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
@@ -561,7 +563,7 @@ fn ambiguous(findings: &[Finding]) -> String {
 fn power(found: &Found) -> String {
     let shown = [EffectKind::BpmGain, EffectKind::CorrectorGain, EffectKind::QuadRoll, EffectKind::StrayGradient];
     let of_kind = |kind: EffectKind| {
-        let limits = Limits::of(kind, &found.next.scanned)?;
+        let limits = Limits::from_scan(kind, &found.next.scanned)?;
         Some(format!("{kind} {}", kind.unit().rounded(limits.median)))
     };
     let list: Vec<String> = shown.into_iter().filter_map(of_kind).collect();
@@ -591,7 +593,7 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > competition.nothing);
-    let menu = Menu::of(data, &competition.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
+    let menu = Menu::from_causes(data, &competition.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
     let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label(&data.ring));
     Ok(Some((menu, [one.label(&data.ring), against])))
 }
@@ -637,17 +639,18 @@ mod tests {
     #[test]
     fn an_effect_at_an_instrument_that_does_something_unknown_is_a_part_of_that() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let alternative = |cause: Cause, probability: f64| Alternative {
             probability,
             ..Alternative::unfitted(cause, 50.0, (-0.2, 0.01))
         };
         let unknown = |at: Location, probability: f64| {
             let one = Discrepancy { at, campaign: 0, log_bayes: 50.0, size: 1e-4, sites: 33, adapted: None };
-            Finding::of(&data, &alternative(Cause::Unmodelled(one), probability))
+            Finding::from_alternative(&data, &alternative(Cause::Unmodelled(one), probability))
         };
-        let of =
-            |kind: EffectKind, site: Site| Finding::of(&data, &alternative(Cause::Effect(Term { kind, site }), 0.99));
+        let of = |kind: EffectKind, site: Site| {
+            Finding::from_alternative(&data, &alternative(Cause::Effect(Term { kind, site }), 0.99))
+        };
         let gain = of(EffectKind::BpmGain, Site::Monitor(ring.read_monitors[3]));
         let curve = unknown(Location::MonitorCurve(3), 0.99);
         assert!(curve.holds(&gain, &data));

@@ -127,11 +127,11 @@ impl Miswired {
     ///
     /// # Errors
     /// [`EffectError`] if the ring as designed has no orbit.
-    pub fn of(ring: &Ring, recording: &Recording) -> Result<Option<Self>, EffectError> {
+    pub fn find(ring: &Ring, recording: &Recording) -> Result<Option<Self>, EffectError> {
         let ring = &*recording.powered(ring);
         let machines = machines(ring, recording)?;
-        let mut designs = Designs::of(&machines)?;
-        let measured = Measured::of(ring, recording, designs.stated());
+        let mut designs = Designs::from_machines(&machines)?;
+        let measured = Measured::from_recording(ring, recording, designs.stated());
         // what looks right on the design itself needs no other tunes
         if measured.judged(&designs).is_none() {
             return Ok(None);
@@ -160,7 +160,7 @@ fn wirings() -> Vec<(Columns, Fault)> {
 
 impl<'m> Designs<'m> {
     /// As the header says.
-    fn of(machines: &'m [Machine]) -> Result<Self, OrbitError> {
+    fn from_machines(machines: &'m [Machine]) -> Result<Self, OrbitError> {
         let ring = machines[0].ring();
         let by_family = families(ring)?;
         Ok(Self { machines, by_family, at: vec![responses(&machines[0], ring)?], off: vec![0.0] })
@@ -253,7 +253,7 @@ fn responses(machine: &Machine, ring: &Ring) -> Result<[[DMatrix<f64>; 2]; 2], O
 }
 
 impl<'r> Measured<'r> {
-    fn of(ring: &'r Ring, recording: &Recording, design: &DMatrix<f64>) -> Self {
+    fn from_recording(ring: &'r Ring, recording: &Recording, design: &DMatrix<f64>) -> Self {
         let (split, kicks) = (ring.horizontal_monitors(), design.ncols() - 1);
         let rms = |part: DMatrixView<f64>| (part.norm_squared() / part.len().max(1) as f64).sqrt();
         let horizontal = ring.horizontal_correctors();
@@ -268,7 +268,9 @@ impl<'r> Measured<'r> {
         });
         let drive = DMatrix::from_rows(&rows.collect::<Vec<_>>());
         let regressed = |by: isize| -> Vec<Regressed> {
-            (0..design.nrows()).map(|b| Regressed::of(recording, &drive, by, b, &prior(ring, scale, b))).collect()
+            (0..design.nrows())
+                .map(|b| Regressed::from_recording(recording, &drive, by, b, &prior(ring, scale, b)))
+                .collect()
         };
         let rows = |of: &[Regressed], row: fn(&Regressed) -> &DVector<f64>| {
             DMatrix::from_columns(&of.iter().map(|one| row(one).clone()).collect::<Vec<_>>()).transpose()
@@ -438,7 +440,7 @@ struct Regressed {
 
 impl Regressed {
     /// Least squares on what drove the beam in the frame so many before, and a baseline, with the prior's widths.
-    fn of(recording: &Recording, drive: &DMatrix<f64>, by: isize, b: usize, prior: &DVector<f64>) -> Self {
+    fn from_recording(recording: &Recording, drive: &DMatrix<f64>, by: isize, b: usize, prior: &DVector<f64>) -> Self {
         let frame = |i: usize| i.checked_add_signed(-by).filter(|frame| *frame < drive.nrows());
         let read = recording.rows.iter().enumerate().filter_map(|(i, row)| Some((frame(i)?, row.reading[b]?)));
         let (frames, readings): (Vec<usize>, Vec<f64>) = read.unzip();
@@ -574,7 +576,7 @@ mod tests {
     }
 
     fn judge(ring: &Ring, recording: &Recording) -> Option<Miswired> {
-        Miswired::of(ring, recording).unwrap()
+        Miswired::find(ring, recording).unwrap()
     }
 
     fn booster(name: &str) -> (Ring, Recording) {

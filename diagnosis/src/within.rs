@@ -21,7 +21,7 @@ pub struct Within {
 
 impl Within {
     /// From differences of readings and of their terms [readings][factors], both over the noise.
-    pub fn of(readings: &DVector<f64>, terms: &DMatrix<f64>) -> Self {
+    pub fn from_differences(readings: &DVector<f64>, terms: &DMatrix<f64>) -> Self {
         let factors = terms.ncols();
         let normal = DMatrix::identity(factors, factors) + terms.tr_mul(terms);
         let unknown = || Self { mean: DVector::zeros(factors), root: DMatrix::identity(factors, factors) };
@@ -59,7 +59,7 @@ mod tests {
                 row -= &mean_terms;
             });
         }
-        let within = Within::of(&off, &off_terms);
+        let within = Within::from_differences(&off, &off_terms);
         let left = &means.0 - &means.1 * &within.mean;
         let terms = &means.1 * &within.root;
         let step = (DMatrix::identity(2, 2) + terms.tr_mul(&terms)).cholesky().unwrap().solve(&terms.tr_mul(&left));

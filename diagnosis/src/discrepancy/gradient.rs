@@ -73,7 +73,7 @@ pub(super) struct Runs {
 
 impl Runs {
     /// Of some monitors and the tunes that are known; none of too many runs.
-    pub fn of(data: &Data, seen: &Seen, monitors: &[usize]) -> Option<Self> {
+    pub fn from_readings(data: &Data, seen: &Seen, monitors: &[usize]) -> Option<Self> {
         if data.pools.count > MANY {
             return None;
         }
@@ -87,7 +87,7 @@ impl Runs {
     /// One amplitude a run of each of some patterns.
     pub(super) fn of_patterns(&self, data: &Data, patterns: &[Signature]) -> Sums {
         let (runs, unknowns) = (data.pools.count, self.channels[0].1.cross.ncols());
-        let mut all = Sums::none(patterns.len() * runs, unknowns);
+        let mut all = Sums::zero(patterns.len() * runs, unknowns);
         let left: Vec<DMatrix<f64>> =
             patterns.iter().map(|one| data.accompanied_in_runs(&self.monitors, &one.readings)).collect();
         for (c, own) in &self.channels {
@@ -136,7 +136,7 @@ impl Where<'_> {
     /// Of patterns that step with time, by whole whitened frames.
     pub(crate) fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
         let patterns: Vec<Signature> = patterns.iter().map(|one| at_monitors(one, self.monitors)).collect();
-        Sums::whole(&self.data.stepping(&patterns, steps), self.own)
+        Sums::from_columns(&self.data.stepping(&patterns, steps), self.own)
     }
 }
 
@@ -152,7 +152,7 @@ impl Linearised<'_> {
                 return first;
             }
             let kicked = self.changes(at, one, 3, all.len());
-            first.into_iter().zip(kicked).map(|(first, kicked)| first.or(kicked)).collect()
+            first.into_iter().zip(kicked).map(|(first, kicked)| first.averaged_with(kicked)).collect()
         };
         all.iter().enumerate().zip(first).flat_map(with_kicks).collect()
     }
@@ -228,7 +228,7 @@ mod tests {
         };
         let exact = (with(1e-4) - with(-1e-4)) / 2e-4;
         let (_, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let design = machine(&vec![1.0; ring.parameters.len()]);
         let signatures = Signatures::of(&design, &data.drives).unwrap();
         let orbit = design.orbit().unwrap();
@@ -254,7 +254,7 @@ mod tests {
             let beyond: &[&dyn Beyond] = &[&one];
             let truth = Truth { vars: &vars, effects: &[], beyond };
             let recording = simulate::campaign(&template, &ring, &truth, &hardware, seed).unwrap();
-            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let last = found.findings.last().unwrap();
             assert_eq!(last.at, one.site.name(&ring), "{}", found.sentence);
@@ -274,7 +274,7 @@ mod tests {
         let beyond: &[&dyn Beyond] = &[&one];
         let truth = Truth { vars: &vars, effects: &[], beyond };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 8).unwrap();
-        let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let names = ring.var_names();
         let at = names.iter().position(|name| *name == one.site.name(&ring)).unwrap();
         let (mean, sigma) = (found.vars_after.mean[at], found.vars_after.covariance[(at, at)].sqrt());

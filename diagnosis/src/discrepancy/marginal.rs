@@ -47,7 +47,7 @@ pub struct Linearised<'f> {
 }
 
 impl<'f> Linearised<'f> {
-    pub fn of(fitted: &'f Fitted) -> Self {
+    pub fn from_fit(fitted: &'f Fitted) -> Self {
         Self { fitted, slope: fitted.free.whiten(&fitted.slope) }
     }
 
@@ -79,7 +79,7 @@ impl<'f> Linearised<'f> {
 
     pub fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
         let sides: Vec<DMatrix<f64>> =
-            each.iter().map(|sums| sums.beside(&(&sums.pull - &sums.cross * &self.slope))).collect();
+            each.iter().map(|sums| sums.with_column(&(&sums.pull - &sums.cross * &self.slope))).collect();
         let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
         self.conclude(at, logs, sites, &each.iter().collect::<Vec<_>>())
     }
@@ -154,7 +154,7 @@ impl Discrepancy {
     }
 
     /// One of two forms of it, equally likely beforehand: the evidence is their mean, all else that of the better one.
-    pub fn or(self, other: Self) -> Self {
+    pub fn averaged_with(self, other: Self) -> Self {
         let (better, worse) = if other.log_bayes > self.log_bayes { (other, self) } else { (self, other) };
         let share = (worse.log_bayes - better.log_bayes).exp();
         Self { log_bayes: better.log_bayes + (0.5 * (1.0 + share)).ln(), ..better }

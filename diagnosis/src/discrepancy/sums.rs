@@ -75,13 +75,13 @@ pub fn at_monitors(signature: &Signature, monitors: &[usize]) -> Signature {
 
 impl Seen {
     /// Some rows of a fit.
-    pub fn by(fitted: &Fitted, rows: Range<usize>) -> Self {
+    pub fn from_fit(fitted: &Fitted, rows: Range<usize>) -> Self {
         let residual = fitted.residual.rows_range(rows.clone()).into_owned();
         let whitened = fitted.free.whiten(&fitted.jacobian.rows_range(rows).transpose());
         Self { residual, jacobian: whitened.transpose() }
     }
 
-    pub fn of(data: &Data, own: &Self) -> Self {
+    pub fn taken_back(data: &Data, own: &Self) -> Self {
         let residual = DMatrix::from_columns(core::slice::from_ref(&own.residual));
         let residual = data.taken_back(&residual).column(0).into_owned();
         Self { residual, jacobian: data.taken_back(&own.jacobian) }
@@ -89,13 +89,13 @@ impl Seen {
 }
 
 impl Sums {
-    pub fn none(numbers: usize, unknowns: usize) -> Self {
+    pub fn zero(numbers: usize, unknowns: usize) -> Self {
         let (gram, cross) = (DMatrix::zeros(numbers, numbers), DMatrix::zeros(numbers, unknowns));
         Self { gram, cross, pull: DVector::zeros(numbers) }
     }
 
     /// Of whitened patterns of all readings, one a column.
-    pub fn whole(columns: &DMatrix<f64>, own: &Seen) -> Self {
+    pub fn from_columns(columns: &DMatrix<f64>, own: &Seen) -> Self {
         let back = columns.transpose();
         Self { gram: &back * columns, cross: &back * &own.jacobian, pull: back * &own.residual }
     }
@@ -103,7 +103,7 @@ impl Sums {
     /// Of several monitors, each with its own amplitudes.
     pub fn stacked(each: &[Self]) -> Self {
         let amplitudes = each.iter().map(|sums| sums.pull.len()).sum();
-        let mut all = Self::none(amplitudes, each.first().map_or(0, |sums| sums.cross.ncols()));
+        let mut all = Self::zero(amplitudes, each.first().map_or(0, |sums| sums.cross.ncols()));
         let mut at = 0;
         for sums in each {
             let n = sums.pull.len();
@@ -125,7 +125,7 @@ impl Sums {
     pub fn through(&self, steps: &DMatrix<f64>) -> Self {
         let (from, to) = steps.shape();
         let blocks = self.pull.len() / from;
-        let mut all = Self::none(blocks * to, self.cross.ncols());
+        let mut all = Self::zero(blocks * to, self.cross.ncols());
         for i in 0..blocks {
             for j in 0..blocks {
                 let block = self.gram.view((i * from, j * from), (from, from));
@@ -138,7 +138,7 @@ impl Sums {
     }
 
     /// The cross sums, and one more column.
-    pub fn beside(&self, column: &DVector<f64>) -> DMatrix<f64> {
+    pub fn with_column(&self, column: &DVector<f64>) -> DMatrix<f64> {
         let at = self.cross.ncols();
         let mut all = self.cross.clone().insert_column(at, 0.0);
         all.set_column(at, column);
@@ -147,7 +147,7 @@ impl Sums {
 }
 
 impl Apart {
-    pub fn of(data: &Data, b: usize, settings: &Settings, sums: &Sums) -> Self {
+    pub fn from_sums(data: &Data, b: usize, settings: &Settings, sums: &Sums) -> Self {
         let (alone, common) = data.information(b, &settings.of_frame, settings.count());
         Self { alone, common, whole: data.remembers(b).then(|| sums.gram.clone()) }
     }

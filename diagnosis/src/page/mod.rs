@@ -119,7 +119,7 @@ mod tests {
         let effects: Vec<Effect> = effects.iter().map(|text| Effect::parse(text, &ring).unwrap()).collect();
         let truth = Truth { vars: &[1.0; 48], effects: &effects, ..Truth::default() };
         let made = campaign(&recording, &ring, &truth, &Hardware::shipped(&ring, &recording), seed).unwrap();
-        let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &made, |_| ()).unwrap();
         (made, diagnosis)
     }
 
@@ -239,7 +239,7 @@ mod tests {
         let ring = twin::Ring::booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed/open-09");
         let recording = Recording::read(&folder, &ring).unwrap();
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert!(diagnosis.findings.first().is_some_and(|one| one.word() == "quad_drift"), "{}", diagnosis.sentence);
         let page = page(&diagnosis, &recording).unwrap();
         all_are_complete(&page);

@@ -37,7 +37,7 @@ fn element_of(data: &Data, without: &Fitted, one: &Discrepancy) -> Result<Option
     let Location::Linear(quadrupole, does) = one.at else { return Ok(None) };
     let (machine, drives) = without.machine_on_orbit(without.data(data), one.campaign)?;
     let signatures = Signatures::of(&machine, &drives)?;
-    Ok(Some(Element::of(&signatures, &data.ring, quadrupole, does, one.size)))
+    Ok(Some(Element::with_size(&signatures, &data.ring, quadrupole, does, one.size)))
 }
 
 /// Weigh the leading unknown elements among some causes by exact fits, in which what is ordinary is learnt beside them, as it is beside the effects of the
@@ -66,7 +66,7 @@ pub fn weigh_elements(data: &Data, without: &Fitted, weights: &mut [(Alternative
         tried.push(element.clone());
         let hypothesis = Hypothesis { element: Some(element), ..without.hypothesis.clone() };
         let own = without.data(data);
-        let Ok(with) = Fitted::of(own, &hypothesis, &without.guess(own, &hypothesis)) else { continue };
+        let Ok(with) = Fitted::from_guess(own, &hypothesis, &without.guess(own, &hypothesis)) else { continue };
         let with = relearnt(own, with);
         let gain = with.log_evidence - without.log_evidence - (SIZES.len() as f64).ln();
         if gain > one.log_bayes && with.is_stable(own) {
@@ -130,7 +130,7 @@ mod tests {
         let gain = Effect::parse("bpm_gain@x_E6=0.2", &ring).unwrap();
         for effects in [vec![], vec![gain]] {
             let recording = solenoid.campaign(&ring, &template, &effects, 21);
-            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let named: Vec<EffectKind> = found.findings.iter().filter_map(|one| Some(one.term()?.kind)).collect();
             let true_kinds: Vec<EffectKind> = effects.iter().map(|effect| effect.kind).collect();
@@ -141,7 +141,7 @@ mod tests {
             assert!(solenoid.is_near(&ring, last.s.unwrap()), "{}", found.sentence);
             let (data, best) = (&found.found.data, &found.found.best);
             // what the vars do to its signature is left out of the derivatives: 0.75 nat where it is 40 mrad
-            let again = Fitted::of(data, &best.hypothesis, &best.u).unwrap();
+            let again = Fitted::from_guess(data, &best.hypothesis, &best.u).unwrap();
             let moved = again.log_evidence - best.log_evidence;
             println!("{moved} nat");
             assert!(moved.abs() < 2.0, "{moved} nat");
@@ -162,7 +162,7 @@ mod tests {
         let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };
         let hardware = Hardware::shipped(&ring, &template);
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 31).unwrap();
-        let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert!(found.findings.iter().all(|one| one.term().is_some()), "{}", found.sentence);
         let named = |effect: &Effect| found.findings.iter().any(|one| one.term() == Some(&Term::from(*effect)));
         assert!(effects.iter().all(named), "{}", found.sentence);
@@ -175,7 +175,8 @@ mod tests {
         let (ring, template) = crate::testing::template();
         for (seed, drift) in [(11, 14), (12, 0), (13, 7)] {
             let solenoid = Solenoid::of(&ring, drift, 0.01);
-            let found = Diagnosis::of(&ring, &solenoid.campaign(&ring, &template, &[], seed), |_| ()).unwrap();
+            let found =
+                Diagnosis::from_recording(&ring, &solenoid.campaign(&ring, &template, &[], seed), |_| ()).unwrap();
             let [only] = found.findings.as_slice() else { panic!("{}", found.sentence) };
             assert!(only.term().is_none() && only.phrase.contains("turning them"), "{}", found.sentence);
             assert!(solenoid.is_near(&ring, only.s.unwrap()), "{}", found.sentence);

@@ -31,16 +31,16 @@ const STILL: f64 = 0.3;
 /// vars alone come to rest, which absorb most of that.
 pub fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
     let start = DVector::zeros(data.units.len());
-    let first = Fitted::of(data, plain, &start)?;
+    let first = Fitted::from_guess(data, plain, &start)?;
     if !first.is_poor() {
         return Ok(first);
     }
-    let of_vars = Fitted::of(data, &Hypothesis::default(), &start).ok();
+    let of_vars = Fitted::from_guess(data, &Hypothesis::default(), &start).ok();
     let begun = [of_vars.map(|fitted| fitted.guess(data, plain)), first.is_stable(data).then(|| first.u.clone())];
     let mut fits: Vec<Fitted> = Vec::new();
     for mut guess in begun.into_iter().flatten() {
         for _ in 0..PASSES {
-            let Ok(fitted) = Fitted::of(data, plain, &guess) else { break };
+            let Ok(fitted) = Fitted::from_guess(data, plain, &guess) else { break };
             guess = fitted.u.clone();
             fits.push(fitted);
         }
@@ -53,10 +53,10 @@ pub fn first_of(data: &Data, plain: &Hypothesis) -> Result<Fitted, FitError> {
 /// those, it is fitted to as many.
 pub fn null_beside(data: &Data, null: Fitted, before: &Data) -> Fitted {
     if data.whole_size() == null.data(before).whole_size() {
-        return null.to(before);
+        return null.keeping(before);
     }
-    let again = Fitted::of(data, &null.hypothesis, &null.u).ok().filter(|fitted| fitted.is_stable(data));
-    again.map_or_else(|| null.to(before), |again| about_itself(data, again))
+    let again = Fitted::from_guess(data, &null.hypothesis, &null.u).ok().filter(|fitted| fitted.is_stable(data));
+    again.map_or_else(|| null.keeping(before), |again| about_itself(data, again))
 }
 
 /// A fit to the readings at hand, where they are linearised about a machine with effects that it may not have.
@@ -64,7 +64,7 @@ pub fn fitted_to(data: &Data, fitted: Fitted) -> Option<Fitted> {
     if !data.is_about_effects {
         return Some(fitted);
     }
-    Fitted::of(data, &fitted.hypothesis, &fitted.u).ok().map(|fitted| about_itself(data, fitted))
+    Fitted::from_guess(data, &fitted.hypothesis, &fitted.u).ok().map(|fitted| about_itself(data, fitted))
 }
 
 /// The same with what is ordinary, which was left out where it kept no beam about the former machine.
@@ -110,7 +110,7 @@ pub fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) ->
     let fits = fits.filter(|fitted| fitted.is_stable(data));
     // a candidate without a stable machine is excluded
     let Some(refitted) = fits.max_by(|one, other| one.log_evidence.total_cmp(&other.log_evidence)) else {
-        return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::of(candidate) };
+        return Alternative { log_gain: f64::NEG_INFINITY, ..Alternative::from_candidate(candidate) };
     };
     Alternative::exact(data, fitted, gross(data, refitted, last), last)
 }
@@ -139,7 +139,7 @@ fn gross(data: &Data, fitted: Fitted, term: usize) -> Fitted {
         return fitted;
     }
     let hypothesis = fitted.hypothesis.with_gross(term);
-    let again = hypothesis.and_then(|gross| Fitted::of(data, &gross, &fitted.guess(data, &gross)).ok());
+    let again = hypothesis.and_then(|gross| Fitted::from_guess(data, &gross, &fitted.guess(data, &gross)).ok());
     again.filter(|again| again.log_evidence > fitted.log_evidence && again.is_stable(data)).unwrap_or(fitted)
 }
 
@@ -177,12 +177,13 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     }
     let own = fitted.has_own().then(|| fitted.data(data).clone());
     let data = own.as_ref().unwrap_or(data);
-    let again = |hypothesis: Hypothesis, from: &Fitted| Fitted::of(data, &hypothesis, &from.guess(data, &hypothesis));
+    let again =
+        |hypothesis: Hypothesis, from: &Fitted| Fitted::from_guess(data, &hypothesis, &from.guess(data, &hypothesis));
     let with_all = || Hypothesis { ordinary: Family::all(), ..fitted.hypothesis.clone() };
     let begun = if lacks_all { again(with_all(), &fitted) } else { Ok(fitted.clone()) };
     let begun = begun.ok().filter(|begun| !begun.is_poor());
     let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun).ok());
     let is_better = |learnt: &Fitted| !learnt.is_poor() && (lacks_all || learnt.log_evidence > fitted.log_evidence);
     let best = learnt.filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
-    if own.is_some() { best.to(data) } else { best }
+    if own.is_some() { best.keeping(data) } else { best }
 }

@@ -26,7 +26,7 @@ enum Wander {
 
 impl Wander {
     /// Those that the leading cause of what is left is about, where nothing is known of their walk yet and repeats say what is ordinary.
-    fn of(data: &Data, leading: &Discrepancy) -> Option<Self> {
+    fn from_discrepancy(data: &Data, leading: &Discrepancy) -> Option<Self> {
         let noise = &data.campaign(leading.campaign).noise;
         let is_known = |b: usize| noise.wandering.iter().any(|(at, _)| *at == b);
         let steady = data.campaigns().all(|own| own.noise.slow.walk.value == 0.0);
@@ -40,7 +40,7 @@ impl Wander {
         }
     }
 
-    fn with(&self, data: &Data, walk: Measured) -> Data {
+    fn added_to(&self, data: &Data, walk: Measured) -> Data {
         match *self {
             Self::All => data.wandering(walk),
             Self::One(campaign, b) => data.with_wandering(campaign, b, walk),
@@ -62,16 +62,17 @@ pub fn wandering(found: &Found) -> Result<Option<Data>, FitError> {
     let Found { data, best, next, .. } = found;
     let leader = next.alternatives.first().filter(|_| next.is_suspicious() && !best.is_poor());
     let Some(Alternative { cause: Cause::Unmodelled(leading), probability, .. }) = leader else { return Ok(None) };
-    let Some(wander) = Wander::of(data, leading) else { return Ok(None) };
+    let Some(wander) = Wander::from_discrepancy(data, leading) else { return Ok(None) };
     let log_likelihood = |value: f64| {
-        let wandering = wander.with(best.data(data), Measured { value, sigma: 0.0 });
-        let fitted = Fitted::of(&wandering, &best.hypothesis, &best.u);
+        let wandering = wander.added_to(best.data(data), Measured { value, sigma: 0.0 });
+        let fitted = Fitted::from_guess(&wandering, &best.hypothesis, &best.u);
         fitted.map_or(f64::NEG_INFINITY, |fitted| fitted.log_evidence)
     };
-    let posterior = HalfNormal::of(log_likelihood, data.campaign(leading.campaign).noise.ordinary_walk, WALKS);
+    let posterior =
+        HalfNormal::from_log_likelihood(log_likelihood, data.campaign(leading.campaign).noise.ordinary_walk, WALKS);
     let (prior, doubt) = wander.odds();
     let of_walk = posterior.log_evidence - best.log_evidence + prior;
     let of_leader = (probability / next.nothing.max(f64::MIN_POSITIVE)).ln();
     let walk = Measured { value: posterior.mean, sigma: posterior.sigma() };
-    Ok((of_walk > (of_leader - doubt).max(0.0)).then(|| wander.with(data, walk)))
+    Ok((of_walk > (of_leader - doubt).max(0.0)).then(|| wander.added_to(data, walk)))
 }

@@ -29,7 +29,7 @@ const LARGEST: f64 = 300.0;
 
 impl<'c> Signals<'c> {
     /// From readings without what is known to pass, rows frames [m].
-    pub fn of(campaign: &'c Campaign, readings: &DMatrix<f64>) -> Self {
+    pub fn from_readings(campaign: &'c Campaign, readings: &DMatrix<f64>) -> Self {
         let kick = DMatrix::from_rows(&campaign.drives.iter().map(|drive| drive.kick.transpose()).collect::<Vec<_>>());
         let rows = &campaign.recording.rows;
         let since = |frame: usize| rows[frame].sequence.wrapping_sub(rows[frame - 1].sequence);

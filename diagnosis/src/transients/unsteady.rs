@@ -51,7 +51,11 @@ struct Sums {
 
 impl<'d> Unsteady<'d> {
     /// `response`: what the corrector does to each monitor, in any unit; none if it does nothing.
-    pub fn of(differences: &'d Differences, white: &'d DMatrix<f64>, response: DVector<f64>) -> Option<Self> {
+    pub fn from_response(
+        differences: &'d Differences,
+        white: &'d DMatrix<f64>,
+        response: DVector<f64>,
+    ) -> Option<Self> {
         let seen: Vec<f64> = (0..response.len()).filter(|&b| differences.sees(b)).map(|b| response[b]).collect();
         let rms = (seen.iter().map(|p| p * p).sum::<f64>() / seen.len().max(1) as f64).sqrt();
         let response = response / rms;
@@ -182,7 +186,7 @@ mod tests {
         let mut made = Coloured::white(&ring, &recording, 7);
         noise(&mut made);
         let made = made.campaign_with(&ring, &recording, &[], &[&Unsteadied { corrector, share }]);
-        let Transients { found, campaign } = Transients::of(&ring, &made).unwrap();
+        let Transients { found, campaign } = Transients::find(&ring, &made).unwrap();
         (campaign.recording, found.into_iter().map(|mut one| one.alternatives.remove(0).cause).collect())
     }
 

@@ -78,7 +78,7 @@ impl Cases {
     /// # Errors
     /// [`DataError`] if that cannot be diagnosed.
     pub fn of(template: &Campaign) -> Result<Self, DataError> {
-        let data = Data::of(template)?;
+        let data = Data::from_campaign(template)?;
         let terms = candidates(&data, template.recording.header.radial_loop_monitors.as_ref());
         Ok(Self { ring: template.ring.clone(), terms, families: Families::of(&data) })
     }

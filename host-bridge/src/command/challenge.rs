@@ -83,7 +83,7 @@ fn scored(ring: &Ring, folder: &Path) -> Result<Scored, CommandError> {
     let recording = recording(folder, ring)?;
     let truth = Truth::read(folder, ring).map_err(|error| CommandError::Input(error.to_string()))?;
     let started = Instant::now();
-    let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
+    let diagnosis = Diagnosis::from_recording(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
     Ok(Scored::of(ring, &recording.name, &diagnosis, &truth, seconds))
 }

@@ -107,7 +107,7 @@ impl CheckResult {
     /// [`CommandError`] if its currents leave no stable ring.
     pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, CommandError> {
         // columns that are not what the header says may leave no stable ring
-        let campaign = campaign(ring, recording).map_err(|error| match Miswired::of(ring, recording) {
+        let campaign = campaign(ring, recording).map_err(|error| match Miswired::find(ring, recording) {
             Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
             _ => error,
         })?;
@@ -247,7 +247,7 @@ fn diagnose(campaign: &Campaign) -> Usable {
     let settings = Settings::of(campaign);
     let reading = (0..campaign.monitors()).filter(|&b| (0..campaign.frames()).any(|i| campaign.counts(i, b))).count();
     let moved = settings.correctors[0];
-    let wiring = Miswired::of(&campaign.ring, &campaign.recording).ok().flatten();
+    let wiring = Miswired::find(&campaign.ring, &campaign.recording).ok().flatten();
     let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1 && wiring.is_none();
     let what = if let Some(why_not) = several_times(campaign) {
         why_not
