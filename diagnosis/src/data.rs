@@ -28,18 +28,18 @@ use twin::{
 use super::baseline::Baseline;
 use super::channel::Channel;
 use super::close_tunes::CloseTunes;
+use super::common_factors::CommonFactors;
 use super::error::FitError;
-use super::exact::Exact;
-use super::frame_to_frame::Shape;
+use super::exact_orbits::Exact;
+use super::frame_pattern::Shape;
 use super::levels::Levels;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
-use super::readmit::{JUMPS, left_aside, readmitted};
+use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
-use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
 use inference::{Campaign, Meter, Screened};
@@ -237,7 +237,7 @@ pub enum DataError {
 }
 
 /// Prior standard deviations of a var up to which its range reaches here, where it ends before: at two, unless the machine file says something else. A
-/// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
+/// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`out_of_range.rs`).
 const REACH: f64 = 5.0;
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
@@ -489,7 +489,7 @@ impl Data {
         let readings = DVector::from_iterator(each.len(), readings).component_div(&noise);
         let terms =
             DMatrix::from_fn(each.len(), all.ncols(), |i, k| (all[(each[i].1, k)] - means[(each[i].0, k)]) / noise[i]);
-        let within = Within::from_differences(&readings, &terms);
+        let within = CommonFactors::from_differences(&readings, &terms);
         let told = &means * within.mean;
         rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
         self.drifting_with(b, rows, &self.drives, means * within.root)

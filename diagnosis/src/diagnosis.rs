@@ -4,20 +4,20 @@ use inference::recording::{Recording, at_energy};
 use twin::{Effect, Ring};
 
 use super::average::Vars;
-use super::beyond::Beyond;
 use super::data::{Data, DataError};
 use super::error::FitError;
 use super::experiment::Proposal;
 use super::heldout::{self, Score};
 use super::hypothesis::in_order;
 use super::imperfection::Imperfection;
-use super::ordinary;
+use super::out_of_range::OutOfRange;
 use super::readback::Contradiction;
 use super::scan;
 use super::search::{Found, Search};
 use super::term::Term;
 use super::transients::{self, Transient, Transients};
 use super::verdict::{self, Finding, Verdict};
+use super::widths;
 use super::wiring::Miswired;
 
 /// What is missing in the model of a recording.
@@ -46,7 +46,7 @@ pub struct Diagnosis {
     /// Vars, averaged over the competing causes.
     pub vars_after: Vars,
     /// Vars beyond the range of their prior.
-    pub beyond: Vec<Beyond>,
+    pub beyond: Vec<OutOfRange>,
     /// The measurement that would best separate the leading causes, for an ambiguous verdict.
     pub next_measurement: Option<String>,
 }
@@ -117,7 +117,7 @@ impl Diagnosis {
         let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
         let (vars_before, vars_after) = (Vars::from_fit(&found.null), Vars::averaged(&found).widened(&found)?);
         // a poor fit says nothing of single vars
-        let beyond = if found.best.is_poor() { Vec::new() } else { Beyond::all(&data.ring, &vars_after) };
+        let beyond = if found.best.is_poor() { Vec::new() } else { OutOfRange::all(&data.ring, &vars_after) };
         let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
         Ok(Self {
             found,
@@ -165,7 +165,7 @@ impl Diagnosis {
         let Found { data, best, .. } = &self.found;
         let names = data.ring.monitor_names();
         let of_others = data.campaigns().skip(1).flat_map(|own| own.noise.of_parts(&own.name, &names));
-        ordinary::rows(data, best).into_iter().chain(data.noise.rows(&names)).chain(of_others).collect()
+        widths::rows(data, best).into_iter().chain(data.noise.rows(&names)).chain(of_others).collect()
     }
 
     /// Names of the monitors that wander by themselves.

@@ -26,7 +26,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
-use super::linearise::about_itself;
+use super::linearisation::about_itself;
 use super::scan::SignatureScore;
 use super::settings::Settings;
 

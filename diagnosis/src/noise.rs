@@ -1,7 +1,7 @@
 //! The noise of a recording as it is: learnt from its repeats, with the header's noise as a prior.
 //!
-//! Of each monitor the scale of its noise; of all together its level in time ([`super::levels`]), what the noise remembers ([`super::slow`]), the jitter of the momentum and
-//! what crates of monitors have in common (`jitter.rs`), and any other pattern that they share ([`super::frame_to_frame`]). Everything comes from differences between readings of the same setting
+//! Of each monitor the scale of its noise; of all together its level in time ([`super::levels`]), what the noise remembers ([`super::slow_noise`]), the jitter of the momentum and
+//! what crates of monitors have in common (`jitter.rs`), and any other pattern that they share ([`super::frame_pattern`]). Everything comes from differences between readings of the same setting
 //! (`repeats.rs`), so that physics that the model lacks does not enter, with two exceptions: what changes with time alone, such as
 //! an orbit that drifts, moves all settings alike and counts as a walk of the monitors as long as that has an ordinary size; and the walk of one
 //! monitor is learnt from what a fit leaves ([`super::search`]).
@@ -15,7 +15,7 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
-use super::frame_to_frame::{self, Found, FrameToFrame, Known, Like, Shape};
+use super::frame_pattern::{self, Found, FrameToFrame, Known, Like, Shape};
 use super::imperfection::{Imperfection, Measure, POSITION};
 use super::jitter::{CRATE, Crate, Differences, groups, with_column, with_crates};
 use super::levels::{Levels, Part};
@@ -25,7 +25,7 @@ use super::odds::{SUSPICIOUS, correction_of_sort};
 use super::period::Period;
 use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
-use super::slow::{SHARE, Slow, steps};
+use super::slow_noise::{SHARE, Slow, steps};
 use inference::Campaign;
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
@@ -302,20 +302,20 @@ impl Noise {
             let missing = (0..own.len()).filter(|&b| !campaign.counts(frame, b));
             missing.for_each(|b| row[b] = f64::NAN);
         }
-        let period = Period::find(&frame_to_frame::amplitudes(moving, &residual, &own, &runs), &runs);
-        let of_period = period.map_or(f64::NEG_INFINITY, |one| frame_to_frame::beyond_chance(one.log_chance));
+        let period = Period::find(&frame_pattern::amplitudes(moving, &residual, &own, &runs), &runs);
+        let of_period = period.map_or(f64::NEG_INFINITY, |one| frame_pattern::beyond_chance(one.log_chance));
         let log_bayes = match (like, &found) {
             (Like::Momentum, _) | (_, None) => {
                 // the momentum's size over its ordinary one is that of the orbit over the noise, where that is largest
                 let size =
                     known.iter().map(|&b| moving.row(b).norm() / own[b].unwrap_or(f64::INFINITY)).fold(0.0, f64::max);
-                frame_to_frame::beyond_ordinary(size).max(of_period)
+                frame_pattern::beyond_ordinary(size).max(of_period)
             }
             (_, Some(found)) => {
                 let ripple = known.iter().map(|&b| campaign.following(b).norm_squared()).sum::<f64>();
                 let ordinary = (ripple / (known.len() * campaign.frames()) as f64).sqrt();
                 let size = square.sqrt() / ordinary.max(f64::MIN_POSITIVE);
-                found.log_bayes.min(frame_to_frame::beyond_ordinary(size)).max(of_period)
+                found.log_bayes.min(frame_pattern::beyond_ordinary(size)).max(of_period)
             }
         };
         let frames = (0..campaign.frames()).filter(|&frame| known.iter().any(|&b| campaign.counts(frame, b))).count();
@@ -335,7 +335,7 @@ impl Noise {
     /// What the sentence says of noise that is far from the header's, or in a part of the recording from that of the rest.
     pub fn remarks(&self) -> Vec<String> {
         let scale = self.common_scale.value;
-        let far = frame_to_frame::beyond_ordinary(scale.ln().abs() / QUOTED) > correction_of_sort();
+        let far = frame_pattern::beyond_ordinary(scale.ln().abs() / QUOTED) > correction_of_sort();
         let of_all = far.then(|| format!("the noise is {scale:.1} times the header's"));
         let of_parts = self.levels.parts.iter().filter(|one| one.factor.value > NOISY).map(Part::said);
         of_all.into_iter().chain(of_parts).collect()

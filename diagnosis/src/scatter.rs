@@ -1,7 +1,7 @@
 //! How much the vars scatter, over the width of their prior.
 //!
 //! The prior of a var is as wide as a design can promise; the quadrupoles of a machine that was built scatter less, or more. What they do is learnt from
-//! the recording, as the widths of the ordinary families are (`ordinary.rs`), with the prior's width counted as [`COUNTS`] further quadrupoles that
+//! the recording, as the widths of the ordinary families are (`widths.rs`), with the prior's width counted as [`COUNTS`] further quadrupoles that
 //! scatter by as much as it says. With `s` the scatter over that width:
 //!
 //! `ln p(ln s) = -COUNTS (ln s + (1/s^2 - 1)/2)`,

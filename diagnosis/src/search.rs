@@ -29,11 +29,11 @@ use super::error::FitError;
 use super::fit::Fitted;
 use super::heldout::{lessened, reduced};
 use super::hypothesis::Hypothesis;
-use super::linearise::{self, CURVED};
+use super::linearisation::{self, CURVED};
 use super::odds::{ODDS, SORTS, TOO_SMALL, UNMODELLED, UNMODELLED_SEEN, log_prior, odds_beside};
-use super::ordinary;
 use super::scan::{Candidate, scan};
 use super::term::Term;
+use super::widths;
 use element::weigh_elements;
 pub use found::Found;
 use inference::bounded::softplus;
@@ -146,10 +146,10 @@ impl Search {
         let (plain, start) = (Hypothesis::plain(), DVector::zeros(data.units.len()));
         let first = first_of(&data, &plain)?;
         let bare = || Hypothesis { ordinary: Vec::new(), ..plain };
-        let hypothesis = if first.is_poor() { bare() } else { ordinary::learnt(&data, &first) };
+        let hypothesis = if first.is_poor() { bare() } else { widths::learnt(&data, &first) };
         let guess = first.guess(&data, &hypothesis);
-        let fitted = linearise::fit(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
-        let null = fitted.map_or_else(|| linearise::fit(&mut data, &Hypothesis::default(), &start), Ok)?;
+        let fitted = linearisation::fit(&mut data, &hypothesis, &guess).ok().filter(|fitted| fitted.is_stable(&data));
+        let null = fitted.map_or_else(|| linearisation::fit(&mut data, &Hypothesis::default(), &start), Ok)?;
         let null = settled(&data, null);
         let next = self.one_more(&data, &null)?;
         Ok(Found { data, best: null.clone(), null, competitions: Vec::new(), next })
@@ -166,7 +166,7 @@ impl Search {
         let (mut best, competitions) = self.settle(&data, won.map_or(again, |_| leader), won)?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
         if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
-            best = linearise::fit(&mut data, &best.hypothesis, &best.u)?;
+            best = linearisation::fit(&mut data, &best.hypothesis, &best.u)?;
             if best.hypothesis.ordinary.is_empty() {
                 best = with_ordinary(&mut data, best);
             }
@@ -280,7 +280,7 @@ impl Search {
         let odds = odds_beside(fitted.hypothesis.count());
         let scanned = scan(fitted.data(data), fitted, &self.terms)?;
         let prior_of = |i: usize| self.log_prior[i] + ((1.0 - UNMODELLED) * odds).ln();
-        let outstanding = ordinary::outstanding(data, fitted);
+        let outstanding = widths::outstanding(data, fitted);
         let mut leaders = self.leaders(data, fitted, &scanned)?;
         leaders.extend((0..scanned.len()).filter(|&i| outstanding.contains(&scanned[i].term)));
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
@@ -391,7 +391,7 @@ impl Search {
         if hypothesis.terms.is_empty() {
             return self.without_effects(data);
         }
-        let less = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
+        let less = linearisation::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
         let less = relearnt(&data, less);
         self.about_effects(found, data, less)
     }

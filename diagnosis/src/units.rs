@@ -92,7 +92,7 @@ impl Units {
 }
 
 /// A Gaussian, and the share of it within the range.
-pub struct Within {
+pub struct BoundedGaussian {
     /// Factor of the precision, the held vars at their bounds.
     pub free: Factor,
     /// Slope of the log-density, zero for the held.
@@ -103,7 +103,7 @@ pub struct Within {
     pub log_inside: f64,
 }
 
-impl Within {
+impl BoundedGaussian {
     /// Of the factor of a precision and the slope at `u`, the first of which are params and have a range; none if the precision is not
     /// positive.
     pub fn from_precision(

@@ -4,8 +4,6 @@ use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
 use super::alternatives::{Alternative, Cause, Competition};
-use super::aside::Aside;
-use super::beyond::Beyond;
 use super::chance;
 use super::choice::Choice;
 use super::data::Data;
@@ -16,17 +14,19 @@ use super::heldout::{Block, Score, gain_of_choice, lessened, reduced};
 use super::imperfection::{Imperfection, POSITION};
 use super::limits::Limits;
 use super::location::Location;
+use super::lost_frames::LostFrames;
 use super::odds::corrections;
 use super::odds::{DECISIVE, SUSPICIOUS};
-use super::ordinary;
+use super::out_of_range::OutOfRange;
 use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
 use super::scan::separations;
 use super::search::Found;
-use super::stuck::Stuck;
+use super::stuck_monitor::Stuck;
 use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
+use super::widths;
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -428,7 +428,7 @@ pub fn sentence(
     verdict: Verdict,
     findings: &[Finding],
     contradictions: &[Contradiction],
-    beyond: &[Beyond],
+    beyond: &[OutOfRange],
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
@@ -446,7 +446,7 @@ pub fn sentence(
         Verdict::Unexplained => unexplained(found, findings),
     };
     let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
-    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(Beyond::to_string)).collect();
+    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
     // these are no missing physics, and a consistent recording's sentence begins with them
     if verdict == Verdict::Consistent && !said.is_empty() {
         said.push(format!("besides, {text}"));
@@ -466,7 +466,7 @@ fn in_recording(data: &Data, recording: &str, said: String) -> String {
 fn remarks(data: &Data, found: &Found) -> Vec<String> {
     let mut remarks = Vec::new();
     let large: Vec<String> =
-        ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
+        widths::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
     if !large.is_empty() {
         remarks.push(format!("larger than ordinary: {}", large.join(", ")));
     }
@@ -476,7 +476,7 @@ fn remarks(data: &Data, found: &Found) -> Vec<String> {
         remarks.extend(wandering(own).into_iter().map(|said| in_recording(data, &own.name, said)));
     }
     remarks.extend(Stuck::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
-    remarks.extend(Aside::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
+    remarks.extend(LostFrames::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)

@@ -8,11 +8,11 @@ use crate::error::FitError;
 use crate::family::Family;
 use crate::fit::Fitted;
 use crate::hypothesis::Hypothesis;
-use crate::linearise::{self, about_itself};
-use crate::ordinary;
+use crate::linearisation::{self, about_itself};
 use crate::scan::Candidate;
 use crate::term::Term;
 use crate::unknown::Unknown;
+use crate::widths;
 
 /// Gain of `ln` posterior that calls for another round of competitions, or of widths.
 pub const BETTER: f64 = 0.1;
@@ -74,7 +74,7 @@ pub fn with_ordinary(data: &mut Data, best: Fitted) -> Fitted {
         return best;
     }
     let mut own = data.clone();
-    let again = linearise::fit(&mut own, &learnt.hypothesis, &learnt.u).ok().filter(|again| again.is_stable(&own));
+    let again = linearisation::fit(&mut own, &learnt.hypothesis, &learnt.u).ok().filter(|again| again.is_stable(&own));
     let Some(again) = again else { return best };
     *data = own;
     again
@@ -134,7 +134,7 @@ fn at_rest(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>, rival: f6
 
 /// The same fit, or with one of its effects gross where that is the better.
 fn gross(data: &Data, fitted: Fitted, term: usize) -> Fitted {
-    let stands_out = |(at, _): (usize, f64)| fitted.u[at].abs() > ordinary::STANDS_OUT;
+    let stands_out = |(at, _): (usize, f64)| fitted.u[at].abs() > widths::STANDS_OUT;
     if !fitted.unknown(data, term).is_some_and(stands_out) {
         return fitted;
     }
@@ -182,7 +182,7 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let with_all = || Hypothesis { ordinary: Family::all(), ..fitted.hypothesis.clone() };
     let begun = if lacks_all { again(with_all(), &fitted) } else { Ok(fitted.clone()) };
     let begun = begun.ok().filter(|begun| !begun.is_poor());
-    let learnt = begun.and_then(|begun| again(ordinary::learnt(begun.data(data), &begun), &begun).ok());
+    let learnt = begun.and_then(|begun| again(widths::learnt(begun.data(data), &begun), &begun).ok());
     let is_better = |learnt: &Fitted| !learnt.is_poor() && (lacks_all || learnt.log_evidence > fitted.log_evidence);
     let best = learnt.filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
     if own.is_some() { best.keeping(data) } else { best }

@@ -10,7 +10,7 @@ use crate::error::FitError;
 use crate::fit::Fitted;
 use crate::half_normal::HalfNormal;
 use crate::location::Location;
-use crate::slow::OWN;
+use crate::slow_noise::OWN;
 
 /// Walks that are tried, and monitors of a recording that may wander by themselves: with more it is something that they share.
 const WALKS: usize = 12;

@@ -105,7 +105,7 @@ impl Transients {
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         let mut found: Vec<Transient> = Vec::new();
         while found.len() < MOST
-            && let Some((transient, without)) = Within::from_campaign(&campaign, &dispersion).strongest()
+            && let Some((transient, without)) = SettingDifferences::from_campaign(&campaign, &dispersion).strongest()
         {
             campaign = Campaign::of(ring, &without)?;
             let is_of_first_frames = matches!(
@@ -141,7 +141,7 @@ pub fn join(known: &mut Vec<Transient>, more: Vec<Transient>, campaign: usize) {
 }
 
 /// A campaign's differences within settings, and what may be in them.
-struct Within<'c> {
+struct SettingDifferences<'c> {
     campaign: &'c Campaign,
     differences: Differences,
     /// Readings at the mean supply currents and kicks [m].
@@ -177,7 +177,7 @@ struct Fit {
     signal: DMatrix<f64>,
 }
 
-impl<'c> Within<'c> {
+impl<'c> SettingDifferences<'c> {
     fn from_campaign(campaign: &'c Campaign, dispersion: &DVector<f64>) -> Self {
         let noise = &campaign.recording.header.noise;
         let readings = steady(campaign);

@@ -4,7 +4,7 @@ use core::fmt;
 use std::path::{Path, PathBuf};
 
 use comfy_table::ColumnConstraint;
-use diagnosis::{Beyond, DataError, Diagnosis, Finding, Fitted, Imperfection, Measure, Score, Vars, page};
+use diagnosis::{DataError, Diagnosis, Finding, Fitted, Imperfection, Measure, OutOfRange, Score, Vars, page};
 use inference::Recording;
 use measured::Folder;
 use report::Page;
@@ -57,8 +57,8 @@ struct BeyondResult {
     range: [f64; 2],
 }
 
-impl From<&Beyond> for BeyondResult {
-    fn from(one: &Beyond) -> Self {
+impl From<&OutOfRange> for BeyondResult {
+    fn from(one: &OutOfRange) -> Self {
         Self { name: one.name.clone(), mean: one.var.value, sigma: one.var.sigma, range: one.range }
     }
 }
