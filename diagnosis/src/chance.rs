@@ -39,8 +39,8 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let normal = DMatrix::<f64>::from_fn(choice.scores.len(), DRAWS, |_, _| rng.sample(StandardNormal));
     let pulls = factor.lower() * normal;
     let drawn = |pulls: DVectorView<f64>| {
-        let of = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
-        best(&mut scores().zip(pulls.iter()).map(of))
+        let with_pull = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
+        best(&mut scores().zip(pulls.iter()).map(with_pull))
     };
     let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= own).count();
     Ok((1 + exceeding) as f64 / (1 + DRAWS) as f64)

@@ -645,8 +645,8 @@ impl Data {
         }
         let is_mixed = |c: usize| c < monitors && !self.mixing.is_none();
         for ((c, channel), rows) in self.channels.iter().enumerate().zip(self.rows_of_channels()) {
-            let of = |pool: usize| if is_mixed(c) { mixed[(pool, c)] } else { value(c, pool) / channel.sigma };
-            all.rows_range_mut(rows).iter_mut().zip(&channel.rows).for_each(|(to, &pool)| *to = of(pool));
+            let number = |pool: usize| if is_mixed(c) { mixed[(pool, c)] } else { value(c, pool) / channel.sigma };
+            all.rows_range_mut(rows).iter_mut().zip(&channel.rows).for_each(|(to, &pool)| *to = number(pool));
         }
     }
 
@@ -665,10 +665,10 @@ impl Data {
         let monitors = self.monitors();
         let starts: Vec<usize> = (0..monitors).map(|b| self.start(b)).collect();
         let places = || {
-            let of = |(b, channel): (usize, &Channel)| {
+            let places_of_channel = |(b, channel): (usize, &Channel)| {
                 channel.rows.iter().enumerate().map(move |(i, &pool)| (i, pool, b)).collect::<Vec<_>>()
             };
-            self.channels[..monitors].iter().enumerate().flat_map(of)
+            self.channels[..monitors].iter().enumerate().flat_map(places_of_channel)
         };
         for mut column in back.column_iter_mut() {
             let mut values = DMatrix::zeros(self.pools.count, monitors);
@@ -681,14 +681,16 @@ impl Data {
 
     /// Pool and channel (a monitor, or a tune after the last of them) of each whitened number.
     pub fn places(&self) -> Vec<(usize, usize)> {
-        let of = |(c, channel): (usize, &Channel)| channel.rows.iter().map(|&pool| (pool, c)).collect::<Vec<_>>();
-        self.channels.iter().enumerate().flat_map(of).collect()
+        let places_of_channel =
+            |(c, channel): (usize, &Channel)| channel.rows.iter().map(|&pool| (pool, c)).collect::<Vec<_>>();
+        self.channels.iter().enumerate().flat_map(places_of_channel).collect()
     }
 
     /// Noise of each whitened number [m], of a tune [1]: that of the mean of its pool.
     pub fn noise_of_means(&self) -> Vec<f64> {
-        let of = |channel: &Channel| (channel.noise_of_means() * channel.sigma).iter().copied().collect::<Vec<_>>();
-        self.channels.iter().flat_map(of).collect()
+        let noise_of_channel =
+            |channel: &Channel| (channel.noise_of_means() * channel.sigma).iter().copied().collect::<Vec<_>>();
+        self.channels.iter().flat_map(noise_of_channel).collect()
     }
 
     /// Readings of a tune in each pool that has some.
@@ -862,13 +864,13 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
     let ring = &campaign.ring;
     let found = ring.with_strengths(&ring.strengths(campaign.params.as_slice(), &campaign.supplies));
     let found = Machine::new(found, Rf::FixedMomentum, &[]).ok();
-    let of = |machine: &Machine| -> Result<_, OrbitError> {
+    let predicted_by = |machine: &Machine| -> Result<_, OrbitError> {
         let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         Ok((machine.readings(drives)?.0, dispersion, Shape::all(&optics, machine.ring())?))
     };
-    let known = found.as_ref().and_then(|machine| of(machine).ok());
-    let (predicted, dispersion, shapes) = known.map_or_else(|| of(design), Ok)?;
+    let known = found.as_ref().and_then(|machine| predicted_by(machine).ok());
+    let (predicted, dispersion, shapes) = known.map_or_else(|| predicted_by(design), Ok)?;
     let residual = &campaign.readings - predicted;
     let source = Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes };
     let (mut noise, mut screened) = (Noise::learn(&source), campaign.screened.clone());

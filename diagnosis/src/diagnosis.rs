@@ -140,8 +140,8 @@ impl Diagnosis {
     /// the names of correctors and monitors in the recording, so that it is farthest from the beam.
     pub fn effects(&self) -> Vec<Effect> {
         let best = &self.found.best;
-        let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
-        let lasting = in_order(best.hypothesis.terms.iter().enumerate().map(of).collect(), []);
+        let effect = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
+        let lasting = in_order(best.hypothesis.terms.iter().enumerate().map(effect).collect(), []);
         let passing = self.transients.iter().filter_map(|one| {
             let leading = &one.alternatives[0];
             Some(leading.term()?.effect(leading.amplitude.0))

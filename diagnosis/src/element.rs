@@ -34,12 +34,12 @@ impl Form {
 
     /// Derivative with respect to its strength, at the entrance of a quadrupole.
     pub fn signature(self, signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Signature {
-        let of = |product| signatures.of_thin_linear(ring.quadrupoles[quadrupole].element.into(), product);
+        let signature = |product| signatures.of_thin_linear(ring.quadrupoles[quadrupole].element.into(), product);
         match self {
-            Self::Product(product) => of(product),
+            Self::Product(product) => signature(product),
             Self::Rotation => {
-                let mut turned = of([0, 3]);
-                turned += of([1, 2]) * -1.0;
+                let mut turned = signature([0, 3]);
+                turned += signature([1, 2]) * -1.0;
                 turned
             }
         }

@@ -107,12 +107,12 @@ impl Derivatives {
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
         let columns: Vec<_> = of_vars.iter().zip(sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
-        let of = |term: &Term| -> Result<DVector<f64>, FitError> {
+        let column = |term: &Term| -> Result<DVector<f64>, FitError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
             Ok(data.signature(&signatures.of_effect(term.kind, term.site)?) * scale)
         };
-        Ok(Self { jacobian: DMatrix::from_columns(&columns), one: of(one)?, other: other.map(of).transpose()? })
+        Ok(Self { jacobian: DMatrix::from_columns(&columns), one: column(one)?, other: other.map(column).transpose()? })
     }
 }
 
@@ -135,8 +135,8 @@ impl Scenario {
 fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<Scenario> {
     let ring = machine.ring();
     let retuned = |supply: usize, factor: f64| {
-        let of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
-        machine.with_strengths(&ring.quadrupoles.iter().map(of).collect::<Vec<_>>())
+        let factor_of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
+        machine.with_strengths(&ring.quadrupoles.iter().map(factor_of).collect::<Vec<_>>())
     };
     let mut all = vec![Scenario::new("with the same settings", Change::Same, machine, drives.clone())];
     let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };

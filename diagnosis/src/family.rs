@@ -83,14 +83,14 @@ impl Family {
 
     /// Those of magnets and instruments, as wide as their tolerances.
     pub fn of_machine() -> Vec<Self> {
-        let of = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
+        let family = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
             name,
             kind,
             grouping,
             tolerance,
             width: tolerance,
         };
-        FAMILIES.iter().map(of).collect()
+        FAMILIES.iter().map(family).collect()
     }
 
     /// Its members; of a family that each recording has for itself those of each.
@@ -164,12 +164,12 @@ impl Family {
     /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by a share of the
     /// width above.
     pub fn hidden(data: &Data) -> Vec<Self> {
-        let of = |(name, kind)| {
+        let hidden_family = |(name, kind)| {
             let one = Self { name, kind, grouping: Grouping::Each, tolerance: 0.0, width: 0.0 }.unseen(data);
             Self { width: HIDDEN * one.width, ..one }
         };
         [("gradients in dipoles", EffectKind::DipoleGradient), ("edge angles of dipoles", EffectKind::DipoleEdge)]
-            .map(of)
+            .map(hidden_family)
             .into()
     }
 

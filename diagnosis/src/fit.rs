@@ -477,8 +477,8 @@ impl Ordinary {
             let machine = machine.on_orbit(&drives.orbit);
             let ends = machine.ends();
             let signatures = Signatures::of(&machine, &drives)?.between(ends.as_ref())?;
-            let of = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
-            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(of))
+            let prediction = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
+            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(prediction))
         })?;
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })

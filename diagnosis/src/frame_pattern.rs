@@ -117,8 +117,9 @@ impl Shape {
             let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
             let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(q.element, direction)).collect();
             let response = optics.response(&observers, &sources);
-            let of = move |q: usize| Self { like: Like::Kick(q, plane), columns: response.columns(q, 1).into_owned() };
-            (0..sources.len()).map(of)
+            let shape =
+                move |q: usize| Self { like: Like::Kick(q, plane), columns: response.columns(q, 1).into_owned() };
+            (0..sources.len()).map(shape)
         };
         let dispersion = optics.dispersion_of(&observers);
         let momentum = Self { like: Like::Momentum, columns: DMatrix::from_columns(&[dispersion]) };
@@ -293,7 +294,7 @@ pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Opt
             start = end;
         }
     }
-    let of = |row: usize| {
+    let amplitude = |row: usize| {
         let seen = monitors.iter().filter(|&&b| !about[(row, b)].is_nan());
         let sum = |(pull, information): (f64, f64), &b: &usize| {
             let share = weight(b) * pattern[b];
@@ -302,7 +303,7 @@ pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Opt
         let (pull, information) = seen.fold((0.0, 0.0), sum);
         pull / information
     };
-    (0..residual.nrows()).map(of).collect()
+    (0..residual.nrows()).map(amplitude).collect()
 }
 
 #[cfg(test)]

@@ -82,11 +82,11 @@ impl Differences {
             let seen = (0..row.len()).filter(|&b| !row[b].is_nan()).collect();
             alike.entry(seen).or_default().push(frame);
         }
-        let of = |(monitors, frames): (Vec<usize>, Vec<usize>)| {
+        let products = |(monitors, frames): (Vec<usize>, Vec<usize>)| {
             let some = all.select_rows(&frames).select_columns(&monitors);
             Alike { products: some.tr_mul(&some), monitors, frames: frames.len() as f64 }
         };
-        Self { alike: alike.into_iter().map(of).collect(), all }
+        Self { alike: alike.into_iter().map(products).collect(), all }
     }
 
     /// `ln` likelihood of common modes, one a column [monitors][modes], over that of none.

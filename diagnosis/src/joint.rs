@@ -86,11 +86,11 @@ impl Data {
 
     /// State of the monitors: of one that is not ok everywhere, that in the first recording where it is not.
     pub fn health_in_any(&self) -> Vec<Health> {
-        let of = |b: usize| {
+        let health = |b: usize| {
             let bad = self.campaigns().map(|own| own.health()[b]).find(|one| one.state != MonitorState::Ok);
             bad.unwrap_or(self.health()[b])
         };
-        (0..self.monitors()).map(of).collect()
+        (0..self.monitors()).map(health).collect()
     }
 
     /// Names of the recordings.

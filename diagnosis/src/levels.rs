@@ -92,8 +92,8 @@ impl Sums {
     /// Noise over that of others, for a dispersion.
     fn over(self, others: Self, dispersion: f64) -> Measured {
         let value = (self.variance() / others.variance()).sqrt();
-        let of = |sums: Self| 0.5 * dispersion / sums.count.max(1.0);
-        Measured { value, sigma: value * (of(self) + of(others)).sqrt() }
+        let relative_variance = |sums: Self| 0.5 * dispersion / sums.count.max(1.0);
+        Measured { value, sigma: value * (relative_variance(self) + relative_variance(others)).sqrt() }
     }
 }
 

@@ -37,8 +37,8 @@ impl Limits {
 /// The limit at each place of a kind.
 pub fn at_places(kind: EffectKind, scanned: &[Candidate]) -> impl Iterator<Item = (&Term, f64)> {
     let scale = kind.prior_scale();
-    let of = move |one: &Candidate| Some(scale? * (2.0 * SEEN / one.power.max(f64::MIN_POSITIVE)).sqrt());
-    scanned.iter().filter(move |one| one.term.kind == kind).filter_map(move |one| Some((&one.term, of(one)?)))
+    let limit = move |one: &Candidate| Some(scale? * (2.0 * SEEN / one.power.max(f64::MIN_POSITIVE)).sqrt());
+    scanned.iter().filter(move |one| one.term.kind == kind).filter_map(move |one| Some((&one.term, limit(one)?)))
 }
 
 #[cfg(test)]

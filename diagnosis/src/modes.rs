@@ -44,7 +44,7 @@ impl Modes {
 impl Mixing {
     /// Over the readings that count in frames of which the noise has a level, rows frames.
     pub fn from_modes(modes: &Modes, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
-        let of = |(frame, level): (usize, &f64)| {
+        let mixed_in_frame = |(frame, level): (usize, &f64)| {
             let mut factors = &modes.factors / *level;
             for (b, mut row) in factors.row_iter_mut().enumerate() {
                 if !counts(frame, b) {
@@ -53,7 +53,9 @@ impl Mixing {
             }
             Mixed::from_factors(factors)
         };
-        Self { frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(of).collect() } }
+        Self {
+            frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(mixed_in_frame).collect() },
+        }
     }
 
     /// True if monitors have nothing in common.
@@ -83,8 +85,8 @@ impl Mixing {
 
     /// The same of one frame.
     pub(crate) fn log_det_of(&self, frame: usize) -> f64 {
-        let of = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
-        self.frames.get(frame).map_or(0.0, of)
+        let log_det = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
+        self.frames.get(frame).map_or(0.0, log_det)
     }
 }
 

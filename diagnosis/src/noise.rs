@@ -225,13 +225,13 @@ impl Noise {
             one.sigma = one.repeats.weigh(slow.memory(one.sigma)).sigma().unwrap_or(one.sigma);
         }
         // what monitors have in common is learnt where the level is ordinary
-        let of = |repeats: fn(&Learner) -> &Repeats| {
+        let differences_of = |repeats: fn(&Learner) -> &Repeats| {
             let mut all = differences(&learners, repeats, &slow, size);
             let larger = (0..size.0).filter(|&frame| levels.at(frame) > 1.0);
             larger.for_each(|frame| all.row_mut(frame).fill(f64::NAN));
             Differences::from_frames(all)
         };
-        let (differences, near) = (of(|one| &one.repeats), of(|one| &one.near));
+        let (differences, near) = (differences_of(|one| &one.repeats), differences_of(|one| &one.near));
         let kurtosis = kurtosis(&differences.all);
         // per momentum, in units of the noise of whole readings
         let mut pattern = DVector::zeros(campaign.monitors());
@@ -477,7 +477,7 @@ fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let settings = &campaign.settings.of_frame;
     let apart: Vec<Option<usize>> = runs(settings).into_iter().map(Some).collect();
     let (runs, apart) = (Run::from_settings(settings), Run::from_settings(&apart));
-    let of = |b: usize| {
+    let learner = |b: usize| {
         let frames: Vec<usize> = (0..campaign.frames()).filter(|&frame| campaign.counts(frame, b)).collect();
         let values: Vec<f64> = frames.iter().map(|&frame| source.residual[(frame, b)]).collect();
         let repeats = Repeats::from_frames(&frames, &values, &runs);
@@ -490,7 +490,7 @@ fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
         (repeats.weigh(Memory::NONE).count >= FEWEST).then_some(Learner { b, repeats, near, sigma })
     };
     let counts = |b: &usize| campaign.is_ok(*b) || sound.contains(b);
-    (0..campaign.monitors()).filter(counts).filter_map(of).collect()
+    (0..campaign.monitors()).filter(counts).filter_map(learner).collect()
 }
 
 /// Whitened differences, rows frames, columns monitors; not a number where there is none.
@@ -512,11 +512,11 @@ fn differences(
 /// The run of consecutive frames of one setting that each frame is in.
 fn runs(settings: &[Option<usize>]) -> Vec<usize> {
     let mut run = 0;
-    let of = |i: usize| {
+    let run_of_frame = |i: usize| {
         run += usize::from(i > 0 && (settings[i].is_none() || settings[i] != settings[i - 1]));
         run
     };
-    (0..settings.len()).map(of).collect()
+    (0..settings.len()).map(run_of_frame).collect()
 }
 
 /// Of differences of variance 1, with its sampling error for normal noise.

@@ -28,7 +28,7 @@ const CERTAIN: f64 = 1.645;
 impl OutOfRange {
     /// Those that are outside with 95 %.
     pub fn all(ring: &Ring, vars: &Vars) -> Vec<Self> {
-        let of = |(i, parameter): (usize, &twin::Parameter)| {
+        let if_outside = |(i, parameter): (usize, &twin::Parameter)| {
             let (mean, sigma) = (vars.mean[i], vars.covariance[(i, i)].sqrt());
             let [lower, upper] = parameter.prior.range.map(f64::ln);
             let is_outside = (mean - upper).max(lower - mean) > CERTAIN * sigma;
@@ -36,7 +36,7 @@ impl OutOfRange {
             let (name, quadrupoles) = (parameter.name.clone(), parameter.quadrupoles.len());
             is_outside.then_some(Self { name, quadrupoles, var, range: parameter.prior.range })
         };
-        ring.parameters.iter().enumerate().filter_map(of).collect()
+        ring.parameters.iter().enumerate().filter_map(if_outside).collect()
     }
 }
 

@@ -72,8 +72,8 @@ impl PlaceScan {
             let of_batch = |batch: &[Segment]| {
                 let columns = data.stacked_columns(batch.len(), |campaign, own| {
                     let scale = scale * data.scale(campaign, of_kind);
-                    let of = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
-                    own.signatures::<Infallible>(batch.len(), batch.iter().map(of))
+                    let signature = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
+                    own.signatures::<Infallible>(batch.len(), batch.iter().map(signature))
                 });
                 let Ok(columns) = columns;
                 projection.score(&columns).scores
@@ -99,9 +99,9 @@ impl PlaceScan {
     fn with(&self, finer: Self) -> Self {
         let likely: Vec<usize> = self.likely().collect();
         let kept = (0..self.segments.len()).filter(|i| !likely.contains(i));
-        let of = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
-        let mut all: Vec<_> = kept.map(|i| of(self, i)).collect();
-        all.extend((0..finer.segments.len()).map(|i| of(&finer, i)));
+        let segment = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
+        let mut all: Vec<_> = kept.map(|i| segment(self, i)).collect();
+        all.extend((0..finer.segments.len()).map(|i| segment(&finer, i)));
         all.sort_by(|one, other| one.0.s.total_cmp(&other.0.s));
         let mut joined = Self { segments: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
         for (segment, log_bayes, amplitude) in all {

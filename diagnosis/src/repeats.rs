@@ -78,13 +78,13 @@ impl Run {
         let mut count = std::collections::BTreeMap::<usize, usize>::new();
         settings.iter().flatten().for_each(|setting| *count.entry(*setting).or_default() += 1);
         let base = count.into_iter().max_by_key(|(_, frames)| *frames).map(|(setting, _)| setting);
-        let of = |i: usize| match settings[i] {
+        let run_of_frame = |i: usize| match settings[i] {
             None => Self::New,
             setting if setting == base => Self::Base,
             setting if i > 0 && settings[i - 1] == setting => Self::Same,
             Some(_) => Self::New,
         };
-        (0..settings.len()).map(of).collect()
+        (0..settings.len()).map(run_of_frame).collect()
     }
 }
 

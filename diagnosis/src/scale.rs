@@ -36,8 +36,8 @@ impl Scales {
         let known: Vec<Measured> = measured.iter().copied().flatten().collect();
         let (near, scatter) = Self::scatter_of(&known);
         let common = common_of(&near, scatter.value);
-        let of = |one: &Option<Measured>| one.map_or(0.0, |one| shrunk(one, common.value, scatter.value));
-        Self { each: measured.iter().map(|one| of(one).exp()).collect(), common, scatter }
+        let shrunk_scale = |one: &Option<Measured>| one.map_or(0.0, |one| shrunk(one, common.value, scatter.value));
+        Self { each: measured.iter().map(|one| shrunk_scale(one).exp()).collect(), common, scatter }
     }
 
     /// The monitors near the others, and the scatter of these.

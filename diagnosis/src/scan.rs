@@ -100,8 +100,9 @@ impl Projection {
     /// Pull of whitened signatures, one a column, and their whole squares, which bound their power.
     pub fn bounds(&self, columns: &DMatrix<f64>) -> Vec<SignatureScore> {
         let pulling = self.pulling();
-        let of = |column: DVectorView<f64>| SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() };
-        columns.column_iter().map(of).collect()
+        let bound =
+            |column: DVectorView<f64>| SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() };
+        columns.column_iter().map(bound).collect()
     }
 
     /// Score some terms by their whitened signatures, one a column. Of an exchange whose pull is below half of the power that stays at least, which makes it
@@ -205,12 +206,12 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
 /// The same by the signatures of the machine in each recording.
 fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64> {
     let columns = data.stacked_columns(terms.len(), |campaign, own| {
-        let of = |term: &Term| {
+        let signature = |term: &Term| {
             let scale = term.kind.prior_scale().unwrap_or(1.0) * data.scale(campaign, term.kind);
             // none if there is no stable machine with it
             Ok(of_each[campaign].of_effect(term.kind, term.site).ok().map(|one| one * scale))
         };
-        own.signatures::<Infallible>(terms.len(), terms.iter().map(of))
+        own.signatures::<Infallible>(terms.len(), terms.iter().map(signature))
     });
     let Ok(columns) = columns;
     columns
@@ -271,10 +272,10 @@ pub fn separations(
     let all: Vec<Term> = core::iter::once(term).chain(others.iter().copied()).copied().collect();
     let gram = Projection::from_fit(fitted).gram(&signatures(data, fitted, &all)?);
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
-    let of = |(i, other): (usize, &&Term)| {
+    let separation = |(i, other): (usize, &&Term)| {
         let free = [term, other].map(|term| !term.kind.is_switch());
         let (power, rival, both) = (gram[(0, 0)], gram[(i + 1, i + 1)], gram[(0, i + 1)]);
         Rivals { power, rival, both, free }.expected(amplitude)
     };
-    Ok(others.iter().enumerate().map(of).collect())
+    Ok(others.iter().enumerate().map(separation).collect())
 }

@@ -120,10 +120,11 @@ impl Slow {
 
 impl<'r> Learner<'r> {
     fn from_repeats(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
-        let of = |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
-        let white: Vec<f64> = (0..repeats.len()).map(|b| of(Common::NONE, b)).collect();
+        let log_likelihood_of =
+            |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
+        let white: Vec<f64> = (0..repeats.len()).map(|b| log_likelihood_of(Common::NONE, b)).collect();
         let frames = frames as f64;
-        let over_white = |common: Common| (0..repeats.len()).map(|b| of(common, b) - white[b]).collect();
+        let over_white = |common: Common| (0..repeats.len()).map(|b| log_likelihood_of(common, b) - white[b]).collect();
         let tried: Vec<(Common, Vec<f64>)> = grid(frames).into_iter().map(|one| (one, over_white(one))).collect();
         let best = |b: usize| tried.iter().map(|(_, logs)| logs[b]).fold(0.0, f64::max);
         let own: Vec<f64> = (0..repeats.len()).map(best).collect();

@@ -538,9 +538,10 @@ fn likely(finding: &Finding) -> String {
     if finding.probability >= DECISIVE {
         return finding.phrase.clone();
     }
-    let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
-    let others = finding.alternatives.iter().filter(|other| other.probability > STATED).take(SAID).map(of);
-    core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ")
+    let said_with_probability = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
+    let others =
+        finding.alternatives.iter().filter(|other| other.probability > STATED).take(SAID).map(said_with_probability);
+    core::iter::once(said_with_probability(finding)).chain(others).collect::<Vec<_>>().join(", or ")
 }
 
 /// The alternatives that share most of the probability.

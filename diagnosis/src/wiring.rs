@@ -353,13 +353,13 @@ impl<'r> Measured<'r> {
         let weights: Vec<f64> = wrong.iter().map(|one| self.best(designs, Some(*one)).log_likelihood + prior).collect();
         let largest = weights.iter().copied().fold(stated, f64::max);
         let sum = weights.iter().map(|weight| (weight - largest).exp()).sum::<f64>() + (stated - largest).exp();
-        let of = |(&(columns, fault), weight): (&(Columns, Fault), &f64)| Wiring {
+        let wiring = |(&(columns, fault), weight): (&(Columns, Fault), &f64)| Wiring {
             columns,
             fault,
             probability: (weight - largest).exp() / sum,
             correlation: self.correlation(designs, columns, fault),
         };
-        let mut likely: Vec<Wiring> = wrong.iter().zip(&weights).map(of).collect();
+        let mut likely: Vec<Wiring> = wrong.iter().zip(&weights).map(wiring).collect();
         likely.sort_by(|one, other| other.probability.total_cmp(&one.probability));
         likely.retain(|one| one.probability > 1.0 - REFUSED && one.correlation[1] > RESEMBLES);
         let refused = (stated - largest).exp() / sum < 1.0 - REFUSED;
@@ -374,12 +374,12 @@ impl<'r> Measured<'r> {
         let off: Vec<[f64; 2]> = designs.at.iter().map(|at| self.off(&response, Self::design(at, wiring))).collect();
         // the orbit in a plane is that of its own tune
         let pairs = (0..off.len()).flat_map(|x| (0..off.len()).map(move |y| [x, y]));
-        let of = |at: [usize; 2]| {
+        let judged = |at: [usize; 2]| {
             let spread = n * (off[at[0]][0] + off[at[1]][1]) / (FREEDOM * self.scatter);
             let prior: f64 = at.iter().map(|&i| designs.log_prior(i)).sum();
             Best { log_likelihood: prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale + of_readings, at }
         };
-        let best = pairs.map(of).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
+        let best = pairs.map(judged).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
         best.expect("at least the design")
     }
 

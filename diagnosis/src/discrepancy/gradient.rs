@@ -54,13 +54,13 @@ fn kick(signatures: &Signatures, ring: &Ring, quadrupole: usize, [x, y]: [f64; 2
 impl Changing {
     /// Of each quadrupole; `sigma`: standard deviation of the orbit at every element (x, y) [m].
     pub fn all(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]], sigma: &[[f64; 2]]) -> Vec<Self> {
-        let of = |(q, gradient): (usize, Signature)| {
+        let changing = |(q, gradient): (usize, Signature)| {
             let log_gradient = FINER / gradient.rms().max(f64::MIN_POSITIVE);
             let [x, y] = sigma[ring.quadrupoles[q].element].map(|sigma| sigma.hypot(AXIS));
             let patterns = [gradient, kick(signatures, ring, q, [x, 0.0]), kick(signatures, ring, q, [0.0, y])];
             Self { log_gradient, patterns: patterns.map(|pattern| pattern * log_gradient) }
         };
-        steering(signatures, ring, orbit).into_iter().enumerate().map(of).collect()
+        steering(signatures, ring, orbit).into_iter().enumerate().map(changing).collect()
     }
 }
 

@@ -318,11 +318,11 @@ impl<'c> SettingDifferences<'c> {
     /// Each corrector as one that is unsteady, by whitened readings, where these confirm it.
     fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
         let correctors = driven(self.campaign);
-        let of = |&c: &usize| {
+        let judged = |&c: &usize| {
             let one = Unsteady::from_response(&self.differences, white, signals.of_corrector(c))?;
             one.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
         };
-        correctors.iter().filter_map(of).collect()
+        correctors.iter().filter_map(judged).collect()
     }
 
     /// Variance of the readings along the signal of an effect.

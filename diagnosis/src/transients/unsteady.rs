@@ -74,14 +74,14 @@ impl<'d> Unsteady<'d> {
         }
         let louder = all.variance_across() / of_others.variance_across().max(f64::MIN_POSITIVE);
         let variance = (of_others.along / of_others.count).max(1.0) * louder.max(1.0);
-        let of = |runs: &[Sums]| {
+        let discrepancy = |runs: &[Sums]| {
             let logs = SIZES.map(|size| runs.iter().map(|run| run.log_bayes(size, variance)).sum());
             Discrepancy::averaged(Location::UnsteadyCorrector(corrector), logs, sites)
         };
-        let found = of(&each);
+        let found = discrepancy(&each);
         let telling = each.iter_mut().max_by(|one, other| one.most.total_cmp(&other.most))?;
         (telling.along, telling.count) = (telling.along - telling.most, telling.count - 1.0);
-        (of(&each).log_bayes > CONFIRMED).then_some(found)
+        (discrepancy(&each).log_bayes > CONFIRMED).then_some(found)
     }
 
     /// In each frame in which it is on the readings less the mean of their run, against what the kick that suits the frame's other monitors best should make
