@@ -30,7 +30,7 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let scores = || choice.scores.iter().copied();
     let best =
         |scores: &mut dyn Iterator<Item = SignatureScore>| choice.log_weights(scores).fold(f64::NEG_INFINITY, f64::max);
-    let own = best(&mut scores());
+    let best_score = best(&mut scores());
     let mut covariance = choice.columns.transpose() * &choice.left;
     // alike signatures leave no more than rounding between them; one of an instrument that is dead is zero
     (0..covariance.nrows()).for_each(|i| covariance[(i, i)] += ROUNDING * (1.0 + covariance[(i, i)]));
@@ -42,7 +42,7 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
         let with_pull = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
         best(&mut scores().zip(pulls.iter()).map(with_pull))
     };
-    let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= own).count();
+    let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= best_score).count();
     Ok((1 + exceeding) as f64 / (1 + DRAWS) as f64)
 }
 

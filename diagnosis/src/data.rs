@@ -164,8 +164,9 @@ impl Displaced {
             orbit: self.orbit.clone(),
         };
         let (_, tunes, changes) = self.machine.readings(&still)?;
-        let at = |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
-        let [start, end] = [at(0), at(1)];
+        let drifted =
+            |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
+        let [start, end] = [drifted(0), drifted(1)];
         let change = |i: usize, plane: usize| change_at(time[i], [start[plane], of_orbit[plane], end[plane]]);
         Ok(MatrixXx2::from_fn(time.len(), change))
     }
@@ -405,9 +406,9 @@ impl Data {
     /// The same recordings where one monitor wanders in one of them.
     pub(crate) fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
         let mut data = self.clone();
-        let own = data.campaign_mut(campaign);
-        own.noise.wandering.push((monitor, walk));
-        own.prepare();
+        let changed = data.campaign_mut(campaign);
+        changed.noise.wandering.push((monitor, walk));
+        changed.prepare();
         data
     }
 

@@ -59,10 +59,10 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
 fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
     let data = all.campaign(campaign);
     let linearised = Linearised::from_fit(fitted);
-    let own = Seen::from_fit(fitted, all.parts().swap_remove(campaign));
+    let whitened = Seen::from_fit(fitted, all.parts().swap_remove(campaign));
     let settings = Settings::from_drives(&data.drives);
     let monitors = data.monitors();
-    let seen = Seen::taken_back(data, &own);
+    let seen = Seen::taken_back(data, &whitened);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
     let apart: Vec<Apart> = (0..monitors).map(|b| Apart::from_sums(data, b, &settings, &sums[b])).collect();
     let stretches = stretches(data);
@@ -111,7 +111,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
         let forms = Element::signatures(&signatures, &data.ring, q);
         let of_rms_1 = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
         let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(of_rms_1))?;
-        let of_all = Sums::from_columns(&columns, &own);
+        let of_all = Sums::from_columns(&columns, &whitened);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
             found.push(linearised.judge(Location::Linear(q, does), &of_all.select(&some), sites));
@@ -119,7 +119,8 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     }
     let changing = Changing::all(&signatures, machine.ring(), &drives.orbit, &data.baseline.sigma);
     let tunes: Vec<Sums> = [0, 1].into_iter().filter_map(|plane| data.tune_sums(plane, &seen, &stretches)).collect();
-    let at = Where { data, own: &own, monitors: &active, runs: Runs::from_readings(data, &seen, &active), stretches };
+    let at =
+        Where { data, own: &whitened, monitors: &active, runs: Runs::from_readings(data, &seen, &active), stretches };
     found.extend(linearised.changing(&at, &changing));
     found.push(linearised.judge_held(Location::Tunes, &tunes.iter().collect::<Vec<_>>()));
     found.push(linearised.judge_held(Location::Time, &some(&steps, &active)));

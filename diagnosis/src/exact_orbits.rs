@@ -37,8 +37,8 @@ impl Exact {
         let cycle = |kick: Vec<f64>, rf_offset: f64| Cycle { kick, strength: strength.clone(), rf_offset, time: 0.0 };
         let still = cycle(vec![0.0; drives.kick.ncols()], 0.0);
         let (without, plain) = tracked.cycle(&still)?;
-        let at = |time: f64| Ok::<_, EffectError>(tracked.cycle(&Cycle { time, ..still.clone() })?.1);
-        let ends = if machine.drift() == 0.0 { None } else { Some([at(-1.0)?, at(1.0)?]) };
+        let tunes_at = |time: f64| Ok::<_, EffectError>(tracked.cycle(&Cycle { time, ..still.clone() })?.1);
+        let ends = if machine.drift() == 0.0 { None } else { Some([tunes_at(-1.0)?, tunes_at(1.0)?]) };
         let mut readings = DMatrix::zeros(settings.count(), without.len());
         let mut tunes = MatrixXx2::from_fn(settings.count(), |_, plane| [plain.x, plain.y][plane]);
         for (i, kick) in means.kick.row_iter().enumerate() {

@@ -165,8 +165,8 @@ impl Family {
     /// width above.
     pub fn hidden(data: &Data) -> Vec<Self> {
         let hidden_family = |(name, kind)| {
-            let one = Self { name, kind, grouping: Grouping::Each, tolerance: 0.0, width: 0.0 }.unseen(data);
-            Self { width: HIDDEN * one.width, ..one }
+            let unseen = Self { name, kind, grouping: Grouping::Each, tolerance: 0.0, width: 0.0 }.unseen(data);
+            Self { width: HIDDEN * unseen.width, ..unseen }
         };
         [("gradients in dipoles", EffectKind::DipoleGradient), ("edge angles of dipoles", EffectKind::DipoleEdge)]
             .map(hidden_family)

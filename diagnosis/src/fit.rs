@@ -247,10 +247,10 @@ impl Fitted {
 
     /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
     pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
-        let own = self.hypothesis.unknowns(data);
+        let unknowns = self.hypothesis.unknowns(data);
         let value = |unknown: &Unknown| {
             let same = |(_, one): &(usize, &Unknown)| self.hypothesis.identity(one) == other.identity(unknown);
-            let (i, one) = own.iter().enumerate().find(same)?;
+            let (i, one) = unknowns.iter().enumerate().find(same)?;
             Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
         };
         let others = other.unknowns(data);
@@ -306,8 +306,8 @@ impl Fitted {
     /// [`EffectError`].
     pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
         let (machine, drives) = self.machine(data)?;
-        let own = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
-        Ok(own.map_or([0.0; 2], |own| own.tunes))
+        let prediction = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
+        Ok(prediction.map_or([0.0; 2], |prediction| prediction.tunes))
     }
 
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
@@ -407,9 +407,9 @@ impl<'d> Problem<'d> {
             *u = u.max(unknown.least_start());
         }
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, &start);
-        let own = start.rows_range(first..).into_owned();
-        let ordinary = Ordinary::about(data, &unknowns[others..], &own, machine)?;
-        Ok(Self { data, hypothesis, start: own, unknowns, ordinary })
+        let of_ordinary = start.rows_range(first..).into_owned();
+        let ordinary = Ordinary::about(data, &unknowns[others..], &of_ordinary, machine)?;
+        Ok(Self { data, hypothesis, start: of_ordinary, unknowns, ordinary })
     }
 
     /// Number of the other unknowns, the first.

@@ -106,9 +106,13 @@ impl Shape {
             let i = usize::from(plane == Plane::Y);
             let rows: Vec<[f64; 2]> = (ring.monitors_read())
                 .map(|monitor| {
-                    let at = &twiss[monitor.element];
-                    let (sin, cos) = at.phase_advance[i].sin_cos();
-                    if monitor.plane == plane { [cos, sin].map(|of| at.beta[i].sqrt() * of) } else { [0.0; 2] }
+                    let optics_there = &twiss[monitor.element];
+                    let (sin, cos) = optics_there.phase_advance[i].sin_cos();
+                    if monitor.plane == plane {
+                        [cos, sin].map(|of| optics_there.beta[i].sqrt() * of)
+                    } else {
+                        [0.0; 2]
+                    }
                 })
                 .collect();
             Self { like: Like::Betatron(plane), columns: DMatrix::from_fn(rows.len(), 2, |b, k| rows[b][k]) }

@@ -173,12 +173,12 @@ impl Hypothesis {
         params: &[f64],
         unknown: &[f64],
     ) -> Result<(Machine, Drives), EffectError> {
-        let own = data.campaign(campaign);
+        let recording = data.campaign(campaign);
         let scaled = |term: &Term, amplitude: f64| term.effect(amplitude * data.scale(campaign, term.kind));
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
         effects.extend(&self.given);
         let mut ordinary = Vec::new();
-        let mut drives = own.drives.clone();
+        let mut drives = recording.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
                 Unknown::Amplitude(i, sigma) => effects[*i] = scaled(&self.terms[*i], u * sigma),
@@ -192,9 +192,9 @@ impl Hypothesis {
             }
         }
         let effects = in_order(effects, ordinary);
-        effects.iter().for_each(|effect| correct_orbit(own, &mut drives, effect));
-        let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
-        Ok((Machine::new(ring, own.believed, &effects)?, drives))
+        effects.iter().for_each(|effect| correct_orbit(recording, &mut drives, effect));
+        let ring = recording.ring.with_strengths(&recording.ring.strengths(params, &recording.supplies));
+        Ok((Machine::new(ring, recording.believed, &effects)?, drives))
     }
 
     /// `kind@place + kind@place`, or `nothing`.

@@ -56,18 +56,18 @@ fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
 
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
 pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
-    let mut own = fitted.data(data).clone();
-    let linearise = |own: &mut Data, fitted: &Fitted| own.linearise_each(&fitted.machines(own)?);
+    let mut relinearised = fitted.data(data).clone();
+    let linearise = |data: &mut Data, fitted: &Fitted| data.linearise_each(&fitted.machines(data)?);
     for pass in 0..PASSES {
         if fitted.is_poor() {
             break;
         }
-        let Ok(moved) = linearise(&mut own, &fitted) else { break };
+        let Ok(moved) = linearise(&mut relinearised, &fitted) else { break };
         if pass == 0 && moved < CURVED {
             break;
         }
-        let Ok(again) = Fitted::from_guess(&own, &fitted.hypothesis, &fitted.u) else { break };
-        fitted = again.keeping(&own);
+        let Ok(again) = Fitted::from_guess(&relinearised, &fitted.hypothesis, &fitted.u) else { break };
+        fitted = again.keeping(&relinearised);
         if moved < CURVED {
             break;
         }

@@ -250,12 +250,12 @@ impl Noise {
         }
         let Shared { momentum, jitter, crates, one_more } = shared;
         let measured = |one: &Learner| {
-            let own = (1.0 - jitter[one.b].powi(2) - patterns.row(one.b).norm_squared()).max(OWN);
+            let share_of_own = (1.0 - jitter[one.b].powi(2) - patterns.row(one.b).norm_squared()).max(OWN);
             let count = one.repeats.weigh(Memory::NONE).count;
-            let value = (own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
+            let value = (share_of_own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
             // the mean of `ln` of a sample's rms is below the true one by the variance of that
             let variance = (kurtosis.value - 1.0) / (4.0 * count);
-            Measured { value: value + variance, sigma: variance.sqrt() / own }
+            Measured { value: value + variance, sigma: variance.sqrt() / share_of_own }
         };
         let mut scales = vec![None; campaign.monitors()];
         learners.iter().for_each(|one| scales[one.b] = Some(measured(one)));
@@ -326,10 +326,10 @@ impl Noise {
 
     /// What varies from frame to frame and is not ordinary, with its probability.
     pub(crate) fn unordinary(&self) -> Option<(&FrameToFrame, f64)> {
-        let one = self.frame_to_frame.as_ref()?;
-        let odds = one.log_bayes - correction_of_sort();
+        let varying = self.frame_to_frame.as_ref()?;
+        let odds = varying.log_bayes - correction_of_sort();
         let probability = 1.0 / (1.0 + (-odds).exp());
-        (probability > SUSPICIOUS).then_some((one, probability))
+        (probability > SUSPICIOUS).then_some((varying, probability))
     }
 
     /// What the sentence says of noise that is far from the header's, or in a part of the recording from that of the rest.
@@ -345,10 +345,10 @@ impl Noise {
     fn is_sound(&self, source: &Source, b: usize) -> bool {
         let campaign = source.campaign;
         let jitter = self.momentum.value * source.dispersion[b];
-        let own = campaign.noise(b).powi(2) - jitter * jitter;
+        let variance = campaign.noise(b).powi(2) - jitter * jitter;
         campaign.screened.health[b].state == MonitorState::Noisy
             && jitter > 0.0
-            && own < (NOISY * self.common_scale.value * campaign.recording.header.noise[b]).powi(2)
+            && variance < (NOISY * self.common_scale.value * campaign.recording.header.noise[b]).powi(2)
     }
 
     /// Scales of all monitors that are known by their repeats; of the others the screening's noise stays, less the momentum's jitter.
@@ -396,8 +396,8 @@ impl Noise {
 
     /// What the noise of a monitor remembers.
     pub(super) fn memory(&self, b: usize) -> Memory {
-        let own = self.wandering.iter().find(|(at, _)| *at == b);
-        let walk = own.map_or(self.slow.walk, |(_, walk)| *walk);
+        let of_monitor = self.wandering.iter().find(|(at, _)| *at == b);
+        let walk = of_monitor.map_or(self.slow.walk, |(_, walk)| *walk);
         Slow { walk, ..self.slow }.memory(self.own[b])
     }
 

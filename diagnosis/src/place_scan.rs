@@ -171,11 +171,11 @@ fn segments(data: &Data) -> Vec<Segment> {
 fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Segment> {
     let count = (length / step).ceil().max(1.0);
     let piece = length / count;
-    let one = |i: usize| {
+    let interval = |i: usize| {
         let middle = (i as f64 + 0.5) * piece;
         Segment { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
     };
-    (0..count as usize).map(one).collect()
+    (0..count as usize).map(interval).collect()
 }
 
 #[cfg(test)]

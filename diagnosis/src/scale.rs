@@ -65,9 +65,9 @@ fn furthest(all: &[Measured]) -> Option<usize> {
 /// True if one of some scales lies near the others, by the scatter of these alone.
 fn is_alike(all: &[Measured], at: usize) -> bool {
     let mut others = all.to_vec();
-    let one = others.remove(at);
+    let left_out = others.remove(at);
     let scatter = scatter_among(&others).map_or(0.0, |scatter| scatter.value);
-    !is_far(one, centre_of(&others), scatter)
+    !is_far(left_out, centre_of(&others), scatter)
 }
 
 /// The scatter of some scales, 0 with its root mean square where none is more likely; none without any scale.

@@ -137,12 +137,12 @@ impl Projection {
     pub fn score(&self, columns: &DMatrix<f64>) -> Scored {
         let shared = &self.back * columns;
         let taken = self.factor.solve(&shared);
-        let one = |i: usize| {
+        let score = |i: usize| {
             let (column, taken) = (columns.column(i), taken.column(i));
             let pull = column.dot(&self.residual) - taken.dot(&self.slope);
             SignatureScore { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
         };
-        Scored { scores: (0..columns.ncols()).map(one).collect(), taken }
+        Scored { scores: (0..columns.ncols()).map(score).collect(), taken }
     }
 }
 

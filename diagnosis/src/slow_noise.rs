@@ -134,8 +134,9 @@ impl<'r> Learner<'r> {
 
     /// `ln` likelihood over that of white noise, each monitor's own kind allowed for.
     fn likelihood(&self, common: Common) -> f64 {
-        let one = |b: usize| self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
-        together(&(0..self.repeats.len()).map(one).collect::<Vec<_>>(), &self.own)
+        let gain_of_monitor =
+            |b: usize| self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
+        together(&(0..self.repeats.len()).map(gain_of_monitor).collect::<Vec<_>>(), &self.own)
     }
 
     /// `ln` prior density of the logarithms of what is free.

@@ -176,10 +176,10 @@ impl Finding {
                 term.kind.phrase(ring, term.site, Measured { value: amplitude, sigma }),
             ),
             Cause::Unmodelled(one) => {
-                let own = data.campaign(one.campaign);
-                let phrase = one.at.phrase(own);
-                let phrase = if data.is_joint() { format!("in {} {phrase}", own.name) } else { phrase };
-                (one.at.label(own), one.at.position(own), phrase)
+                let recording = data.campaign(one.campaign);
+                let phrase = one.at.phrase(recording);
+                let phrase = if data.is_joint() { format!("in {} {phrase}", recording.name) } else { phrase };
+                (one.at.label(recording), one.at.position(recording), phrase)
             }
         };
         let fixed = Fixed::from_alternative(data, alternative);
@@ -319,8 +319,9 @@ pub fn tests(
         }
         let kind = found.best.hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
-        let own = family_of(kind);
-        let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == own);
+        let kind_of_family = family_of(kind);
+        let is_learnt =
+            without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind_of_family);
         let choice = Choice::from_terms(data, without, candidates, penalty)?;
         let is_of_family = is_of_an_instrument && is_learnt;
         let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
@@ -363,7 +364,7 @@ pub fn findings(
 ) -> Result<Vec<Finding>, FitError> {
     let (named, unmodelled): (Vec<Finding>, Vec<Finding>) =
         transients.iter().map(|one| Finding::of_transient(data, one)).partition(|one| one.term().is_some());
-    let mut own = Vec::new();
+    let mut findings = Vec::new();
     for (index, ((competition, term), &tested)) in
         found.competitions.iter().zip(&found.best.hypothesis.terms).zip(tests).enumerate()
     {
@@ -375,11 +376,11 @@ pub fn findings(
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
-        own.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
+        findings.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
     let is_stated = |finding: &Finding| finding.probability > STATED;
-    let is_explained_better = !own.iter().any(is_stated);
-    let mut all: Vec<Finding> = named.into_iter().chain(own).filter(is_stated).collect();
+    let is_explained_better = !findings.iter().any(is_stated);
+    let mut all: Vec<Finding> = named.into_iter().chain(findings).filter(is_stated).collect();
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),

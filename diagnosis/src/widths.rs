@@ -163,9 +163,9 @@ impl Projected {
             let Some(posterior) = self.posterior(&widths) else { break };
             let Posterior { mean, variance, .. } = &posterior;
             let of_family = |(f, &width): (usize, &f64)| {
-                let own = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
-                let squares: f64 = own().map(|i| mean[i].powi(2)).sum();
-                let known: f64 = own().map(|i| 1.0 - variance[i]).sum();
+                let members = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
+                let squares: f64 = members().map(|i| mean[i].powi(2)).sum();
+                let known: f64 = members().map(|i| 1.0 - variance[i]).sum();
                 let next = width * (squares / (known + width.powi(2)).max(f64::MIN_POSITIVE)).sqrt();
                 if is_learnt[f] { next } else { width }
             };
@@ -211,8 +211,8 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
         })
         .collect();
     let most = |family: &Family| {
-        let own = members.iter().filter(|(member, u, _)| member.family == family.name && *u > STANDS_OUT);
-        own.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
+        let outstanding = members.iter().filter(|(member, u, _)| member.family == family.name && *u > STANDS_OUT);
+        outstanding.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
     let proposed = |(member, _, amplitude): &(&Member, f64, f64)| {
@@ -247,17 +247,17 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         ordinary: data.units.sigma.mean(),
     }];
     for family in families {
-        let own = at..at + family.members(data).len();
-        at = own.end;
+        let places = at..at + family.members(data).len();
+        at = places.end;
         let width = family.width;
         let (value, sigma) = match family.grouping {
-            _ if own.is_empty() => continue,
+            _ if places.is_empty() => continue,
             Grouping::Each | Grouping::Instrument if family.is_learnt() => {
-                (width, width / information(&covariance, own).sqrt())
+                (width, width / information(&covariance, places).sqrt())
             }
             Grouping::Each | Grouping::Instrument | Grouping::OfOrbit => continue,
             Grouping::Plane(_) | Grouping::All => {
-                (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
+                (fitted.u[places.start] * width, covariance[(places.start, places.start)].sqrt() * width)
             }
         };
         rows.push(Imperfection {

@@ -65,11 +65,13 @@ pub fn weigh_elements(data: &Data, without: &Fitted, weights: &mut [(Alternative
         }
         tried.push(element.clone());
         let hypothesis = Hypothesis { element: Some(element), ..without.hypothesis.clone() };
-        let own = without.data(data);
-        let Ok(with) = Fitted::from_guess(own, &hypothesis, &without.guess(own, &hypothesis)) else { continue };
-        let with = relearnt(own, with);
+        let readings = without.data(data);
+        let Ok(with) = Fitted::from_guess(readings, &hypothesis, &without.guess(readings, &hypothesis)) else {
+            continue;
+        };
+        let with = relearnt(readings, with);
         let gain = with.log_evidence - without.log_evidence - (SIZES.len() as f64).ln();
-        if gain > one.log_bayes && with.is_stable(own) {
+        if gain > one.log_bayes && with.is_stable(readings) {
             *weight += gain - one.log_bayes;
             (one.log_bayes, alternative.log_gain) = (gain, gain);
         }

@@ -73,10 +73,12 @@ pub fn with_ordinary(data: &mut Data, best: Fitted) -> Fitted {
     if learnt.hypothesis.ordinary.is_empty() {
         return best;
     }
-    let mut own = data.clone();
-    let again = linearisation::fit(&mut own, &learnt.hypothesis, &learnt.u).ok().filter(|again| again.is_stable(&own));
+    let mut relinearised = data.clone();
+    let again = linearisation::fit(&mut relinearised, &learnt.hypothesis, &learnt.u)
+        .ok()
+        .filter(|again| again.is_stable(&relinearised));
     let Some(again) = again else { return best };
-    *data = own;
+    *data = relinearised;
     again
 }
 
@@ -175,8 +177,8 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_poor() && !lacks_all {
         return fitted;
     }
-    let own = fitted.has_own().then(|| fitted.data(data).clone());
-    let data = own.as_ref().unwrap_or(data);
+    let kept = fitted.has_own().then(|| fitted.data(data).clone());
+    let data = kept.as_ref().unwrap_or(data);
     let again =
         |hypothesis: Hypothesis, from: &Fitted| Fitted::from_guess(data, &hypothesis, &from.guess(data, &hypothesis));
     let with_all = || Hypothesis { ordinary: Family::all(), ..fitted.hypothesis.clone() };
@@ -185,5 +187,5 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     let learnt = begun.and_then(|begun| again(widths::learnt(begun.data(data), &begun), &begun).ok());
     let is_better = |learnt: &Fitted| !learnt.is_poor() && (lacks_all || learnt.log_evidence > fitted.log_evidence);
     let best = learnt.filter(|learnt| is_better(learnt) && learnt.is_stable(data)).unwrap_or(fitted);
-    if own.is_some() { best.keeping(data) } else { best }
+    if kept.is_some() { best.keeping(data) } else { best }
 }

@@ -262,8 +262,9 @@ impl<'c> SettingDifferences<'c> {
 
     /// Whitened derivative of a signal.
     fn slope(&self, signals: &Signals, term: Term, amplitude: f64) -> DMatrix<f64> {
-        let at = |amplitude: f64| signals.of_effect(term, amplitude);
-        self.differences.whiten(&((at(amplitude + DIFFERENCE) - at(amplitude - DIFFERENCE)) / (2.0 * DIFFERENCE)))
+        let signal = |amplitude: f64| signals.of_effect(term, amplitude);
+        self.differences
+            .whiten(&((signal(amplitude + DIFFERENCE) - signal(amplitude - DIFFERENCE)) / (2.0 * DIFFERENCE)))
     }
 
     /// `ln` of prior times Bayes factor of each term to first order, then that of a share of the former orbit.
@@ -319,8 +320,8 @@ impl<'c> SettingDifferences<'c> {
     fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
         let correctors = driven(self.campaign);
         let judged = |&c: &usize| {
-            let one = Unsteady::from_response(&self.differences, white, signals.of_corrector(c))?;
-            one.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
+            let unsteady = Unsteady::from_response(&self.differences, white, signals.of_corrector(c))?;
+            unsteady.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
         };
         correctors.iter().filter_map(judged).collect()
     }
