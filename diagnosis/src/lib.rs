@@ -3,7 +3,7 @@
 //!
 //! [`Diagnosis::from_recording`] is the path from top to bottom: columns that are not what the header says are refused (`wiring.rs`), and read-backs that are not
 //! the settings are told (`readback.rs`); what passes within a
-//! setting is found by the differences of its frames and taken out (`transients.rs`); the recording is
+//! setting is found by the differences of its frames and taken out (`transients/`); the recording is
 //! whitened (`data.rs`), fitted by the exact twin without any
 //! effect (`fit.rs`), every effect of the library is tried at every place (`scan.rs`), and so is an unmodelled discrepancy
 //! (`discrepancy.rs`); the leading candidates are refitted and compete (`search.rs`); what is found has to predict frames that it was
