@@ -18,7 +18,7 @@ const SAME_OFFSET: f64 = 1e-8;
 
 impl Settings {
     /// Group the frames.
-    pub fn of(drives: &Drives) -> Self {
+    pub fn from_drives(drives: &Drives) -> Self {
         let (mut known, mut powered) = (BTreeMap::new(), Vec::new());
         let mut setting = |frame: usize| {
             let fifths = drives.kick.row(frame).map(|kick| (5.0 * kick / drives.nominal_kick).round() as i64);
@@ -46,7 +46,7 @@ impl Settings {
     }
 
     /// Rows frames, columns settings.
-    pub fn indicator(&self) -> DMatrix<f64> {
+    pub(crate) fn indicator(&self) -> DMatrix<f64> {
         let mut indicator = DMatrix::zeros(self.of_frame.len(), self.powered.len());
         self.of_frame.iter().enumerate().for_each(|(frame, &setting)| indicator[(frame, setting)] = 1.0);
         indicator

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use control::Plan;
-use diagnosis::experiment::{Change, Proposal};
+use diagnosis::{Change, Proposal};
 use inference::recording::Names;
 use toml::{Table, Value};
 use twin::Ring;

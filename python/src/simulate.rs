@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
 use inference::{BatchFit, TuneUse};
 use pyo3::prelude::*;

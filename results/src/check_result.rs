@@ -4,8 +4,7 @@ use core::fmt;
 use estimator::Walk;
 
 use comfy_table::CellAlignment;
-use diagnosis::data::DataError;
-use diagnosis::wiring::Miswired;
+use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
 use inference::{Campaign, Lack, Recording};
 use serde::Serialize;
@@ -18,7 +17,7 @@ use crate::fit_result::{Monitor, TunesMeasured, faults, lack, monitors};
 use crate::output::{lines, table};
 
 /// Fewest monitors with readings, and correctors that were moved, for a diagnosis.
-const LEAST: usize = diagnosis::data::LEAST;
+const LEAST: usize = diagnosis::LEAST;
 /// Rate of a device's serial line where none is given [baud], and bits of a byte on it.
 const LINE: (f64, f64) = (921_600.0, 10.0);
 
@@ -98,7 +97,7 @@ impl CheckResult {
     /// [`CommandError`] if its currents leave no stable ring.
     pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, CommandError> {
         // columns that are not what the header says may leave no stable ring
-        let campaign = campaign(ring, recording).map_err(|error| match Miswired::of(ring, recording) {
+        let campaign = campaign(ring, recording).map_err(|error| match Miswired::find(ring, recording) {
             Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
             _ => error,
         })?;
@@ -238,7 +237,7 @@ fn diagnose(campaign: &Campaign) -> Usable {
     let settings = Settings::of(campaign);
     let reading = (0..campaign.monitors()).filter(|&b| (0..campaign.frames()).any(|i| campaign.counts(i, b))).count();
     let moved = settings.correctors[0];
-    let wiring = Miswired::of(&campaign.ring, &campaign.recording).ok().flatten();
+    let wiring = Miswired::find(&campaign.ring, &campaign.recording).ok().flatten();
     let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1 && wiring.is_none();
     let what = if let Some(why_not) = several_times(campaign) {
         why_not

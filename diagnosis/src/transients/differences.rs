@@ -36,7 +36,7 @@ const LOST: f64 = 4.0;
 impl Differences {
     /// Of readings, rows frames, columns monitors, not a number where missing [m]; the setting of each frame; the noise that the header states [m]
     /// and the dispersion [m] of each monitor; `ln` of each supply's factor off its mean, rows frames.
-    pub fn of(
+    pub fn from_readings(
         readings: &DMatrix<f64>,
         settings: &[Option<usize>],
         noise: &[f64],
@@ -121,7 +121,7 @@ impl Differences {
     }
 
     /// An orbit [m] that is added to every frame, over the noise and without the direction of the dispersion, rows frames; 0 where nothing counts.
-    pub fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
+    pub(crate) fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
         let mut all = self.counts.map_with_location(|_, b, counts| if counts { orbit[b] / self.sigma[b] } else { 0.0 });
         self.runs.iter().flat_map(Clone::clone).for_each(|frame| self.without_momentum(&mut all, frame));
         all
@@ -138,7 +138,7 @@ impl Differences {
     }
 
     /// True for a monitor with readings that count.
-    pub fn sees(&self, b: usize) -> bool {
+    pub(crate) fn sees(&self, b: usize) -> bool {
         self.counts.column(b).iter().any(|counts| *counts)
     }
 }
@@ -241,7 +241,8 @@ mod tests {
         let readings = DMatrix::from_fn(90, 5, |frame, b| {
             setting(frame, b) + 0.1 * noise(frame, b) + dispersion[b] * 0.05 * (frame as f64).sin()
         });
-        let differences = Differences::of(&readings, &settings, &[0.1; 5], &dispersion, &DMatrix::zeros(90, 0));
+        let differences =
+            Differences::from_readings(&readings, &settings, &[0.1; 5], &dispersion, &DMatrix::zeros(90, 0));
         assert_eq!(differences.runs.len(), 30);
         let white = differences.whiten(&readings);
         let moved = differences.whiten(&DMatrix::from_fn(90, 5, |frame, b| setting(frame, b) + 7.0));
@@ -274,7 +275,8 @@ mod tests {
         let settings: Vec<Option<usize>> = (0..120).map(|frame| Some(frame / 4)).collect();
         let mut readings = DMatrix::from_fn(120, 2, |frame, b| 0.1 * (1.7 * (frame * frame + b) as f64).sin());
         (readings[(10, 0)], readings[(8, 1)]) = (5.0, 5.0);
-        let differences = Differences::of(&readings, &settings, &[0.1; 2], &DVector::zeros(2), &DMatrix::zeros(120, 0));
+        let differences =
+            Differences::from_readings(&readings, &settings, &[0.1; 2], &DVector::zeros(2), &DMatrix::zeros(120, 0));
         assert_eq!([0, 1].map(|b| differences.sees(b)), [false, true]);
         assert!(differences.whiten(&readings)[(8, 1)] > 10.0, "the first of a run is what is looked at");
     }
@@ -289,7 +291,7 @@ mod tests {
                 0.1 * (1.7 * (frame * frame + b) as f64).sin() + jump
             });
             let none = DMatrix::zeros(120, 0);
-            let differences = Differences::of(&readings, &settings, &[0.1; 8], &DVector::zeros(8), &none);
+            let differences = Differences::from_readings(&readings, &settings, &[0.1; 8], &DVector::zeros(8), &none);
             assert!((0..8).all(|b| differences.sees(b) == (b >= jumping || count)), "{jumping}");
         }
     }
