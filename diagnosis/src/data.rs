@@ -43,7 +43,7 @@ use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
-use inference::{Campaign, Meter, Screened};
+use inference::{Campaign, Meter, Screened, is_powered};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -285,7 +285,7 @@ impl Data {
         let accepted = &screened.accepted;
         let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
-        let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
+        let pools = Pools::of(&campaign.settings.repeatable, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
@@ -535,7 +535,7 @@ impl Data {
 
     /// Correctors that were powered, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
-        let moved = |&c: &usize| self.drives.kick.column(c).amax() > 0.05 * self.drives.nominal_kick;
+        let moved = |&c: &usize| is_powered(self.drives.kick.column(c).amax(), self.drives.nominal_kick);
         (0..self.drives.kick.ncols()).filter(moved).collect()
     }
 

@@ -21,7 +21,7 @@ pub(crate) mod gradient;
 use core::ops::Range;
 
 use estimator::MonitorState;
-use inference::Factor;
+use inference::{Factor, Settings};
 use nalgebra::{DMatrix, DVector, DVectorView, SymmetricEigen};
 use twin::{Plane, Signature, Signatures};
 
@@ -30,7 +30,6 @@ use super::element::{Element, Form, Linear};
 use super::error::FitError;
 use super::fit::Fitted;
 use super::location::Location;
-use super::settings::Settings;
 use gradient::{Changing, Runs, Where};
 
 /// Free amplitudes at one place, and their evidence.
@@ -129,7 +128,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     let data = all.campaign(campaign);
     let linearised = Linearised::of(fitted);
     let own = Seen::by(fitted, all.parts().swap_remove(campaign));
-    let settings = Settings::of(&data.drives);
+    let settings = Settings::from_drives(&data.drives);
     let monitors = data.monitors();
     let seen = Seen::of(data, &own);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
@@ -159,12 +158,12 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     }
     let driven = data.driven_correctors();
     for &c in &driven {
-        let of_corrector = settings.of_corrector(c);
+        let of_corrector = settings.with_corrector(c);
         let (of_each, apart): (Vec<Sums>, Vec<Apart>) =
             active.iter().map(|&b| (sums[b].select(&of_corrector), apart[b].select(&of_corrector))).unzip();
         found.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
         let patterns = independent(signatures.beside(c));
-        let beside = patterned(data, &sums, &active, &settings.strength(c), &patterns);
+        let beside = patterned(data, &sums, &active, &settings.strength_of(c), &patterns);
         found.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;
@@ -571,7 +570,7 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
-        let (linearised, settings) = (Linearised::of(&fitted), Settings::of(&data.drives));
+        let (linearised, settings) = (Linearised::of(&fitted), Settings::from_drives(&data.drives));
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
@@ -633,7 +632,7 @@ mod tests {
             let (near, exact) = (evidence(&data.sums(b, &seen, &stretches)), evidence(&whole(&alone, &stretches)));
             largest = largest.max((near - exact).abs());
         }
-        let indicator = Settings::of(&data.drives).indicator();
+        let indicator = Settings::from_drives(&data.drives).indicator();
         let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
         let (machine, drives) = fitted.machine(&data).unwrap();
         let read = |pattern: &DVector<f64>| {

@@ -18,7 +18,7 @@
 //! Comput. 13 (2001) 1103, eq. 10, what is left out of a Gaussian process.
 
 use estimator::MonitorState;
-use inference::Factor;
+use inference::{Factor, Settings};
 use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
@@ -28,7 +28,6 @@ use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use super::linearise::about_itself;
 use super::scan::SignatureScore;
-use super::settings::Settings;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;
@@ -49,7 +48,7 @@ pub fn by_pool(data: &Data) -> Vec<Block> {
 pub fn by_corrector(data: &Data) -> Vec<Block> {
     let mut blocks = vec![Block::new(); data.drives.kick.ncols()];
     for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
-        let settings = Settings::of(&own.drives);
+        let settings = Settings::from_drives(&own.drives);
         for pool in 0..own.pools.count {
             if let Some((corrector, _)) = settings.kick(pool) {
                 blocks[corrector].push(pools.start + pool);

@@ -57,7 +57,6 @@ pub mod scan;
 pub mod scatter;
 pub mod score;
 pub mod search;
-pub mod settings;
 pub mod slow;
 pub mod stuck;
 pub mod transients;

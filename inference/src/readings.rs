@@ -108,7 +108,7 @@ impl Reduced {
 
     /// Number of frames that repeat each frame's setting, itself included.
     fn repeats(&self) -> Vec<usize> {
-        let of_frame = &self.campaign.settings.of_frame;
+        let of_frame = &self.campaign.settings.repeatable;
         let repeats = |setting: &Option<usize>| match setting {
             Some(_) => of_frame.iter().filter(|other| *other == setting).count(),
             None => 1,

@@ -8,7 +8,7 @@ use crate::Diagnosis;
 use crate::data::Data;
 use crate::error::FitError;
 use crate::fit::Fitted;
-use crate::settings::Settings;
+use inference::Settings;
 use report::{Axes, Figure, Map, Section};
 
 /// One reading less its prediction.
@@ -41,7 +41,7 @@ pub struct Residuals {
 impl Residual {
     /// Whitened numbers of some data as residuals, those of the tunes left out.
     pub fn all(data: &Data, whitened: &DVector<f64>) -> Vec<Self> {
-        let settings = Settings::of(&data.drives);
+        let settings = Settings::from_drives(&data.drives);
         let horizontal: Vec<bool> = data.ring.correctors.iter().map(|c| c.plane == Plane::X).collect();
         let planes: Vec<bool> = data.ring.monitors_read().map(|m| m.plane == Plane::X).collect();
         let of = |(((pool, monitor), noise), &value): (((usize, usize), f64), &f64)| {

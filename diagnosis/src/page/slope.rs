@@ -10,9 +10,9 @@ use std::collections::BTreeMap;
 use super::partial::Partial;
 use super::signed;
 use crate::Finding;
-use crate::settings::Settings;
 use crate::transients::Shown;
 use crate::verdict::capitalised;
+use inference::Settings;
 use report::{Axes, Figure, Series};
 
 /// Share of the largest signature below which a setting tells nothing by itself.
@@ -228,7 +228,7 @@ fn line(x: &[f64], slope: f64, sigma: f64, finding: &Finding, is_switch: bool) -
 /// Means over the readings of each monitor at each setting, the signature per so many steps of the amplitude.
 fn of_settings(partial: &Partial, per: f64) -> Vec<Point> {
     let data = partial.data;
-    let settings = Settings::of(&data.drives);
+    let settings = Settings::from_drives(&data.drives);
     let mut all: BTreeMap<(usize, usize), Point> = BTreeMap::new();
     for (i, ((pool, monitor), noise)) in data.places().into_iter().zip(data.noise_of_means()).enumerate() {
         if monitor >= data.monitors() {

@@ -12,8 +12,8 @@ use crate::discrepancy::Discrepancy;
 use crate::discrepancy::gradient::steering;
 use crate::error::FitError;
 use crate::location::Location;
-use crate::settings::Settings;
 use crate::verdict::capitalised;
+use inference::Settings;
 use report::{Axes, Figure, Map, Reference, Series};
 
 /// Stretches of time.
@@ -279,7 +279,7 @@ impl Left<'_> {
     /// The mean of each setting, from those of runs of frames.
     fn in_settings(&self, axis: &str, runs: &[Mean]) -> Figure {
         let data = self.partial.data;
-        let (driven, settings) = (data.driven_correctors(), Settings::of(&data.drives));
+        let (driven, settings) = (data.driven_correctors(), Settings::from_drives(&data.drives));
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
             for (run, mean) in runs.iter().enumerate() {

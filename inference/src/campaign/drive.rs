@@ -85,9 +85,3 @@ pub(crate) fn mean(drives: &[&Drive]) -> Drive {
     }
     mean
 }
-
-/// Number of frames with each frame's RF offset.
-pub(crate) fn sharing(drives: &[Drive]) -> Vec<f64> {
-    let alike = |drive: &Drive| drives.iter().filter(|other| other.rf_offset == drive.rf_offset).count() as f64;
-    drives.iter().map(alike).collect()
-}

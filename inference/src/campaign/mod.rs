@@ -30,7 +30,7 @@ pub use meter::{Meter, TUNE_CALIBRATION};
 pub(crate) use normal::{Normal, Terms};
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen};
-pub use setting::Settings;
+pub use setting::{Setting, Settings, is_powered};
 pub use times::{Stray, Times, furthest_stray};
 
 /// A recording and what follows from it before any fit.
@@ -97,7 +97,7 @@ impl Campaign {
         let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
         let supplies = drive::mean_supplies(&drives);
         let times = Times::of(recording);
-        let settings = Settings::of(&drives, &times.of_frame, recording.nominal_kick());
+        let settings = Settings::from_frames(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
         let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
@@ -111,7 +111,7 @@ impl Campaign {
             groups: Groups::of(&drives, &times, &settings),
             readings: &of_beam(recording, &readings),
             noise: &recording.header.noise,
-            sharing: &drive::sharing(&drives),
+            sharing: &setting::sharing(&drives),
             // each of two opposite offsets is given one of its own
             spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
         };

@@ -148,7 +148,7 @@ impl Groups {
         let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
         let mut time_of = Vec::new();
         let mut group = |(frame, drive): (usize, _)| {
-            let key = settings.of_frame[frame].ok_or(frame);
+            let key = settings.repeatable[frame].ok_or(frame);
             let group = *known.entry(key).or_insert(members.len());
             members.resize(members.len().max(group + 1), Vec::new());
             members[group].push(drive);
@@ -211,9 +211,9 @@ impl Screener<'_> {
     }
 
     fn to_mean_drive(&self, orbit: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut sum = DMatrix::<f64>::zeros(self.settings.count, orbit.ncols());
-        let mut frames = vec![0.0; self.settings.count];
-        let settings = || self.settings.of_frame.iter().enumerate().filter_map(|(i, setting)| Some((i, (*setting)?)));
+        let mut sum = DMatrix::<f64>::zeros(self.settings.count(), orbit.ncols());
+        let mut frames = vec![0.0; self.settings.count()];
+        let settings = || self.settings.repeatable.iter().enumerate().filter_map(|(i, setting)| Some((i, (*setting)?)));
         for (i, setting) in settings() {
             frames[setting] += 1.0;
             let mut row = sum.row_mut(setting);
@@ -238,7 +238,7 @@ impl<'c> Screening<'c> {
         Ok(Self {
             gate: Gate::default(),
             monitors: of.noise.iter().map(expecting).collect(),
-            repeats: vec![vec![Repeats::default(); monitors]; of.settings.count],
+            repeats: vec![vec![Repeats::default(); monitors]; of.settings.count()],
             accepted: DMatrix::from_element(frames, monitors, false),
             best: Best::of(of, &model, &normal).expect("a prior's precision is positive"),
             model,
@@ -251,7 +251,7 @@ impl<'c> Screening<'c> {
 
     /// Take one frame: judge its readings, then learn from those that pass.
     fn take(&mut self, frame: usize) {
-        let setting = self.of.settings.of_frame[frame];
+        let setting = self.of.settings.repeatable[frame];
         let reports = |b: usize| !self.of.readings[(frame, b)].is_nan();
         let expected: Vec<bool> = (0..self.monitors.len()).map(|b| reports(b) && self.is_expected(frame, b)).collect();
         let is_lone = self.is_expected_but_for_a_few(frame, &expected);

@@ -15,15 +15,12 @@ pub struct Times {
     pub known: Vec<f64>,
 }
 
-/// Times this close are one, as in the core [us].
-const SAME_TIME: f64 = 1e3;
-
 impl Times {
     /// Those of a recording.
     pub fn of(recording: &Recording) -> Self {
         let mut known: Vec<f64> = Vec::new();
         let is_ramped = recording.header.ramp.is_given();
-        let is_same = |one: f64, other: f64| ((one - other) * 1e6).round().abs() <= SAME_TIME;
+        let is_same = |one: f64, other: f64| ((one - other) * 1e6).round().abs() <= f64::from(estimator::SAME_TIME);
         let mut index = |time: f64| {
             known.iter().position(|one| !is_ramped || is_same(*one, time)).unwrap_or_else(|| {
                 known.push(time);

@@ -137,7 +137,7 @@ impl Screening<'_> {
 
     /// True if other frames of its setting confirm what most monitors read.
     fn is_repeated(&self, frame: usize) -> bool {
-        let Some(setting) = self.of.settings.of_frame[frame] else { return false };
+        let Some(setting) = self.of.settings.repeatable[frame] else { return false };
         let confirmed = self.repeats[setting].iter().filter(|repeats| repeats.frames.len() > 1).count();
         2 * confirmed > self.monitors.len()
     }
@@ -151,10 +151,10 @@ impl Screening<'_> {
 
     /// True if another cycle with the corrector of this one surprises as well, or if there is none.
     fn surprises_again(&self, frame: usize, plane: usize) -> bool {
-        let of_frame = &self.of.settings.corrector;
-        let is_another =
-            |other: &usize| *other != frame && of_frame[frame].is_some() && of_frame[*other] == of_frame[frame];
-        let mut others = (0..of_frame.len()).filter(is_another).peekable();
+        let corrector = |frame: usize| self.of.settings.setting(frame).only_corrector();
+        let moved = corrector(frame);
+        let is_another = |other: &usize| *other != frame && moved.is_some() && corrector(*other) == moved;
+        let mut others = (0..self.of.drives.len()).filter(is_another).peekable();
         others.peek().is_none() || others.any(|other| self.surprises(other, plane) == Some(true))
     }
 
