@@ -43,7 +43,7 @@ use super::wiring::Miswired;
 use super::within::Within;
 use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
-use inference::{Campaign, Meter, Screened, is_powered};
+use inference::{Campaign, Excluded, Meter, Screened, is_powered};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -278,12 +278,12 @@ impl Data {
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         for &b in &noise.sound {
-            let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
+            let jumps = !noise.levels.is_constant() && left_aside(&screened.excluded, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
         let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
-        let accepted = &screened.accepted;
-        let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
+        let excluded = &screened.excluded;
+        let has_same_monitors = |i: usize| sharing.iter().all(|&b| excluded.counts(i, b) == excluded.counts(i - 1, b));
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
         let pools = Pools::of(&campaign.settings.repeatable, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
@@ -364,7 +364,7 @@ impl Data {
         let dropped: Vec<(usize, usize)> = places.map(|(place, _)| place).filter(is_faulty).collect();
         for (frame, pool) in self.pools.of_frame.iter().enumerate() {
             for &(_, b) in dropped.iter().filter(|(dropped, _)| dropped == pool) {
-                self.screened.accepted[(frame, b)] = false;
+                self.screened.excluded.exclude(frame, b, Excluded::Poor);
             }
         }
         if !dropped.is_empty() {
@@ -809,15 +809,14 @@ impl Data {
 
     /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
     pub fn is_aside(&self, frame: usize, b: usize) -> bool {
-        !self.frames.recorded[(frame, b)].is_nan() && !self.screened.accepted[(frame, b)]
+        self.screened.excluded.is_aside(frame, b)
     }
 
     /// True if a frame's reading of a monitor, or of a tune after the last of them, counts.
     fn counts(&self, frame: usize, c: usize) -> bool {
-        let is_read = !self.frames.readings[(frame, c)].is_nan();
         match c.checked_sub(self.monitors()) {
-            None => is_read && self.screened.accepted[(frame, c)],
-            Some(plane) => is_read && self.frames.tune_noise[plane].is_some(),
+            None => self.screened.excluded.counts(frame, c),
+            Some(plane) => !self.frames.readings[(frame, c)].is_nan() && self.frames.tune_noise[plane].is_some(),
         }
     }
 
@@ -874,7 +873,7 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
     // with the readings that were put aside for their size the noise is larger, and more of them are what it makes
     for _ in 0..PASSES {
         let again = if noise.levels.is_constant() { campaign.screened.clone() } else { readmitted(&source, &noise) };
-        if again.accepted == screened.accepted && again.health == screened.health {
+        if again == screened {
             break;
         }
         let mut counting = campaign.clone();

@@ -18,7 +18,7 @@ pub mod recording;
 pub mod simulate;
 pub mod stream;
 
-pub use campaign::{Campaign, Drive, Meter, Screened, Settings, is_powered};
+pub use campaign::{Campaign, Drive, Excluded, Exclusions, Meter, Screened, Settings, is_powered};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use factor::Factor;
 pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, TuneUse};

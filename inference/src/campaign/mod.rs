@@ -4,6 +4,7 @@
 
 mod common;
 mod drive;
+mod exclusion;
 mod linear;
 mod meter;
 mod normal;
@@ -23,6 +24,7 @@ use crate::recording::Recording;
 pub use common::chi_square;
 pub(crate) use common::{Common, Eliminated, Weighed};
 pub use drive::{Drive, supplies_of};
+pub use exclusion::{Excluded, Exclusions};
 pub(crate) use linear::AtTimes;
 use linear::Linearised;
 pub use linear::rf_orbit;
@@ -110,6 +112,7 @@ impl Campaign {
             settings: &settings,
             groups: Groups::of(&drives, &times, &settings),
             readings: &of_beam(recording, &readings),
+            excluded: excluded(recording, &readings),
             noise: &recording.header.noise,
             sharing: &setting::sharing(&drives),
             // each of two opposite offsets is given one of its own
@@ -168,7 +171,7 @@ impl Campaign {
 
     /// True if a reading counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
-        self.screened.accepted[(frame, b)]
+        self.screened.excluded.counts(frame, b)
     }
 
     /// Noise as which a reading of a monitor is weighted [m].
@@ -229,7 +232,7 @@ impl Campaign {
 
     /// True if any reading counts.
     pub fn has_readings(&self) -> bool {
-        self.screened.accepted.iter().any(|counts| *counts)
+        self.screened.excluded.counting().iter().any(|counts| *counts)
     }
 
     /// The meter's tunes of the frames without an RF offset, the supplies' fluctuations taken out to first order.
@@ -256,9 +259,19 @@ fn readings(recording: &Recording) -> DMatrix<f64> {
 /// Readings without those of frames that had no beam.
 fn of_beam(recording: &Recording, readings: &DMatrix<f64>) -> DMatrix<f64> {
     let mut readings = readings.clone();
-    let lost = recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam());
-    lost.for_each(|(i, _)| readings.row_mut(i).fill(f64::NAN));
+    without_beam(recording).for_each(|frame| readings.row_mut(frame).fill(f64::NAN));
     readings
+}
+
+/// What is known before the screening: readings that are missing, and those of frames that had no beam.
+fn excluded(recording: &Recording, readings: &DMatrix<f64>) -> Exclusions {
+    let mut excluded = Exclusions::from_readings(readings);
+    without_beam(recording).for_each(|frame| excluded.exclude_frame(frame, Excluded::LostBeam));
+    excluded
+}
+
+fn without_beam(recording: &Recording) -> impl Iterator<Item = usize> {
+    recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam()).map(|(frame, _)| frame)
 }
 
 fn tunes(recording: &Recording) -> DMatrix<f64> {

@@ -14,6 +14,7 @@ use twin::{Machine, OrbitError, Ring};
 
 use super::common::Weighed;
 use super::drive::{self, Drive};
+use super::exclusion::{Excluded, Exclusions};
 use super::linear::Linearised;
 use super::normal::{Normal, Terms};
 use super::rms_by_plane;
@@ -25,8 +26,8 @@ use crate::prior::Prior;
 /// The monitors, and their readings that count.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Screened {
-    /// Which readings count, rows frames, columns monitors.
-    pub accepted: DMatrix<bool>,
+    /// Which readings count, and why the others do not.
+    pub excluded: Exclusions,
     /// State and noise of each monitor.
     pub health: Vec<Health>,
 }
@@ -44,6 +45,8 @@ pub(super) struct Screener<'c> {
     pub groups: Groups,
     /// Rows frames, columns monitors, not a number where a monitor did not report [m].
     pub readings: &'c DMatrix<f64>,
+    /// What is left out beforehand.
+    pub excluded: Exclusions,
     /// Expected noise of each monitor [m].
     pub noise: &'c [f64],
     /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
@@ -110,7 +113,8 @@ struct Screening<'c> {
     monitors: Vec<Monitor>,
     /// By setting and monitor.
     repeats: Vec<Vec<Repeats>>,
-    accepted: DMatrix<bool>,
+    /// Frames to come are unconfirmed.
+    excluded: Exclusions,
     model: Model,
     normal: Normal,
     best: Best,
@@ -173,9 +177,11 @@ impl Screener<'_> {
         }
         screening.take_back_unconfirmed();
         screening.drop_stuck();
-        let Screening { accepted, monitors, model, best, normal, .. } = screening;
-        let health = monitors.iter().map(Monitor::health).collect();
-        let screened = Screened { accepted, health };
+        let Screening { mut excluded, monitors, model, best, normal, .. } = screening;
+        let health: Vec<Health> = monitors.iter().map(Monitor::health).collect();
+        let dead = health.iter().enumerate().filter(|(_, health)| health.state == MonitorState::Dead);
+        dead.for_each(|(b, _)| excluded.set_dead(b));
+        let screened = Screened { excluded, health };
         // the last step has not been tried: next to a resonance it may lead to no stable ring
         let shares = (0..HALVINGS).map(|halvings| 0.5_f64.powi(halvings)).chain([0.0]);
         let mut tried = shares.map(|share| {
@@ -227,7 +233,6 @@ impl Screener<'_> {
 
 impl<'c> Screening<'c> {
     fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
-        let (frames, monitors) = (of.drives.len(), of.noise.len());
         let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
         let normal = Normal::new(of.prior, &model.params, of.channels(), COMMON);
         let expecting = |sigma: &f64| {
@@ -235,11 +240,13 @@ impl<'c> Screening<'c> {
             monitor.expect(*sigma as f32);
             monitor
         };
+        let mut excluded = of.excluded.clone();
+        (0..of.drives.len()).for_each(|frame| excluded.exclude_frame(frame, Excluded::Unconfirmed));
         Ok(Self {
             gate: Gate::default(),
             monitors: of.noise.iter().map(expecting).collect(),
-            repeats: vec![vec![Repeats::default(); monitors]; of.settings.count()],
-            accepted: DMatrix::from_element(frames, monitors, false),
+            repeats: vec![vec![Repeats::default(); of.noise.len()]; of.settings.count()],
+            excluded,
             best: Best::of(of, &model, &normal).expect("a prior's precision is positive"),
             model,
             normal,
@@ -261,12 +268,15 @@ impl<'c> Screening<'c> {
             if self.monitors[b].hear(code(reading)) {
                 match setting {
                     Some(setting) => self.judge_repeat((frame, b, setting), expected, is_lone),
-                    None if expected => self.accepted[(frame, b)] = true,
+                    None if expected => self.excluded.lift(frame, b),
                     None => {
                         self.monitors[b].reject();
+                        self.excluded.exclude(frame, b, Excluded::Jump);
                         rejected.push(b);
                     }
                 }
+            } else {
+                self.excluded.exclude(frame, b, Excluded::Stuck);
             }
             self.stale |= self.monitors[b].judge();
         }
@@ -280,7 +290,7 @@ impl<'c> Screening<'c> {
     /// Add the readings of a frame that count to the normal equations.
     fn learn(&mut self, frame: usize) {
         let group = self.of.groups.of_frame[frame];
-        let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).collect();
+        let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.excluded.counts(frame, b)).collect();
         let mut slopes = DMatrix::zeros(self.model.params.len(), counting.len());
         for (mut to, &b) in slopes.column_iter_mut().zip(&counting) {
             to.copy_from(&self.model.slope[b].column(group));
@@ -323,24 +333,28 @@ impl<'c> Screening<'c> {
                 self.monitors[b].pardon(repeats.waiting);
                 self.stale = true;
                 if outvotes {
-                    repeats.frames.drain(..).for_each(|i| self.accepted[(i, b)] = false);
+                    repeats.frames.drain(..).for_each(|i| self.excluded.exclude(i, b, Excluded::Jump));
                 }
                 repeats.frames.extend(repeats.last);
-                repeats.last.into_iter().for_each(|last| self.accepted[(last, b)] = true);
+                repeats.last.into_iter().for_each(|last| self.excluded.lift(last, b));
             }
         }
         repeats.waiting = verdict.waiting();
         repeats.last = Some(frame);
         if repeats.waiting == 0 {
             repeats.frames.push(frame);
-            self.accepted[(frame, b)] = true;
+            self.excluded.lift(frame, b);
+        }
+        if !repeats.frames.is_empty() {
+            let outvoted = repeats.held.iter().filter(|held| !repeats.frames.contains(held));
+            outvoted.for_each(|&held| self.excluded.exclude(held, b, Excluded::Jump));
         }
     }
 
     /// Monitors fail one at a time: when most readings of a frame without a setting lie outside the gate, the beam was lost or the model is
     /// at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before are not.
     fn judge_frame(&mut self, frame: usize, rejected: &[usize]) {
-        let accepted = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).count();
+        let accepted = (0..self.monitors.len()).filter(|&b| self.excluded.counts(frame, b)).count();
         if MOST * rejected.len() <= accepted + rejected.len() {
             self.unexpected = 0;
             return;
@@ -349,10 +363,11 @@ impl<'c> Screening<'c> {
         let convinced = self.unexpected >= CONVINCED;
         for &b in rejected {
             self.monitors[b].pardon(1);
-            self.accepted[(frame, b)] = true;
+            self.excluded.lift(frame, b);
         }
-        let mut row = self.accepted.row_mut(frame);
-        row.iter_mut().for_each(|accepted| *accepted &= convinced);
+        if !convinced {
+            self.excluded.exclude_frame(frame, Excluded::LostBeam);
+        }
     }
 
     /// True if the model expects nearly all readings of a frame, those of dead monitors left out.
@@ -438,7 +453,7 @@ impl<'c> Screening<'c> {
         if stuck.is_empty() {
             return;
         }
-        stuck.into_iter().for_each(|b| self.accepted.column_mut(b).fill(false));
+        stuck.into_iter().for_each(|b| self.excluded.exclude_monitor(b, Excluded::Stuck));
         self.rebuild(frames);
     }
 
@@ -449,7 +464,7 @@ impl<'c> Screening<'c> {
         for b in 0..monitors {
             let none = |time: &usize| (time * monitors + b, Weighed::none(TERMS.len()));
             let mut sums: Vec<(usize, Weighed)> = self.of.groups.times.iter().map(none).collect();
-            for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
+            for frame in (0..frames).filter(|&frame| self.excluded.counts(frame, b)) {
                 sums[self.of.groups.of_frame[frame]].1 += &self.weighed(frame, b);
             }
             self.normal.add(&self.model.slope[b], &sums);

@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 
 use estimator::MonitorState;
 
-use super::{MOST, Repeats, Screening};
+use super::{Excluded, MOST, Repeats, Screening};
 
 /// Ordinary scatter of a reading's response, gains of 2 % of the monitor and of the corrector [1].
 const SCATTER: f64 = 0.03;
@@ -61,16 +61,16 @@ impl Screening<'_> {
         if unconfirmed.is_empty() {
             return;
         }
-        let (counting, mut judged) = (self.accepted.clone(), Judged::default());
+        let (before, mut judged) = (self.excluded.clone(), Judged::default());
         for _ in 0..PASSES {
             let again = self.judged(&unconfirmed);
             if again == judged {
                 break;
             }
             judged = again;
-            self.accepted.clone_from(&counting);
-            judged.sound.iter().for_each(|reading| self.accepted[*reading] = true);
-            judged.failed.iter().for_each(|frame| self.accepted.row_mut(*frame).fill(false));
+            self.excluded.clone_from(&before);
+            judged.sound.iter().for_each(|&(frame, b)| self.excluded.lift(frame, b));
+            judged.failed.iter().for_each(|frame| self.excluded.exclude_frame(*frame, Excluded::LostBeam));
             self.stale = true;
             self.linearise_if_due(self.of.drives.len());
             self.linearise_if_due(self.of.drives.len());
