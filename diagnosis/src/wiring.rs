@@ -268,7 +268,7 @@ impl<'r> Measured<'r> {
             rms(design.view((0, kicks), (split, 1))),
         ];
         let rows = recording.rows.iter().map(|row| {
-            let Drive { kick, rf_offset, .. } = Drive::of(&recording.header, row);
+            let Drive { kick, rf_offset, .. } = Drive::from_row(&recording.header, row);
             kick.push(rf_offset).transpose()
         });
         let drive = DMatrix::from_rows(&rows.collect::<Vec<_>>());

@@ -9,7 +9,6 @@ use std::borrow::Cow;
 
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
-use inference::campaign::supplies_of;
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
 use serde::Serialize;
@@ -137,7 +136,7 @@ impl FitResult {
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
         // vars that walk are those of the last frames, and so are their tunes
         let seen = if walk.params > 0.0 { latest(recording) } else { Cow::Borrowed(recording) };
-        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &supplies_of(&seen)));
+        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &seen.mean_supplies()));
         Self {
             recording: recording.name.clone(),
             method: "laplace",

@@ -18,13 +18,13 @@ pub mod recording;
 pub mod simulate;
 pub mod stream;
 
-pub use campaign::{Campaign, Drive, Excluded, Exclusions, Meter, Screened, Settings, is_powered};
+pub use campaign::{Campaign, Excluded, Exclusions, Meter, Screened, Settings, is_powered};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use factor::Factor;
 pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, TuneUse};
 pub use model::{GreenModel, ResnetModel, ResponseModel};
 pub use posterior::{Laplace, LaplaceError, Posterior};
-pub use prior::{Prior, Width, with_priors};
+pub use prior::{Prior, Width, draw, with_priors};
 pub use readings::{Pair, Readings, Reduced};
-pub use recording::{Recording, RecordingError};
+pub use recording::{Drive, Recording, RecordingError};
 pub use stream::{Core, Estimate, StreamError};

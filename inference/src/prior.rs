@@ -2,6 +2,8 @@
 
 use estimator::Marginal;
 use nalgebra::DVector;
+use rand::rngs::StdRng;
+use rand_distr::{Distribution, Normal};
 use twin::{ParameterPrior, Ring};
 
 /// Prior of every param [N].
@@ -112,6 +114,21 @@ pub fn with_priors(ring: &Ring, width: Option<f64>, range: Option<[f64; 2]>) -> 
         parameter.prior.range = range.unwrap_or(parameter.prior.range);
     }
     ring
+}
+
+/// A factor from its truncated lognormal prior.
+///
+/// # Panics
+/// If the width is not positive.
+pub fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
+    let (mean, precision) = Width::Lognormal(prior.width).normal();
+    let normal = Normal::new(mean, precision.sqrt().recip()).expect("a width is positive");
+    loop {
+        let var = normal.sample(random).exp();
+        if (prior.range[0]..=prior.range[1]).contains(&var) {
+            return var;
+        }
+    }
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
 use twin::OrbitError;
 
-use crate::campaign::{AtTimes, Campaign, Common, Eliminated, Meter, Weighed};
+use crate::campaign::{Campaign, Common, Eliminated, Meter, Weighed};
 use crate::map_fit::{BatchFit, TuneUse};
 use crate::model::{Prediction, ResponseModel};
 
@@ -69,7 +69,7 @@ impl Reduced {
     pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
         let Campaign { ring, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
-        let exact = AtTimes::of(&campaign, &params)?.orbits(drives);
+        let exact = campaign.linearised(&params)?.orbits(drives);
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;

@@ -106,7 +106,7 @@ fn what_is_held_instead_of_the_momentum_is_part_of_the_fit() {
         let held = response(&[Effect::parse(effect, &ring).unwrap()]) - response(&[]);
         let mut recording = plain.clone();
         for row in recording.rows.iter_mut().filter(|row| row.rf_offset == 0.0) {
-            let kick = DVector::from_vec(Drive::of(&plain.header, row).kick.as_slice().to_vec());
+            let kick = DVector::from_vec(Drive::from_row(&plain.header, row).kick.as_slice().to_vec());
             let moved = &held * kick;
             let monitors = ring.horizontal_monitors();
             row.reading[..monitors].iter_mut().zip(moved.iter()).for_each(|(to, x)| *to = to.map(|to| to + x));

@@ -440,7 +440,7 @@ fn between_two_points_the_momentum_is_linear() {
     let recording = through_files(&one_cycle(), &ring).unwrap();
     let mut row = recording.rows[0].clone();
     row.cycle_time = 0.0505;
-    let [at, later] = [&recording.rows[0], &row].map(|row| Drive::of(&recording.header, row));
+    let [at, later] = [&recording.rows[0], &row].map(|row| Drive::from_row(&recording.header, row));
     let [first, next] = [0.35, 0.65].map(momentum);
     let expected = (first + 0.5 / 20.0 * (next - first)) / first;
     let [dipole, dipole_next] = [0.35, 0.65].map(|energy| currents(energy)[0]);

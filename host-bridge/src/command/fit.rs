@@ -4,7 +4,6 @@ use core::ops::ControlFlow;
 use std::sync::Arc;
 
 use indicatif::ProgressBar;
-use inference::campaign::supplies_of;
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use measured::Folder;
@@ -62,7 +61,7 @@ fn check(options: &Fit) -> Result<(), CommandError> {
 /// # Errors
 /// [`CommandError::Other`] where the design or the calibrated ring has no stable motion.
 pub fn page(ring: &Ring, recording: &Recording, result: &FitResult) -> Result<Page, CommandError> {
-    let page = fit_page::page(&recording.powered(ring), &supplies_of(recording), result);
+    let page = fit_page::page(&recording.powered(ring), &recording.mean_supplies(), result);
     page.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
 }
 

@@ -3,7 +3,6 @@
 //! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
 
 mod common;
-mod drive;
 mod exclusion;
 mod linear;
 mod meter;
@@ -19,11 +18,10 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Machine, Optics, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
-use crate::recording::Recording;
+use crate::recording::{self, Drive, Recording};
 
 pub use common::chi_square;
 pub(crate) use common::{Common, Eliminated, Weighed};
-pub use drive::{Drive, supplies_of};
 pub use exclusion::{Excluded, Exclusions};
 pub(crate) use linear::AtTimes;
 use linear::Linearised;
@@ -31,7 +29,7 @@ pub use linear::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
 pub(crate) use normal::{Normal, Terms};
 pub use screen::Screened;
-use screen::{Groups, Screener, Seen};
+use screen::{Groups, Screener, Seen, rms_by_plane};
 pub use setting::{Setting, Settings, is_powered};
 pub use times::{Stray, Times, furthest_stray};
 
@@ -96,8 +94,8 @@ impl Campaign {
         let ring = recording.powered(ring).into_owned();
         let believed = recording.header.believed(&ring).expect("the header is checked against its ring");
         let held = Machine::new(ring.clone(), believed, &[]).expect("there is no effect");
-        let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
-        let supplies = drive::mean_supplies(&drives);
+        let drives = recording.drives();
+        let supplies = recording::mean_supplies(&drives);
         let times = Times::of(recording);
         let settings = Settings::from_frames(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
@@ -225,6 +223,14 @@ impl Campaign {
         terms
     }
 
+    /// Linearised about params, at the supplies of each time in the cycle.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if there is no stable ring.
+    pub(crate) fn linearised(&self, params: &DVector<f64>) -> Result<AtTimes, OrbitError> {
+        AtTimes::new(&self.held, params, &self.supplies, &self.drives, &self.times)
+    }
+
     /// Rms of the baselines that are known, in x and y [m].
     pub(crate) fn rms_by_plane(&self, baselines: &[Option<f64>]) -> [f64; 2] {
         rms_by_plane(&self.ring, baselines)
@@ -281,19 +287,8 @@ fn tunes(recording: &Recording) -> DMatrix<f64> {
 
 /// `ln` of the dipoles' field off its mean in each frame; none where their current is not read.
 fn fields(recording: &Recording) -> Option<Vec<f64>> {
-    let logs = recording.rows.iter().map(|row| drive::field(&recording.header, row).map(f64::ln));
+    let logs = recording.rows.iter().map(|row| recording::field(&recording.header, row).map(f64::ln));
     let logs = logs.collect::<Option<Vec<f64>>>()?;
     let mean = logs.iter().sum::<f64>() / logs.len() as f64;
     Some(logs.into_iter().map(|log| log - mean).collect())
-}
-
-/// Rms of the baselines that are known, in x and y [m].
-fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
-    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
-    [0, 1].map(|plane| {
-        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
-        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
-        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
-        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
-    })
 }

@@ -13,15 +13,14 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
 use super::common::Weighed;
-use super::drive::{self, Drive};
 use super::exclusion::{Excluded, Exclusions};
 use super::linear::Linearised;
 use super::normal::{Normal, Terms};
-use super::rms_by_plane;
 use super::setting::Settings;
 use super::times::Times;
 use crate::factor::Factor;
 use crate::prior::Prior;
+use crate::recording::{self, Drive};
 
 /// The monitors, and their readings that count.
 #[derive(Debug, Clone, PartialEq)]
@@ -160,7 +159,7 @@ impl Groups {
             group
         };
         let of_frame = drives.iter().enumerate().map(&mut group).collect();
-        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect(), times: time_of }
+        Self { of_frame, drives: members.iter().map(|members| recording::mean(members)).collect(), times: time_of }
     }
 }
 
@@ -187,7 +186,7 @@ impl Screener<'_> {
         let mut tried = shares.map(|share| {
             let step = &best.step * share;
             let (params, baselines) = (&model.params + &step, normal.baselines(&step));
-            let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
+            let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
             Ok(Seen { screened: screened.clone(), params, linearised, baselines })
         });
         let first = tried.next().expect("there are shares");
@@ -210,7 +209,7 @@ impl Screener<'_> {
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
-        let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
+        let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
         let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
         let to_mean_drive = self.to_mean_drive(&orbit);
         Ok(Model { params, orbit, slope, to_mean_drive })
@@ -490,6 +489,17 @@ impl Best {
         let baselines = normal.baselines(&step);
         Some(Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost })
     }
+}
+
+/// Rms of the baselines that are known, in x and y [m].
+pub(super) fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
+    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
+    [0, 1].map(|plane| {
+        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
+        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
+        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
+        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+    })
 }
 
 /// A reading as the wire has it; none where it is missing.

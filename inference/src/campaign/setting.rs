@@ -6,7 +6,7 @@ use estimator::{SAME_KICK, SAME_OFFSET};
 use nalgebra::{DMatrix, DVector};
 use twin::Drives;
 
-use super::drive::Drive;
+use crate::recording::Drive;
 
 /// Frames grouped by setting.
 #[derive(Debug, Clone, PartialEq)]

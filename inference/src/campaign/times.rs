@@ -3,8 +3,7 @@
 
 use core::fmt;
 
-use super::drive::{Drive, mean_supplies};
-use crate::recording::Recording;
+use crate::recording::{Drive, Recording, mean_supplies};
 
 /// The frames by their time in the cycle.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,7 +55,7 @@ pub struct Stray {
 /// The supply that is furthest off the ramp at some time, from what it is on average; none without several times.
 pub fn furthest_stray(recording: &Recording) -> Option<Stray> {
     let times = Times::of(recording);
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    let drives = recording.drives();
     let all = mean_supplies(&drives);
     let at = |(time, milliseconds): (usize, f64)| {
         let own: Vec<Drive> = (drives.iter().zip(&times.of_frame))

@@ -12,7 +12,7 @@ use rand::rngs::StdRng;
 use twin::{OrbitError, Ring, VariedRing};
 
 use super::{Optics, Prediction, slopes};
-use crate::simulate::draw;
+use crate::prior::draw;
 
 /// The design and its derivatives.
 #[derive(Debug, Clone)]
