@@ -10,7 +10,7 @@ use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut};
 
 use super::levels::Levels;
 use super::memory::Memory;
-use inference::factor::solve_lower_mut;
+use inference::solve_lower_mut;
 
 /// A monitor's or a tune's readings.
 #[derive(Debug, Clone)]

@@ -41,9 +41,9 @@ use super::pools::Pools;
 use super::readmit::{JUMPS, left_aside, readmitted};
 use super::wiring::Miswired;
 use super::within::Within;
-use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
 use inference::{Campaign, Excluded, Meter, Screened, is_powered};
+use inference::{TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -424,7 +424,7 @@ impl Data {
         let time = &self.frames.drives.time;
         self.frames.tune_noise = [0, 1].map(|plane| {
             let tunes = self.frames.readings.column(monitors + plane);
-            Meter::of(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
+            Meter::from_tunes(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
         });
         self.readings = self.pools.means(&self.frames.readings, |frame, c| self.counts(frame, c));
         let frames = self.pools.frames();

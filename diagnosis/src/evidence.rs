@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector};
 
-use inference::bounded::Coordinates;
+use inference::Coordinates;
 use inference::{Factor, Prior};
 
 /// Precision given to a var that is held.
@@ -37,7 +37,7 @@ impl Units {
             range: prior.range.iter().enumerate().map(range).collect(),
             mean: prior.mean.clone(),
             sigma,
-            coordinates: Coordinates::of(prior),
+            coordinates: Coordinates::from_prior(prior),
         }
     }
 

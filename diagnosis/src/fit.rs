@@ -20,8 +20,8 @@ use super::evidence::{Units, Within};
 use super::hypothesis::{Hypothesis, Member, Term, Unknown};
 use super::ordinary::Family;
 use inference::Factor;
-use inference::factor::gram;
-use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
+use inference::gram;
+use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]

@@ -32,7 +32,7 @@ use super::location::{Location, SORTS};
 use super::ordinary::{self, Family};
 use super::scan::{Candidate, scan};
 use super::slow::OWN;
-use inference::bounded::softplus;
+use inference::softplus;
 
 /// Prior odds of one (more) effect.
 pub(super) const ODDS: f64 = 1.0;

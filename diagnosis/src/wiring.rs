@@ -286,7 +286,7 @@ impl<'r> Measured<'r> {
         });
         let response = rows(&stated, |one| &one.response);
         let variance = rows(&stated, |one| &one.variance);
-        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design);
+        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::from_ring(ring), design);
         Self { ring, response, late, variance, scale, scatter }
     }
 

@@ -129,7 +129,7 @@ impl FitResult {
         quality: FitQuality,
         timing: Timing,
     ) -> Self {
-        let prior = Prior::of(ring);
+        let prior = Prior::from_ring(ring);
         let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), last.params_sigma[i].into());
         let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);

@@ -128,7 +128,7 @@ impl BatchFit {
     ///
     /// # Errors
     /// [`BatchError`].
-    pub fn of(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
+    pub fn best(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
         let problem = Problem { campaign, tunes };
         let watch = |steps, _| {
             progress(steps);

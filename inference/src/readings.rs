@@ -66,7 +66,7 @@ impl Reduced {
     ///
     /// # Errors
     /// [`OrbitError`] if these have no closed orbit.
-    pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
+    pub fn from_fit(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
         let Campaign { ring, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
         let exact = campaign.linearised(&params)?.orbits(drives);
@@ -269,8 +269,8 @@ mod tests {
         let mut recording = Recording::read(&folder.join("plain"), &ring).unwrap();
         let repeats = |recording: &Recording| {
             let campaign = Campaign::of(&ring, recording).unwrap();
-            let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
-            Reduced::of(campaign, fit).unwrap().repeats()
+            let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
+            Reduced::from_fit(campaign, fit).unwrap().repeats()
         };
         let named = repeats(&recording);
         recording.rows.iter_mut().for_each(|row| row.correctors.clear());

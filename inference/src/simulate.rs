@@ -141,7 +141,7 @@ impl TuneWindow {
     ///
     /// # Errors
     /// [`OrbitError`] if the design has no tunes.
-    pub fn of(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
+    pub fn from_ring(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
         let design = tunes(ring)?;
         let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
         Ok(Self { x, y })
@@ -170,7 +170,7 @@ impl Window {
 /// [`VarsError`].
 pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsError> {
     let mut random = StdRng::seed_from_u64(seed);
-    let window = TuneWindow::of(ring, tune_cut)?;
+    let window = TuneWindow::from_ring(ring, tune_cut)?;
     let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
     let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| window.holds(at));
     let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);

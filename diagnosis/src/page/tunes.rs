@@ -8,7 +8,7 @@ use crate::data::Data;
 use crate::error::FitError;
 use crate::fit::{Fitted, predicted};
 use crate::verdict::capitalised;
-use inference::campaign::TUNE_CALIBRATION;
+use inference::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
 use twin::{Drives, EffectError, Machine};
 

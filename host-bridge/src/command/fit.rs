@@ -104,7 +104,7 @@ fn fitted(
     progress: impl FnMut(usize),
 ) -> Result<(Campaign, BatchFit), CommandError> {
     let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, progress)?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, progress)?;
     Ok((campaign, fit))
 }
 
@@ -122,7 +122,7 @@ pub fn by_draws(
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
     let (campaign, fit) = fitted(ring, recording, |_| ())?;
-    let reduced = Reduced::of(campaign, fit)?;
+    let reduced = Reduced::from_fit(campaign, fit)?;
     let ring = &reduced.campaign.ring;
     let is_network = model == FitModel::Resnet;
     let model = match model {
@@ -133,7 +133,7 @@ pub fn by_draws(
     };
     let word = model.word();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
-    let posterior = Posterior::new(model, readings, Prior::of(ring));
+    let posterior = Posterior::new(model, readings, Prior::from_ring(ring));
     let laplace = posterior.laplace(&reduced.fit.map_params).map_err(|e| failed(e.to_string()))?;
     let names = ring.var_names();
     let posterior = Arc::new(posterior);

@@ -30,7 +30,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use inference::campaign::furthest_stray;
+use inference::furthest_stray;
 use inference::recording::BelievedRf;
 use inference::{BatchError, Campaign, Recording, RecordingError, stream, with_priors};
 use serde::Serialize;

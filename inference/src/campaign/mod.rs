@@ -2,11 +2,11 @@
 //!
 //! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
 
-mod common;
+mod common_terms;
 mod exclusion;
-mod linear;
+mod linearisation;
 mod meter;
-mod normal;
+mod normal_equations;
 mod screen;
 mod setting;
 mod times;
@@ -20,14 +20,14 @@ use twin::{Hold, Machine, Optics, OrbitError, Ring, SHARED, ripple_of_misaligned
 use crate::prior::Prior;
 use crate::recording::{self, Drive, Recording};
 
-pub use common::chi_square;
-pub(crate) use common::{Common, Eliminated, Weighed};
+pub use common_terms::chi_square;
+pub(crate) use common_terms::{Common, Eliminated, Weighed};
 pub use exclusion::{Excluded, Exclusions};
-pub(crate) use linear::AtTimes;
-use linear::Linearised;
-pub use linear::rf_orbit;
+pub(crate) use linearisation::AtTimes;
+use linearisation::Linearised;
+pub use linearisation::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::{Normal, Terms};
+pub(crate) use normal_equations::{Normal, Terms};
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen, rms_by_plane};
 pub use setting::{Setting, Settings, is_powered};
@@ -96,10 +96,10 @@ impl Campaign {
         let held = Machine::new(ring.clone(), believed, &[]).expect("there is no effect");
         let drives = recording.drives();
         let supplies = recording::mean_supplies(&drives);
-        let times = Times::of(recording);
+        let times = Times::in_recording(recording);
         let settings = Settings::from_frames(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
-        let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
+        let (prior, of_design) = (Prior::from_ring(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
             held: &held,
             ring: &ring,
@@ -108,7 +108,7 @@ impl Campaign {
             supplies: &supplies,
             times: &times,
             settings: &settings,
-            groups: Groups::of(&drives, &times, &settings),
+            groups: Groups::from_settings(&drives, &times, &settings),
             readings: &of_beam(recording, &readings),
             excluded: excluded(recording, &readings),
             noise: &recording.header.noise,
@@ -252,7 +252,7 @@ impl Campaign {
             };
             self.drives.iter().enumerate().map(frame).collect()
         };
-        [0, 1].map(|plane| Meter::of(at_mean(plane).iter().zip(&self.time)))
+        [0, 1].map(|plane| Meter::from_tunes(at_mean(plane).iter().zip(&self.time)))
     }
 }
 

@@ -12,10 +12,10 @@ use estimator::{Beside, ByRepeats, Gate, Health, Monitor, MonitorState, Position
 use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
-use super::common::Weighed;
+use super::common_terms::Weighed;
 use super::exclusion::{Excluded, Exclusions};
-use super::linear::Linearised;
-use super::normal::{Normal, Terms};
+use super::linearisation::Linearised;
+use super::normal_equations::{Normal, Terms};
 use super::setting::Settings;
 use super::times::Times;
 use crate::factor::Factor;
@@ -107,7 +107,7 @@ struct Repeats {
 
 /// The screening after some frames.
 struct Screening<'c> {
-    of: &'c Screener<'c>,
+    screener: &'c Screener<'c>,
     gate: Gate,
     monitors: Vec<Monitor>,
     /// By setting and monitor.
@@ -147,7 +147,7 @@ struct Best {
 }
 
 impl Groups {
-    pub fn of(drives: &[Drive], times: &Times, settings: &Settings) -> Self {
+    pub fn from_settings(drives: &[Drive], times: &Times, settings: &Settings) -> Self {
         let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
         let mut time_of = Vec::new();
         let mut group = |(frame, drive): (usize, _)| {
@@ -231,39 +231,39 @@ impl Screener<'_> {
 }
 
 impl<'c> Screening<'c> {
-    fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
-        let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
-        let normal = Normal::new(of.prior, &model.params, of.channels(), COMMON);
+    fn new(screener: &'c Screener<'c>) -> Result<Self, OrbitError> {
+        let model = screener.model(screener.prior.clamp(&DVector::zeros(screener.prior.len())))?;
+        let normal = Normal::new(screener.prior, &model.params, screener.channels(), COMMON);
         let expecting = |sigma: &f64| {
             let mut monitor = Monitor::BLANK;
             monitor.expect(*sigma as f32);
             monitor
         };
-        let mut excluded = of.excluded.clone();
-        (0..of.drives.len()).for_each(|frame| excluded.exclude_frame(frame, Excluded::Unconfirmed));
+        let mut excluded = screener.excluded.clone();
+        (0..screener.drives.len()).for_each(|frame| excluded.exclude_frame(frame, Excluded::Unconfirmed));
         Ok(Self {
             gate: Gate::default(),
-            monitors: of.noise.iter().map(expecting).collect(),
-            repeats: vec![vec![Repeats::default(); of.noise.len()]; of.settings.count()],
+            monitors: screener.noise.iter().map(expecting).collect(),
+            repeats: vec![vec![Repeats::default(); screener.noise.len()]; screener.settings.count()],
             excluded,
-            best: Best::of(of, &model, &normal).expect("a prior's precision is positive"),
+            best: Best::solve(screener, &model, &normal).expect("a prior's precision is positive"),
             model,
             normal,
             stale: false,
             unexpected: 0,
-            of,
+            screener,
         })
     }
 
     /// Take one frame: judge its readings, then learn from those that pass.
     fn take(&mut self, frame: usize) {
-        let setting = self.of.settings.repeatable[frame];
-        let reports = |b: usize| !self.of.readings[(frame, b)].is_nan();
+        let setting = self.screener.settings.repeatable[frame];
+        let reports = |b: usize| !self.screener.readings[(frame, b)].is_nan();
         let expected: Vec<bool> = (0..self.monitors.len()).map(|b| reports(b) && self.is_expected(frame, b)).collect();
         let is_lone = self.is_expected_but_for_a_few(frame, &expected);
         let mut rejected = Vec::new();
         for (b, expected) in expected.into_iter().enumerate() {
-            let reading = self.of.readings[(frame, b)];
+            let reading = self.screener.readings[(frame, b)];
             if self.monitors[b].hear(code(reading)) {
                 match setting {
                     Some(setting) => self.judge_repeat((frame, b, setting), expected, is_lone),
@@ -288,13 +288,13 @@ impl<'c> Screening<'c> {
 
     /// Add the readings of a frame that count to the normal equations.
     fn learn(&mut self, frame: usize) {
-        let group = self.of.groups.of_frame[frame];
+        let group = self.screener.groups.of_frame[frame];
         let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.excluded.counts(frame, b)).collect();
         let mut slopes = DMatrix::zeros(self.model.params.len(), counting.len());
         for (mut to, &b) in slopes.column_iter_mut().zip(&counting) {
             to.copy_from(&self.model.slope[b].column(group));
         }
-        let weighed = |&b: &usize| (self.of.channel(frame, b), self.weighed(frame, b));
+        let weighed = |&b: &usize| (self.screener.channel(frame, b), self.weighed(frame, b));
         let readings: Vec<(usize, Weighed)> = counting.iter().map(weighed).collect();
         self.normal.add(&slopes, &readings);
     }
@@ -302,7 +302,7 @@ impl<'c> Screening<'c> {
     /// A reading in a setting is judged by its repeats, the first one by the model.
     fn judge_repeat(&mut self, (frame, b, setting): (usize, usize, usize), expected: bool, is_lone: bool) {
         let repeats = &self.repeats[setting][b];
-        let moved = |i: usize| self.of.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
+        let moved = |i: usize| self.screener.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
         let (here, last) = (moved(frame), repeats.last);
         if let Some(last) = last {
             self.monitors[b].noise.learn((here - moved(last)) as f32);
@@ -377,7 +377,7 @@ impl<'c> Screening<'c> {
 
     /// The monitors that report in a frame, without dead ones.
     fn alive(&self, frame: usize) -> impl Iterator<Item = usize> {
-        let reports = move |b: &usize| !self.of.readings[(frame, *b)].is_nan();
+        let reports = move |b: &usize| !self.screener.readings[(frame, *b)].is_nan();
         (0..self.monitors.len()).filter(reports).filter(|b| self.monitors[*b].state() != MonitorState::Dead)
     }
 
@@ -388,8 +388,8 @@ impl<'c> Screening<'c> {
 
     /// The same, where a reading has a further variance [m^2].
     fn is_expected_within(&self, frame: usize, b: usize, further: f64) -> bool {
-        let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
-        let channel = self.of.channel(frame, b);
+        let slope = self.model.slope[b].column(self.screener.groups.of_frame[frame]);
+        let channel = self.screener.channel(frame, b);
         let expectation = self.normal.expect(channel, slope, &TERMS, &self.best.step, &self.best.factor);
         let (expected, of_baseline, of_params) = expectation.expect("a baseline's prior is known");
         let innovation = (self.residual(frame, b) - expected) as f32;
@@ -400,15 +400,15 @@ impl<'c> Screening<'c> {
     }
 
     fn residual(&self, frame: usize, b: usize) -> f64 {
-        self.of.readings[(frame, b)] - self.model.orbit[(frame, b)]
+        self.screener.readings[(frame, b)] - self.model.orbit[(frame, b)]
     }
 
     /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
     fn variance(&self, frame: usize, b: usize) -> f64 {
-        let plane = self.of.plane(b);
-        let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
+        let plane = self.screener.plane(b);
+        let shared = self.screener.spurious[plane] * self.best.orbit[plane] * self.screener.drives[frame].rf_offset;
         // frames of one RF offset share it, and so do those of all times in the cycle
-        let sharing = self.of.sharing[frame] * self.of.times.count() as f64;
+        let sharing = self.screener.sharing[frame] * self.screener.times.count() as f64;
         f64::from(self.monitors[b].variance()) + sharing * shared * shared
     }
 
@@ -428,13 +428,13 @@ impl<'c> Screening<'c> {
         self.stale = false;
         let (from, step) = (self.model.params.clone(), self.best.step.clone());
         for halvings in 0..HALVINGS {
-            let Ok(model) = self.of.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
+            let Ok(model) = self.screener.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
             self.model = model;
             if self.rebuild(frames) && self.best.cost <= highest {
                 return;
             }
         }
-        if let Ok(model) = self.of.model(from) {
+        if let Ok(model) = self.screener.model(from) {
             self.model = model;
             if !self.rebuild(frames) {
                 self.best.step.fill(0.0);
@@ -445,8 +445,8 @@ impl<'c> Screening<'c> {
     /// Take back every reading of a monitor that ends dead and does report: those before it was found to be stuck or flat are no better.
     /// One that went silent was sound as long as it spoke.
     fn drop_stuck(&mut self) {
-        let frames = self.of.drives.len();
-        let reports = |b: usize| frames > 0 && !self.of.readings[(frames - 1, b)].is_nan();
+        let frames = self.screener.drives.len();
+        let reports = |b: usize| frames > 0 && !self.screener.readings[(frames - 1, b)].is_nan();
         let is_stuck = |b: usize| self.monitors[b].health().state == MonitorState::Dead && reports(b);
         let stuck: Vec<usize> = (0..self.monitors.len()).filter(|&b| is_stuck(b)).collect();
         if stuck.is_empty() {
@@ -459,12 +459,12 @@ impl<'c> Screening<'c> {
     /// The normal equations of the accepted readings of the first frames; false if they have no best params.
     fn rebuild(&mut self, frames: usize) -> bool {
         let monitors = self.monitors.len();
-        self.normal = Normal::new(self.of.prior, &self.model.params, self.of.channels(), COMMON);
+        self.normal = Normal::new(self.screener.prior, &self.model.params, self.screener.channels(), COMMON);
         for b in 0..monitors {
             let none = |time: &usize| (time * monitors + b, Weighed::none(TERMS.len()));
-            let mut sums: Vec<(usize, Weighed)> = self.of.groups.times.iter().map(none).collect();
+            let mut sums: Vec<(usize, Weighed)> = self.screener.groups.times.iter().map(none).collect();
             for frame in (0..frames).filter(|&frame| self.excluded.counts(frame, b)) {
-                sums[self.of.groups.of_frame[frame]].1 += &self.weighed(frame, b);
+                sums[self.screener.groups.of_frame[frame]].1 += &self.weighed(frame, b);
             }
             self.normal.add(&self.model.slope[b], &sums);
         }
@@ -474,7 +474,7 @@ impl<'c> Screening<'c> {
     /// The best params. At a resonance derivatives are so large that rounding leaves the normal equations without any: then those of
     /// before stay, and this is false.
     fn solve(&mut self) -> bool {
-        let Some(best) = Best::of(self.of, &self.model, &self.normal) else { return false };
+        let Some(best) = Best::solve(self.screener, &self.model, &self.normal) else { return false };
         self.best = best;
         true
     }
@@ -482,12 +482,12 @@ impl<'c> Screening<'c> {
 
 impl Best {
     /// None if the matrix of the normal equations is not positive.
-    fn of(of: &Screener, model: &Model, normal: &Normal) -> Option<Self> {
+    fn solve(screener: &Screener, model: &Model, normal: &Normal) -> Option<Self> {
         let (cost, quadratic) = normal.eliminated();
         let factor = quadratic.factor()?;
-        let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
+        let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &screener.prior.range);
         let baselines = normal.baselines(&step);
-        Some(Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost })
+        Some(Self { orbit: rms_by_plane(screener.ring, &baselines), step, factor, cost })
     }
 }
 

@@ -16,7 +16,7 @@ pub struct Times {
 
 impl Times {
     /// Those of a recording.
-    pub fn of(recording: &Recording) -> Self {
+    pub fn in_recording(recording: &Recording) -> Self {
         let mut known: Vec<f64> = Vec::new();
         let is_ramped = recording.header.ramp.is_given();
         let is_same = |one: f64, other: f64| ((one - other) * 1e6).round().abs() <= f64::from(estimator::SAME_TIME);
@@ -54,7 +54,7 @@ pub struct Stray {
 
 /// The supply that is furthest off the ramp at some time, from what it is on average; none without several times.
 pub fn furthest_stray(recording: &Recording) -> Option<Stray> {
-    let times = Times::of(recording);
+    let times = Times::in_recording(recording);
     let drives = recording.drives();
     let all = mean_supplies(&drives);
     let at = |(time, milliseconds): (usize, f64)| {

@@ -10,7 +10,7 @@ mod frames;
 mod header;
 mod limit;
 mod names;
-mod plausible;
+mod plausibility;
 mod ramp;
 mod write;
 
@@ -72,11 +72,11 @@ impl Recording {
     ) -> Result<Self, RecordingError> {
         let (file, frames_file) = (folder.join(HEADER), folder.join(FRAMES));
         let ring = powered(ring, header::format(&file, header_text)?);
-        let names = Names::of(&ring);
+        let names = Names::from_ring(&ring);
         let header = Header::parse(&file, header_text, &ring, &names)?;
         let (rows, other) = frames::parse(&frames_file, &frames()?, &header, &ring, &names)?;
         let refuse = |(key, what): (&str, String)| header::refuse(&file, header_text, key, &what);
-        plausible::check(&header, &rows, &names.supplies).map_err(refuse)?;
+        plausibility::check(&header, &rows, &names.supplies).map_err(refuse)?;
         Ok(Self { name: name(folder), header, other, rows })
     }
 
