@@ -208,7 +208,7 @@ impl FitResult {
             tunes: Some(Tunes { x: x.model, y: y.model }),
             tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
             lack: fit.lack.map(|lack| lack.to_string()),
-            monitors: monitors(&campaign.ring, &campaign.screened.health),
+            monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             log_evidence: None,
             timing: None,
             nuts: None,

@@ -98,6 +98,11 @@ impl Exclusions {
         tally
     }
 
+    /// [`Exclusions::tally`] of every monitor.
+    pub fn tallies(&self) -> Vec<BTreeMap<Excluded, usize>> {
+        (0..self.reasons.ncols()).map(|b| self.tally(b)).collect()
+    }
+
     /// Leave a reading out. The first reason stays, unless it is that nothing has confirmed the reading.
     pub fn exclude(&mut self, frame: usize, b: usize, reason: Excluded) {
         let known = &mut self.reasons[(frame, b)];
