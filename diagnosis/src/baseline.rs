@@ -138,8 +138,8 @@ fn lengthened(ring: &Ring, optics: &Optics, kick: f64) -> Vec<f64> {
 /// Mean of each monitor's readings [m]; none for a monitor without readings.
 fn means(readings: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
     let of = |b: usize| {
-        let counts = |i: usize| screened.accepted[(i, b)] && !readings[(i, b)].is_nan();
-        let counting: Vec<f64> = (0..readings.nrows()).filter(|&i| counts(i)).map(|i| readings[(i, b)]).collect();
+        let frames = (0..readings.nrows()).filter(|&frame| screened.excluded.counts(frame, b));
+        let counting: Vec<f64> = frames.map(|frame| readings[(frame, b)]).collect();
         (!counting.is_empty()).then(|| counting.iter().sum::<f64>() / counting.len() as f64)
     };
     (0..readings.ncols()).map(of).collect()

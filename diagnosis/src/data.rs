@@ -40,9 +40,9 @@ use super::pools::Pools;
 use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
-use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
-use inference::{Campaign, Meter, Screened};
+use inference::{Campaign, Excluded, Meter, Screened, is_powered};
+use inference::{TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -280,14 +280,14 @@ impl Data {
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         for &b in &noise.sound {
-            let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
+            let jumps = !noise.levels.is_constant() && left_aside(&screened.excluded, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
         let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
-        let accepted = &screened.accepted;
-        let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
+        let excluded = &screened.excluded;
+        let has_same_monitors = |i: usize| sharing.iter().all(|&b| excluded.counts(i, b) == excluded.counts(i - 1, b));
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
-        let pools = Pools::from_settings(&campaign.settings.of_frame, is_like_before);
+        let pools = Pools::from_settings(&campaign.settings.repeatable, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
@@ -366,7 +366,7 @@ impl Data {
         let dropped: Vec<(usize, usize)> = places.map(|(place, _)| place).filter(is_faulty).collect();
         for (frame, pool) in self.pools.of_frame.iter().enumerate() {
             for &(_, b) in dropped.iter().filter(|(dropped, _)| dropped == pool) {
-                self.screened.accepted[(frame, b)] = false;
+                self.screened.excluded.exclude(frame, b, Excluded::Poor);
             }
         }
         if !dropped.is_empty() {
@@ -426,7 +426,7 @@ impl Data {
         let time = &self.frames.drives.time;
         self.frames.tune_noise = [0, 1].map(|plane| {
             let tunes = self.frames.readings.column(monitors + plane);
-            Meter::of(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
+            Meter::from_tunes(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
         });
         self.readings = self.pools.means(&self.frames.readings, |frame, c| self.counts(frame, c));
         let frames = self.pools.frames();
@@ -537,7 +537,7 @@ impl Data {
 
     /// Correctors that were powered, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
-        let moved = |&c: &usize| self.drives.kick.column(c).amax() > 0.05 * self.drives.nominal_kick;
+        let moved = |&c: &usize| is_powered(self.drives.kick.column(c).amax(), self.drives.nominal_kick);
         (0..self.drives.kick.ncols()).filter(moved).collect()
     }
 
@@ -813,15 +813,14 @@ impl Data {
 
     /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
     pub(crate) fn is_aside(&self, frame: usize, b: usize) -> bool {
-        !self.frames.recorded[(frame, b)].is_nan() && !self.screened.accepted[(frame, b)]
+        self.screened.excluded.is_aside(frame, b)
     }
 
     /// True if a frame's reading of a monitor, or of a tune after the last of them, counts.
     fn counts(&self, frame: usize, c: usize) -> bool {
-        let is_read = !self.frames.readings[(frame, c)].is_nan();
         match c.checked_sub(self.monitors()) {
-            None => is_read && self.screened.accepted[(frame, c)],
-            Some(plane) => is_read && self.frames.tune_noise[plane].is_some(),
+            None => self.screened.excluded.counts(frame, c),
+            Some(plane) => !self.frames.readings[(frame, c)].is_nan() && self.frames.tune_noise[plane].is_some(),
         }
     }
 
@@ -878,7 +877,7 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
     // with the readings that were put aside for their size the noise is larger, and more of them are what it makes
     for _ in 0..PASSES {
         let again = if noise.levels.is_constant() { campaign.screened.clone() } else { readmitted(&source, &noise) };
-        if again.accepted == screened.accepted && again.health == screened.health {
+        if again == screened {
             break;
         }
         let mut counting = campaign.clone();

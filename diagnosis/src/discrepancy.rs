@@ -18,6 +18,7 @@ mod marginal;
 mod sums;
 
 use estimator::MonitorState;
+use inference::Settings;
 use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Plane, Signature, Signatures};
 
@@ -26,7 +27,6 @@ use super::element::{Element, Form, Linear};
 use super::error::FitError;
 use super::fit::Fitted;
 use super::location::Location;
-use super::settings::Settings;
 pub use gradient::steering;
 use gradient::{Changing, Runs, Where};
 use marginal::Linearised;
@@ -90,12 +90,12 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     }
     let driven = data.driven_correctors();
     for &c in &driven {
-        let of_corrector = settings.of_corrector(c);
+        let of_corrector = settings.with_corrector(c);
         let (of_each, apart): (Vec<Sums>, Vec<Apart>) =
             active.iter().map(|&b| (sums[b].select(&of_corrector), apart[b].select(&of_corrector))).unzip();
         found.push(linearised.judge_apart(Location::Corrector(c), &of_each, &apart, driven.len()));
         let patterns = independent(signatures.beside(c));
-        let beside = patterned(data, &sums, &active, &settings.strength(c), &patterns);
+        let beside = patterned(data, &sums, &active, &settings.strength_of(c), &patterns);
         found.push(linearised.judge(Location::CorrectorElsewhere(c), &beside, driven.len()));
     }
     let patterns = kicked(&machine)?;

@@ -3,10 +3,9 @@
 //! A horizontal orbit of some mm in the dipoles focuses, as one in a sextupole does, and moves the tunes in proportion to the kick. The tune meter sees
 //! that in the mean of many frames, so that tunes of a campaign in which correctors and signs take turns seem to drift.
 
+use inference::Settings;
 use nalgebra::{DMatrix, MatrixXx2};
 use twin::{Cycle, Drives, EffectError, Machine, Tracked, Tunes};
-
-use super::settings::Settings;
 
 /// Exact orbits and tunes of every setting.
 pub struct Exact {

@@ -22,7 +22,7 @@ use super::term::Term;
 use super::units::{BoundedGaussian, Units};
 use super::unknown::{Member, Unknown};
 use evidence::{Factor, gram};
-use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
+use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]

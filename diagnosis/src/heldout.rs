@@ -19,6 +19,7 @@
 
 use estimator::MonitorState;
 use evidence::Factor;
+use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
@@ -28,7 +29,6 @@ use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use super::linearisation::about_itself;
 use super::scan::SignatureScore;
-use super::settings::Settings;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;

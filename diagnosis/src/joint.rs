@@ -8,8 +8,10 @@
 //! tesla: where its integrated gradient over the rigidity is `a` in the first recording, it is `a p_first/p` in one of momentum `p`.
 
 use core::ops::Range;
+use std::collections::BTreeMap;
 
 use estimator::{Health, MonitorState};
+use inference::Excluded;
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine};
 
@@ -91,6 +93,17 @@ impl Data {
             bad.unwrap_or(self.health()[b])
         };
         (0..self.monitors()).map(health).collect()
+    }
+
+    /// Of each monitor, the number of readings of all recordings that are left out for each reason.
+    pub fn excluded_in_any(&self) -> Vec<BTreeMap<Excluded, usize>> {
+        let mut sums: Vec<BTreeMap<Excluded, usize>> = vec![BTreeMap::new(); self.monitors()];
+        for own in self.campaigns() {
+            for (sum, tally) in sums.iter_mut().zip(own.screened.excluded.tallies()) {
+                tally.into_iter().for_each(|(reason, count)| *sum.entry(reason).or_default() += count);
+            }
+        }
+        sums
     }
 
     /// Names of the recordings.

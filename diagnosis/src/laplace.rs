@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use inference::optimise::{Limits, Objective, Quadratic, minimise};
+use inference::{Limits, Objective, Quadratic, minimise};
 
 /// A peak.
 #[derive(Debug, Clone)]

@@ -296,7 +296,7 @@ impl Noise {
         if square == 0.0 {
             return None;
         }
-        let runs = runs(&campaign.settings.of_frame);
+        let runs = runs(&campaign.settings.repeatable);
         let mut residual = source.residual.clone();
         for (frame, mut row) in residual.row_iter_mut().enumerate() {
             let missing = (0..own.len()).filter(|&b| !campaign.counts(frame, b));
@@ -474,7 +474,7 @@ fn orders(campaign: &Campaign, learners: &[Learner]) -> [Vec<usize>; 2] {
 /// The monitors in state ok, and some others, that have enough repeats.
 fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let campaign = source.campaign;
-    let settings = &campaign.settings.of_frame;
+    let settings = &campaign.settings.repeatable;
     let apart: Vec<Option<usize>> = runs(settings).into_iter().map(Some).collect();
     let (runs, apart) = (Run::from_settings(settings), Run::from_settings(&apart));
     let learner = |b: usize| {
@@ -625,7 +625,7 @@ mod tests {
             horizontal.step_by(2).for_each(|reading| *reading = None);
         }
         let campaign = Campaign::of(&ring, &made).unwrap();
-        let (settings, pools) = (&campaign.settings.of_frame, Data::from_campaign(&campaign).unwrap().pools.of_frame);
+        let (settings, pools) = (&campaign.settings.repeatable, Data::from_campaign(&campaign).unwrap().pools.of_frame);
         let within: Vec<usize> = partial().filter(|&frame| settings[frame] == settings[frame - 1]).collect();
         assert!(within.len() > 10 && within.iter().all(|&frame| pools[frame] != pools[frame - 1]), "{within:?}");
         let found = Diagnosis::from_recording(&ring, &made, |_| ()).unwrap();

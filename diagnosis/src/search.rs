@@ -36,7 +36,7 @@ use super::term::Term;
 use super::widths;
 use element::weigh_elements;
 pub use found::Found;
-use inference::bounded::softplus;
+use inference::softplus;
 use refit::{
     BEHIND, BEHIND_SHARE, BETTER, WORTH, first_of, fitted_to, null_beside, refit, relearn, relearnt, settled,
     with_ordinary,

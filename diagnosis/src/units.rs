@@ -9,8 +9,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector};
 
 use evidence::Factor;
-use inference::Prior;
-use inference::bounded::Coordinates;
+use inference::{Coordinates, Prior};
 
 /// Precision given to a var that is held.
 const HELD: f64 = 1e12;
@@ -38,7 +37,7 @@ impl Units {
             range: prior.range.iter().enumerate().map(range).collect(),
             mean: prior.mean.clone(),
             sigma,
-            coordinates: Coordinates::of(prior),
+            coordinates: Coordinates::from_prior(prior),
         }
     }
 

@@ -263,7 +263,7 @@ impl<'r> Measured<'r> {
             rms(design.view((0, kicks), (split, 1))),
         ];
         let rows = recording.rows.iter().map(|row| {
-            let Drive { kick, rf_offset, .. } = Drive::of(&recording.header, row);
+            let Drive { kick, rf_offset, .. } = Drive::from_row(&recording.header, row);
             kick.push(rf_offset).transpose()
         });
         let drive = DMatrix::from_rows(&rows.collect::<Vec<_>>());
@@ -283,7 +283,7 @@ impl<'r> Measured<'r> {
         });
         let response = rows(&stated, |one| &one.response);
         let variance = rows(&stated, |one| &one.variance);
-        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design);
+        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::from_ring(ring), design);
         Self { ring, response, late, variance, scale, scatter }
     }
 

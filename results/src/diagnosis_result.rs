@@ -198,7 +198,7 @@ impl DiagnosisResult {
             sentence: diagnosis.sentence.clone(),
             findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
             joint_probability: diagnosis.joint_probability(),
-            monitors: monitors(ring, &data.health_in_any()),
+            monitors: monitors(ring, &data.health_in_any(), &data.excluded_in_any()),
             fit: Fits {
                 before: fit(&found.null, before)?,
                 after: fit(&found.best, after)?,

@@ -48,7 +48,7 @@ impl Families {
 
     /// Draw those of a machine of a ring with some vars; `None` if hardly any has tunes near the design's.
     pub fn draw(&self, ring: &Ring, vars: &[f64], random: &mut impl Rng) -> Option<Imperfections> {
-        let (made, window) = (ring.with_vars(vars), TuneWindow::of(ring, true).ok()?);
+        let (made, window) = (ring.with_vars(vars), TuneWindow::from_ring(ring, true).ok()?);
         let is_near_design = |drawn: &Imperfections| {
             let machine = Machine::new(made.clone(), Rf::FixedMomentum, &drawn.effects);
             let tunes = machine.ok().and_then(|machine| machine.optics().ok()?.tunes().ok());
@@ -91,7 +91,7 @@ mod tests {
         let data = Data::from_campaign(&Campaign::of(&ring, &template).unwrap()).unwrap();
         let families = Families::of(&data);
         let mut random = StdRng::seed_from_u64(3);
-        let (vars, window) = (vec![1.0; ring.parameters.len()], TuneWindow::of(&ring, true).unwrap());
+        let (vars, window) = (vec![1.0; ring.parameters.len()], TuneWindow::from_ring(&ring, true).unwrap());
         let (mut widths, mut rejected) = (Vec::new(), 0);
         for _ in 0..DRAWS {
             let drawn = families.draw(&ring, &vars, &mut random).unwrap();

@@ -13,7 +13,7 @@ use twin::Signature;
 
 use crate::data::Data;
 use crate::fit::Fitted;
-use crate::settings::Settings;
+use inference::Settings;
 
 /// Sums of whitened numbers over settings or stretches of time, one group for each amplitude.
 #[derive(Clone)]

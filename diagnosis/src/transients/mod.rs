@@ -38,8 +38,8 @@ use super::odds::{ODDS, UNMODELLED, UNMODELLED_SEEN};
 use super::term::Term;
 use super::tested::Tested;
 use differences::{Differences, median, run_means};
-use inference::Campaign;
 use inference::recording::Recording;
+use inference::{Campaign, is_powered};
 pub use shown::Shown;
 use signals::Signals;
 use unsteady::Unsteady;
@@ -65,8 +65,6 @@ pub struct Transient {
     pub shown: Vec<Shown>,
 }
 
-/// Share of the nominal kick above which a corrector was moved.
-const DRIVEN: f64 = 0.25;
 /// Most causes.
 const MOST: usize = 4;
 /// Causes whose amplitude is fitted with the exact signal.
@@ -181,7 +179,7 @@ impl<'c> SettingDifferences<'c> {
     fn from_campaign(campaign: &'c Campaign, dispersion: &DVector<f64>) -> Self {
         let noise = &campaign.recording.header.noise;
         let readings = steady(campaign);
-        let (settings, ripple) = (&campaign.settings.of_frame, &campaign.fluctuation);
+        let (settings, ripple) = (&campaign.settings.repeatable, &campaign.fluctuation);
         let differences = Differences::from_readings(&readings, settings, noise, dispersion, ripple);
         let white = differences.whiten(&readings);
         let monitors = (0..campaign.monitors()).filter(|&b| differences.sees(b));
@@ -444,7 +442,7 @@ impl Fit {
 
 /// True of a frame in which a corrector kicks the beam.
 fn is_on(campaign: &Campaign, corrector: usize, frame: usize) -> bool {
-    campaign.drives[frame].kick[corrector].abs() > DRIVEN * campaign.recording.nominal_kick()
+    is_powered(campaign.drives[frame].kick[corrector], campaign.recording.nominal_kick())
 }
 
 /// Correctors that kick the beam in some frame.
@@ -463,7 +461,7 @@ fn steady(campaign: &Campaign) -> DMatrix<f64> {
         let of_kicks = machine.readings(&drives)?.0;
         let slopes = Signatures::of(&machine, &drives)?.of_quadrupoles();
         let of_supplies = rippled(&campaign.ring, &slopes, &campaign.fluctuation);
-        let means = run_means(&of_kicks, &campaign.settings.of_frame);
+        let means = run_means(&of_kicks, &campaign.settings.repeatable);
         Ok(of_kicks - means + of_supplies.columns(0, campaign.monitors()))
     };
     let readings = campaign.readings_of_beam();

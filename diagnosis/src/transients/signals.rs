@@ -34,7 +34,7 @@ impl<'c> Signals<'c> {
         let rows = &campaign.recording.rows;
         let since = |frame: usize| rows[frame].sequence.wrapping_sub(rows[frame - 1].sequence);
         let elapsed = (0..rows.len()).map(|frame| if frame == 0 { 0 } else { since(frame) }).collect();
-        let orbit = run_means(readings, &campaign.settings.of_frame);
+        let orbit = run_means(readings, &campaign.settings.repeatable);
         let response = response(campaign, &kick, &orbit);
         Self { campaign, kick, orbit, elapsed, response }
     }

@@ -1,6 +1,7 @@
 //! Residuals of the readings, setting by setting.
 
-use diagnosis::{Data, Diagnosis, FitError, Fitted, Settings};
+use diagnosis::{Data, Diagnosis, FitError, Fitted};
+use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Map, Section};
 use twin::Plane;

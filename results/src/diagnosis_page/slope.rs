@@ -7,7 +7,8 @@
 
 use std::collections::BTreeMap;
 
-use diagnosis::{Finding, Settings, Shown, capitalised};
+use diagnosis::{Finding, Shown, capitalised};
+use inference::Settings;
 use report::{Axes, Figure, Series};
 
 use super::partial::Partial;

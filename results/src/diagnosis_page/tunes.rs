@@ -3,7 +3,7 @@
 use core::ops::RangeInclusive;
 
 use diagnosis::{Data, Finding, FitError, Fitted, capitalised};
-use inference::campaign::TUNE_CALIBRATION;
+use inference::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
 
 use super::partial::{Partial, ends};

@@ -1,6 +1,7 @@
 //! The decisive picture of an unmodelled discrepancy: the residuals at its place.
 
-use diagnosis::{Diagnosis, Discrepancy, FitError, Location, Settings, capitalised, steering};
+use diagnosis::{Diagnosis, Discrepancy, FitError, Location, capitalised, steering};
+use inference::Settings;
 use nalgebra::DVector;
 use report::{Axes, Figure, Map, Reference, Series};
 use twin::{Hold, Optics, Plane, Signatures};
