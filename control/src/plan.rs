@@ -195,7 +195,7 @@ impl Plan {
         let header_file = file.parent().unwrap_or(Path::new("")).join(&plan.header);
         let header = Header::read(&header_file, ring)?;
         let header_text = fs::read_to_string(&header_file).map_err(|error| unreadable(&header_file, error))?;
-        let mut check = Check { ring, names: Names::of(ring), wrong: Vec::new() };
+        let mut check = Check { ring, names: Names::from_ring(ring), wrong: Vec::new() };
         check.expect(header.format == Format::Two, || format!("{}: expected format = 2", header_file.display()));
         let resolved = check.plan(&plan, header, header_text);
         if check.wrong.is_empty() { Ok(resolved) } else { Err(PlanError::Values(file.into(), check.wrong)) }

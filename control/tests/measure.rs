@@ -71,7 +71,7 @@ fn written(plan: &Plan, ring: &Ring, journal: &Journal, folder: &TempDir) -> Rec
 
 /// Normalised estimation error squared over the number of vars, 1 expected.
 fn nees(recording: &Recording, ring: &Ring, seed: u64) -> f64 {
-    let fit = BatchFit::of(&Campaign::of(ring, recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
+    let fit = BatchFit::best(&Campaign::of(ring, recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
     let truth = simulate::vars(ring, true, seed).unwrap();
     let error = DVector::from_fn(truth.len(), |i, _| fit.map_params[i] - truth[i].ln());
     let solved = fit.covariance.cholesky().unwrap().solve(&error);

@@ -5,17 +5,11 @@ use nalgebra::DVector;
 use super::data::Data;
 use super::discrepancy::Discrepancy;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::location::Location;
 use super::noise::Noise;
+use super::odds::{SUSPICIOUS, UNMODELLED};
 use super::scan::Candidate;
-use super::search::UNMODELLED;
-
-/// Probability at which a cause counts as decided.
-pub const DECISIVE: f64 = 0.95;
-/// Probability of missing physics that can be seen above which a recording is not consistent. A lower limit would call too many recordings without
-/// missing physics ambiguous.
-pub const SUSPICIOUS: f64 = 0.6;
+use super::term::Term;
 
 /// Share of the causes that the library does not hold which pass for one of its effects at their place, and show nothing else: in two validations 11 of 171
 /// that could be seen.
@@ -87,7 +81,7 @@ impl Cause {
 
 impl Alternative {
     /// A candidate, to first order.
-    pub(super) fn of(candidate: &Candidate) -> Self {
+    pub(super) fn from_candidate(candidate: &Candidate) -> Self {
         let scale = candidate.term.kind.prior_scale();
         let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
         Self {
@@ -165,7 +159,7 @@ pub(super) struct Weighed {
 impl Weighed {
     /// Normalise posterior weights (`ln`; that of no effect is 0); a share [`IMITATED`] of an effect's is that of what only looks like it. What is too
     /// small to be seen explains the readings as no effect does, so that its odds over none, `too_small`, are those of the prior.
-    pub fn of(mut weights: Vec<(Alternative, f64)>, too_small: f64) -> Self {
+    pub fn from_log_weights(mut weights: Vec<(Alternative, f64)>, too_small: f64) -> Self {
         weights.retain(|(_, weight)| weight.is_finite());
         weights.sort_by(|(_, one), (_, other)| other.total_cmp(one));
         let largest = weights.first().map_or(0.0, |(_, weight)| weight.max(0.0));
@@ -186,26 +180,26 @@ impl Weighed {
 
 impl Competition {
     /// Of posterior weights (`ln`; that of no effect is 0), and the odds of what is too small to be seen.
-    pub(super) fn of(
+    pub(super) fn from_log_weights(
         weights: Vec<(Alternative, f64)>,
         too_small: f64,
         without: Fitted,
         scanned: Vec<Candidate>,
     ) -> Self {
-        let Weighed { alternatives, nothing, too_small, log_odds } = Weighed::of(weights, too_small);
+        let Weighed { alternatives, nothing, too_small, log_odds } = Weighed::from_log_weights(weights, too_small);
         Self { alternatives, nothing, too_small, log_odds, scanned, without }
     }
 
     /// With fits that keep the data which they are to, for a place beside other data.
     #[must_use]
-    pub(super) fn to(self, data: &Data) -> Self {
-        let keeping = |one: Alternative| Alternative { fitted: one.fitted.map(|fitted| fitted.to(data)), ..one };
+    pub(super) fn keeping(self, data: &Data) -> Self {
+        let keeping = |one: Alternative| Alternative { fitted: one.fitted.map(|fitted| fitted.keeping(data)), ..one };
         let alternatives = self.alternatives.into_iter().map(keeping).collect();
-        Self { alternatives, without: self.without.to(data), ..self }
+        Self { alternatives, without: self.without.keeping(data), ..self }
     }
 
     /// True if an effect is likely to be needed.
-    pub fn is_suspicious(&self) -> bool {
+    pub(crate) fn is_suspicious(&self) -> bool {
         1.0 - self.nothing - self.too_small > SUSPICIOUS
     }
 
@@ -225,7 +219,7 @@ impl Competition {
     }
 
     /// The same without what is too small to be seen, which is no evidence of anything.
-    pub fn unknown_seen(&self) -> f64 {
+    pub(crate) fn unknown_seen(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
         self.imitating() + listed.map(|a| a.probability).sum::<f64>()
     }
@@ -250,7 +244,7 @@ mod tests {
             (Alternative::unfitted(Cause::Effect(term), log_gain, (0.1, 0.01)), log_gain)
         };
         for (first, least) in [(40.0, 0.985), (2.0, 0.6)] {
-            let all = Weighed::of(vec![of(first, 0), of(0.0, 1)], 0.06);
+            let all = Weighed::from_log_weights(vec![of(first, 0), of(0.0, 1)], 0.06);
             let library: f64 = all.alternatives.iter().map(|one| one.probability).sum();
             assert!((all.nothing + all.too_small + library + imitating(library) - 1.0).abs() < 1e-12);
             assert!((all.too_small - 0.06 * all.nothing).abs() < 1e-12);

@@ -6,13 +6,14 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::alternatives::{Cause, Competition, DECISIVE};
+use super::alternatives::{Cause, Competition};
 use super::discrepancy::Discrepancy;
 use super::error::FitError;
+use super::family::Family;
 use super::fit::Fitted;
 #[cfg(doc)]
 use super::hypothesis::Hypothesis;
-use super::ordinary::Family;
+use super::odds::DECISIVE;
 use super::search::Found;
 
 /// `ln` of the vars.
@@ -26,7 +27,7 @@ pub struct Vars {
 
 impl Vars {
     /// The vars of one fit.
-    pub fn of(fitted: &Fitted) -> Self {
+    pub fn from_fit(fitted: &Fitted) -> Self {
         Self { mean: DVector::from_column_slice(&fitted.params), covariance: fitted.covariance() }
     }
 
@@ -38,7 +39,7 @@ impl Vars {
     }
 
     /// The vars averaged over the alternatives of the least certain finding.
-    pub fn averaged(found: &Found) -> Self {
+    pub(crate) fn averaged(found: &Found) -> Self {
         let certainty = |competition: &&Competition| {
             competition.alternatives.first().map_or(competition.nothing, |a| a.probability)
         };
@@ -50,19 +51,19 @@ impl Vars {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn widened(self, found: &Found) -> Result<Self, FitError> {
+    pub(crate) fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let (step, wide) = best.widened(data, &best.hypothesis.unseen(data), &Family::hidden(data))?;
         Ok(Self { mean: self.mean + step, covariance: self.covariance + wide - best.covariance() })
     }
 
     fn over(competition: &Competition) -> Self {
-        let plain = Self::of(&competition.without);
+        let plain = Self::from_fit(&competition.without);
         let (vars, units) = (plain.mean.len(), &competition.without.units);
         let mut parts = vec![(competition.nothing + competition.too_small, plain.clone())];
         for alternative in &competition.alternatives {
             let part = match (&alternative.fitted, &alternative.cause) {
-                (Some(fitted), _) => Self::of(fitted),
+                (Some(fitted), _) => Self::from_fit(fitted),
                 (None, Cause::Unmodelled(Discrepancy { adapted: Some(adapted), .. })) => Self {
                     mean: &plain.mean + units.step(&adapted.step),
                     covariance: units.covariance(&adapted.covariance),
@@ -109,14 +110,14 @@ mod tests {
     fn room_for_what_is_hidden_is_that_of_a_fit_with_it() {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, 71).campaign(&ring, &recording, &[]);
-        let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let plain = Hypothesis::plain();
-        let fitted = Fitted::of(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
+        let fitted = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
         let (wide, hidden) = (plain.unseen(&data), Family::hidden(&data));
         let (step, covariance) = fitted.widened(&data, &wide, &hidden).unwrap();
         let ordinary = hidden.into_iter().chain(wide.ordinary.clone()).collect();
         let whole = Hypothesis { ordinary, ..wide };
-        let exact = Fitted::of(&data, &whole, &fitted.guess(&data, &whole)).unwrap();
+        let exact = Fitted::from_guess(&data, &whole, &fitted.guess(&data, &whole)).unwrap();
         let of_exact = exact.covariance();
         let (mut off, mut width) = (0.0_f64, 0.0_f64);
         for (i, (own, param)) in fitted.params.iter().zip(&exact.params).enumerate() {
@@ -139,7 +140,7 @@ mod tests {
         for seed in 0..6 {
             let effect = Effect { kind: EffectKind::DipoleGradient, site: dipoles[6 * seed], amplitude: 0.012 };
             let made = Coloured::white(&ring, &recording, 40 + seed as u64);
-            let found = Diagnosis::of(&ring, &made.campaign(&ring, &recording, &[effect]), |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &made.campaign(&ring, &recording, &[effect]), |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Consistent, "{}", found.sentence);
             let truth = DVector::from_vec(made.vars).map(f64::ln);
             for (mean, vars) in means.iter_mut().zip([&found.vars_before, &found.vars_after]) {

@@ -51,7 +51,7 @@ impl Baseline {
     ///
     /// # Errors
     /// [`OrbitError`] if the ring has no orbit.
-    pub fn of(
+    pub fn from_readings(
         ring: &Ring,
         readings: &DMatrix<f64>,
         screened: &Screened,
@@ -64,7 +64,7 @@ impl Baseline {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let sensitivity = sensitivity(recorded_tunes, &optics.tunes()?);
         let spurious = [0, 1].map(|plane| SPURIOUS * per_rms[plane] * rms[plane]);
-        let Kriged { orbit, sigma, share, kick, .. } = Kriged::of(ring, &baselines, rms)?;
+        let Kriged { orbit, sigma, share, kick, .. } = Kriged::from_baselines(ring, &baselines, rms)?;
         let lengthened = lengthened(ring, &optics, kick);
         Ok((orbit, Self { rms, sensitivity, spurious, lengthened, sigma, share, read: baselines }))
     }
@@ -91,14 +91,14 @@ impl Baseline {
     ///
     /// # Errors
     /// [`OrbitError`] if the machine has no orbit.
-    pub fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
+    pub(crate) fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
         let own = machine.orbit()?;
         let ring = machine.ring_mut();
         let less = |(read, monitor): (&Option<f64>, Monitor)| {
             read.map(|read| read - own[monitor.element][usize::from(monitor.plane == Plane::Y)])
         };
         let read: Vec<Option<f64>> = self.read.iter().zip(ring.monitors_read()).map(less).collect();
-        let kicks = Kriged::of(ring, &read, self.rms)?.kicks;
+        let kicks = Kriged::from_baselines(ring, &read, self.rms)?.kicks;
         let strengths = ring.integrated_gradients();
         for ((quadrupole, strength), [x, y]) in ring.quadrupoles.iter().zip(strengths).zip(kicks) {
             if strength != 0.0 {
@@ -138,8 +138,8 @@ fn lengthened(ring: &Ring, optics: &Optics, kick: f64) -> Vec<f64> {
 /// Mean of each monitor's readings [m]; none for a monitor without readings.
 fn means(readings: &DMatrix<f64>, screened: &Screened) -> Vec<Option<f64>> {
     let of = |b: usize| {
-        let counts = |i: usize| screened.accepted[(i, b)] && !readings[(i, b)].is_nan();
-        let counting: Vec<f64> = (0..readings.nrows()).filter(|&i| counts(i)).map(|i| readings[(i, b)]).collect();
+        let frames = (0..readings.nrows()).filter(|&frame| screened.excluded.counts(frame, b));
+        let counting: Vec<f64> = frames.map(|frame| readings[(frame, b)]).collect();
         (!counting.is_empty()).then(|| counting.iter().sum::<f64>() / counting.len() as f64)
     };
     (0..readings.ncols()).map(of).collect()
@@ -168,7 +168,7 @@ impl Kriged {
     /// From the baselines of the monitors, whose offsets are unknown; the kicks are of the size that explains the baselines' rms.
     ///
     /// Source: D. G. Krige's interpolation; C. E. Rasmussen and C. Williams, Gaussian Processes (2006), eq. 2.25.
-    fn of(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Self, OrbitError> {
+    fn from_baselines(ring: &Ring, baselines: &[Option<f64>], rms: [f64; 2]) -> Result<Self, OrbitError> {
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let zero = |count: usize| vec![[0.0; 2]; count];
         let monitors: Vec<_> = ring.monitors_read().collect();
@@ -230,7 +230,7 @@ mod tests {
             let of = |b: usize| 3e-3 * (b as f64).sin() + if moved == Some(b) { 1e-3 } else { 0.0 };
             (0..ring.read_monitors.len()).map(|b| (b != 5).then(|| of(b))).collect()
         };
-        let of = |moved| Kriged::of(&ring, &read(moved), [2e-3; 2]).unwrap();
+        let of = |moved| Kriged::from_baselines(&ring, &read(moved), [2e-3; 2]).unwrap();
         let plain = of(None);
         for (b, monitor) in ring.monitors_read().enumerate().step_by(4).filter(|(b, _)| *b != 5) {
             let plane = usize::from(monitor.plane == Plane::Y);

@@ -30,7 +30,7 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let scores = || choice.scores.iter().copied();
     let best =
         |scores: &mut dyn Iterator<Item = SignatureScore>| choice.log_weights(scores).fold(f64::NEG_INFINITY, f64::max);
-    let own = best(&mut scores());
+    let best_score = best(&mut scores());
     let mut covariance = choice.columns.transpose() * &choice.left;
     // alike signatures leave no more than rounding between them; one of an instrument that is dead is zero
     (0..covariance.nrows()).for_each(|i| covariance[(i, i)] += ROUNDING * (1.0 + covariance[(i, i)]));
@@ -39,10 +39,10 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let normal = DMatrix::<f64>::from_fn(choice.scores.len(), DRAWS, |_, _| rng.sample(StandardNormal));
     let pulls = factor.lower() * normal;
     let drawn = |pulls: DVectorView<f64>| {
-        let of = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
-        best(&mut scores().zip(pulls.iter()).map(of))
+        let with_pull = |(score, pull): (SignatureScore, &f64)| SignatureScore { pull: *pull, ..score };
+        best(&mut scores().zip(pulls.iter()).map(with_pull))
     };
-    let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= own).count();
+    let exceeding = pulls.column_iter().filter(|pulls| drawn(*pulls) >= best_score).count();
     Ok((1 + exceeding) as f64 / (1 + DRAWS) as f64)
 }
 
@@ -53,8 +53,9 @@ mod tests {
     use super::*;
     use crate::data::Data;
     use crate::heldout::{gain_of_choice, reduced};
+    use crate::odds::corrections;
     use crate::scan::candidates;
-    use crate::search::{Found, Search, corrections};
+    use crate::search::{Found, Search};
     use crate::testing::{Coloured, template};
     use twin::{Effect, EffectKind};
 
@@ -62,12 +63,12 @@ mod tests {
     fn tested(effects: &[Effect], seed: u64) -> (f64, f64) {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, seed).campaign(&ring, &recording, effects);
-        let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let terms = candidates(&data, None);
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
         let fitted = if best.hypothesis.terms.is_empty() { null } else { reduced(&data, &best, 0).unwrap() };
         let penalty = corrections(&terms);
-        let choice = Choice::of(&data, &fitted, &terms, &penalty).unwrap();
+        let choice = Choice::from_terms(&data, &fitted, &terms, &penalty).unwrap();
         (of_search(&choice).unwrap(), gain_of_choice(&choice).unwrap())
     }
 

@@ -39,7 +39,7 @@ enum Root {
 
 impl Root {
     /// `frames` of each row.
-    fn of(memory: Memory, levels: &Levels, frames: &[Vec<usize>]) -> Option<Self> {
+    fn from_memory(memory: Memory, levels: &Levels, frames: &[Vec<usize>]) -> Option<Self> {
         if memory.is_none() {
             let root = |of_row: &Vec<usize>| {
                 let square: f64 = of_row.iter().map(|&frame| levels.at(frame).powi(2)).sum();
@@ -86,14 +86,14 @@ impl Root {
 impl Channel {
     /// Of the readings in some frames of each row, with noise `sigma` each at the ordinary level, and their common terms in standard deviations
     /// [rows][factors].
-    pub fn of(
+    pub fn from_frames(
         rows: Vec<usize>,
         frames: &[Vec<usize>],
         (sigma, memory, levels): (f64, Memory, &Levels),
         common: DMatrix<f64>,
     ) -> Self {
-        let root =
-            Root::of(memory, levels, frames).unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
+        let root = Root::from_memory(memory, levels, frames)
+            .unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
         let mut common = common / sigma;
         root.whiten(common.as_view_mut());
         let (basis, of_common) = match rows.is_empty() {
@@ -121,7 +121,7 @@ impl Channel {
     }
 
     /// The same in place.
-    pub fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
+    pub(crate) fn whiten_mut(&self, mut columns: DMatrixViewMut<f64>) {
         self.root.whiten(columns.as_view_mut());
         // column by column, since there are few factors
         for mut column in columns.column_iter_mut() {
@@ -131,7 +131,7 @@ impl Channel {
     }
 
     /// The same of one column.
-    pub fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
+    pub(crate) fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
         let rows = column.len();
         self.whiten_mut(DMatrixViewMut::from_slice(column.as_mut_slice(), rows, 1));
     }
@@ -183,7 +183,7 @@ mod tests {
         for (memory, levels) in
             [(none, &Levels::CONSTANT), (remembers, &Levels::CONSTANT), (none, &larger), (remembers, &larger)]
         {
-            let channel = Channel::of(vec![0, 1, 2, 3], &frames, (sigma, memory, levels), common.clone());
+            let channel = Channel::from_frames(vec![0, 1, 2, 3], &frames, (sigma, memory, levels), common.clone());
             let covariance = |i: usize, j: usize| memory.covariance(levels, 0, [i, j]);
             let mean = |one: &[usize], other: &[usize]| {
                 let all = one.iter().flat_map(|&i| other.iter().map(move |&j| covariance(i, j)));

@@ -6,8 +6,8 @@ use nalgebra::DMatrix;
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::scan::{Projection, Scored, SignatureScore, signatures};
+use super::term::Term;
 
 /// Candidates beside a fit, to first order.
 pub struct Choice<'d> {
@@ -34,9 +34,9 @@ impl<'d> Choice<'d> {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
+    pub fn from_terms(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
         let columns = signatures(data, without, terms)?;
-        let projection = Projection::of(without);
+        let projection = Projection::from_fit(without);
         let bounds = projection.bounds(&columns);
         let is_open = |&i: &usize| {
             let bound = bounds[i];
@@ -51,7 +51,7 @@ impl<'d> Choice<'d> {
     }
 
     /// `ln` weight of each over that of none, by some scores.
-    pub fn log_weights<'c>(
+    pub(crate) fn log_weights<'c>(
         &'c self,
         scores: impl Iterator<Item = SignatureScore> + 'c,
     ) -> impl Iterator<Item = f64> + 'c {

@@ -10,9 +10,7 @@ use core::f64::consts::TAU;
 use core::fmt;
 
 use nalgebra::DMatrix;
-use twin::{EffectKind, Machine, OrbitError, Plane};
-
-use super::ordinary::Family;
+use twin::{Machine, OrbitError, Plane};
 
 /// The tunes of a recording that are too close.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,6 +21,8 @@ pub struct CloseTunes {
     pub approach: f64,
 }
 
+/// Ordinary roll of a quadrupole, as surveys leave it [rad].
+pub const ROLL: f64 = 0.001;
 /// Closest approaches that tunes have to be apart.
 const APART: f64 = 3.0;
 
@@ -31,7 +31,7 @@ impl CloseTunes {
     ///
     /// # Errors
     /// [`OrbitError`] if the machine keeps no beam.
-    pub fn of(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
+    pub fn find(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
         let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
         if distances.is_empty() {
@@ -39,13 +39,9 @@ impl CloseTunes {
         }
         let (distance, optics) = (distances.iter().sum::<f64>() / distances.len() as f64, machine.optics()?);
         let ring = machine.ring();
-        let roll = Family::of_machine()
-            .iter()
-            .find(|family| family.kind == EffectKind::QuadRoll)
-            .map_or(0.0, |one| one.tolerance);
         let by_roll = ring.quadrupoles.iter().zip(ring.integrated_gradients()).map(|(quadrupole, k1l)| {
             let [x, y] = [Plane::X, Plane::Y].map(|plane| optics.beta(quadrupole.element, plane));
-            2.0 * roll * k1l * (x * y).sqrt() / TAU
+            2.0 * ROLL * k1l * (x * y).sqrt() / TAU
         });
         let approach = by_roll.map(|one| one * one).sum::<f64>().sqrt().hypot(optics.closest_tune_approach()?);
         Ok((distance < APART * approach).then_some(Self { distance, approach }))
@@ -74,7 +70,7 @@ mod tests {
     #[test]
     fn tunes_that_coupling_mixes_are_left_out_and_told() {
         let (ring, mut recording) = template();
-        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
         let apart = data(&recording);
         assert!(apart.close_tunes.is_none() && apart.tune_noise(0).is_some());
         // as a meter reads two modes next to each other
@@ -98,7 +94,7 @@ mod tests {
             let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &effects).unwrap();
             let own = machine.optics().unwrap().closest_tune_approach().unwrap();
             let tunes = DMatrix::from_row_slice(2, 2, &[0.7, 0.699, f64::NAN, 0.7]);
-            (CloseTunes::of(&machine, &tunes).unwrap().unwrap(), own)
+            (CloseTunes::find(&machine, &tunes).unwrap().unwrap(), own)
         };
         let ((plain, none), (coupled, own)) = (of(&[]), of(&["stray_skew_gradient@SLOT_F6=0.02"]));
         assert!(none < 1e-6 && (plain.distance - 1e-3).abs() < 1e-12);

@@ -28,22 +28,21 @@ use twin::{
 use super::baseline::Baseline;
 use super::channel::Channel;
 use super::close_tunes::CloseTunes;
+use super::common_factors::CommonFactors;
 use super::error::FitError;
-use super::exact::Exact;
-use super::frame_to_frame::Shape;
-use super::joint::following;
+use super::exact_orbits::Exact;
+use super::frame_pattern::Shape;
 use super::levels::Levels;
 use super::memory::{Filter, Memory};
 use super::modes::Mixing;
 use super::noise::{Noise, Source};
 use super::pools::Pools;
-use super::readmit::{JUMPS, left_aside, readmitted};
+use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
-use super::within::Within;
-use inference::campaign::{TUNE_CALIBRATION, chi_square};
 use inference::recording::Recording;
-use inference::{Campaign, Meter, Screened};
+use inference::{Campaign, Excluded, Meter, Screened, is_powered};
+use inference::{TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -121,7 +120,7 @@ struct Displaced {
 impl Displaced {
     /// `off`: by how much the orbit at each element is off the estimated one (x, y) [m], where a fit moves it at a sextupole or an octupole. The field is
     /// displaced against the orbit instead.
-    fn of(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
+    fn from_machine(machine: &Machine, baseline: &Baseline, off: &[[f64; 2]]) -> Result<Self, OrbitError> {
         let machine = machine.without_memory();
         let mut displaced = machine.clone();
         baseline.displace(&mut displaced)?;
@@ -165,8 +164,9 @@ impl Displaced {
             orbit: self.orbit.clone(),
         };
         let (_, tunes, changes) = self.machine.readings(&still)?;
-        let at = |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
-        let [start, end] = [at(0), at(1)];
+        let drifted =
+            |end: usize| [ends[end].x - tunes.x - changes[(end, 0)], ends[end].y - tunes.y - changes[(end, 1)]];
+        let [start, end] = [drifted(0), drifted(1)];
         let change = |i: usize, plane: usize| change_at(time[i], [start[plane], of_orbit[plane], end[plane]]);
         Ok(MatrixXx2::from_fn(time.len(), change))
     }
@@ -238,7 +238,7 @@ pub enum DataError {
 }
 
 /// Prior standard deviations of a var up to which its range reaches here, where it ends before: at two, unless the machine file says something else. A
-/// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`beyond.rs`).
+/// quadrupole beyond its range would otherwise be told as a gradient in the dipole beside it (`out_of_range.rs`).
 const REACH: f64 = 5.0;
 /// Prior standard deviation of a baseline [m].
 const BASELINE: f64 = 20e-3;
@@ -254,7 +254,7 @@ impl Data {
     ///
     /// # Errors
     /// [`DataError`].
-    pub fn of(campaign: &Campaign) -> Result<Self, DataError> {
+    pub fn from_campaign(campaign: &Campaign) -> Result<Self, DataError> {
         if campaign.times.count() > 1 {
             let (recording, found) = (campaign.recording.name.clone(), campaign.times.to_string());
             return Err(DataError::Times { recording, found });
@@ -269,30 +269,32 @@ impl Data {
             if of_momentum(i, plane) { campaign.tunes[(i, plane)] } else { f64::NAN }
         });
         let kicked_off = recorded - design.readings(&drives)?.0;
-        let (orbit, baseline) = Baseline::of(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
+        let (orbit, baseline) =
+            Baseline::from_readings(design.ring(), &kicked_off, screened, &recorded_tunes, campaign.spurious)?;
         drives.orbit = orbit;
-        let close_tunes = CloseTunes::of(&Displaced::of(&design, &baseline, &[])?.displaced, &recorded_tunes)?;
+        let close_tunes =
+            CloseTunes::find(&Displaced::from_machine(&design, &baseline, &[])?.displaced, &recorded_tunes)?;
         if close_tunes.is_some() {
             recorded_tunes.fill(f64::NAN);
         }
         let shared = |b: usize| campaign.following_with_field(b).insert_column(0, BASELINE);
         let (noise, mut screened) = noise_of(campaign, &design, &drives)?;
         for &b in &noise.sound {
-            let jumps = !noise.levels.is_constant() && left_aside(campaign, &screened, b) > JUMPS;
+            let jumps = !noise.levels.is_constant() && left_aside(&screened.excluded, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
         let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
-        let accepted = &screened.accepted;
-        let has_same_monitors = |i: usize| sharing.iter().all(|&b| accepted[(i, b)] == accepted[(i - 1, b)]);
+        let excluded = &screened.excluded;
+        let has_same_monitors = |i: usize| sharing.iter().all(|&b| excluded.counts(i, b) == excluded.counts(i - 1, b));
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
-        let pools = Pools::of(&campaign.settings.of_frame, is_like_before);
+        let pools = Pools::from_settings(&campaign.settings.repeatable, is_like_before);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
             others: Vec::new(),
             momentum: ring.particle.momentum() * ramped.map_or(1.0, |at| at.momentum),
             ring: ring.clone(),
-            units: Units::of(&campaign.prior.reaching(REACH)),
+            units: Units::from_prior(&campaign.prior.reaching(REACH)),
             screened,
             supplies: supplies.clone(),
             readings: DMatrix::zeros(pools.count, recorded.ncols() + 2),
@@ -332,14 +334,14 @@ impl Data {
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings; the readings are then as they were.
-    pub fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
+    pub(crate) fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
         let frames = Drives { orbit: orbit.to_vec(), ..self.frames.drives.clone() };
         let means = Drives { orbit: orbit.to_vec(), ..self.drives.clone() };
         let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&means)?.0);
         let off: Vec<[f64; 2]> =
             orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
-        let displaced = Displaced::of(machine, &self.baseline, &off)?;
-        let exact = Exact::of(&displaced.displaced, &self.frames.drives)?;
+        let displaced = Displaced::from_machine(machine, &self.baseline, &off)?;
+        let exact = Exact::from_machine(&displaced.displaced, &self.frames.drives)?;
         let higher = displaced.higher_orders(&exact, &self.frames.drives.time)?;
         let slopes = Signatures::of(&machine.on_orbit(&frames.orbit), &frames)?.of_quadrupoles();
         let monitors = self.monitors();
@@ -364,7 +366,7 @@ impl Data {
         let dropped: Vec<(usize, usize)> = places.map(|(place, _)| place).filter(is_faulty).collect();
         for (frame, pool) in self.pools.of_frame.iter().enumerate() {
             for &(_, b) in dropped.iter().filter(|(dropped, _)| dropped == pool) {
-                self.screened.accepted[(frame, b)] = false;
+                self.screened.excluded.exclude(frame, b, Excluded::Poor);
             }
         }
         if !dropped.is_empty() {
@@ -384,7 +386,7 @@ impl Data {
     }
 
     /// The same recording where all quadrupoles drift by `-amplitude` to `amplitude`: every baseline drifts with them.
-    pub fn drifting(&self, amplitude: f64) -> Self {
+    pub(crate) fn drifting(&self, amplitude: f64) -> Self {
         let mut data = self.clone();
         data.drift = amplitude;
         data.prepare();
@@ -402,16 +404,16 @@ impl Data {
     }
 
     /// The same recordings where one monitor wanders in one of them.
-    pub fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
+    pub(crate) fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
         let mut data = self.clone();
-        let own = data.campaign_mut(campaign);
-        own.noise.wandering.push((monitor, walk));
-        own.prepare();
+        let changed = data.campaign_mut(campaign);
+        changed.noise.wandering.push((monitor, walk));
+        changed.prepare();
         data
     }
 
     /// A hypothetical campaign with other drives, by itself; its readings are ignored.
-    pub fn driven_by(&self, drives: &Drives) -> Self {
+    pub(crate) fn driven_by(&self, drives: &Drives) -> Self {
         let mut data = Self { drives: drives.clone(), others: Vec::new(), ..self.clone() };
         data.noise.levels = Levels::CONSTANT;
         data.prepare();
@@ -424,7 +426,7 @@ impl Data {
         let time = &self.frames.drives.time;
         self.frames.tune_noise = [0, 1].map(|plane| {
             let tunes = self.frames.readings.column(monitors + plane);
-            Meter::of(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
+            Meter::from_tunes(tunes.iter().zip(time.iter())).map(|meter| meter.noise)
         });
         self.readings = self.pools.means(&self.frames.readings, |frame, c| self.counts(frame, c));
         let frames = self.pools.frames();
@@ -434,7 +436,7 @@ impl Data {
             self.channels.push(channel);
         }
         let count = self.pools.counts(monitors, |frame, b| self.counts(frame, b));
-        self.mixing = Mixing::of(&self.noise.modes, &self.levels_of_pools(), |pool, b| count[(pool, b)] > 0.0);
+        self.mixing = Mixing::from_modes(&self.noise.modes, &self.levels_of_pools(), |pool, b| count[(pool, b)] > 0.0);
         if !self.mixing.is_none() {
             let mean = |c: usize| {
                 let rows = &self.channels[c].rows;
@@ -462,12 +464,12 @@ impl Data {
             None => {
                 let common = self.common(c, &rows, &frames);
                 let Noise { own, levels, .. } = &self.noise;
-                Channel::of(rows, &frames, (own[c], self.noise.memory(c), levels), common)
+                Channel::from_frames(rows, &frames, (own[c], self.noise.memory(c), levels), common)
             }
             Some(plane) => {
                 let common = DMatrix::from_element(rows.len(), 1, TUNE_CALIBRATION);
                 let noise = self.frames.tune_noise[plane].unwrap_or(TUNE_CALIBRATION);
-                Channel::of(rows, &frames, (noise, Memory::NONE, &Levels::CONSTANT), common)
+                Channel::from_frames(rows, &frames, (noise, Memory::NONE, &Levels::CONSTANT), common)
             }
         }
     }
@@ -488,7 +490,7 @@ impl Data {
         let readings = DVector::from_iterator(each.len(), readings).component_div(&noise);
         let terms =
             DMatrix::from_fn(each.len(), all.ncols(), |i, k| (all[(each[i].1, k)] - means[(each[i].0, k)]) / noise[i]);
-        let within = Within::of(&readings, &terms);
+        let within = CommonFactors::from_differences(&readings, &terms);
         let told = &means * within.mean;
         rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
         self.drifting_with(b, rows, &self.drives, means * within.root)
@@ -535,7 +537,7 @@ impl Data {
 
     /// Correctors that were powered, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
-        let moved = |&c: &usize| self.drives.kick.column(c).amax() > 0.05 * self.drives.nominal_kick;
+        let moved = |&c: &usize| is_powered(self.drives.kick.column(c).amax(), self.drives.nominal_kick);
         (0..self.drives.kick.ncols()).filter(moved).collect()
     }
 
@@ -555,7 +557,7 @@ impl Data {
     }
 
     /// `ln` of the determinant of the covariance.
-    pub fn log_det(&self) -> f64 {
+    pub(crate) fn log_det(&self) -> f64 {
         // the tune meter's noise is not compared
         self.channels[..self.monitors()].iter().map(|c| c.log_det).sum::<f64>() + self.mixing.log_det()
     }
@@ -600,7 +602,7 @@ impl Data {
     ///
     /// # Errors
     /// The first among the signatures.
-    pub fn signatures<E>(
+    pub(crate) fn signatures<E>(
         &self,
         count: usize,
         signatures: impl Iterator<Item = Result<Option<Signature>, E>>,
@@ -644,8 +646,8 @@ impl Data {
         }
         let is_mixed = |c: usize| c < monitors && !self.mixing.is_none();
         for ((c, channel), rows) in self.channels.iter().enumerate().zip(self.rows_of_channels()) {
-            let of = |pool: usize| if is_mixed(c) { mixed[(pool, c)] } else { value(c, pool) / channel.sigma };
-            all.rows_range_mut(rows).iter_mut().zip(&channel.rows).for_each(|(to, &pool)| *to = of(pool));
+            let number = |pool: usize| if is_mixed(c) { mixed[(pool, c)] } else { value(c, pool) / channel.sigma };
+            all.rows_range_mut(rows).iter_mut().zip(&channel.rows).for_each(|(to, &pool)| *to = number(pool));
         }
     }
 
@@ -656,7 +658,7 @@ impl Data {
 
     /// Whitened numbers, one set a column, with the noise in common taken out once more: the product of what only one monitor would read
     /// with them is then that with all that it would leave in the others.
-    pub fn taken_back(&self, whitened: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn taken_back(&self, whitened: &DMatrix<f64>) -> DMatrix<f64> {
         let mut back = whitened.clone();
         if self.mixing.is_none() {
             return back;
@@ -664,10 +666,10 @@ impl Data {
         let monitors = self.monitors();
         let starts: Vec<usize> = (0..monitors).map(|b| self.start(b)).collect();
         let places = || {
-            let of = |(b, channel): (usize, &Channel)| {
+            let places_of_channel = |(b, channel): (usize, &Channel)| {
                 channel.rows.iter().enumerate().map(move |(i, &pool)| (i, pool, b)).collect::<Vec<_>>()
             };
-            self.channels[..monitors].iter().enumerate().flat_map(of)
+            self.channels[..monitors].iter().enumerate().flat_map(places_of_channel)
         };
         for mut column in back.column_iter_mut() {
             let mut values = DMatrix::zeros(self.pools.count, monitors);
@@ -680,14 +682,16 @@ impl Data {
 
     /// Pool and channel (a monitor, or a tune after the last of them) of each whitened number.
     pub fn places(&self) -> Vec<(usize, usize)> {
-        let of = |(c, channel): (usize, &Channel)| channel.rows.iter().map(|&pool| (pool, c)).collect::<Vec<_>>();
-        self.channels.iter().enumerate().flat_map(of).collect()
+        let places_of_channel =
+            |(c, channel): (usize, &Channel)| channel.rows.iter().map(|&pool| (pool, c)).collect::<Vec<_>>();
+        self.channels.iter().enumerate().flat_map(places_of_channel).collect()
     }
 
     /// Noise of each whitened number [m], of a tune [1]: that of the mean of its pool.
     pub fn noise_of_means(&self) -> Vec<f64> {
-        let of = |channel: &Channel| (channel.noise_of_means() * channel.sigma).iter().copied().collect::<Vec<_>>();
-        self.channels.iter().flat_map(of).collect()
+        let noise_of_channel =
+            |channel: &Channel| (channel.noise_of_means() * channel.sigma).iter().copied().collect::<Vec<_>>();
+        self.channels.iter().flat_map(noise_of_channel).collect()
     }
 
     /// Readings of a tune in each pool that has some.
@@ -718,7 +722,7 @@ impl Data {
             }
         }
         let levels: Vec<f64> = (0..frames).map(|frame| self.noise.levels.at(frame)).collect();
-        Mixing::of(&self.noise.modes, &levels, |frame, b| self.counts(frame, b)).apply(&mut values);
+        Mixing::from_modes(&self.noise.modes, &levels, |frame, b| self.counts(frame, b)).apply(&mut values);
         let is_ok = |b: &usize| self.health()[*b].state == MonitorState::Ok;
         let mut sums = (0.0, 0.0);
         for b in self.active_monitors().into_iter().filter(is_ok) {
@@ -727,7 +731,7 @@ impl Data {
             let mut terms = self.drifting_with(b, &rows, &self.frames.drives, shared) / self.channels[b].sigma;
             terms.column_mut(0).fill(1.0);
             let mut residual = values.select_rows(&rows).columns(b, 1).into_owned();
-            let filter = Filter::of(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
+            let filter = Filter::from_frames(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
             filter.whiten_columns(&mut terms);
             filter.whiten_columns(&mut residual);
             let (chi2, freedom) = chi_square(&residual.column(0).into_owned(), &terms.transpose(), 1, 1.0);
@@ -737,13 +741,13 @@ impl Data {
     }
 
     /// Whiten columns over all pools as readings of one channel.
-    pub fn whiten_columns(&self, c: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn whiten_columns(&self, c: usize, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let channel = &self.channels[c];
         channel.whiten(columns.select_rows(&channel.rows) / channel.sigma)
     }
 
     /// What a monitor's readings tell beside those of the others in the same frames, as a share of what they tell alone, on average.
-    pub fn own_share(&self, b: usize) -> f64 {
+    pub(crate) fn own_share(&self, b: usize) -> f64 {
         let rows = &self.channels[b].rows;
         if self.mixing.is_none() || rows.is_empty() || b >= self.monitors() {
             return 1.0;
@@ -753,13 +757,13 @@ impl Data {
 
     /// What a pattern over some monitors [m] has to be multiplied by, monitor by monitor, with [`Data::own_share`]: itself with what it leaves
     /// in each by the noise in common.
-    pub fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
+    pub(crate) fn accompanied(&self, monitors: &[usize], pattern: &DVector<f64>) -> DVector<f64> {
         let row = DMatrix::from_rows(&[pattern.transpose()]);
         self.accompanied_at(&[1.0], monitors, &row).row(0).transpose()
     }
 
     /// The same in every run of a setting: rows pools.
-    pub fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn accompanied_in_runs(&self, monitors: &[usize], patterns: &DMatrix<f64>) -> DMatrix<f64> {
         self.accompanied_at(&self.levels_of_pools(), monitors, patterns)
     }
 
@@ -768,7 +772,7 @@ impl Data {
         if self.mixing.is_none() {
             return patterns.clone();
         }
-        let mixing = Mixing::of(&self.noise.modes, levels, |_, b| monitors.contains(&b));
+        let mixing = Mixing::from_modes(&self.noise.modes, levels, |_, b| monitors.contains(&b));
         let mut all = DMatrix::zeros(patterns.nrows(), patterns.ncols());
         monitors.iter().for_each(|&b| all.set_column(b, &(patterns.column(b) / self.channels[b].sigma)));
         mixing.apply(&mut all);
@@ -777,7 +781,7 @@ impl Data {
     }
 
     /// Signatures that step with time, whitened: of each signature all steps, rows pools, one a column.
-    pub fn stepping(&self, signatures: &[Signature], steps: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn stepping(&self, signatures: &[Signature], steps: &DMatrix<f64>) -> DMatrix<f64> {
         let each = signatures.iter().flat_map(|signature| steps.column_iter().map(move |step| (signature, step)));
         let mut all = DMatrix::zeros(self.size(), signatures.len() * steps.ncols());
         for (mut column, (signature, step)) in all.column_iter_mut().zip(each) {
@@ -789,7 +793,7 @@ impl Data {
 
     /// `E^T S^-1 E` of a monitor's readings for groups of pools, of which `group` names that of each pool, as if the noise were white:
     /// `diag(alone) - common common^T`, the latter of their common terms. Returns both, [groups] and [groups][factors].
-    pub fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
+    pub(crate) fn information(&self, b: usize, group: &[usize], groups: usize) -> (DVector<f64>, DMatrix<f64>) {
         let channel = &self.channels[b];
         let (share, per) = (self.own_share(b), channel.sigma.powi(-2));
         let taken = channel.taken() * (share.sqrt() / channel.sigma);
@@ -808,16 +812,15 @@ impl Data {
     }
 
     /// True if a frame's reading of a monitor was put aside: it is there, and does not count.
-    pub fn is_aside(&self, frame: usize, b: usize) -> bool {
-        !self.frames.recorded[(frame, b)].is_nan() && !self.screened.accepted[(frame, b)]
+    pub(crate) fn is_aside(&self, frame: usize, b: usize) -> bool {
+        self.screened.excluded.is_aside(frame, b)
     }
 
     /// True if a frame's reading of a monitor, or of a tune after the last of them, counts.
     fn counts(&self, frame: usize, c: usize) -> bool {
-        let is_read = !self.frames.readings[(frame, c)].is_nan();
         match c.checked_sub(self.monitors()) {
-            None => is_read && self.screened.accepted[(frame, c)],
-            Some(plane) => is_read && self.frames.tune_noise[plane].is_some(),
+            None => self.screened.excluded.counts(frame, c),
+            Some(plane) => !self.frames.readings[(frame, c)].is_nan() && self.frames.tune_noise[plane].is_some(),
         }
     }
 
@@ -827,12 +830,12 @@ impl Data {
     }
 
     /// True if a monitor's noise remembers the frames before.
-    pub fn remembers(&self, b: usize) -> bool {
+    pub(crate) fn remembers(&self, b: usize) -> bool {
         !self.noise.memory(b).is_none()
     }
 
     /// `ln` of the determinant of what monitors have in common in some pools, in units of their own noise.
-    pub fn mixed_log_det(&self, pools: &[usize]) -> f64 {
+    pub(crate) fn mixed_log_det(&self, pools: &[usize]) -> f64 {
         pools.iter().map(|&pool| self.mixing.log_det_of(pool)).sum()
     }
 
@@ -861,20 +864,20 @@ fn noise_of(campaign: &Campaign, design: &Machine, drives: &Drives) -> Result<(N
     let ring = &campaign.ring;
     let found = ring.with_strengths(&ring.strengths(campaign.params.as_slice(), &campaign.supplies));
     let found = Machine::new(found, Rf::FixedMomentum, &[]).ok();
-    let of = |machine: &Machine| -> Result<_, OrbitError> {
+    let predicted_by = |machine: &Machine| -> Result<_, OrbitError> {
         let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         Ok((machine.readings(drives)?.0, dispersion, Shape::all(&optics, machine.ring())?))
     };
-    let known = found.as_ref().and_then(|machine| of(machine).ok());
-    let (predicted, dispersion, shapes) = known.map_or_else(|| of(design), Ok)?;
+    let known = found.as_ref().and_then(|machine| predicted_by(machine).ok());
+    let (predicted, dispersion, shapes) = known.map_or_else(|| predicted_by(design), Ok)?;
     let residual = &campaign.readings - predicted;
     let source = Source { campaign, residual: &residual, dispersion: &dispersion, shapes: &shapes };
     let (mut noise, mut screened) = (Noise::learn(&source), campaign.screened.clone());
     // with the readings that were put aside for their size the noise is larger, and more of them are what it makes
     for _ in 0..PASSES {
         let again = if noise.levels.is_constant() { campaign.screened.clone() } else { readmitted(&source, &noise) };
-        if again.accepted == screened.accepted && again.health == screened.health {
+        if again == screened {
             break;
         }
         let mut counting = campaign.clone();
@@ -914,4 +917,14 @@ pub(super) fn drives_of(campaign: &Campaign) -> Drives {
         nominal_kick: campaign.recording.nominal_kick(),
         orbit: vec![[0.0; 2]; campaign.ring.elements.len()],
     }
+}
+/// Ranges of some lengths, one after the other.
+pub fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
+    lengths
+        .scan(0, |end, length| {
+            let start = *end;
+            *end += length;
+            Some(start..*end)
+        })
+        .collect()
 }

@@ -12,7 +12,7 @@
 
 use twin::{Ring, Signature, Signatures};
 
-use super::hypothesis::Term;
+use super::term::Term;
 
 /// Share of the largest change of the readings by a form below which another one is not seen.
 const SHOWN: f64 = 1e-3;
@@ -34,12 +34,12 @@ impl Form {
 
     /// Derivative with respect to its strength, at the entrance of a quadrupole.
     pub fn signature(self, signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Signature {
-        let of = |product| signatures.of_thin_linear(ring.quadrupoles[quadrupole].element.into(), product);
+        let signature = |product| signatures.of_thin_linear(ring.quadrupoles[quadrupole].element.into(), product);
         match self {
-            Self::Product(product) => of(product),
+            Self::Product(product) => signature(product),
             Self::Rotation => {
-                let mut turned = of([0, 3]);
-                turned += of([1, 2]) * -1.0;
+                let mut turned = signature([0, 3]);
+                turned += signature([1, 2]) * -1.0;
                 turned
             }
         }
@@ -109,14 +109,14 @@ pub struct Element {
 impl Element {
     /// One whose forms each change the readings by `size` (rms); those that change them by much less than others do, such as those of a plane in which
     /// nothing was kicked, are left out.
-    pub fn of(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
+    pub fn with_size(signatures: &Signatures, ring: &Ring, quadrupole: usize, does: Linear, size: f64) -> Self {
         let all = Self::signatures(signatures, ring, quadrupole);
         let some = all.into_iter().filter(|(form, _)| does.has(*form));
         Self { quadrupole, does, forms: some.map(|(form, signature)| (form, size / signature.rms())).collect() }
     }
 
     /// The forms at a quadrupole that a recording shows, with their signatures.
-    pub fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<(Form, Signature)> {
+    pub(crate) fn signatures(signatures: &Signatures, ring: &Ring, quadrupole: usize) -> Vec<(Form, Signature)> {
         let mut all: Vec<_> = Form::all().map(|form| (form, form.signature(signatures, ring, quadrupole))).collect();
         let largest = all.iter().map(|(_, signature)| signature.rms()).fold(0.0, f64::max);
         all.retain(|(_, signature)| signature.rms() > SHOWN * largest);
@@ -124,7 +124,7 @@ impl Element {
     }
 
     /// True for the same thing at the same place, whatever its size.
-    pub fn is_like(&self, other: &Self) -> bool {
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.quadrupole == other.quadrupole && self.does == other.does
     }
 

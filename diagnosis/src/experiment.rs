@@ -9,8 +9,8 @@ use twin::{Drives, Machine, Quadrupole, Signatures};
 use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
-use super::hypothesis::Term;
 use super::scan::Rivals;
+use super::term::Term;
 
 /// What a possible measurement changes of the present one.
 #[derive(Debug, Clone, PartialEq)]
@@ -64,12 +64,17 @@ impl Menu {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, fitted: &Fitted, one: (&Term, f64), other: Option<&Term>) -> Result<Self, FitError> {
+    pub fn from_causes(
+        data: &Data,
+        fitted: &Fitted,
+        one: (&Term, f64),
+        other: Option<&Term>,
+    ) -> Result<Self, FitError> {
         let sigma = &fitted.units.sigma;
         let of_recording = |campaign: usize| {
             let (machine, drives) = fitted.machine_in(data, campaign)?;
             let weight = data.momentum / data.campaign(campaign).momentum;
-            Derivatives::of(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
+            Derivatives::from_machine(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
         };
         let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
         let (machine, drives) = fitted.machine(data)?;
@@ -78,7 +83,7 @@ impl Menu {
         let mut proposals = Vec::new();
         for Scenario { what, change, machine, drives, weight } in scenarios(data, &machine, &drives, one.0) {
             // a machine that would lose its beam is not proposed
-            let new = Derivatives::of(data, (&machine, &drives), sigma, (one.0, other), weight);
+            let new = Derivatives::from_machine(data, (&machine, &drives), sigma, (one.0, other), weight);
             let Ok(new) = new else { continue };
             let both: Vec<&Derivatives> = present.iter().chain([&new]).collect();
             proposals.push(Proposal { what, change, separation: separation(&both, amplitude, free) });
@@ -90,7 +95,7 @@ impl Menu {
 
 impl Derivatives {
     /// `sigma`: standard deviations of the vars; `weight`: size of the cause over its present size.
-    fn of(
+    fn from_machine(
         data: &Data,
         (machine, drives): (&Machine, &Drives),
         sigma: &DVector<f64>,
@@ -102,12 +107,12 @@ impl Derivatives {
         let data = &data.driven_by(drives);
         let of_vars = signatures.of_vars();
         let columns: Vec<_> = of_vars.iter().zip(sigma).map(|(s, sigma)| data.signature(s) * *sigma).collect();
-        let of = |term: &Term| -> Result<DVector<f64>, FitError> {
+        let column = |term: &Term| -> Result<DVector<f64>, FitError> {
             let weight = if term.kind.is_stray() { weight } else { 1.0 };
             let scale = weight * term.kind.prior_scale().unwrap_or(1.0);
             Ok(data.signature(&signatures.of_effect(term.kind, term.site)?) * scale)
         };
-        Ok(Self { jacobian: DMatrix::from_columns(&columns), one: of(one)?, other: other.map(of).transpose()? })
+        Ok(Self { jacobian: DMatrix::from_columns(&columns), one: column(one)?, other: other.map(column).transpose()? })
     }
 }
 
@@ -130,8 +135,8 @@ impl Scenario {
 fn scenarios(data: &Data, machine: &Machine, drives: &Drives, one: &Term) -> Vec<Scenario> {
     let ring = machine.ring();
     let retuned = |supply: usize, factor: f64| {
-        let of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
-        machine.with_strengths(&ring.quadrupoles.iter().map(of).collect::<Vec<_>>())
+        let factor_of = |q: &Quadrupole| if q.supply == Some(supply) { factor } else { 1.0 };
+        machine.with_strengths(&ring.quadrupoles.iter().map(factor_of).collect::<Vec<_>>())
     };
     let mut all = vec![Scenario::new("with the same settings", Change::Same, machine, drives.clone())];
     let doubled = Drives { kick: &drives.kick * 2.0, ..drives.clone() };

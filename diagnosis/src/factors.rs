@@ -68,7 +68,7 @@ struct Sums {
 
 impl Seen {
     /// From differences, rows frames, columns monitors, not a number where there is none.
-    pub fn of(differences: &DMatrix<f64>) -> Self {
+    pub fn from_differences(differences: &DMatrix<f64>) -> Self {
         let monitors = differences.ncols();
         let is_seen = |frame: &usize| differences.row(*frame).iter().any(|z| !z.is_nan());
         let frames: Vec<usize> = (0..differences.nrows()).filter(is_seen).collect();
@@ -90,7 +90,7 @@ impl Seen {
 
 impl Factors {
     /// Fit unknown patterns near some `start` beside known ones; the evidence is the mean over the widths of the prior.
-    pub fn of(seen: &Seen, known: &DMatrix<f64>, start: &DMatrix<f64>) -> Self {
+    pub fn learn(seen: &Seen, known: &DMatrix<f64>, start: &DMatrix<f64>) -> Self {
         let widths = if start.ncols() == 0 { &WIDTHS[..1] } else { &WIDTHS[..] };
         let fits: Vec<Self> = widths.iter().map(|width| Fit::new(seen, known, start, *width).run()).collect();
         let largest = fits.iter().map(|fit| fit.log_evidence).fold(f64::NEG_INFINITY, f64::max);
@@ -215,7 +215,7 @@ mod tests {
             row.iter_mut().zip(common.iter()).for_each(|(z, common)| *z = common + normal(random));
         }
         all.iter_mut().skip(3).step_by(10).for_each(|z| *z = f64::NAN);
-        Seen::of(&all)
+        Seen::from_differences(&all)
     }
 
     fn start(random: &mut StdRng, columns: usize) -> DMatrix<f64> {
@@ -230,12 +230,12 @@ mod tests {
         let none = DMatrix::zeros(48, 0);
         for frames in [2, 3].repeat(12) {
             let z = differences(frames, &none, &mut random);
-            let nothing = Factors::of(&z, &none, &none).log_evidence;
+            let nothing = Factors::learn(&z, &none, &none).log_evidence;
             let svd = z.differences.clone().svd(false, true);
             let begun = svd.v_t.unwrap().transpose() * DMatrix::from_diagonal(&(svd.singular_values / frames as f64));
             for columns in 1..=2 {
                 let start = begun.columns(0, columns).into_owned();
-                let gain = Factors::of(&z, &none, &start).log_evidence - nothing;
+                let gain = Factors::learn(&z, &none, &start).log_evidence - nothing;
                 assert!(gain < 0.0, "{frames} {columns}: {gain}");
             }
         }
@@ -247,16 +247,16 @@ mod tests {
         let truth = DMatrix::from_fn(MONITORS, 1, |b, _| 0.7 * (1.3 * b as f64).cos());
         let z = differences(FRAMES, &truth, &mut random);
         let none = DMatrix::zeros(MONITORS, 0);
-        let found = Factors::of(&z, &none, &start(&mut random, 1));
-        let nothing = Factors::of(&z, &none, &none);
+        let found = Factors::learn(&z, &none, &start(&mut random, 1));
+        let nothing = Factors::learn(&z, &none, &none);
         assert!(found.log_evidence > nothing.log_evidence + 50.0);
         let (one, other) = (found.patterns.column(0), truth.column(0));
         let cosine = one.dot(&other).abs() / (one.norm() * other.norm());
         // each element has an error of 1/sqrt(216) or a little more: sin^2 = 30/216/7.3 or so
         assert!(cosine > 0.985, "{cosine}");
         // known, it is not found again
-        let beside = Factors::of(&z, &truth, &start(&mut random, 1)).log_evidence;
-        assert!(beside < Factors::of(&z, &truth, &none).log_evidence + 1.0);
+        let beside = Factors::learn(&z, &truth, &start(&mut random, 1)).log_evidence;
+        assert!(beside < Factors::learn(&z, &truth, &none).log_evidence + 1.0);
     }
 
     #[test]
@@ -265,9 +265,9 @@ mod tests {
         let none = DMatrix::zeros(MONITORS, 0);
         for _ in 0..20 {
             let z = differences(FRAMES, &none, &mut random);
-            let nothing = Factors::of(&z, &none, &none).log_evidence;
+            let nothing = Factors::learn(&z, &none, &none).log_evidence;
             for columns in 1..3 {
-                let gain = Factors::of(&z, &none, &start(&mut random, columns)).log_evidence - nothing;
+                let gain = Factors::learn(&z, &none, &start(&mut random, columns)).log_evidence - nothing;
                 assert!(gain < 1.0, "{gain}");
             }
         }

@@ -52,7 +52,7 @@ mod tests {
     #[test]
     fn an_orbit_in_a_sextupole_is_a_roll_of_the_nearest_quadrupole() {
         let (mut ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let baseline = |y: f64| {
             let mut baseline = data.baseline.clone();
             baseline.sigma.iter_mut().for_each(|sigma| sigma[1] = y);

@@ -16,11 +16,13 @@ use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signat
 use super::data::Data;
 use super::element::Form;
 use super::error::FitError;
-use super::hypothesis::{Hypothesis, Member, Term, Unknown};
-use super::ordinary::Family;
-use super::units::{Units, Within};
+use super::family::Family;
+use super::hypothesis::Hypothesis;
+use super::term::Term;
+use super::units::{BoundedGaussian, Units};
+use super::unknown::{Member, Unknown};
 use evidence::{Factor, gram};
-use inference::optimise::{Limits, Objective, OptimiseError, Quadratic, minimise};
+use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
 /// A hypothesis at its best.
 #[derive(Debug, Clone)]
@@ -90,7 +92,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, FitError> {
+    pub fn from_guess(data: &Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Self, FitError> {
         Self::against(data, hypothesis, guess, f64::INFINITY)
     }
 
@@ -118,13 +120,13 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
+    pub(crate) fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
         let u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
         let problem = Problem::new(data, hypothesis, &u)?;
         let (cost, residual) = problem.evaluate(&u)?;
         let (quadratic, slopes) = problem.linearise(&u, &residual)?;
         let factor = quadratic.factor().ok_or(FitError::Degenerate)?;
-        Self::at(&problem, Point { u, residual, cost }, factor, slopes)
+        Self::from_point(&problem, Point { u, residual, cost }, factor, slopes)
     }
 
     /// The data as this fit has them.
@@ -139,7 +141,7 @@ impl Fitted {
 
     /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
     #[must_use]
-    pub(super) fn to(self, data: &Data) -> Self {
+    pub(super) fn keeping(self, data: &Data) -> Self {
         Self { own: self.own.or_else(|| Some(Box::new(data.clone()))), ..self }
     }
 
@@ -155,16 +157,16 @@ impl Fitted {
         })?;
         let factor = found.quadratic.factor().ok_or(FitError::Degenerate)?;
         let here = Point { u: found.x, residual: found.point, cost: found.cost };
-        Self::at(&problem, here, factor, found.slopes)
+        Self::from_point(&problem, here, factor, found.slopes)
     }
 
-    fn at(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
+    fn from_point(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
         let jacobian = problem.ordinary.beside(slopes);
         let params = units.params(&here.u);
         let slope = jacobian.tr_mul(&here.residual) - &here.u;
-        let within = Within::of(&factor, &here.u, slope, &units);
-        let Within { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
+        let within = BoundedGaussian::from_precision(&factor, &here.u, slope, &units);
+        let BoundedGaussian { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let log_prior = problem.hypothesis.log_prior();
         let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
         let hypothesis = problem.hypothesis.clone();
@@ -189,7 +191,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
-    pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+    pub(crate) fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
         let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
         let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
@@ -224,7 +226,7 @@ impl Fitted {
     }
 
     /// Angle by which its unknown element turns the planes [rad], if that is what it does.
-    pub fn turned(&self, data: &Data) -> Option<Measured> {
+    pub(crate) fn turned(&self, data: &Data) -> Option<Measured> {
         let turns = |(i, unknown): (usize, &Unknown)| match unknown {
             Unknown::Form(_, Form::Rotation, sigma) => Some((self.params.len() + i, *sigma)),
             _ => None,
@@ -245,10 +247,10 @@ impl Fitted {
 
     /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
     pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
-        let own = self.hypothesis.unknowns(data);
+        let unknowns = self.hypothesis.unknowns(data);
         let value = |unknown: &Unknown| {
-            let same = |(_, one): &(usize, &Unknown)| one.is_of(&self.hypothesis) == unknown.is_of(other);
-            let (i, one) = own.iter().enumerate().find(same)?;
+            let same = |(_, one): &(usize, &Unknown)| self.hypothesis.identity(one) == other.identity(unknown);
+            let (i, one) = unknowns.iter().enumerate().find(same)?;
             Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
         };
         let others = other.unknowns(data);
@@ -269,7 +271,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+    pub(crate) fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
         self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
@@ -286,7 +288,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
+    pub(crate) fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
@@ -304,12 +306,12 @@ impl Fitted {
     /// [`EffectError`].
     pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
         let (machine, drives) = self.machine(data)?;
-        let own = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
-        Ok(own.map_or([0.0; 2], |own| own.tunes))
+        let prediction = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
+        Ok(prediction.map_or([0.0; 2], |prediction| prediction.tunes))
     }
 
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
-    pub fn is_stable(&self, data: &Data) -> bool {
+    pub(crate) fn is_stable(&self, data: &Data) -> bool {
         let keeps = |campaign: usize| {
             self.machine_in(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
         };
@@ -328,7 +330,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
+    pub(crate) fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
         Ok(self.predicted_at(data, campaign, &self.u)?.by_frame())
     }
 
@@ -365,7 +367,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn widened(
+    pub(crate) fn widened(
         &self,
         data: &Data,
         other: &Hypothesis,
@@ -405,9 +407,9 @@ impl<'d> Problem<'d> {
             *u = u.max(unknown.least_start());
         }
         let machine = |campaign: usize| machine_at(data, hypothesis, campaign, &start);
-        let own = start.rows_range(first..).into_owned();
-        let ordinary = Ordinary::about(data, &unknowns[others..], &own, machine)?;
-        Ok(Self { data, hypothesis, start: own, unknowns, ordinary })
+        let of_ordinary = start.rows_range(first..).into_owned();
+        let ordinary = Ordinary::about(data, &unknowns[others..], &of_ordinary, machine)?;
+        Ok(Self { data, hypothesis, start: of_ordinary, unknowns, ordinary })
     }
 
     /// Number of the other unknowns, the first.
@@ -475,8 +477,8 @@ impl Ordinary {
             let machine = machine.on_orbit(&drives.orbit);
             let ends = machine.ends();
             let signatures = Signatures::of(&machine, &drives)?.between(ends.as_ref())?;
-            let of = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
-            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(of))
+            let prediction = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
+            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(prediction))
         })?;
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })
@@ -658,7 +660,7 @@ mod tests {
     #[test]
     fn the_derivative_of_a_gain_is_right_about_a_gain() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let beside = [
             "",
             "bpm_swap@y_C5,y_D5=1",
@@ -680,7 +682,7 @@ mod tests {
     #[test]
     fn one_more_effect_is_scored_as_it_is_fitted() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let term = |text: &str| Term::from(twin::Effect::parse(&format!("{text}=1"), &ring).unwrap());
         let (monitors, correctors) = ("bpm_swap@y_C5,y_D5", "corrector_swap@V_D3,V_D7");
         let after = [

@@ -7,8 +7,9 @@ use twin::{Effect, EffectError, EffectKind, Machine, Rf, Ring, Signatures, Site}
 
 use crate::data::Data;
 use crate::fit::Fitted;
-use crate::hypothesis::{Hypothesis, Term};
+use crate::hypothesis::Hypothesis;
 use crate::scan::{Projection, candidates, scan};
+use crate::term::Term;
 use crate::testing::template;
 use inference::Campaign;
 use inference::recording::Recording;
@@ -77,7 +78,7 @@ impl Standard {
             row.reading.iter_mut().enumerate().for_each(|(b, r)| *r = r.map(|r| r + noise(i, b)));
             row.tune.iter_mut().enumerate().for_each(|(plane, t)| *t = t.map(|t| t + tune_noise(i, plane)));
         }
-        let data = Data::of(&Campaign::of(&self.ring, &recording).ok()?).ok()?;
+        let data = Data::from_campaign(&Campaign::of(&self.ring, &recording).ok()?).ok()?;
         let n = recording.rows.len();
         let readings = DMatrix::from_fn(n, self.hardware.noise.len(), noise);
         let mut data = data.less(&readings, &DMatrix::from_fn(n, 2, tune_noise));
@@ -96,16 +97,16 @@ impl Standard {
     fn bias(&self, effect: Effect) -> Option<f64> {
         let mut data = self.data(effect)?;
         let hypothesis = Hypothesis { given: vec![effect], ..Hypothesis::default() };
-        let mut fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
+        let mut fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
         for _ in 0..PASSES {
             let (machine, drives) = fitted.machine(&data).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
-            fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
+            fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
         }
         let (machine, drives) = fitted.machine_on_orbit(&data, 0).unwrap();
         let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
         let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
-        let score = Projection::of(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];
+        let score = Projection::from_fit(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];
         Some(score.pull / (1.0 + score.power).sqrt())
     }
 
@@ -118,9 +119,9 @@ impl Standard {
 
     /// The place of each kind that the campaign sees best.
     fn best_seen(&self) -> Vec<Term> {
-        let data = Data::of(&Campaign::of(&self.ring, &self.noisy).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&self.ring, &self.noisy).unwrap()).unwrap();
         let pair = self.template.header.radial_loop_monitors.as_ref();
-        let null = Fitted::of(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
+        let null = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
         let scanned = scan(&data, &null, &candidates(&data, pair)).unwrap();
         let best = |kind: &EffectKind| {
             let of_kind = scanned.iter().filter(|candidate| candidate.term.kind == *kind);

@@ -19,7 +19,7 @@ pub struct HalfNormal {
 
 impl HalfNormal {
     /// From a `ln` likelihood and the width of the prior, on so many points.
-    pub fn of(log_likelihood: impl Fn(f64) -> f64, width: f64, points: usize) -> Self {
+    pub fn from_log_likelihood(log_likelihood: impl Fn(f64) -> f64, width: f64, points: usize) -> Self {
         let step = SPAN / points as f64;
         let log_weight = |x: f64| (x * width, log_likelihood(x * width) - 0.5 * x * x);
         let all: Vec<(f64, f64)> = (0..points).map(|i| log_weight((i as f64 + 0.5) * step)).collect();
@@ -50,7 +50,7 @@ mod tests {
 
     #[test]
     fn a_likelihood_that_says_nothing_leaves_the_prior() {
-        let posterior = HalfNormal::of(|_| 0.0, 2.0, 600);
+        let posterior = HalfNormal::from_log_likelihood(|_| 0.0, 2.0, 600);
         // a grid of three widths leaves out 0.27 % of the prior, 0.9 % of its mean and 2.9 % of its square
         assert!(posterior.log_evidence.abs() < 0.003);
         assert!((posterior.mean / (2.0 * core::f64::consts::FRAC_2_PI.sqrt()) - 1.0).abs() < 0.012);
@@ -63,7 +63,7 @@ mod tests {
 
     #[test]
     fn an_overwhelming_likelihood_stays_a_number() {
-        let posterior = HalfNormal::of(|size| 1e4 * size, 1.0, 60);
+        let posterior = HalfNormal::from_log_likelihood(|size| 1e4 * size, 1.0, 60);
         assert!(posterior.log_evidence > 2.9e4 && posterior.log_evidence.is_finite());
         assert!((posterior.mean - 2.975).abs() < 1e-9, "the last point of the grid");
         assert!(posterior.sigma() < 1e-6 && posterior.range(0.0).is_finite());

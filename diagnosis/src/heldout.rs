@@ -19,6 +19,7 @@
 
 use estimator::MonitorState;
 use evidence::Factor;
+use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
@@ -26,9 +27,8 @@ use super::data::Data;
 use super::error::FitError;
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
-use super::linearise::about_itself;
+use super::linearisation::about_itself;
 use super::scan::SignatureScore;
-use super::settings::Settings;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;
@@ -49,7 +49,7 @@ pub fn by_pool(data: &Data) -> Vec<Block> {
 pub fn by_corrector(data: &Data) -> Vec<Block> {
     let mut blocks = vec![Block::new(); data.drives.kick.ncols()];
     for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
-        let settings = Settings::of(&own.drives);
+        let settings = Settings::from_drives(&own.drives);
         for pool in 0..own.pools.count {
             if let Some((corrector, _)) = settings.kick(pool) {
                 blocks[corrector].push(pools.start + pool);
@@ -81,9 +81,9 @@ impl Score {
     ///
     /// # Errors
     /// [`FitError::Degenerate`].
-    pub fn of(data: &Data, fitted: &Fitted, blocks: &[Block]) -> Result<Self, FitError> {
+    pub fn from_blocks(data: &Data, fitted: &Fitted, blocks: &[Block]) -> Result<Self, FitError> {
         let data = fitted.data(data);
-        let precision = Precision::of(data, fitted);
+        let precision = Precision::from_fit(data, fitted);
         let (mut log_density, mut inside) = (Vec::new(), [0.0; 2]);
         let (mut squares, mut ok) = (0.0, 0usize);
         for block in blocks {
@@ -153,7 +153,7 @@ struct OfChannel {
 }
 
 impl<'d> Precision<'d> {
-    fn of(data: &'d Data, fitted: &'d Fitted) -> Self {
+    fn from_fit(data: &'d Data, fitted: &'d Fitted) -> Self {
         let mut start = 0;
         let mut channels = Vec::new();
         for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
@@ -271,7 +271,7 @@ const FOLDS: usize = 5;
 /// [`FitError`].
 pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     let (data, all) = (choice.data, &choice.scores);
-    let precision = Precision::of(data, choice.without);
+    let precision = Precision::from_fit(data, choice.without);
     let back = precision.back(&choice.left);
     // ln of the weight of any term over that of none
     let odds = |scores: &mut dyn Iterator<Item = SignatureScore>| {
@@ -320,8 +320,8 @@ pub(super) fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Resul
 fn from_near_or_far(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
     let far = DVector::zeros(fitted.params.len());
     let stable = |fitted: &Fitted| fitted.is_stable(data);
-    let near = Fitted::of(data, &other, &fitted.guess(data, &other)).ok().filter(stable);
-    let other_than_near = || Fitted::of(data, &other, &far).ok().filter(stable);
+    let near = Fitted::from_guess(data, &other, &fitted.guess(data, &other)).ok().filter(stable);
+    let other_than_near = || Fitted::from_guess(data, &other, &far).ok().filter(stable);
     let bare = Hypothesis { ordinary: Vec::new(), ..other.clone() };
-    near.or_else(other_than_near).map_or_else(|| Fitted::of(data, &bare, &far), Ok)
+    near.or_else(other_than_near).map_or_else(|| Fitted::from_guess(data, &bare, &far), Ok)
 }

@@ -6,18 +6,11 @@ use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
 
 use super::data::Data;
 use super::element::{Element, Form};
-use super::ordinary::{Family, is_absorbed};
+use super::family::Family;
 use super::scatter::Scatter;
+use super::term::Term;
 use super::units::Units;
-
-/// One effect that a hypothesis holds, its amplitude unknown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Term {
-    /// Kind of effect.
-    pub kind: EffectKind,
-    /// Its place.
-    pub site: Site,
-}
+use super::unknown::{Member, Unknown};
 
 /// Some effects, any number of them.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -41,50 +34,6 @@ pub struct Hypothesis {
 const GROSS: f64 = 0.1;
 const WIDER: f64 = 5.0;
 
-/// One unknown besides the vars, with its prior standard deviation.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Unknown {
-    /// The amplitude of a term.
-    Amplitude(usize, f64),
-    /// The orbit of a recording at an element, in x or y [m].
-    Orbit(usize, usize, Plane, f64),
-    /// The strength of a form of an unknown element near a quadrupole.
-    Form(usize, Form, f64),
-    /// One ordinary imperfection.
-    Ordinary(Member, f64),
-}
-
-/// Effects that share an amplitude.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Member {
-    /// The family's name: two may hold the same effect.
-    pub family: &'static str,
-    /// The effects.
-    pub terms: Vec<Term>,
-    /// The recording in which they have it; none if they have it in all.
-    pub campaign: Option<usize>,
-}
-
-/// Least gain error that a fit is linearised about: the derivative is the signature over `1 + a`, and both vanish at -1.
-const LEAST_GAIN: f64 = -0.5;
-
-impl Member {
-    /// True for a gain of monitors or correctors.
-    fn is_gain(&self) -> bool {
-        self.terms.iter().all(|term| matches!(term.kind, EffectKind::BpmGain | EffectKind::CorrectorGain))
-    }
-
-    /// What its amplitude multiplies readings or kicks by, if it is a gain; 1 of another.
-    pub(super) fn factor(&self, amplitude: f64) -> f64 {
-        if self.is_gain() { 1.0 + amplitude } else { 1.0 }
-    }
-
-    /// True if it acts in a recording.
-    pub fn is_in(&self, campaign: usize) -> bool {
-        self.campaign.is_none_or(|own| own == campaign)
-    }
-}
-
 /// What an unknown is the amplitude of, whatever its width.
 #[derive(Debug, PartialEq)]
 pub enum Identity<'u> {
@@ -96,78 +45,6 @@ pub enum Identity<'u> {
     Form(usize, Form),
     /// An ordinary imperfection.
     Ordinary(&'u Member),
-}
-
-impl Unknown {
-    /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
-    /// evaluated for the same machine.
-    pub fn is_of_first_order(&self) -> bool {
-        matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
-    }
-
-    /// The least that it is where a fit is linearised about it, in prior standard deviations.
-    pub fn least_start(&self) -> f64 {
-        match self {
-            Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,
-            _ => f64::NEG_INFINITY,
-        }
-    }
-
-    /// Its prior standard deviation.
-    pub fn sigma(&self) -> f64 {
-        match self {
-            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(.., sigma) | Self::Ordinary(_, sigma) => {
-                *sigma
-            }
-        }
-    }
-
-    /// What it is, as an unknown of a hypothesis.
-    pub fn is_of<'u>(&'u self, hypothesis: &Hypothesis) -> Identity<'u> {
-        match self {
-            Self::Amplitude(i, _) => Identity::Amplitude(hypothesis.terms[*i]),
-            Self::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
-            Self::Form(quadrupole, form, _) => Identity::Form(*quadrupole, *form),
-            Self::Ordinary(member, _) => Identity::Ordinary(member),
-        }
-    }
-}
-
-impl Term {
-    /// An effect at a named place.
-    ///
-    /// # Errors
-    /// [`EffectError::Place`].
-    pub fn at(kind: EffectKind, place: &str, ring: &Ring) -> Result<Self, EffectError> {
-        Effect::at(kind, place, 1.0, ring).map(Self::from)
-    }
-
-    /// The effect, of an amplitude.
-    pub fn effect(self, amplitude: f64) -> Effect {
-        Effect { kind: self.kind, site: self.site, amplitude }
-    }
-
-    /// True of two exchanged instruments.
-    pub fn is_exchange(self) -> bool {
-        self.kind.is_switch() && self.site.is_pair()
-    }
-
-    /// `kind@place`.
-    pub fn label(self, ring: &Ring) -> String {
-        let place = self.site.name(ring);
-        if place.is_empty() { self.kind.word().into() } else { format!("{}@{place}", self.kind) }
-    }
-
-    /// Position along the beam [m], the first of two places; none for the whole ring.
-    pub fn position(self, ring: &Ring) -> Option<f64> {
-        self.site.positions(ring).first().copied()
-    }
-}
-
-impl From<Effect> for Term {
-    fn from(effect: Effect) -> Self {
-        Self { kind: effect.kind, site: effect.site }
-    }
 }
 
 impl Hypothesis {
@@ -189,7 +66,7 @@ impl Hypothesis {
     }
 
     /// The same with one of its effects gross; none for a field, which iron and alignment bound.
-    pub fn with_gross(&self, index: usize) -> Option<Self> {
+    pub(crate) fn with_gross(&self, index: usize) -> Option<Self> {
         let term = self.terms[index];
         let kind = term.kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector() || kind == EffectKind::RfStep;
@@ -208,7 +85,7 @@ impl Hypothesis {
 
     /// `ln` prior of the widths that its unknowns have: of vars relative to that of their prior, of ordinary families to none, of gross effects to usual
     /// ones.
-    pub fn log_prior(&self) -> f64 {
+    pub(crate) fn log_prior(&self) -> f64 {
         let of_families: f64 = self.ordinary.iter().map(Family::log_prior).sum();
         self.scatter.log_prior() + of_families + self.gross.len() as f64 * GROSS.ln()
     }
@@ -221,6 +98,16 @@ impl Hypothesis {
     /// Prior standard deviation of a term's amplitude; none for a switch.
     fn scale(&self, term: &Term) -> Option<f64> {
         term.kind.prior_scale().map(|scale| scale * if self.gross.contains(term) { WIDER } else { 1.0 })
+    }
+
+    /// What one of its unknowns is the amplitude of.
+    pub(crate) fn identity<'u>(&self, unknown: &'u Unknown) -> Identity<'u> {
+        match unknown {
+            Unknown::Amplitude(i, _) => Identity::Amplitude(self.terms[*i]),
+            Unknown::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
+            Unknown::Form(quadrupole, form, _) => Identity::Form(*quadrupole, *form),
+            Unknown::Ordinary(member, _) => Identity::Ordinary(member),
+        }
     }
 
     /// The unknowns besides the vars.
@@ -279,19 +166,19 @@ impl Hypothesis {
     ///
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
-    pub fn machine_in(
+    pub(crate) fn machine_in(
         &self,
         data: &Data,
         campaign: usize,
         params: &[f64],
         unknown: &[f64],
     ) -> Result<(Machine, Drives), EffectError> {
-        let own = data.campaign(campaign);
+        let recording = data.campaign(campaign);
         let scaled = |term: &Term, amplitude: f64| term.effect(amplitude * data.scale(campaign, term.kind));
         let mut effects: Vec<Effect> = self.terms.iter().map(|term| term.effect(1.0)).collect();
         effects.extend(&self.given);
         let mut ordinary = Vec::new();
-        let mut drives = own.drives.clone();
+        let mut drives = recording.drives.clone();
         for (what, u) in self.unknowns(data).iter().zip(unknown) {
             match what {
                 Unknown::Amplitude(i, sigma) => effects[*i] = scaled(&self.terms[*i], u * sigma),
@@ -305,9 +192,9 @@ impl Hypothesis {
             }
         }
         let effects = in_order(effects, ordinary);
-        effects.iter().for_each(|effect| correct_orbit(own, &mut drives, effect));
-        let ring = own.ring.with_strengths(&own.ring.strengths(params, &own.supplies));
-        Ok((Machine::new(ring, own.believed, &effects)?, drives))
+        effects.iter().for_each(|effect| correct_orbit(recording, &mut drives, effect));
+        let ring = recording.ring.with_strengths(&recording.ring.strengths(params, &recording.supplies));
+        Ok((Machine::new(ring, recording.believed, &effects)?, drives))
     }
 
     /// `kind@place + kind@place`, or `nothing`.
@@ -347,19 +234,4 @@ fn correct_orbit(data: &Data, drives: &mut Drives, effect: &Effect) {
         let orbit = &mut drives.orbit[element][plane.index()];
         *orbit = data.baseline.corrected(b, *orbit, |x| effect.misreads(x));
     }
-}
-
-/// The members of a family that affect the data, those of any recording.
-pub fn members(kind: EffectKind, data: &Data) -> Vec<Term> {
-    let driven: Vec<usize> = data.campaigns().flat_map(Data::driven_correctors).collect();
-    let active = data.campaigns().flat_map(Data::active_monitors);
-    let active: Vec<usize> = active.map(|b| data.ring.read_monitors[b]).collect();
-    let tells = |site: &Site| match site {
-        Site::Monitor(at) => active.contains(at),
-        Site::MonitorPair(one, other) => active.contains(one) && active.contains(other),
-        Site::Corrector(at) => driven.contains(at),
-        Site::CorrectorPair(one, other) => driven.contains(one) && driven.contains(other),
-        Site::Ring | Site::Quadrupole(_) | Site::Element(_) => true,
-    };
-    kind.sites(&data.ring).into_iter().filter(tells).map(|site| Term { kind, site }).collect()
 }

@@ -2,6 +2,9 @@
 
 use twin::{Measured, Unit};
 
+/// Unit of positions at the monitors [m], shown in mm.
+pub const POSITION: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
+
 /// What a number is of a family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Measure {

@@ -76,17 +76,17 @@ impl Alike {
 
 impl Differences {
     /// Of a matrix, rows frames, columns monitors, not a number where there is none.
-    pub fn of(all: DMatrix<f64>) -> Self {
+    pub fn from_frames(all: DMatrix<f64>) -> Self {
         let mut alike: BTreeMap<Vec<usize>, Vec<usize>> = BTreeMap::new();
         for (frame, row) in all.row_iter().enumerate() {
             let seen = (0..row.len()).filter(|&b| !row[b].is_nan()).collect();
             alike.entry(seen).or_default().push(frame);
         }
-        let of = |(monitors, frames): (Vec<usize>, Vec<usize>)| {
+        let products = |(monitors, frames): (Vec<usize>, Vec<usize>)| {
             let some = all.select_rows(&frames).select_columns(&monitors);
             Alike { products: some.tr_mul(&some), monitors, frames: frames.len() as f64 }
         };
-        Self { alike: alike.into_iter().map(of).collect(), all }
+        Self { alike: alike.into_iter().map(products).collect(), all }
     }
 
     /// `ln` likelihood of common modes, one a column [monitors][modes], over that of none.
@@ -97,7 +97,7 @@ impl Differences {
     /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior, beside known modes.
     pub fn momentum(&self, pattern: &DVector<f64>, width: f64, known: &DMatrix<f64>) -> Measured {
         let without = self.log_likelihood(known);
-        let with = |jitter: f64| self.log_likelihood(&beside(known, &(pattern * jitter))) - without;
+        let with = |jitter: f64| self.log_likelihood(&with_column(known, &(pattern * jitter))) - without;
         self.sampled(learnt(with, width, 0.0), 0.5)
     }
 
@@ -110,7 +110,7 @@ impl Differences {
     }
 
     /// Crates, beside known modes, and what the recording allows of one more, whose neighbours are in one of some `orders`.
-    pub fn crates(&self, others: &DMatrix<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
+    pub(crate) fn crates(&self, others: &DMatrix<f64>, orders: &[Vec<usize>]) -> (Vec<Crate>, Measured) {
         let correlation = self.correlation(others);
         let strength = |group: &&[usize]| strength(&correlation, group);
         let mut groups = groups(orders);
@@ -122,7 +122,7 @@ impl Differences {
             };
             let known = with_crates(others, &crates);
             let without = self.log_likelihood(&known);
-            let with = |share: f64| beside(&known, &crate_mode(others.nrows(), group, share));
+            let with = |share: f64| with_column(&known, &crate_mode(others.nrows(), group, share));
             let share = learnt(|share| self.log_likelihood(&with(share)) - without, CRATE, correction);
             let share = self.sampled(Measured { value: share.value.min(1.0 - OWN), ..share }, 1.0);
             if share.value == 0.0 || crates.len() == MOST {
@@ -160,12 +160,12 @@ fn learnt(log_likelihood: impl Fn(f64) -> f64, width: f64, correction: f64) -> M
     let sizes = (0..SEARCH).map(|i| 3.0 * width / FACTOR.powi(i as i32));
     let start = sizes.map(|size| (size, density(size))).max_by(|a, b| a.1.total_cmp(&b.1)).map_or(width, |best| best.0);
     let bounds = [[(width * 1e-3).ln(), (width * 4.0).ln()]];
-    let peak = Peak::of(|x| density(x[0].exp()), &DVector::from_element(1, start.ln()), &bounds);
+    let peak = Peak::find(|x| density(x[0].exp()), &DVector::from_element(1, start.ln()), &bounds);
     if let Some(peak) = peak.filter(|peak| peak.log_integral > correction) {
         let value = peak.at[0].exp();
         return Measured { value, sigma: value * peak.sigma(0) };
     }
-    Measured { value: 0.0, sigma: HalfNormal::of(log_likelihood, width, RANGE).range(correction) }
+    Measured { value: 0.0, sigma: HalfNormal::from_log_likelihood(log_likelihood, width, RANGE).range(correction) }
 }
 
 /// Groups of neighbours that may share a crate, in some orders.
@@ -174,7 +174,7 @@ pub fn groups(orders: &[Vec<usize>]) -> Vec<&[usize]> {
 }
 
 /// Modes, and one more.
-pub fn beside(modes: &DMatrix<f64>, one: &DVector<f64>) -> DMatrix<f64> {
+pub fn with_column(modes: &DMatrix<f64>, one: &DVector<f64>) -> DMatrix<f64> {
     let mut all = modes.clone().insert_column(modes.ncols(), 0.0);
     all.set_column(modes.ncols(), one);
     all
@@ -183,7 +183,7 @@ pub fn beside(modes: &DMatrix<f64>, one: &DVector<f64>) -> DMatrix<f64> {
 /// Modes, and one for each crate.
 pub fn with_crates(modes: &DMatrix<f64>, crates: &[Crate]) -> DMatrix<f64> {
     let of_crate = |one: &Crate| crate_mode(modes.nrows(), &one.monitors, one.share.value);
-    crates.iter().fold(modes.clone(), |modes, one| beside(&modes, &of_crate(one)))
+    crates.iter().fold(modes.clone(), |modes, one| with_column(&modes, &of_crate(one)))
 }
 
 /// The mode of a crate: the root of its share in each of its monitors.
@@ -224,7 +224,7 @@ mod tests {
             density(&z, covariance) - density(&z, DMatrix::identity(seen.len(), seen.len()))
         };
         let known: f64 = (0..12).map(of_frame).sum();
-        let found = Differences::of(all.clone()).log_likelihood(&modes);
+        let found = Differences::from_frames(all.clone()).log_likelihood(&modes);
         assert!((found - known).abs() < 1e-12 * known.abs(), "{found} {known}");
     }
 }

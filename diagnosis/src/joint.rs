@@ -8,12 +8,14 @@
 //! tesla: where its integrated gradient over the rigidity is `a` in the first recording, it is `a p_first/p` in one of momentum `p`.
 
 use core::ops::Range;
+use std::collections::BTreeMap;
 
 use estimator::{Health, MonitorState};
+use inference::Excluded;
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine};
 
-use super::data::{Data, DataError};
+use super::data::{Data, DataError, following};
 
 /// Momentum of a particle of one elementary charge over its rigidity [GeV/c per T m].
 const PER_RIGIDITY: f64 = 0.299_792_458;
@@ -23,7 +25,7 @@ impl Data {
     ///
     /// # Errors
     /// [`DataError::Apart`] where they are not of one machine.
-    pub fn joined_with(mut self, others: Vec<Self>) -> Result<Self, DataError> {
+    pub(crate) fn joined_with(mut self, others: Vec<Self>) -> Result<Self, DataError> {
         for other in &others {
             let same = [
                 ("machine", self.ring.name == other.ring.name),
@@ -75,7 +77,7 @@ impl Data {
     }
 
     /// Rigidity of the beam, of one elementary charge [T m].
-    pub fn rigidity(&self) -> f64 {
+    pub(crate) fn rigidity(&self) -> f64 {
         self.momentum / PER_RIGIDITY
     }
 
@@ -86,11 +88,22 @@ impl Data {
 
     /// State of the monitors: of one that is not ok everywhere, that in the first recording where it is not.
     pub fn health_in_any(&self) -> Vec<Health> {
-        let of = |b: usize| {
+        let health = |b: usize| {
             let bad = self.campaigns().map(|own| own.health()[b]).find(|one| one.state != MonitorState::Ok);
             bad.unwrap_or(self.health()[b])
         };
-        (0..self.monitors()).map(of).collect()
+        (0..self.monitors()).map(health).collect()
+    }
+
+    /// Of each monitor, the number of readings of all recordings that are left out for each reason.
+    pub fn excluded_in_any(&self) -> Vec<BTreeMap<Excluded, usize>> {
+        let mut sums: Vec<BTreeMap<Excluded, usize>> = vec![BTreeMap::new(); self.monitors()];
+        for own in self.campaigns() {
+            for (sum, tally) in sums.iter_mut().zip(own.screened.excluded.tallies()) {
+                tally.into_iter().for_each(|(reason, count)| *sum.entry(reason).or_default() += count);
+            }
+        }
+        sums
     }
 
     /// Names of the recordings.
@@ -104,12 +117,12 @@ impl Data {
     }
 
     /// Pools of each among those of all.
-    pub fn pools_of_each(&self) -> Vec<Range<usize>> {
+    pub(crate) fn pools_of_each(&self) -> Vec<Range<usize>> {
         following(self.campaigns().map(|one| one.pools.count))
     }
 
     /// Number of whitened numbers of all.
-    pub fn whole_size(&self) -> usize {
+    pub(crate) fn whole_size(&self) -> usize {
         self.campaigns().map(Self::size).sum()
     }
 
@@ -117,7 +130,7 @@ impl Data {
     ///
     /// # Errors
     /// Those of `of`.
-    pub fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
+    pub(crate) fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
         let mut all = DVector::zeros(self.whole_size());
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
             all.rows_range_mut(rows).copy_from(&of(index, one)?);
@@ -129,7 +142,7 @@ impl Data {
     ///
     /// # Errors
     /// Those of `of`.
-    pub fn stacked_columns<E>(
+    pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,
         of: impl Fn(usize, &Self) -> Result<DMatrix<f64>, E>,
@@ -143,7 +156,7 @@ impl Data {
     }
 
     /// `ln` of the determinant of the covariance of all.
-    pub fn whole_log_det(&self) -> f64 {
+    pub(crate) fn whole_log_det(&self) -> f64 {
         self.campaigns().map(Self::log_det).sum()
     }
 
@@ -151,7 +164,7 @@ impl Data {
     ///
     /// # Errors
     /// [`EffectError`]; all are then as they were.
-    pub fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
+    pub(crate) fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
         let mut others = self.others.clone();
         let mut moved = 0.0;
         for (other, (machine, drives)) in others.iter_mut().zip(&machines[1..]) {
@@ -164,7 +177,7 @@ impl Data {
     }
 
     /// [`Data::trim`] of each recording by the residuals of all.
-    pub fn trim_each(&mut self, residual: &DVector<f64>) -> bool {
+    pub(crate) fn trim_each(&mut self, residual: &DVector<f64>) -> bool {
         let parts = self.parts();
         let part = |index: usize| residual.rows_range(parts[index].clone()).into_owned();
         let mut trimmed = self.trim(&part(0));
@@ -175,17 +188,6 @@ impl Data {
     }
 }
 
-/// Ranges of some lengths, one after the other.
-pub(super) fn following(lengths: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
-    lengths
-        .scan(0, |end, length| {
-            let start = *end;
-            *end += length;
-            Some(start..*end)
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use inference::Campaign;
@@ -194,8 +196,9 @@ mod tests {
 
     use super::*;
     use crate::fit::Fitted;
-    use crate::hypothesis::{Hypothesis, Term};
+    use crate::hypothesis::Hypothesis;
     use crate::scan::signatures;
+    use crate::term::Term;
     use crate::testing::{Coloured, template};
     use crate::{Diagnosis, Verdict};
 
@@ -227,7 +230,7 @@ mod tests {
 
     fn data_of(ring: &Ring, recording: &Recording) -> Data {
         let ring = at_energy(ring, recording.header.kinetic_energy);
-        Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap()
+        Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap()
     }
 
     /// About the same machine chi-square and information are sums; a stray field counts by the rigidity, a magnet's error does not.
@@ -274,7 +277,7 @@ mod tests {
         let (ring, [first, second]) = pair(gradient, 40);
         for alone in [&first, &second] {
             let ring = at_energy(&ring, alone.header.kinetic_energy);
-            assert_ne!(Diagnosis::of(&ring, alone, |_| ()).unwrap().verdict, Verdict::Identified);
+            assert_ne!(Diagnosis::from_recording(&ring, alone, |_| ()).unwrap().verdict, Verdict::Identified);
         }
         let joint = Diagnosis::jointly(&ring, &first, core::slice::from_ref(&second), |_| ()).unwrap();
         println!("{}", joint.sentence);

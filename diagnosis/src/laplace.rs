@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use inference::optimise::{Limits, Objective, Quadratic, minimise};
+use inference::{Limits, Objective, Quadratic, minimise};
 
 /// A peak.
 #[derive(Debug, Clone)]
@@ -82,7 +82,7 @@ impl<F: Fn(&DVector<f64>) -> f64> Objective for Density<F> {
 
 impl Peak {
     /// Of a log-density, near a start and within bounds; none if there is no peak near it.
-    pub fn of(log_density: impl Fn(&DVector<f64>) -> f64, start: &DVector<f64>, bounds: &[[f64; 2]]) -> Option<Self> {
+    pub fn find(log_density: impl Fn(&DVector<f64>) -> f64, start: &DVector<f64>, bounds: &[[f64; 2]]) -> Option<Self> {
         let density = Density(log_density);
         let found = minimise(&density, start, bounds, &LIMITS, |_, _| true).ok()?;
         let factor = density.quadratic(&found.x).matrix.cholesky()?;

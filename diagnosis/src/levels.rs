@@ -62,7 +62,7 @@ struct Sums {
 }
 
 impl Sums {
-    fn of(values: impl Iterator<Item = f64>) -> Self {
+    fn from_values(values: impl Iterator<Item = f64>) -> Self {
         let known = values.filter(|z| !z.is_nan());
         let (count, square) = known.fold((0.0, 0.0), |(count, square), z| (count + 1.0, square + z * z));
         Self { frames: usize::from(count > 0.0), count, square }
@@ -92,8 +92,8 @@ impl Sums {
     /// Noise over that of others, for a dispersion.
     fn over(self, others: Self, dispersion: f64) -> Measured {
         let value = (self.variance() / others.variance()).sqrt();
-        let of = |sums: Self| 0.5 * dispersion / sums.count.max(1.0);
-        Measured { value, sigma: value * (of(self) + of(others)).sqrt() }
+        let relative_variance = |sums: Self| 0.5 * dispersion / sums.count.max(1.0);
+        Measured { value, sigma: value * (relative_variance(self) + relative_variance(others)).sqrt() }
     }
 }
 
@@ -127,7 +127,7 @@ impl Levels {
 
     /// Learn from whitened differences, rows frames, columns monitors; not a number where there is none.
     pub fn learn(differences: &DMatrix<f64>) -> Self {
-        let squares = Squares::of(differences);
+        let squares = Squares::from_differences(differences);
         let tried = squares.parts();
         let rest = squares.rest(&tried);
         let part = |frames: Range<usize>| {
@@ -156,7 +156,7 @@ impl Levels {
     }
 
     /// True if it is the same in all frames.
-    pub fn is_constant(&self) -> bool {
+    pub(crate) fn is_constant(&self) -> bool {
         self.parts.is_empty()
     }
 }
@@ -170,8 +170,8 @@ struct Squares<'d> {
 }
 
 impl<'d> Squares<'d> {
-    fn of(differences: &'d DMatrix<f64>) -> Self {
-        let of_frame: Vec<Sums> = differences.row_iter().map(|row| Sums::of(row.iter().copied())).collect();
+    fn from_differences(differences: &'d DMatrix<f64>) -> Self {
+        let of_frame: Vec<Sums> = differences.row_iter().map(|row| Sums::from_values(row.iter().copied())).collect();
         let mut before = vec![Sums::default()];
         for one in &of_frame {
             before.push(before[before.len() - 1].plus(*one));
@@ -259,7 +259,7 @@ impl<'d> Squares<'d> {
         let outside = rest.variance();
         let ratio = self.sums(frames).variance() / outside;
         let values = self.differences.rows_range(frames.clone());
-        let each = values.column_iter().map(|column| Sums::of(column.iter().copied()));
+        let each = values.column_iter().map(|column| Sums::from_values(column.iter().copied()));
         let mut each: Vec<Sums> = each.filter(|sums| sums.count > 0.0).collect();
         each.sort_by(|one, other| one.variance().total_cmp(&other.variance()));
         let quarter = each[each.len() / 4];

@@ -1,303 +1,104 @@
 //! Missing physics: where the model and a recording differ, which effect explains it, and whether a model with that effect predicts
 //! better.
 //!
-//! [`Diagnosis::of`] is the path from top to bottom: columns that are not what the header says are refused ([`wiring`]), and read-backs that are not
-//! the settings are told ([`readback`]); what passes within a
-//! setting is found by the differences of its frames and taken out ([`transients`]); the recording is
-//! whitened ([`data`]), fitted by the exact twin without any
-//! effect ([`fit`]), every effect of the library is tried at every place ([`scan`]), and so is an unmodelled discrepancy
-//! ([`discrepancy`]); the leading candidates are refitted and compete ([`search`]); what is found has to predict frames that it was
-//! not fitted to ([`heldout`]); [`verdict`] puts the result into one word and one sentence.
+//! [`Diagnosis::from_recording`] is the path from top to bottom: columns that are not what the header says are refused (`wiring.rs`), and read-backs that are not
+//! the settings are told (`readback.rs`); what passes within a
+//! setting is found by the differences of its frames and taken out (`transients/`); the recording is
+//! whitened (`data.rs`), fitted by the exact twin without any
+//! effect (`fit.rs`), every effect of the library is tried at every place (`scan.rs`), and so is an unmodelled discrepancy
+//! (`discrepancy.rs`); the leading candidates are refitted and compete (`search.rs`); what is found has to predict frames that it was
+//! not fitted to (`heldout.rs`); `verdict.rs` puts the result into one word and one sentence.
 
-pub mod alternatives;
-pub mod aside;
-pub mod average;
-pub mod baseline;
-pub mod beyond;
-pub mod chance;
+mod alternatives;
+mod average;
+mod baseline;
+mod chance;
 mod channel;
-pub mod choice;
-pub mod close_tunes;
-pub mod data;
-pub mod discrepancy;
-pub mod element;
-pub mod error;
-mod exact;
-pub mod experiment;
+mod choice;
+mod close_tunes;
+mod common_factors;
+mod data;
+mod diagnosis;
+mod discrepancy;
+mod element;
+mod error;
+mod exact_orbits;
+mod experiment;
 mod factors;
-pub mod feed_down;
-pub mod fit;
-pub mod frame_to_frame;
+mod family;
+mod feed_down;
+mod fit;
+mod frame_pattern;
 mod half_normal;
-pub mod heldout;
-pub mod hypothesis;
-pub mod imperfection;
+mod heldout;
+mod hypothesis;
+mod imperfection;
 mod jitter;
-pub mod joint;
+mod joint;
 mod laplace;
-pub mod levels;
-pub mod limits;
-mod linearise;
-pub mod location;
+mod levels;
+mod limits;
+mod linearisation;
+mod location;
+mod lost_frames;
 mod memory;
 mod modes;
-pub mod noise;
-pub mod ordinary;
-pub mod period;
-pub mod place_scan;
-pub mod pools;
-pub mod readback;
-mod readmit;
+mod noise;
+mod odds;
+mod out_of_range;
+mod period;
+mod place_scan;
+mod pools;
+mod readback;
+mod readmission;
 mod repeats;
-pub mod sample;
+mod sample;
 mod scale;
-pub mod scan;
-pub mod scatter;
-pub mod search;
-pub mod settings;
-pub mod slow;
-pub mod stuck;
-pub mod transients;
-pub mod units;
-pub mod verdict;
-pub mod wiring;
-mod within;
+mod scan;
+mod scatter;
+mod search;
+mod slow_noise;
+mod stuck_monitor;
+mod term;
+mod tested;
+mod transients;
+mod units;
+mod unknown;
+mod verdict;
+mod widths;
+mod wiring;
 
 #[cfg(test)]
 mod forward;
 #[cfg(test)]
 mod testing;
 
-use twin::{Effect, Ring};
-
-use average::Vars;
-use beyond::Beyond;
-use data::{Data, DataError};
-use heldout::Score;
-use hypothesis::{Term, in_order};
-use imperfection::Imperfection;
-use inference::recording::{Recording, at_energy};
-use readback::Contradiction;
+pub use alternatives::{Alternative, Cause, Competition, imitating};
+pub use average::Vars;
+pub use data::{Data, DataError, LEAST};
+pub use diagnosis::Diagnosis;
+pub use discrepancy::{Discrepancy, scan as scan_discrepancies, steering};
+pub use element::Linear;
+pub use error::FitError;
+pub use experiment::{Change, Menu, Proposal};
+pub use family::Family;
+pub use fit::{Fitted, of_element, predicted, predicted_by};
+pub use heldout::{CHANCE, SUPPORTED, Score, VALIDATED};
+pub use hypothesis::{Hypothesis, in_order};
+pub use imperfection::{Imperfection, Measure};
+pub use limits::{Limits, SEEN, at_places};
+pub use location::Location;
+pub use odds::{DECISIVE, ODDS, SUSPICIOUS, UNMODELLED, corrections};
+pub use out_of_range::OutOfRange;
+pub use place_scan::{Interval, PlaceScan};
+pub use readback::Contradiction;
+pub use sample::sample;
 pub use scale::QUOTED;
-use search::{Found, Search};
-use transients::{Transient, Transients};
-pub use verdict::{Finding, Verdict};
-use wiring::Miswired;
-
-/// What is missing in the model of a recording.
-#[derive(Debug, Clone)]
-pub struct Diagnosis {
-    /// All that was found, with its fits.
-    pub found: Found,
-    /// Read-backs of correctors that contradict their settings.
-    pub contradictions: Vec<Contradiction>,
-    /// What passes within settings, which is not in the data of `found`.
-    pub transients: Vec<Transient>,
-    /// The verdict.
-    pub verdict: Verdict,
-    /// The verdict as a sentence.
-    pub sentence: String,
-    /// One finding for each effect, strongest first.
-    pub findings: Vec<Finding>,
-    /// Held-out frames, predicted without any effect.
-    pub before: Score,
-    /// Held-out frames, predicted with all effects.
-    pub after: Score,
-    /// Held-out correctors without and with the effects, where none is a corrector's own.
-    pub correctors: Option<(Score, Score)>,
-    /// Strength factors of the quadrupoles (vars), fitted without any effect.
-    pub vars_before: Vars,
-    /// Vars, averaged over the competing causes.
-    pub vars_after: Vars,
-    /// Vars beyond the range of their prior.
-    pub beyond: Vec<Beyond>,
-    /// The measurement that would best separate the leading causes, for an ambiguous verdict.
-    pub next_measurement: Option<String>,
-}
-
-impl Diagnosis {
-    /// Diagnose a recording; `progress` is called with the name of each step.
-    ///
-    /// # Errors
-    /// [`DataError`].
-    pub fn of(ring: &Ring, recording: &Recording, progress: impl FnMut(&str)) -> Result<Self, DataError> {
-        Self::jointly(ring, recording, &[], progress)
-    }
-
-    /// Diagnose several recordings of one machine together, at other tunes, energies or times in the cycle ([`joint`]).
-    ///
-    /// # Errors
-    /// [`DataError`].
-    pub fn jointly(
-        ring: &Ring,
-        first: &Recording,
-        others: &[Recording],
-        mut progress: impl FnMut(&str),
-    ) -> Result<Self, DataError> {
-        let recordings: Vec<&Recording> = core::iter::once(first).chain(others).collect();
-        progress("reading");
-        for recording in &recordings {
-            if let Some(wiring) = Miswired::of(&at_energy(ring, recording.header.kinetic_energy), recording)? {
-                return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
-            }
-        }
-        let names = ring.corrector_names();
-        let of_each = recordings.iter().flat_map(|recording| Contradiction::all(recording, &names));
-        let contradictions: Vec<Contradiction> = of_each.collect();
-        progress("what passes within settings");
-        let (mut transients, mut joined) = (Vec::new(), Vec::new());
-        for (index, recording) in recordings.iter().enumerate() {
-            let ring = at_energy(ring, recording.header.kinetic_energy);
-            let Transients { found, campaign } = Transients::of(&ring, recording)?;
-            transients::join(&mut transients, found, index);
-            joined.push(Data::of(&campaign)?);
-        }
-        let data = joined.remove(0).joined_with(joined)?;
-        let candidates = scan::candidates(&data, first.header.radial_loop_monitors.as_ref());
-        progress("searching");
-        let found = Search::new(candidates.clone()).run(data)?;
-        let data = &found.data;
-        progress("held-out frames");
-        let blocks = heldout::by_pool(data);
-        let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
-        let before = Score::of(data, &bare, &blocks)?;
-        let after = if found.has_more() { Score::of(data, &found.best, &blocks)? } else { before.clone() };
-        let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
-        let of_means = Verdict::of(&found, &tests);
-        let verdict = of_means.beside(&transients).with_noise(data);
-        let of_element = verdict::test_of_element(data, &found, &before, &after, &blocks)?;
-        let findings = verdict::findings(data, &found, &transients, &tests, of_element, of_means)?;
-        progress("held-out correctors");
-        let whole = found.has_more() && !found.best.hypothesis.terms.iter().any(|t| t.kind.is_of_a_corrector());
-        let blocks = heldout::by_corrector(data);
-        let correctors = if whole && !blocks.is_empty() {
-            let scored = |fitted| Score::of(data, fitted, &blocks).ok();
-            scored(&bare).zip(scored(&found.best))
-        } else {
-            None
-        };
-        progress("what to measure next");
-        // the proposal is no part of the verdict, so its failure is not one of the diagnosis
-        let next_measurement = verdict::next_measurement(data, &found, verdict).unwrap_or_default();
-        let (vars_before, vars_after) = (Vars::of(&found.null), Vars::averaged(&found).widened(&found)?);
-        // a poor fit says nothing of single vars
-        let beyond = if found.best.is_poor() { Vec::new() } else { Beyond::all(&data.ring, &vars_after) };
-        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
-        Ok(Self {
-            found,
-            contradictions,
-            transients,
-            verdict,
-            sentence,
-            findings,
-            before,
-            after,
-            correctors,
-            vars_before,
-            vars_after,
-            beyond,
-            next_measurement,
-        })
-    }
-
-    /// The effects in the fitted model, at their most likely amplitudes, in the order in which a signal passes them. What passes within a setting was found by
-    /// the names of correctors and monitors in the recording, so that it is farthest from the beam.
-    pub fn effects(&self) -> Vec<Effect> {
-        let best = &self.found.best;
-        let of = |(i, term): (usize, &Term)| term.effect(best.amplitude(&self.found.data, i).0);
-        let lasting = in_order(best.hypothesis.terms.iter().enumerate().map(of).collect(), []);
-        let passing = self.transients.iter().filter_map(|one| {
-            let leading = &one.alternatives[0];
-            Some(leading.term()?.effect(leading.amplitude.0))
-        });
-        let (of_correctors, others): (Vec<Effect>, Vec<Effect>) =
-            passing.partition(|effect| effect.kind.is_of_a_corrector());
-        of_correctors.into_iter().chain(lasting).chain(others).collect()
-    }
-
-    /// The possible measurements for an ambiguous verdict, best first; none for another.
-    ///
-    /// # Errors
-    /// [`error::FitError`].
-    pub fn proposals(&self) -> Result<Vec<experiment::Proposal>, error::FitError> {
-        let menu = verdict::menu(&self.found.data, &self.found, self.verdict)?;
-        Ok(menu.map_or_else(Vec::new, |(menu, _)| menu.proposals))
-    }
-
-    /// What was learnt of the machine besides.
-    pub fn imperfections(&self) -> Vec<Imperfection> {
-        let Found { data, best, .. } = &self.found;
-        let names = data.ring.monitor_names();
-        let of_others = data.campaigns().skip(1).flat_map(|own| own.noise.of_parts(&own.name, &names));
-        ordinary::rows(data, best).into_iter().chain(data.noise.rows(&names)).chain(of_others).collect()
-    }
-
-    /// Names of the monitors that wander by themselves.
-    pub fn wandering(&self) -> Vec<String> {
-        let names = self.found.data.ring.monitor_names();
-        let of_one = |own: &Data| own.noise.wandering.iter().map(|(b, _)| names[*b].clone()).collect::<Vec<_>>();
-        self.found.data.campaigns().flat_map(of_one).collect()
-    }
-
-    /// Least probability that all effects in the fitted model are there: each has its own, given the others, so that all of them hold with
-    /// `1 - sum of (1 - P)` or more (Bonferroni). None where nothing is in it.
-    pub fn joint_probability(&self) -> Option<f64> {
-        let in_model = self.findings.iter().filter(|finding| finding.tested.is_some());
-        let (count, doubt) = in_model.fold((0, 0.0), |(n, sum), finding| (n + 1, sum + 1.0 - finding.probability));
-        (count > 0).then_some((1.0 - doubt).max(0.0))
-    }
-
-    /// Gain of held-out log predictive density by all effects, and its standard error.
-    pub fn gain(&self) -> (f64, f64) {
-        if self.found.has_more() { self.after.gain_over(&self.before) } else { (0.0, 0.0) }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::path::Path;
-
-    use super::*;
-
-    /// 0.24 mm until the end, beside a gain and alone.
-    #[test]
-    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn a_monitor_that_wanders_is_said_and_hides_nothing() {
-        let (ring, recording) = testing::template();
-        let y_d5 = ring.monitor_names().iter().position(|name| name == "y_D5").unwrap();
-        let white = testing::Coloured::white(&ring, &recording, 11);
-        let noise = testing::Coloured { wandering: Some((y_d5, 13e-6)), ..white };
-        let gain = Effect::parse("bpm_gain@x_E6=0.15", &ring).unwrap();
-        for (effects, verdict) in [(vec![], Verdict::Consistent), (vec![gain], Verdict::Identified)] {
-            let made = noise.campaign(&ring, &recording, &effects);
-            let found = Diagnosis::of(&ring, &made, |_| ()).unwrap();
-            assert_eq!(found.verdict, verdict, "{}", found.sentence);
-            assert_eq!(found.wandering(), ["y_D5"]);
-            assert!(found.sentence.contains("monitor y_D5 wanders"), "{}", found.sentence);
-            assert_eq!(found.findings.iter().filter_map(Finding::term).count(), effects.len());
-            let rows = found.imperfections();
-            let walk = rows.iter().find(|row| row.at == "y_D5").unwrap().measured;
-            assert!((walk.value - 13e-6).abs() < 3.0 * walk.sigma, "{walk:?}");
-        }
-    }
-
-    /// A recording of format 2 need not name the correctors that were set: held-out settings and correctors are those of the read-backs.
-    #[test]
-    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn correctors_are_held_out_without_their_names() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
-        let ring = Ring::read(&folder.join("ring.json")).unwrap();
-        let mut recording = Recording::read(&folder.join("gain"), &ring).unwrap();
-        let named = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
-        recording.rows.iter_mut().for_each(|row| row.correctors.clear());
-        let unnamed = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
-        let of_correctors = |diagnosis: &Diagnosis| {
-            let (before, after) = diagnosis.correctors.as_ref().unwrap();
-            after.gain_over(before).0
-        };
-        assert_eq!(of_correctors(&unnamed), of_correctors(&named));
-        assert!(named.gain().0 > 10.0);
-        assert_eq!(named.joint_probability(), Some(named.findings[0].probability), "of one effect, its own");
-        assert_eq!(unnamed.gain(), named.gain());
-    }
-}
+pub use scan::{Candidate, candidates, scan};
+pub use search::{Found, correction_of};
+pub use term::Term;
+pub use tested::Tested;
+pub use transients::{Shown, Transient};
+pub use unknown::{Member, Unknown};
+pub use verdict::{Finding, Verdict, capitalised, menu};
+pub use wiring::Miswired;

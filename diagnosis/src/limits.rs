@@ -5,8 +5,8 @@
 
 use twin::EffectKind;
 
-use super::hypothesis::Term;
 use super::scan::Candidate;
+use super::term::Term;
 
 /// `ln` Bayes factor at the limit.
 pub const SEEN: f64 = 12.0;
@@ -26,7 +26,7 @@ pub struct Limits {
 
 impl Limits {
     /// Of a kind among scanned candidates; none of a kind without an amplitude.
-    pub fn of(kind: EffectKind, scanned: &[Candidate]) -> Option<Self> {
+    pub fn from_scan(kind: EffectKind, scanned: &[Candidate]) -> Option<Self> {
         let mut all: Vec<f64> = at_places(kind, scanned).map(|(_, limit)| limit).collect();
         all.sort_by(f64::total_cmp);
         let last = all.len().checked_sub(1)?;
@@ -37,8 +37,8 @@ impl Limits {
 /// The limit at each place of a kind.
 pub fn at_places(kind: EffectKind, scanned: &[Candidate]) -> impl Iterator<Item = (&Term, f64)> {
     let scale = kind.prior_scale();
-    let of = move |one: &Candidate| Some(scale? * (2.0 * SEEN / one.power.max(f64::MIN_POSITIVE)).sqrt());
-    scanned.iter().filter(move |one| one.term.kind == kind).filter_map(move |one| Some((&one.term, of(one)?)))
+    let limit = move |one: &Candidate| Some(scale? * (2.0 * SEEN / one.power.max(f64::MIN_POSITIVE)).sqrt());
+    scanned.iter().filter(move |one| one.term.kind == kind).filter_map(move |one| Some((&one.term, limit(one)?)))
 }
 
 #[cfg(test)]
@@ -61,7 +61,7 @@ mod tests {
             adapting: DVector::zeros(0),
         };
         let scanned: Vec<Candidate> = terms.enumerate().map(of).collect();
-        let limits = Limits::of(EffectKind::BpmGain, &scanned).unwrap();
+        let limits = Limits::from_scan(EffectKind::BpmGain, &scanned).unwrap();
         assert!(limits.least < limits.median && limits.median < limits.at_most);
         for (candidate, (_, limit)) in scanned.iter().zip(at_places(EffectKind::BpmGain, &scanned)) {
             let rivals = Rivals { power: candidate.power, rival: 0.0, both: 0.0, free: [true, false] };
@@ -69,6 +69,6 @@ mod tests {
             // the limit is stated before the correction for the free amplitude
             assert!((gain + 0.5 * candidate.power.ln_1p() - SEEN).abs() < 1e-9, "{gain}");
         }
-        assert!(Limits::of(EffectKind::BpmSwap, &scanned).is_none(), "an exchange has no amplitude");
+        assert!(Limits::from_scan(EffectKind::BpmSwap, &scanned).is_none(), "an exchange has no amplitude");
     }
 }

@@ -4,7 +4,7 @@ use twin::{Plane, Ring, Site};
 
 use super::data::Data;
 use super::element::Linear;
-use super::hypothesis::Term;
+use super::term::Term;
 
 /// Location of an unmodelled discrepancy.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,9 +51,6 @@ pub enum Location {
     /// A pattern that all monitors share, from frame to frame: of the noise, so that it competes with none of the others.
     FrameToFrame,
 }
-
-/// Number of sorts of location that compete with each other, equally likely a priori.
-pub const SORTS: usize = 15;
 
 impl Location {
     /// The name of the place: a monitor, a corrector, the label of a quadrupole, or a stretch.

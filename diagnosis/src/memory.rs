@@ -54,18 +54,18 @@ impl Memory {
     }
 
     /// What is left of slow noise after some frames.
-    pub fn decay(self, frames: usize) -> f64 {
+    pub(crate) fn decay(self, frames: usize) -> f64 {
         (-(frames as f64) / self.time).exp()
     }
 
     /// Covariance of white and slow noise in two frames so far apart, at the ordinary level.
-    pub fn stationary(self, apart: usize) -> f64 {
+    pub(crate) fn stationary(self, apart: usize) -> f64 {
         let white = if apart == 0 { 1.0 - self.share } else { 0.0 };
         white + self.share * self.decay(apart)
     }
 
     /// Covariance of the walk in two frames, counted from where it begins.
-    pub fn walked(self, one: usize, other: usize) -> f64 {
+    pub(crate) fn walked(self, one: usize, other: usize) -> f64 {
         self.steps * self.steps * one.min(other) as f64
     }
 
@@ -87,7 +87,7 @@ impl Memory {
 
 impl Filter {
     /// Over some frames in rising order, the walk counted from `origin`.
-    pub fn of(memory: Memory, levels: &Levels, origin: usize, frames: &[usize]) -> Self {
+    pub fn from_frames(memory: Memory, levels: &Levels, origin: usize, frames: &[usize]) -> Self {
         let (mut at, mut after) = (origin, Matrix2::new(memory.share, 0.0, 0.0, 0.0));
         let step = |&frame: &usize| {
             let (carried, before) = memory.carry(&after, frame - at);
@@ -115,7 +115,7 @@ impl Filter {
     }
 
     /// The same of every column.
-    pub fn whiten_columns(&self, columns: &mut DMatrix<f64>) {
+    pub(crate) fn whiten_columns(&self, columns: &mut DMatrix<f64>) {
         columns.column_iter_mut().for_each(|mut column| self.whiten(column.iter_mut()));
     }
 }
@@ -148,7 +148,7 @@ mod tests {
                 let factor = dense(memory, &levels, 2).cholesky().unwrap();
                 let noise = some_noise(FRAMES.len());
                 let expected = factor.l().solve_lower_triangular(&noise).unwrap();
-                let filter = Filter::of(memory, &levels, 2, &FRAMES);
+                let filter = Filter::from_frames(memory, &levels, 2, &FRAMES);
                 let mut found = noise;
                 filter.whiten(found.iter_mut());
                 assert!((found - expected).amax() < 1e-12, "rounding");
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn white_noise_stays_as_it_is_to_the_bit() {
         let noise = some_noise(FRAMES.len());
-        let filter = Filter::of(Memory::NONE, &Levels::CONSTANT, 0, &FRAMES);
+        let filter = Filter::from_frames(Memory::NONE, &Levels::CONSTANT, 0, &FRAMES);
         let mut found = noise.clone();
         filter.whiten(found.iter_mut());
         assert_eq!(found, noise);

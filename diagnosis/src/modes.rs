@@ -31,7 +31,7 @@ struct Mixed {
 
 impl Modes {
     /// None, of so many monitors.
-    pub fn none(monitors: usize) -> Self {
+    pub(crate) fn none(monitors: usize) -> Self {
         Self { factors: DMatrix::zeros(monitors, 0) }
     }
 
@@ -43,17 +43,19 @@ impl Modes {
 
 impl Mixing {
     /// Over the readings that count in frames of which the noise has a level, rows frames.
-    pub fn of(modes: &Modes, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
-        let of = |(frame, level): (usize, &f64)| {
+    pub fn from_modes(modes: &Modes, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
+        let mixed_in_frame = |(frame, level): (usize, &f64)| {
             let mut factors = &modes.factors / *level;
             for (b, mut row) in factors.row_iter_mut().enumerate() {
                 if !counts(frame, b) {
                     row.fill(0.0);
                 }
             }
-            Mixed::of(factors)
+            Mixed::from_factors(factors)
         };
-        Self { frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(of).collect() } }
+        Self {
+            frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(mixed_in_frame).collect() },
+        }
     }
 
     /// True if monitors have nothing in common.
@@ -77,19 +79,19 @@ impl Mixing {
     }
 
     /// `ln` of the determinant of the covariances.
-    pub fn log_det(&self) -> f64 {
+    pub(crate) fn log_det(&self) -> f64 {
         (0..self.frames.len()).map(|frame| self.log_det_of(frame)).sum()
     }
 
     /// The same of one frame.
-    pub fn log_det_of(&self, frame: usize) -> f64 {
-        let of = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
-        self.frames.get(frame).map_or(0.0, of)
+    pub(crate) fn log_det_of(&self, frame: usize) -> f64 {
+        let log_det = |mixed: &Mixed| mixed.shrink.iter().map(|shrink| -2.0 * (1.0 - shrink).ln()).sum::<f64>();
+        self.frames.get(frame).map_or(0.0, log_det)
     }
 }
 
 impl Mixed {
-    fn of(factors: DMatrix<f64>) -> Self {
+    fn from_factors(factors: DMatrix<f64>) -> Self {
         let svd = factors.svd(true, false);
         let shrink = svd.singular_values.map(|d| 1.0 - (1.0 + d * d).sqrt().recip());
         Self { basis: svd.u.expect("asked for"), shrink }
@@ -105,7 +107,7 @@ mod tests {
         let factors = DMatrix::from_row_slice(4, 2, &[0.5, 0.0, -0.7, 0.0, 0.3, 0.6, 0.9, 0.6]);
         let counts = |frame: usize, b: usize| frame == 0 || b != 1;
         let levels = [1.0, 3.0];
-        let mixing = Mixing::of(&Modes { factors: factors.clone() }, &levels, counts);
+        let mixing = Mixing::from_modes(&Modes { factors: factors.clone() }, &levels, counts);
         let mut log_det = 0.0;
         for frame in 0..2 {
             let kept =

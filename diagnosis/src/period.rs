@@ -52,8 +52,8 @@ struct Grouped {
 
 impl Period {
     /// Of amplitudes, not a number where there is none, of frames in some runs.
-    pub fn of(amplitudes: &[f64], runs: &[usize]) -> Option<Self> {
-        let grouped = Grouped::of(amplitudes, runs);
+    pub fn find(amplitudes: &[f64], runs: &[usize]) -> Option<Self> {
+        let grouped = Grouped::by_run(amplitudes, runs);
         let freedom = grouped.frames.len() as f64 - grouped.groups.len() as f64;
         if freedom < FEWEST {
             return None;
@@ -79,7 +79,7 @@ impl Period {
 }
 
 impl Grouped {
-    fn of(amplitudes: &[f64], runs: &[usize]) -> Self {
+    fn by_run(amplitudes: &[f64], runs: &[usize]) -> Self {
         let frames: Vec<usize> = (0..amplitudes.len()).filter(|&frame| !amplitudes[frame].is_nan()).collect();
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for (i, &frame) in frames.iter().enumerate() {
@@ -161,10 +161,10 @@ mod tests {
         let (mut values, runs) = noise(1);
         values.iter_mut().skip(4).step_by(7).for_each(|value| *value += 2.0);
         values[50] = f64::NAN;
-        assert_eq!(Period::of(&values, &runs).unwrap().recurs, Recurs::Every(7));
+        assert_eq!(Period::find(&values, &runs).unwrap().recurs, Recurs::Every(7));
         let (mut values, runs) = noise(2);
         values.iter_mut().enumerate().for_each(|(i, value)| *value += 1.5 * (TAU * i as f64 / 5.3).sin());
-        let Recurs::Sine(period) = Period::of(&values, &runs).unwrap().recurs else { panic!("no sine") };
+        let Recurs::Sine(period) = Period::find(&values, &runs).unwrap().recurs else { panic!("no sine") };
         // a line's width in 346 frames is 5.3^2/346 = 0.08 frames
         assert!((period - 5.3).abs() < 0.05, "{period}");
     }
@@ -172,7 +172,7 @@ mod tests {
     #[test]
     fn noise_has_no_period() {
         // with a chance of less than one per cent each, two of forty have a probability of 6 %
-        let found = (0..40).map(|seed| noise(10 + seed)).filter(|(values, runs)| Period::of(values, runs).is_some());
+        let found = (0..40).map(|seed| noise(10 + seed)).filter(|(values, runs)| Period::find(values, runs).is_some());
         assert!(found.count() < 2);
     }
 }

@@ -58,9 +58,10 @@ impl PlaceScan {
     ///
     /// # Errors
     /// [`FitError`].
-    pub fn of(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
+    pub fn from_fit(data: &Data, fitted: &Fitted, left_out: Option<usize>, kind: Thin) -> Result<Self, FitError> {
         let unknown = left_out.and_then(|term| fitted.unknown(data, term)).map(|(at, _)| at);
-        let projection = unknown.map_or_else(|| Ok(Projection::of(fitted)), |at| Projection::without(fitted, at))?;
+        let projection =
+            unknown.map_or_else(|| Ok(Projection::from_fit(fitted)), |at| Projection::without(fitted, at))?;
         let data = fitted.data(data);
         let machines = fitted.machines_on_orbit(data)?;
         let signatures = of_each(&machines)?;
@@ -71,8 +72,8 @@ impl PlaceScan {
             let of_batch = |batch: &[Segment]| {
                 let columns = data.stacked_columns(batch.len(), |campaign, own| {
                     let scale = scale * data.scale(campaign, of_kind);
-                    let of = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
-                    own.signatures::<Infallible>(batch.len(), batch.iter().map(of))
+                    let signature = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
+                    own.signatures::<Infallible>(batch.len(), batch.iter().map(signature))
                 });
                 let Ok(columns) = columns;
                 projection.score(&columns).scores
@@ -98,9 +99,9 @@ impl PlaceScan {
     fn with(&self, finer: Self) -> Self {
         let likely: Vec<usize> = self.likely().collect();
         let kept = (0..self.segments.len()).filter(|i| !likely.contains(i));
-        let of = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
-        let mut all: Vec<_> = kept.map(|i| of(self, i)).collect();
-        all.extend((0..finer.segments.len()).map(|i| of(&finer, i)));
+        let segment = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
+        let mut all: Vec<_> = kept.map(|i| segment(self, i)).collect();
+        all.extend((0..finer.segments.len()).map(|i| segment(&finer, i)));
         all.sort_by(|one, other| one.0.s.total_cmp(&other.0.s));
         let mut joined = Self { segments: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
         for (segment, log_bayes, amplitude) in all {
@@ -170,11 +171,11 @@ fn segments(data: &Data) -> Vec<Segment> {
 fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Segment> {
     let count = (length / step).ceil().max(1.0);
     let piece = length / count;
-    let one = |i: usize| {
+    let interval = |i: usize| {
         let middle = (i as f64 + 0.5) * piece;
         Segment { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
     };
-    (0..count as usize).map(one).collect()
+    (0..count as usize).map(interval).collect()
 }
 
 #[cfg(test)]
@@ -197,13 +198,13 @@ mod tests {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
             let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
             let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
-            let mut data = Data::of(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = Data::from_campaign(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
-            let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let (machine, drives) = fitted.machine(&data).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
-            let fitted = Fitted::of(&data, &hypothesis, &fitted.u).unwrap();
-            let scan = PlaceScan::of(&data, &fitted, Some(0), thin).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
+            let scan = PlaceScan::from_fit(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
             let peak = scan.peak();
             let credible = scan.credible(0.95);

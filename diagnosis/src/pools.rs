@@ -23,7 +23,7 @@ const PARTS: usize = 32;
 
 impl Pools {
     /// From the setting of each frame, and whether its noise is like that of the frame before; a frame without a setting has a pool of its own.
-    pub fn of(settings: &[Option<usize>], is_like_before: impl Fn(usize) -> bool) -> Self {
+    pub fn from_settings(settings: &[Option<usize>], is_like_before: impl Fn(usize) -> bool) -> Self {
         let longest = settings.len().div_ceil(PARTS);
         let (mut of_frame, mut count, mut first) = (Vec::with_capacity(settings.len()), 0, 0);
         for (i, setting) in settings.iter().enumerate() {
@@ -76,7 +76,7 @@ impl Pools {
     }
 
     /// Rows of pools as those of their frames.
-    pub fn by_frame(&self, of_pools: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn by_frame(&self, of_pools: &DMatrix<f64>) -> DMatrix<f64> {
         of_pools.select_rows(&self.of_frame)
     }
 }
@@ -89,10 +89,10 @@ mod tests {
     fn a_pool_is_a_run_of_one_setting_and_no_longer_than_a_part_of_the_campaign() {
         let settings: Vec<Option<usize>> =
             [0, 0, 0, 1, 1, 0].map(Some).into_iter().chain([None, None]).chain([Some(2); 88]).collect();
-        let pools = Pools::of(&settings, |_| true);
+        let pools = Pools::from_settings(&settings, |_| true);
         assert_eq!(pools.of_frame[..12], [0, 0, 0, 1, 1, 2, 3, 4, 5, 5, 5, 6], "a 32nd of 96 frames is 3");
         assert_eq!(pools.count, 5 + 88_usize.div_ceil(3));
-        let pools = Pools::of(&settings, |frame| ![2, 4].contains(&frame));
+        let pools = Pools::from_settings(&settings, |frame| ![2, 4].contains(&frame));
         assert_eq!(pools.of_frame[..6], [0, 0, 1, 2, 3, 4], "and where the noise is another");
     }
 

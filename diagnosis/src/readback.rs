@@ -30,10 +30,10 @@ pub struct Contradiction {
 impl Contradiction {
     /// Those of a recording, by corrector; `names` of its correctors.
     pub fn all(recording: &Recording, names: &[String]) -> Vec<Self> {
-        (0..names.len()).filter_map(|c| Self::of(recording, c, &names[c])).collect()
+        (0..names.len()).filter_map(|c| Self::find(recording, c, &names[c])).collect()
     }
 
-    fn of(recording: &Recording, corrector: usize, name: &str) -> Option<Self> {
+    fn find(recording: &Recording, corrector: usize, name: &str) -> Option<Self> {
         let off = |row: &inference::recording::Row| {
             row.corrector_current[corrector] - row.setting(corrector).unwrap_or_default()
         };

@@ -74,23 +74,23 @@ struct State {
 
 impl Run {
     /// Of every frame, from the setting of each.
-    pub fn of(settings: &[Option<usize>]) -> Vec<Self> {
+    pub fn from_settings(settings: &[Option<usize>]) -> Vec<Self> {
         let mut count = std::collections::BTreeMap::<usize, usize>::new();
         settings.iter().flatten().for_each(|setting| *count.entry(*setting).or_default() += 1);
         let base = count.into_iter().max_by_key(|(_, frames)| *frames).map(|(setting, _)| setting);
-        let of = |i: usize| match settings[i] {
+        let run_of_frame = |i: usize| match settings[i] {
             None => Self::New,
             setting if setting == base => Self::Base,
             setting if i > 0 && settings[i - 1] == setting => Self::Same,
             Some(_) => Self::New,
         };
-        (0..settings.len()).map(of).collect()
+        (0..settings.len()).map(run_of_frame).collect()
     }
 }
 
 impl Repeats {
     /// From the frames that count, in rising order, and their readings less predictions [m].
-    pub fn of(frames: &[usize], values: &[f64], runs: &[Run]) -> Self {
+    pub fn from_frames(frames: &[usize], values: &[f64], runs: &[Run]) -> Self {
         let first = values.first().copied().unwrap_or(0.0);
         let mut readings: Vec<Repeat> = Vec::new();
         for (&frame, &value) in frames.iter().zip(values) {
@@ -103,7 +103,7 @@ impl Repeats {
         Self { readings, fitted: 0.0 }
     }
 
-    /// Without what follows known drives, rows frames (those given to [`Repeats::of`]), columns drives, in prior standard deviations [m]: the
+    /// Without what follows known drives, rows frames (those given to [`Repeats::from_frames`]), columns drives, in prior standard deviations [m]: the
     /// orbit follows the supplies by unknown factors. `sigma`: noise [m].
     #[must_use]
     pub fn without(mut self, following: &DMatrix<f64>, sigma: f64) -> Self {
@@ -123,7 +123,7 @@ impl Repeats {
 
     /// With the level of the noise in each frame.
     #[must_use]
-    pub fn at_levels(mut self, levels: &Levels) -> Self {
+    pub(crate) fn at_levels(mut self, levels: &Levels) -> Self {
         self.readings.iter_mut().for_each(|reading| reading.level = levels.at(reading.frame));
         self
     }
@@ -147,7 +147,7 @@ impl Repeats {
     }
 
     /// Standard deviation of the noise [m] by the differences of neighbours of one setting; none where there are few.
-    pub fn of_neighbours(&self) -> Option<f64> {
+    pub(crate) fn of_neighbours(&self) -> Option<f64> {
         let repeated = |pair: &&[Repeat]| {
             let [one, other] = [pair[0], pair[1]];
             other.frame == one.frame + 1 && (other.run == Run::Same || (one.run == Run::Base && other.run == Run::Base))
@@ -175,7 +175,7 @@ impl Repeats {
     }
 
     /// What they say of a memory.
-    pub fn weigh(&self, memory: Memory) -> Weighed {
+    pub(crate) fn weigh(&self, memory: Memory) -> Weighed {
         let mut weighed = Weighed { count: -self.fitted, ..Weighed::default() };
         for (_, innovation, variance) in self.differences(memory) {
             weighed.count += 1.0;
@@ -267,7 +267,7 @@ mod tests {
     #[test]
     fn the_filter_gives_the_likelihood_of_contrasts_within_settings() {
         let settings = [0, 0, 1, 1, 1, 2, 2, 0, 0, 0, 3, 3, 0, 0].map(Some);
-        let runs = Run::of(&settings);
+        let runs = Run::from_settings(&settings);
         // frame 5 does not count, so that its run begins a frame later
         let frames: Vec<usize> = (0..settings.len()).filter(|frame| *frame != 5).collect();
         let y = DVector::from_fn(frames.len(), |i, _| (2.1 * (i * i) as f64).sin() + 30.0);
@@ -275,7 +275,7 @@ mod tests {
             let setting = settings[frames[i]].unwrap();
             if k == 0 || k == setting { 1.0 } else { 0.0 }
         });
-        let repeats = Repeats::of(&frames, y.as_slice(), &runs);
+        let repeats = Repeats::from_frames(&frames, y.as_slice(), &runs);
         let larger = Levels::some(3..9, 2.0);
         let both_at = |memory: Memory, levels: &Levels| {
             let (square, log_det) = restricted(memory, levels, &frames, &y, &x);
@@ -296,12 +296,12 @@ mod tests {
     #[test]
     fn a_change_of_the_setting_by_any_physics_changes_nothing() {
         let settings = [0, 0, 1, 1, 1, 0, 0, 2, 2, 0].map(Some);
-        let runs = Run::of(&settings);
+        let runs = Run::from_settings(&settings);
         let frames: Vec<usize> = (0..10).collect();
         let weigh = |change: f64| {
             let value = |i: usize| (1.7 * (i * i) as f64).sin() + change * settings[i].unwrap() as f64;
             let values: Vec<f64> = (0..10).map(value).collect();
-            Repeats::of(&frames, &values, &runs).weigh(Memory { share: 0.2, time: 5.0, steps: 0.1 }).square
+            Repeats::from_frames(&frames, &values, &runs).weigh(Memory { share: 0.2, time: 5.0, steps: 0.1 }).square
         };
         assert!((weigh(0.0) / weigh(50.0) - 1.0).abs() < 1e-4, "the diffuse variance is 1e8");
     }

@@ -1,7 +1,7 @@
 //! The posterior of vars and amplitudes of a hypothesis, sampled by NUTS to validate the Gaussian of [`super::fit`].
 //!
 //! In units of prior standard deviations, `-cost/2` is the log-density of u. The vars have coordinates w without bounds (see
-//! [`inference::bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
+//! [`inference::Bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
 
 use core::ops::ControlFlow;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::data::Data;
 use super::fit::Fitted;
-use inference::bounded::Bounded;
+use inference::Bounded;
 use inference::nuts::{Density, NutsError, NutsRun, NutsSettings, Unstable, explore};
 
 /// A fitted hypothesis, its density sampled.

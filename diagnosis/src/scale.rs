@@ -32,12 +32,12 @@ const SCATTERS: usize = 60;
 
 impl Scales {
     /// From each monitor's `ln` of its measured scale, where there is one.
-    pub fn of(measured: &[Option<Measured>]) -> Self {
+    pub fn from_measured(measured: &[Option<Measured>]) -> Self {
         let known: Vec<Measured> = measured.iter().copied().flatten().collect();
         let (near, scatter) = Self::scatter_of(&known);
         let common = common_of(&near, scatter.value);
-        let of = |one: &Option<Measured>| one.map_or(0.0, |one| shrunk(one, common.value, scatter.value));
-        Self { each: measured.iter().map(|one| of(one).exp()).collect(), common, scatter }
+        let shrunk_scale = |one: &Option<Measured>| one.map_or(0.0, |one| shrunk(one, common.value, scatter.value));
+        Self { each: measured.iter().map(|one| shrunk_scale(one).exp()).collect(), common, scatter }
     }
 
     /// The monitors near the others, and the scatter of these.
@@ -65,9 +65,9 @@ fn furthest(all: &[Measured]) -> Option<usize> {
 /// True if one of some scales lies near the others, by the scatter of these alone.
 fn is_alike(all: &[Measured], at: usize) -> bool {
     let mut others = all.to_vec();
-    let one = others.remove(at);
+    let left_out = others.remove(at);
     let scatter = scatter_among(&others).map_or(0.0, |scatter| scatter.value);
-    !is_far(one, centre_of(&others), scatter)
+    !is_far(left_out, centre_of(&others), scatter)
 }
 
 /// The scatter of some scales, 0 with its root mean square where none is more likely; none without any scale.
@@ -82,7 +82,7 @@ fn scatter_among(near: &[Measured]) -> Option<Measured> {
         let square: f64 = near.iter().zip(&weights).map(|(one, weight)| (one.value - mean).powi(2) * weight).sum();
         0.5 * (weights.iter().map(|weight| weight.ln()).sum::<f64>() - square - total.ln())
     };
-    let posterior = HalfNormal::of(log_density, ALIKE, SCATTERS);
+    let posterior = HalfNormal::from_log_likelihood(log_density, ALIKE, SCATTERS);
     let needed = posterior.log_evidence > log_density(0.0);
     let of_grid = || Measured { value: posterior.mean, sigma: posterior.sigma() };
     Some(if needed { of_grid() } else { Measured { value: 0.0, sigma: posterior.square.sqrt() } })
@@ -143,7 +143,7 @@ mod tests {
         let of = |scales: &[f64]| {
             let others = (0..29).map(|_| Some(Measured { value: 0.0, sigma: 0.15 }));
             let own = |scale: &f64| Some(Measured { value: scale.ln(), sigma: 44_f64.sqrt().recip() });
-            Scales::of(&others.chain(scales.iter().map(own)).collect::<Vec<_>>()).each.split_off(29)
+            Scales::from_measured(&others.chain(scales.iter().map(own)).collect::<Vec<_>>()).each.split_off(29)
         };
         assert_eq!(of(&[0.51]), [1.0]);
         let own = of(&[2.0, 0.2]);
@@ -158,7 +158,7 @@ mod tests {
         // an orbit that drifts makes the noise of monitors as different as their beta functions, to far beyond their errors
         let measured: Vec<Option<Measured>> =
             (0..30).map(|b| Some(Measured { value: f64::from(b % 7), sigma: 0.02 })).collect();
-        let scales = Scales::of(&measured);
+        let scales = Scales::from_measured(&measured);
         assert!(scales.scatter.value.is_finite() && scales.common.sigma.is_finite());
         for (scale, measured) in scales.each.iter().zip(measured.iter().flatten()) {
             // the scatter among them is a hundred times each error, so that none is shrunk by more than a hundredth of its error

@@ -15,8 +15,9 @@ use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
 use super::data::Data;
 use super::error::FitError;
+use super::family::members;
 use super::fit::Fitted;
-use super::hypothesis::{Term, members};
+use super::term::Term;
 
 /// One candidate.
 #[derive(Debug, Clone)]
@@ -69,7 +70,7 @@ pub struct Scored {
 
 impl Projection {
     /// About a fit at its best.
-    pub fn of(fitted: &Fitted) -> Self {
+    pub fn from_fit(fitted: &Fitted) -> Self {
         Self {
             residual: fitted.residual.clone(),
             back: fitted.jacobian.transpose(),
@@ -99,8 +100,9 @@ impl Projection {
     /// Pull of whitened signatures, one a column, and their whole squares, which bound their power.
     pub fn bounds(&self, columns: &DMatrix<f64>) -> Vec<SignatureScore> {
         let pulling = self.pulling();
-        let of = |column: DVectorView<f64>| SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() };
-        columns.column_iter().map(of).collect()
+        let bound =
+            |column: DVectorView<f64>| SignatureScore { pull: column.dot(&pulling), power: column.norm_squared() };
+        columns.column_iter().map(bound).collect()
     }
 
     /// Score some terms by their whitened signatures, one a column. Of an exchange whose pull is below half of the power that stays at least, which makes it
@@ -126,7 +128,7 @@ impl Projection {
     }
 
     /// `d_i P d_j` of whitened signatures, one a column.
-    pub fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
         columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
     }
@@ -135,12 +137,12 @@ impl Projection {
     pub fn score(&self, columns: &DMatrix<f64>) -> Scored {
         let shared = &self.back * columns;
         let taken = self.factor.solve(&shared);
-        let one = |i: usize| {
+        let score = |i: usize| {
             let (column, taken) = (columns.column(i), taken.column(i));
             let pull = column.dot(&self.residual) - taken.dot(&self.slope);
             SignatureScore { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
         };
-        Scored { scores: (0..columns.ncols()).map(one).collect(), taken }
+        Scored { scores: (0..columns.ncols()).map(score).collect(), taken }
     }
 }
 
@@ -151,12 +153,12 @@ impl SignatureScore {
     }
 
     /// Of a bound: an exchange is less likely than nothing.
-    pub fn is_below_half_of_least(self) -> bool {
+    pub(crate) fn is_below_half_of_least(self) -> bool {
         self.pull < 0.5 * self.least()
     }
 
     /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
-    pub fn of_amplitude(self) -> (f64, f64) {
+    pub(crate) fn of_amplitude(self) -> (f64, f64) {
         let Evidence { amplitude, log_bayes_factor, .. } = Evidence::from_score(self.pull, self.power, 1.0);
         (amplitude, log_bayes_factor)
     }
@@ -167,7 +169,7 @@ impl SignatureScore {
     }
 
     /// The same for an effect without an amplitude.
-    pub fn of_switch(self) -> (f64, f64) {
+    pub(crate) fn of_switch(self) -> (f64, f64) {
         (1.0, self.pull - 0.5 * self.power)
     }
 }
@@ -204,12 +206,12 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
 /// The same by the signatures of the machine in each recording.
 fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64> {
     let columns = data.stacked_columns(terms.len(), |campaign, own| {
-        let of = |term: &Term| {
+        let signature = |term: &Term| {
             let scale = term.kind.prior_scale().unwrap_or(1.0) * data.scale(campaign, term.kind);
             // none if there is no stable machine with it
             Ok(of_each[campaign].of_effect(term.kind, term.site).ok().map(|one| one * scale))
         };
-        own.signatures::<Infallible>(terms.len(), terms.iter().map(of))
+        own.signatures::<Infallible>(terms.len(), terms.iter().map(signature))
     });
     let Ok(columns) = columns;
     columns
@@ -220,7 +222,7 @@ fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64>
 /// # Errors
 /// [`FitError`].
 pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidate>, FitError> {
-    let (data, projection) = (fitted.data(data), Projection::of(fitted));
+    let (data, projection) = (fitted.data(data), Projection::from_fit(fitted));
     let machines = fitted.machines_on_orbit(data)?;
     let of_each = of_each(&machines)?;
     // all at once would be gigabytes for a ring of 150 monitors
@@ -268,12 +270,12 @@ pub fn separations(
     others: &[&Term],
 ) -> Result<Vec<f64>, FitError> {
     let all: Vec<Term> = core::iter::once(term).chain(others.iter().copied()).copied().collect();
-    let gram = Projection::of(fitted).gram(&signatures(data, fitted, &all)?);
+    let gram = Projection::from_fit(fitted).gram(&signatures(data, fitted, &all)?);
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
-    let of = |(i, other): (usize, &&Term)| {
+    let separation = |(i, other): (usize, &&Term)| {
         let free = [term, other].map(|term| !term.kind.is_switch());
         let (power, rival, both) = (gram[(0, 0)], gram[(i + 1, i + 1)], gram[(0, i + 1)]);
         Rivals { power, rival, both, free }.expected(amplitude)
     };
-    Ok(others.iter().enumerate().map(of).collect())
+    Ok(others.iter().enumerate().map(separation).collect())
 }

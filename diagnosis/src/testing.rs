@@ -51,7 +51,7 @@ pub struct Coloured {
 
 impl Coloured {
     /// As the header states it, on a machine of random vars.
-    pub fn white(ring: &Ring, recording: &Recording, seed: u64) -> Self {
+    pub(crate) fn white(ring: &Ring, recording: &Recording, seed: u64) -> Self {
         let vars = inference::simulate::vars(ring, true, seed).unwrap();
         let made = recording.powered(ring).with_vars(&vars);
         let optics = Optics::of(&made, Hold::Momentum { delta: 0.0 }).unwrap();
@@ -68,7 +68,7 @@ impl Coloured {
     }
 
     /// The same with more physics.
-    pub fn campaign_with(
+    pub(crate) fn campaign_with(
         &self,
         ring: &Ring,
         recording: &Recording,

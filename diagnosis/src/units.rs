@@ -9,8 +9,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector};
 
 use evidence::Factor;
-use inference::Prior;
-use inference::bounded::Coordinates;
+use inference::{Coordinates, Prior};
 
 /// Precision given to a var that is held.
 const HELD: f64 = 1e12;
@@ -31,19 +30,19 @@ pub struct Units {
 
 impl Units {
     /// Of a prior that has a width.
-    pub fn of(prior: &Prior) -> Self {
+    pub fn from_prior(prior: &Prior) -> Self {
         let sigma = prior.precision.map(|precision| precision.sqrt().recip());
         let range = |(i, range): (usize, &[f64; 2])| range.map(|bound| (bound - prior.mean[i]) / sigma[i]);
         Self {
             range: prior.range.iter().enumerate().map(range).collect(),
             mean: prior.mean.clone(),
             sigma,
-            coordinates: Coordinates::of(prior),
+            coordinates: Coordinates::from_prior(prior),
         }
     }
 
     /// The same of a prior whose standard deviations are so many times as large, within the same range.
-    pub fn scaled(&self, by: f64) -> Self {
+    pub(crate) fn scaled(&self, by: f64) -> Self {
         let range = self.range.iter().map(|range| range.map(|bound| bound / by)).collect();
         Self { sigma: &self.sigma * by, range, ..self.clone() }
     }
@@ -92,7 +91,7 @@ impl Units {
 }
 
 /// A Gaussian, and the share of it within the range.
-pub struct Within {
+pub struct BoundedGaussian {
     /// Factor of the precision, the held vars at their bounds.
     pub free: Factor,
     /// Slope of the log-density, zero for the held.
@@ -103,10 +102,15 @@ pub struct Within {
     pub log_inside: f64,
 }
 
-impl Within {
+impl BoundedGaussian {
     /// Of the factor of a precision and the slope at `u`, the first of which are params and have a range; none if the precision is not
     /// positive.
-    pub fn of(precision: &Factor, u: &DVector<f64>, mut slope: DVector<f64>, units: &Units) -> Option<Self> {
+    pub fn from_precision(
+        precision: &Factor,
+        u: &DVector<f64>,
+        mut slope: DVector<f64>,
+        units: &Units,
+    ) -> Option<Self> {
         let vars = units.len();
         let against = |&i: &usize| {
             let [lower, upper] = units.range[i];

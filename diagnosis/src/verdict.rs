@@ -3,26 +3,30 @@
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
-use super::alternatives::{Alternative, Cause, Competition, DECISIVE, SUSPICIOUS};
-use super::aside::Aside;
-use super::beyond::Beyond;
+use super::alternatives::{Alternative, Cause, Competition};
 use super::chance;
 use super::choice::Choice;
 use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
-use super::heldout::{Block, CHANCE, SUPPORTED, Score, VALIDATED, gain_of_choice, lessened, reduced};
-use super::hypothesis::Term;
-use super::imperfection::Imperfection;
+use super::family::family_of;
+use super::heldout::{Block, Score, gain_of_choice, lessened, reduced};
+use super::imperfection::{Imperfection, POSITION};
 use super::limits::Limits;
 use super::location::Location;
-use super::ordinary;
+use super::lost_frames::LostFrames;
+use super::odds::corrections;
+use super::odds::{DECISIVE, SUSPICIOUS};
+use super::out_of_range::OutOfRange;
 use super::place_scan::{Interval, PlaceScan};
 use super::readback::Contradiction;
 use super::scan::separations;
-use super::search::{Found, corrections};
-use super::stuck::Stuck;
+use super::search::Found;
+use super::stuck_monitor::Stuck;
+use super::term::Term;
+use super::tested::Tested;
 use super::transients::Transient;
+use super::widths;
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,8 +42,6 @@ pub enum Verdict {
     Unexplained,
 }
 
-/// Unit of an unmodelled discrepancy [m], shown in mm.
-pub(super) const UNMODELLED: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 /// Alternatives are listed down to this probability.
 const LISTED: f64 = 0.005;
 /// An effect in the model that something else explains better is no finding below this probability.
@@ -62,7 +64,7 @@ impl Verdict {
 
     /// The same with what passes within settings.
     #[must_use]
-    pub fn beside(self, transients: &[Transient]) -> Self {
+    pub fn with_transients(self, transients: &[Transient]) -> Self {
         let decided = |one: &Transient| {
             one.alternatives[0].probability >= DECISIVE && one.tested.is_some_and(|tested| tested.is_passed())
         };
@@ -77,12 +79,12 @@ impl Verdict {
 
     /// The same beside noise that is not ordinary.
     #[must_use]
-    pub fn with_noise(self, data: &Data) -> Self {
+    pub(crate) fn with_noise(self, data: &Data) -> Self {
         if data.campaigns().any(|one| one.noise.unordinary().is_some()) { Self::Unexplained } else { self }
     }
 
     /// From the competition of each effect, and how it stood its tests.
-    pub fn of(found: &Found, tests: &[Tested]) -> Self {
+    pub fn from_tests(found: &Found, tests: &[Tested]) -> Self {
         let next = &found.next;
         if next.unknown_seen() > SUSPICIOUS || found.best.is_poor() {
             return Self::Unexplained;
@@ -108,35 +110,6 @@ impl Verdict {
     }
 }
 
-/// How an effect predicts what it was not chosen by, and how often chance would find as much.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tested {
-    /// Gain of held-out log predictive density with the amplitude fitted to the rest, and its standard error.
-    pub gain: (f64, f64),
-    /// The same where kind and place are chosen by the rest too; none beside a fit that is poor without the effect, about which nothing is of
-    /// first order, and of an unknown element, whose place and form all readings have chosen.
-    pub of_choice: Option<f64>,
-    /// Probability of as good a candidate were nothing there.
-    pub chance: Option<f64>,
-    /// True of an instrument, if the fit without it has a learnt scatter of its kind: once one run shows it, that scatter predicts the other runs nearly as well, so
-    /// that held-out readings tell little.
-    pub is_of_family: bool,
-}
-
-impl Tested {
-    /// True if held-out readings are predicted better by more than the standard errors asked for, and by the choice too; of an instrument beside the scatter of
-    /// its like, if they are not predicted worse and chance is excluded.
-    pub fn is_passed(&self) -> bool {
-        let (gain, error) = self.gain;
-        let Some(of_choice) = self.of_choice else { return gain > VALIDATED * error };
-        match (self.chance.is_some_and(|chance| chance <= CHANCE), self.is_of_family) {
-            (true, true) => gain > 0.0,
-            (true, false) => of_choice > 0.0 && gain > SUPPORTED * error,
-            (false, _) => of_choice > 0.0 && gain > VALIDATED * error,
-        }
-    }
-}
-
 /// The integrated gradient of a field that does not grow with the magnets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fixed {
@@ -147,7 +120,7 @@ pub struct Fixed {
 }
 
 impl Fixed {
-    fn of(data: &Data, alternative: &Alternative) -> Option<Self> {
+    fn from_alternative(data: &Data, alternative: &Alternative) -> Option<Self> {
         let kind = alternative.term()?.kind;
         let is_fixed = data.is_joint() && kind.is_stray() && kind.thin().is_some();
         let (value, sigma) = alternative.amplitude;
@@ -193,7 +166,7 @@ pub struct Finding {
 }
 
 impl Finding {
-    fn of(data: &Data, alternative: &Alternative) -> Self {
+    fn from_alternative(data: &Data, alternative: &Alternative) -> Self {
         let (amplitude, sigma) = alternative.amplitude;
         let ring = &data.ring;
         let (at, s, phrase) = match &alternative.cause {
@@ -203,13 +176,13 @@ impl Finding {
                 term.kind.phrase(ring, term.site, Measured { value: amplitude, sigma }),
             ),
             Cause::Unmodelled(one) => {
-                let own = data.campaign(one.campaign);
-                let phrase = one.at.phrase(own);
-                let phrase = if data.is_joint() { format!("in {} {phrase}", own.name) } else { phrase };
-                (one.at.label(own), one.at.position(own), phrase)
+                let recording = data.campaign(one.campaign);
+                let phrase = one.at.phrase(recording);
+                let phrase = if data.is_joint() { format!("in {} {phrase}", recording.name) } else { phrase };
+                (one.at.label(recording), one.at.position(recording), phrase)
             }
         };
-        let fixed = Fixed::of(data, alternative);
+        let fixed = Fixed::from_alternative(data, alternative);
         let phrase = fixed.map_or_else(|| phrase.clone(), |fixed| phrase.clone() + &fixed.phrase());
         Self {
             fixed,
@@ -234,8 +207,8 @@ impl Finding {
         let others = transient.alternatives[1..].iter().filter(listed);
         Self {
             tested: transient.tested,
-            alternatives: others.map(|one| Self::of(data, one)).collect(),
-            ..Self::of(data, &transient.alternatives[0])
+            alternatives: others.map(|one| Self::from_alternative(data, one)).collect(),
+            ..Self::from_alternative(data, &transient.alternatives[0])
         }
     }
 
@@ -244,8 +217,8 @@ impl Finding {
         let listed = |(i, a): &(usize, &Alternative)| *i != first && a.probability > LISTED;
         let others: Vec<&Alternative> =
             competition.alternatives.iter().enumerate().filter(listed).map(|(_, a)| a).collect();
-        let finding = Self::of(data, &competition.alternatives[first]);
-        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::of(data, a)).collect();
+        let finding = Self::from_alternative(data, &competition.alternatives[first]);
+        let mut alternatives: Vec<Self> = others.iter().map(|a| Self::from_alternative(data, a)).collect();
         if let Cause::Effect(term) = &competition.alternatives[first].cause {
             let effects: Vec<(usize, &Term)> =
                 others.iter().enumerate().filter_map(|(i, a)| Some((i, a.term()?))).collect();
@@ -299,7 +272,7 @@ impl Finding {
 
     /// Unit of the amplitude; for an unmodelled discrepancy that of its rms in the readings.
     pub fn unit(&self) -> Unit {
-        self.term().map_or(UNMODELLED, |term| term.kind.unit())
+        self.term().map_or(POSITION, |term| term.kind.unit())
     }
 
     /// True if held-out frames are predicted better by more than the standard errors asked for.
@@ -339,16 +312,17 @@ pub fn tests(
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let without = &reduced(data, &found.best, i)?;
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
-        let rival = if is_all { before } else { &Score::of(data, without, blocks)? };
+        let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
             return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
         }
         let kind = found.best.hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
-        let own = ordinary::family_of(kind);
-        let is_learnt = without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == own);
-        let choice = Choice::of(data, without, candidates, penalty)?;
+        let kind_of_family = family_of(kind);
+        let is_learnt =
+            without.hypothesis.ordinary.iter().any(|family| family.is_learnt() && family.kind == kind_of_family);
+        let choice = Choice::from_terms(data, without, candidates, penalty)?;
         let is_of_family = is_of_an_instrument && is_learnt;
         let (of_choice, chance) = (Some(gain_of_choice(&choice)?), Some(chance::of_search(&choice)?));
         Ok(Tested { gain, of_choice, chance, is_of_family })
@@ -371,7 +345,7 @@ pub fn test_of_element(
         return Ok(None);
     }
     let without = || lessened(data, &found.best, found.best.hypothesis.without_element());
-    let rival = if found.competitions.is_empty() { before } else { &Score::of(data, &without()?, blocks)? };
+    let rival = if found.competitions.is_empty() { before } else { &Score::from_blocks(data, &without()?, blocks)? };
     Ok(Some(Tested { gain: after.gain_over(rival), of_choice: None, chance: None, is_of_family: false }))
 }
 
@@ -390,7 +364,7 @@ pub fn findings(
 ) -> Result<Vec<Finding>, FitError> {
     let (named, unmodelled): (Vec<Finding>, Vec<Finding>) =
         transients.iter().map(|one| Finding::of_transient(data, one)).partition(|one| one.term().is_some());
-    let mut own = Vec::new();
+    let mut findings = Vec::new();
     for (index, ((competition, term), &tested)) in
         found.competitions.iter().zip(&found.best.hypothesis.terms).zip(tests).enumerate()
     {
@@ -398,15 +372,15 @@ pub fn findings(
         let Some(first) = competition.alternatives.iter().position(is_it) else { continue };
         let interval = match term.kind.thin() {
             // if the scan fails there is no interval, but the finding stands
-            Some(kind) => PlaceScan::of(data, &found.best, Some(index), kind)
+            Some(kind) => PlaceScan::from_fit(data, &found.best, Some(index), kind)
                 .map_or_else(|_| Vec::new(), |s| s.credible(CREDIBLE)),
             None => Vec::new(),
         };
-        own.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
+        findings.push(Finding { tested: Some(tested), interval, ..Finding::of_competition(data, competition, first)? });
     }
     let is_stated = |finding: &Finding| finding.probability > STATED;
-    let is_explained_better = !own.iter().any(is_stated);
-    let mut all: Vec<Finding> = named.into_iter().chain(own).filter(is_stated).collect();
+    let is_explained_better = !findings.iter().any(is_stated);
+    let mut all: Vec<Finding> = named.into_iter().chain(findings).filter(is_stated).collect();
     all.sort_by(|one, other| other.log_evidence_gain.total_cmp(&one.log_evidence_gain));
     let open = match of_means {
         Verdict::Unexplained => found.next.alternatives.iter().position(|a| !a.is_of_library()),
@@ -441,7 +415,9 @@ pub fn findings(
     }
     all.extend(unmodelled);
     for (index, campaign) in data.campaigns().enumerate() {
-        all.extend(Alternative::from_frame_to_frame(&campaign.noise, index).map(|one| Finding::of(data, &one)));
+        all.extend(
+            Alternative::from_frame_to_frame(&campaign.noise, index).map(|one| Finding::from_alternative(data, &one)),
+        );
     }
     Ok(all)
 }
@@ -453,7 +429,7 @@ pub fn sentence(
     verdict: Verdict,
     findings: &[Finding],
     contradictions: &[Contradiction],
-    beyond: &[Beyond],
+    beyond: &[OutOfRange],
 ) -> String {
     let phrases =
         |separator: &str| findings.iter().map(|finding| finding.phrase.as_str()).collect::<Vec<_>>().join(separator);
@@ -470,8 +446,8 @@ pub fn sentence(
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => unexplained(found, findings),
     };
-    let contradicted = contradictions.iter().map(|one| within(data, &one.recording, one.to_string()));
-    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(Beyond::to_string)).collect();
+    let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
+    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
     // these are no missing physics, and a consistent recording's sentence begins with them
     if verdict == Verdict::Consistent && !said.is_empty() {
         said.push(format!("besides, {text}"));
@@ -483,7 +459,7 @@ pub fn sentence(
 }
 
 /// What is said of one of several recordings.
-fn within(data: &Data, recording: &str, said: String) -> String {
+fn in_recording(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
 }
 
@@ -491,17 +467,17 @@ fn within(data: &Data, recording: &str, said: String) -> String {
 fn remarks(data: &Data, found: &Found) -> Vec<String> {
     let mut remarks = Vec::new();
     let large: Vec<String> =
-        ordinary::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
+        widths::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
     if !large.is_empty() {
         remarks.push(format!("larger than ordinary: {}", large.join(", ")));
     }
     for own in data.campaigns() {
-        remarks.extend(own.close_tunes.iter().map(|one| within(data, &own.name, one.to_string())));
-        remarks.extend(own.noise.remarks().into_iter().map(|said| within(data, &own.name, said)));
-        remarks.extend(wandering(own).into_iter().map(|said| within(data, &own.name, said)));
+        remarks.extend(own.close_tunes.iter().map(|one| in_recording(data, &own.name, one.to_string())));
+        remarks.extend(own.noise.remarks().into_iter().map(|said| in_recording(data, &own.name, said)));
+        remarks.extend(wandering(own).into_iter().map(|said| in_recording(data, &own.name, said)));
     }
-    remarks.extend(Stuck::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
-    remarks.extend(Aside::all(data).iter().map(|one| within(data, &one.recording, one.to_string())));
+    remarks.extend(Stuck::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
+    remarks.extend(LostFrames::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
@@ -563,9 +539,10 @@ fn likely(finding: &Finding) -> String {
     if finding.probability >= DECISIVE {
         return finding.phrase.clone();
     }
-    let of = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
-    let others = finding.alternatives.iter().filter(|other| other.probability > STATED).take(SAID).map(of);
-    core::iter::once(of(finding)).chain(others).collect::<Vec<_>>().join(", or ")
+    let said_with_probability = |f: &Finding| format!("{} ({:.0} %)", f.phrase, 100.0 * f.probability);
+    let others =
+        finding.alternatives.iter().filter(|other| other.probability > STATED).take(SAID).map(said_with_probability);
+    core::iter::once(said_with_probability(finding)).chain(others).collect::<Vec<_>>().join(", or ")
 }
 
 /// The alternatives that share most of the probability.
@@ -588,7 +565,7 @@ fn ambiguous(findings: &[Finding]) -> String {
 fn power(found: &Found) -> String {
     let shown = [EffectKind::BpmGain, EffectKind::CorrectorGain, EffectKind::QuadRoll, EffectKind::StrayGradient];
     let of_kind = |kind: EffectKind| {
-        let limits = Limits::of(kind, &found.next.scanned)?;
+        let limits = Limits::from_scan(kind, &found.next.scanned)?;
         Some(format!("{kind} {}", kind.unit().rounded(limits.median)))
     };
     let list: Vec<String> = shown.into_iter().filter_map(of_kind).collect();
@@ -618,7 +595,7 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
     let leaders: Vec<(&Alternative, &Term)> = effects.take(2).collect();
     let Some((first, one)) = leaders.first() else { return Ok(None) };
     let rival = leaders.get(1).filter(|(a, _)| a.probability > competition.nothing);
-    let menu = Menu::of(data, &competition.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
+    let menu = Menu::from_causes(data, &competition.without, (one, first.amplitude.0), rival.map(|(_, term)| *term))?;
     let against = rival.map_or_else(|| "nothing".to_owned(), |(_, term)| term.label(&data.ring));
     Ok(Some((menu, [one.label(&data.ring), against])))
 }
@@ -664,17 +641,18 @@ mod tests {
     #[test]
     fn an_effect_at_an_instrument_that_does_something_unknown_is_a_part_of_that() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let alternative = |cause: Cause, probability: f64| Alternative {
             probability,
             ..Alternative::unfitted(cause, 50.0, (-0.2, 0.01))
         };
         let unknown = |at: Location, probability: f64| {
             let one = Discrepancy { at, campaign: 0, log_bayes: 50.0, size: 1e-4, sites: 33, adapted: None };
-            Finding::of(&data, &alternative(Cause::Unmodelled(one), probability))
+            Finding::from_alternative(&data, &alternative(Cause::Unmodelled(one), probability))
         };
-        let of =
-            |kind: EffectKind, site: Site| Finding::of(&data, &alternative(Cause::Effect(Term { kind, site }), 0.99));
+        let of = |kind: EffectKind, site: Site| {
+            Finding::from_alternative(&data, &alternative(Cause::Effect(Term { kind, site }), 0.99))
+        };
         let gain = of(EffectKind::BpmGain, Site::Monitor(ring.read_monitors[3]));
         let curve = unknown(Location::MonitorCurve(3), 0.99);
         assert!(curve.holds(&gain, &data));

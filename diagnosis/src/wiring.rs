@@ -127,22 +127,17 @@ impl Miswired {
     ///
     /// # Errors
     /// [`EffectError`] if the ring as designed has no orbit.
-    pub fn of(ring: &Ring, recording: &Recording) -> Result<Option<Self>, EffectError> {
+    pub fn find(ring: &Ring, recording: &Recording) -> Result<Option<Self>, EffectError> {
         let ring = &*recording.powered(ring);
         let machines = machines(ring, recording)?;
-        let mut designs = Designs::of(&machines)?;
-        let measured = Measured::of(ring, recording, designs.stated());
+        let mut designs = Designs::from_machines(&machines)?;
+        let measured = Measured::from_recording(ring, recording, designs.stated());
         // what looks right on the design itself needs no other tunes
         if measured.judged(&designs).is_none() {
             return Ok(None);
         }
         designs.at_other_tunes(&measured);
         Ok(measured.judged(&designs))
-    }
-
-    /// The likely wirings, most likely first.
-    pub fn wirings(&self) -> &[Wiring] {
-        &self.0
     }
 }
 
@@ -165,7 +160,7 @@ fn wirings() -> Vec<(Columns, Fault)> {
 
 impl<'m> Designs<'m> {
     /// As the header says.
-    fn of(machines: &'m [Machine]) -> Result<Self, OrbitError> {
+    fn from_machines(machines: &'m [Machine]) -> Result<Self, OrbitError> {
         let ring = machines[0].ring();
         let by_family = families(ring)?;
         Ok(Self { machines, by_family, at: vec![responses(&machines[0], ring)?], off: vec![0.0] })
@@ -258,7 +253,7 @@ fn responses(machine: &Machine, ring: &Ring) -> Result<[[DMatrix<f64>; 2]; 2], O
 }
 
 impl<'r> Measured<'r> {
-    fn of(ring: &'r Ring, recording: &Recording, design: &DMatrix<f64>) -> Self {
+    fn from_recording(ring: &'r Ring, recording: &Recording, design: &DMatrix<f64>) -> Self {
         let (split, kicks) = (ring.horizontal_monitors(), design.ncols() - 1);
         let rms = |part: DMatrixView<f64>| (part.norm_squared() / part.len().max(1) as f64).sqrt();
         let horizontal = ring.horizontal_correctors();
@@ -268,12 +263,14 @@ impl<'r> Measured<'r> {
             rms(design.view((0, kicks), (split, 1))),
         ];
         let rows = recording.rows.iter().map(|row| {
-            let Drive { kick, rf_offset, .. } = Drive::of(&recording.header, row);
+            let Drive { kick, rf_offset, .. } = Drive::from_row(&recording.header, row);
             kick.push(rf_offset).transpose()
         });
         let drive = DMatrix::from_rows(&rows.collect::<Vec<_>>());
         let regressed = |by: isize| -> Vec<Regressed> {
-            (0..design.nrows()).map(|b| Regressed::of(recording, &drive, by, b, &prior(ring, scale, b))).collect()
+            (0..design.nrows())
+                .map(|b| Regressed::from_recording(recording, &drive, by, b, &prior(ring, scale, b)))
+                .collect()
         };
         let rows = |of: &[Regressed], row: fn(&Regressed) -> &DVector<f64>| {
             DMatrix::from_columns(&of.iter().map(|one| row(one).clone()).collect::<Vec<_>>()).transpose()
@@ -286,7 +283,7 @@ impl<'r> Measured<'r> {
         });
         let response = rows(&stated, |one| &one.response);
         let variance = rows(&stated, |one| &one.variance);
-        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::of(ring), design);
+        let scatter = ORDINARY.powi(2) + of_vars(ring, &Prior::from_ring(ring), design);
         Self { ring, response, late, variance, scale, scatter }
     }
 
@@ -356,13 +353,13 @@ impl<'r> Measured<'r> {
         let weights: Vec<f64> = wrong.iter().map(|one| self.best(designs, Some(*one)).log_likelihood + prior).collect();
         let largest = weights.iter().copied().fold(stated, f64::max);
         let sum = weights.iter().map(|weight| (weight - largest).exp()).sum::<f64>() + (stated - largest).exp();
-        let of = |(&(columns, fault), weight): (&(Columns, Fault), &f64)| Wiring {
+        let wiring = |(&(columns, fault), weight): (&(Columns, Fault), &f64)| Wiring {
             columns,
             fault,
             probability: (weight - largest).exp() / sum,
             correlation: self.correlation(designs, columns, fault),
         };
-        let mut likely: Vec<Wiring> = wrong.iter().zip(&weights).map(of).collect();
+        let mut likely: Vec<Wiring> = wrong.iter().zip(&weights).map(wiring).collect();
         likely.sort_by(|one, other| other.probability.total_cmp(&one.probability));
         likely.retain(|one| one.probability > 1.0 - REFUSED && one.correlation[1] > RESEMBLES);
         let refused = (stated - largest).exp() / sum < 1.0 - REFUSED;
@@ -377,12 +374,12 @@ impl<'r> Measured<'r> {
         let off: Vec<[f64; 2]> = designs.at.iter().map(|at| self.off(&response, Self::design(at, wiring))).collect();
         // the orbit in a plane is that of its own tune
         let pairs = (0..off.len()).flat_map(|x| (0..off.len()).map(move |y| [x, y]));
-        let of = |at: [usize; 2]| {
+        let judged = |at: [usize; 2]| {
             let spread = n * (off[at[0]][0] + off[at[1]][1]) / (FREEDOM * self.scatter);
             let prior: f64 = at.iter().map(|&i| designs.log_prior(i)).sum();
             Best { log_likelihood: prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale + of_readings, at }
         };
-        let best = pairs.map(of).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
+        let best = pairs.map(judged).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
         best.expect("at least the design")
     }
 
@@ -443,7 +440,7 @@ struct Regressed {
 
 impl Regressed {
     /// Least squares on what drove the beam in the frame so many before, and a baseline, with the prior's widths.
-    fn of(recording: &Recording, drive: &DMatrix<f64>, by: isize, b: usize, prior: &DVector<f64>) -> Self {
+    fn from_recording(recording: &Recording, drive: &DMatrix<f64>, by: isize, b: usize, prior: &DVector<f64>) -> Self {
         let frame = |i: usize| i.checked_add_signed(-by).filter(|frame| *frame < drive.nrows());
         let read = recording.rows.iter().enumerate().filter_map(|(i, row)| Some((frame(i)?, row.reading[b]?)));
         let (frames, readings): (Vec<usize>, Vec<f64>) = read.unzip();
@@ -579,7 +576,7 @@ mod tests {
     }
 
     fn judge(ring: &Ring, recording: &Recording) -> Option<Miswired> {
-        Miswired::of(ring, recording).unwrap()
+        Miswired::find(ring, recording).unwrap()
     }
 
     fn booster(name: &str) -> (Ring, Recording) {
@@ -648,7 +645,7 @@ mod tests {
             for (recording, columns, fault) in cases.into_iter().chain([moved(1), moved(-1)]) {
                 let found = judge(&ring, &recording).unwrap_or_else(|| panic!("{name}: {columns:?} {fault:?} missed"));
                 let is_it = |one: &Wiring| one.columns == columns && one.fault == fault;
-                assert!(found.wirings().iter().any(is_it), "{name}: {columns:?} {fault:?}: {found}");
+                assert!(found.0.iter().any(is_it), "{name}: {columns:?} {fault:?}: {found}");
             }
         }
     }

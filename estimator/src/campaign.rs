@@ -33,9 +33,10 @@ pub struct Setting {
 state!([] Setting { reference, corrector, kick, tolerance, rf_offset, cycle_time });
 
 /// Kicks this close belong to the same setting, as a share of the kick: 1/16.
-const SAME_KICK: i32 = 16;
-/// RF offsets this close belong to the same setting: 1e-6.
-const SAME_OFFSET: i32 = 1_000;
+pub const SAME_KICK: i32 = 16;
+/// RF offsets this close belong to the same setting, in steps of the wire: 1e-6. That moves an orbit by a few micrometres, below the noise of a
+/// reading, and is more than the read-back scatters; measurements move the RF by 1e-4 and more.
+pub const SAME_OFFSET: i32 = 1_000;
 
 impl Setting {
     /// True if a corrector is powered or the RF frequency moved.

@@ -34,7 +34,7 @@ mod tune;
 pub mod wire;
 
 pub use beyond::Beyond;
-pub use campaign::{Beside, ByRepeats, Campaign, Cell, Setting, Verdict};
+pub use campaign::{Beside, ByRepeats, Campaign, Cell, SAME_KICK, SAME_OFFSET, Setting, Verdict};
 pub use drive::{Calibration, Drive, Each, SupplyCalibration};
 pub use estimate::{Estimate, Health, MonitorState, Remarks};
 pub use estimator::{Estimator, FitQuality, GROUPS, IngestError, Model, Prepared, Setup, Walk};
@@ -43,7 +43,7 @@ pub use judged::Judged;
 pub use mask::{Mask, words};
 pub use monitor::{Gate, Monitor, Noise};
 pub use prior::{Marginal, Prior};
-pub use ramp::{RAMP_POINTS, Ramp, RampPoint};
+pub use ramp::{RAMP_POINTS, Ramp, RampPoint, SAME_TIME};
 pub use sizes::{Layout, Sizes, largest};
 pub use state::{Bytes, State, StateError};
 pub use steer::{Feedback, Hold, Response, Steer, Steered};

@@ -11,7 +11,7 @@ pub const RAMP_POINTS: usize = 8;
 /// Most times in the cycle at which one core keeps baselines.
 pub(crate) const TIMES: usize = 4;
 /// Times this close are one [us].
-const SAME_TIME: u32 = 1_000;
+pub const SAME_TIME: u32 = 1_000;
 
 /// True for times in the cycle that count as one [us].
 pub(crate) fn is_same_time(one: u32, other: u32) -> bool {

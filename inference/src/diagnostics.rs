@@ -34,7 +34,7 @@ pub fn r_hat<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
     if chains.len() < 2 || !are_valid(chains) {
         return f64::NAN;
     }
-    let halves = Halves::of(chains);
+    let halves = Halves::split(chains);
     let bulk = halves.normal_scores().r_hat();
     let tail = halves.folded().normal_scores().r_hat();
     if tail > bulk { tail } else { bulk } // a NaN of the tail alone is passed over: two values are equally far out
@@ -47,7 +47,7 @@ pub fn r_hat<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
 ///
 /// Source: Vehtari et al. 2021, sec. 3.2 and 4.1.
 pub fn ess_bulk<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
-    if are_valid(chains) { Halves::of(chains).normal_scores().ess() } else { f64::NAN }
+    if are_valid(chains) { Halves::split(chains).normal_scores().ess() } else { f64::NAN }
 }
 
 /// Effective number of independent draws behind the tails [1]: the smaller one of whether a draw lies up to the 5 %
@@ -60,7 +60,7 @@ pub fn ess_tail<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
     if !are_valid(chains) {
         return f64::NAN;
     }
-    let (sorted, halves) = (sorted(chains), Halves::of(chains));
+    let (sorted, halves) = (sorted(chains), Halves::split(chains));
     let [low, high] = [0.05, 0.95].map(|probability| {
         let quantile = quantile(&sorted, probability);
         halves.map(|draw| if draw <= quantile { 1.0 } else { 0.0 }).ess()
@@ -78,7 +78,7 @@ pub fn mcse_mean<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
         return f64::NAN;
     }
     let draws: Vec<f64> = pooled(chains).collect();
-    (variance(&draws) / Halves::of(chains).ess()).sqrt()
+    (variance(&draws) / Halves::split(chains).ess()).sqrt()
 }
 
 /// Monte Carlo standard error of the standard deviation of all draws, in the draws' unit.
@@ -95,7 +95,7 @@ pub fn mcse_sd<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
     let squares: Vec<f64> = pooled(chains).map(squared).collect();
     let fourth = squares.iter().map(|square| square * square).sum::<f64>() / squares.len() as f64;
     let second = mean(&squares);
-    ((fourth - second * second) / Halves::of(chains).map(squared).ess() / second / 4.0).sqrt()
+    ((fourth - second * second) / Halves::split(chains).map(squared).ess() / second / 4.0).sqrt()
 }
 
 /// Quantile of values in rising order by linear interpolation, as of numpy and type 7 of R, in the values' unit.
@@ -103,7 +103,7 @@ pub fn mcse_sd<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
 /// `(1 − γ)·x_k + γ·x_{k+1}`, where `k + γ = (n − 1)·p` counts from 0. NaN for no values.
 ///
 /// ```
-/// # use inference::diagnostics::quantile;
+/// # use inference::quantile;
 /// assert_eq!(quantile(&[1.0, 2.0, 4.0], 0.75), 3.0);
 /// ```
 ///
@@ -156,7 +156,7 @@ struct Halves {
 }
 
 impl Halves {
-    fn of<C: AsRef<[f64]>>(chains: &[C]) -> Self {
+    fn split<C: AsRef<[f64]>>(chains: &[C]) -> Self {
         let draws = chains[0].as_ref().len() / 2;
         let ends = |chain: &[f64]| [&chain[..draws], &chain[chain.len() - draws..]].concat();
         Self { draws, values: chains.iter().flat_map(|chain| ends(chain.as_ref())).collect() }

@@ -132,7 +132,7 @@ impl Draws {
     /// Every quantity's posterior, in the order of the names.
     #[must_use]
     pub fn summary(&self) -> Vec<Summary> {
-        self.names.iter().enumerate().map(|(index, name)| Summary::of(name, &self.quantity(index))).collect()
+        self.names.iter().enumerate().map(|(index, name)| Summary::from_chains(name, &self.quantity(index))).collect()
     }
 
     /// Number of divergent draws in all chains.
@@ -176,7 +176,7 @@ fn is_name(name: &str) -> bool {
 }
 
 impl Summary {
-    fn of(name: &str, chains: &[Vec<f64>]) -> Self {
+    fn from_chains(name: &str, chains: &[Vec<f64>]) -> Self {
         let sorted = sorted(chains);
         Self {
             name: name.to_owned(),

@@ -128,7 +128,7 @@ impl BatchFit {
     ///
     /// # Errors
     /// [`BatchError`].
-    pub fn of(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
+    pub fn best(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
         let problem = Problem { campaign, tunes };
         let watch = |steps, _| {
             progress(steps);
@@ -167,7 +167,7 @@ impl Objective for Problem<'_> {
 
     fn evaluate(&self, params: &DVector<f64>) -> Result<(f64, Point), OrbitError> {
         let prior = &self.campaign.prior;
-        let linearised = AtTimes::of(self.campaign, params)?;
+        let linearised = self.campaign.linearised(params)?;
         let (mut normal, chi2) = self.orbits(params, &linearised);
         let (_, of_orbits) = normal.eliminated();
         if self.tunes == TuneUse::Readings {

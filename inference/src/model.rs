@@ -44,7 +44,7 @@ impl ResponseModel {
     /// # Errors
     /// [`training::TrainingError`] if it cannot be tabulated.
     pub fn green(ring: &Ring) -> Result<Self, training::TrainingError> {
-        Ok(Self::Green(Box::new(GreenModel::of(&training::green::tables(ring)?))))
+        Ok(Self::Green(Box::new(GreenModel::from_tables(&training::green::tables(ring)?))))
     }
 
     /// The network, of the ring that it was trained on.
@@ -53,8 +53,8 @@ impl ResponseModel {
     /// [`StreamError`] for another ring.
     pub fn resnet(ring: &Ring) -> Result<Self, StreamError> {
         training::network::expect_known(ring)?;
-        let green = GreenModel::of(&training::green::tables(ring)?);
-        Ok(Self::Resnet(Box::new(ResnetModel::of(green))))
+        let green = GreenModel::from_tables(&training::green::tables(ring)?);
+        Ok(Self::Resnet(Box::new(ResnetModel::from_green(green))))
     }
 
     /// The first order about a ring's design.
@@ -62,7 +62,7 @@ impl ResponseModel {
     /// # Errors
     /// [`OrbitError`] if the ring has no closed orbit.
     pub fn linear(ring: &Ring) -> Result<Self, OrbitError> {
-        Ok(Self::Linear(Box::new(LinearModel::of(ring)?)))
+        Ok(Self::Linear(Box::new(LinearModel::from_ring(ring)?)))
     }
 
     /// False if a prediction at `ln` of the factor on each quadrupole's gradient [M] is beyond the range that the model was made for.

@@ -2,14 +2,14 @@
 //! measured tunes or without.
 //!
 //! `ln p(theta) = -chi2(theta)/2 + ln prior(theta)`, `theta = ln var` within its range, up to a constant. A sampler sees it in
-//! coordinates u without bounds ([`crate::bounded`]), whitened by the Laplace covariance: `u = u_MAP + L z`, `L L^T` the covariance of u,
+//! coordinates u without bounds ([`crate::Bounded`]), whitened by the Laplace covariance: `u = u_MAP + L z`, `L L^T` the covariance of u,
 //! with the Jacobian of the first map in the density.
 
 use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
 use twin::OrbitError;
 
-use crate::bounded::{Bounded, Coordinates};
+use crate::bounds::{Bounded, Coordinates};
 use crate::model::ResponseModel;
 use crate::optimise::{End, Limits, Objective, OptimiseError, Quadratic, minimise};
 use crate::prior::Prior;
@@ -74,7 +74,7 @@ const CLOSE: f64 = 0.05 * 0.05;
 impl Posterior {
     /// Of readings under a model.
     pub fn new(model: ResponseModel, readings: Readings, prior: Prior) -> Self {
-        Self { model, readings, coordinates: Coordinates::of(&prior), prior }
+        Self { model, readings, coordinates: Coordinates::from_prior(&prior), prior }
     }
 
     /// Number of params.

@@ -2,6 +2,8 @@
 
 use estimator::Marginal;
 use nalgebra::DVector;
+use rand::rngs::StdRng;
+use rand_distr::{Distribution, Normal};
 use twin::{ParameterPrior, Ring};
 
 /// Prior of every param [N].
@@ -40,7 +42,7 @@ impl Width {
 
 impl Prior {
     /// That of a ring's params.
-    pub fn of(ring: &Ring) -> Self {
+    pub fn from_ring(ring: &Ring) -> Self {
         Self::shaped(ring, |prior| Width::Lognormal(prior.width))
     }
 
@@ -114,6 +116,21 @@ pub fn with_priors(ring: &Ring, width: Option<f64>, range: Option<[f64; 2]>) -> 
     ring
 }
 
+/// A factor from its truncated lognormal prior.
+///
+/// # Panics
+/// If the width is not positive.
+pub fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
+    let (mean, precision) = Width::Lognormal(prior.width).normal();
+    let normal = Normal::new(mean, precision.sqrt().recip()).expect("a width is positive");
+    loop {
+        let var = normal.sample(random).exp();
+        if (prior.range[0]..=prior.range[1]).contains(&var) {
+            return var;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,7 +138,7 @@ mod tests {
     #[test]
     fn a_range_reaches_as_far_as_it_is_told_and_no_less_than_it_did() {
         let ring = with_priors(&Ring::booster(), None, Some([0.8, 1.06]));
-        let prior = Prior::of(&ring);
+        let prior = Prior::from_ring(&ring);
         let far = prior.reaching(5.0).range[7];
         assert_eq!(far[0], 0.8_f64.ln(), "beyond five deviations already");
         assert!((far[1] - (prior.mean[7] + 5.0 / prior.precision[7].sqrt())).abs() < 1e-15);
@@ -143,10 +160,10 @@ mod tests {
     #[test]
     fn what_is_given_replaces_the_priors_of_all_params() {
         let ring = with_priors(&Ring::booster(), Some(0.01), None);
-        let (prior, own) = (Prior::of(&ring), Prior::of(&Ring::booster()));
+        let (prior, own) = (Prior::from_ring(&ring), Prior::from_ring(&Ring::booster()));
         assert_eq!(prior.range, own.range);
         assert!((prior.precision[47] / 1e4 - 1.0).abs() < 1e-4); // ln(1 + w^2) = w^2 (1 - w^2/2)
-        let narrow = Prior::of(&with_priors(&ring, None, Some([0.99, 1.02])));
+        let narrow = Prior::from_ring(&with_priors(&ring, None, Some([0.99, 1.02])));
         assert_eq!((narrow.range[3], narrow.precision[3]), ([0.99f64.ln(), 1.02f64.ln()], prior.precision[3]));
     }
 }

@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
 use twin::OrbitError;
 
-use crate::campaign::{AtTimes, Campaign, Common, Eliminated, Meter, Weighed};
+use crate::campaign::{Campaign, Common, Eliminated, Meter, Weighed};
 use crate::map_fit::{BatchFit, TuneUse};
 use crate::model::{Prediction, ResponseModel};
 
@@ -66,10 +66,10 @@ impl Reduced {
     ///
     /// # Errors
     /// [`OrbitError`] if these have no closed orbit.
-    pub fn of(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
+    pub fn from_fit(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
         let Campaign { ring, supplies, drives, .. } = &campaign;
         let params = DVector::from_column_slice(&fit.map_params);
-        let exact = AtTimes::of(&campaign, &params)?.orbits(drives);
+        let exact = campaign.linearised(&params)?.orbits(drives);
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;
@@ -108,7 +108,7 @@ impl Reduced {
 
     /// Number of frames that repeat each frame's setting, itself included.
     fn repeats(&self) -> Vec<usize> {
-        let of_frame = &self.campaign.settings.of_frame;
+        let of_frame = &self.campaign.settings.repeatable;
         let repeats = |setting: &Option<usize>| match setting {
             Some(_) => of_frame.iter().filter(|other| *other == setting).count(),
             None => 1,
@@ -269,8 +269,8 @@ mod tests {
         let mut recording = Recording::read(&folder.join("plain"), &ring).unwrap();
         let repeats = |recording: &Recording| {
             let campaign = Campaign::of(&ring, recording).unwrap();
-            let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
-            Reduced::of(campaign, fit).unwrap().repeats()
+            let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
+            Reduced::from_fit(campaign, fit).unwrap().repeats()
         };
         let named = repeats(&recording);
         recording.rows.iter_mut().for_each(|row| row.correctors.clear());

@@ -10,13 +10,13 @@ mod live;
 use nalgebra::DVector;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use rand_distr::{Distribution, Normal, StandardNormal};
-use twin::{Hold, Optics, OrbitError, ParameterPrior, Ring, SHARED, Tunes, spurious_dispersion};
+use rand_distr::{Distribution, StandardNormal};
+use twin::{Hold, Optics, OrbitError, Ring, SHARED, Tunes, spurious_dispersion};
 
-use crate::campaign::{Drive, rf_orbit};
+use crate::campaign::rf_orbit;
 use crate::model::ResponseModel;
-use crate::prior::Width;
-use crate::recording::Recording;
+use crate::prior::draw;
+use crate::recording::{Drive, Recording};
 
 pub use campaign::{Beyond, Hardware, Jumps, Truth, campaign};
 pub use conceal::conceal;
@@ -83,7 +83,7 @@ pub fn like(
     let mut simulated = recording.clone();
     simulated.name = format!("{} (simulated)", recording.name);
     for (row, given) in simulated.rows.iter_mut().zip(&recording.rows) {
-        let orbit = orbit(&Drive::of(&recording.header, given))? + &baselines;
+        let orbit = orbit(&Drive::from_row(&recording.header, given))? + &baselines;
         for (b, reading) in row.reading.iter_mut().enumerate() {
             let noise = instruments.noise[b] * normal(&mut random);
             *reading = reading.map(|_| orbit[b] + noise);
@@ -141,7 +141,7 @@ impl TuneWindow {
     ///
     /// # Errors
     /// [`OrbitError`] if the design has no tunes.
-    pub fn of(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
+    pub fn from_ring(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
         let design = tunes(ring)?;
         let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
         Ok(Self { x, y })
@@ -170,26 +170,11 @@ impl Window {
 /// [`VarsError`].
 pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsError> {
     let mut random = StdRng::seed_from_u64(seed);
-    let window = TuneWindow::of(ring, tune_cut)?;
+    let window = TuneWindow::from_ring(ring, tune_cut)?;
     let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
     let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| window.holds(at));
     let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);
     kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [window.x.design, window.y.design] })
-}
-
-/// A factor from its truncated lognormal prior.
-///
-/// # Panics
-/// If the width is not positive.
-pub fn draw(prior: &ParameterPrior, random: &mut StdRng) -> f64 {
-    let (mean, precision) = Width::Lognormal(prior.width).normal();
-    let normal = Normal::new(mean, precision.sqrt().recip()).expect("a width is positive");
-    loop {
-        let var = normal.sample(random).exp();
-        if (prior.range[0]..=prior.range[1]).contains(&var) {
-            return var;
-        }
-    }
 }
 
 fn tunes(ring: &Ring) -> Result<Tunes, OrbitError> {

@@ -43,7 +43,7 @@ fn without(ring: &Ring, columns: &[&str], corrector: Option<&str>) -> Recording 
 
 fn fit(ring: &Ring, recording: &Recording, tunes: TuneUse) -> (Campaign, BatchFit) {
     let campaign = Campaign::of(ring, recording).unwrap();
-    let fit = BatchFit::of(&campaign, tunes, |_| ()).unwrap();
+    let fit = BatchFit::best(&campaign, tunes, |_| ()).unwrap();
     (campaign, fit)
 }
 
@@ -106,7 +106,7 @@ fn what_is_held_instead_of_the_momentum_is_part_of_the_fit() {
         let held = response(&[Effect::parse(effect, &ring).unwrap()]) - response(&[]);
         let mut recording = plain.clone();
         for row in recording.rows.iter_mut().filter(|row| row.rf_offset == 0.0) {
-            let kick = DVector::from_vec(Drive::of(&plain.header, row).kick.as_slice().to_vec());
+            let kick = DVector::from_vec(Drive::from_row(&plain.header, row).kick.as_slice().to_vec());
             let moved = &held * kick;
             let monitors = ring.horizontal_monitors();
             row.reading[..monitors].iter_mut().zip(moved.iter()).for_each(|(to, x)| *to = to.map(|to| to + x));
@@ -195,7 +195,7 @@ fn a_family_is_fitted_as_one_factor_beside_single_magnets() {
     let (vars, made) = simulated(&ring, &without(&ring, &[], None), 7);
     let (campaign, fit) = fit(&ring, &made, TuneUse::LeftOut);
     assert_right("a family", &fit, &vars);
-    assert!(campaign.screened.accepted.iter().filter(|counts| **counts).count() > 11_000);
+    assert!(campaign.screened.excluded.counting().iter().filter(|counts| **counts).count() > 11_000);
 }
 
 /// The twin, every magnet of a family by one factor: the sampler's Gaussian is the batch fit's, and its draws are those of it.
@@ -208,7 +208,7 @@ fn the_posterior_of_family_factors_is_that_of_the_batch_fit() {
     let model = ResponseModel::twin(&ring).unwrap();
     let (prior, map) = (campaign.prior.clone(), fit.map_params.clone());
     let sigma = [0, 1].map(|i| fit.covariance[(i, i)].sqrt());
-    let reduced = Reduced::of(campaign, fit).unwrap();
+    let reduced = Reduced::from_fit(campaign, fit).unwrap();
     let posterior = Posterior::new(model.clone(), Readings::of_frames(&reduced, &model, TuneUse::LeftOut), prior);
     let laplace = posterior.laplace(&map).unwrap();
     let settings = NutsSettings { chains: 2, warm_up: 200, draws: 1500, seed: 1 };
@@ -240,7 +240,7 @@ fn without_a_kick_or_a_reading_the_result_is_the_prior_and_says_so() {
         println!("{lack}: furthest param {furthest:.3} prior sigma from its mean");
         // orbits that take less than a tenth of a width away move its mean by 0.44 of it: sqrt(1 - 0.9^2)
         assert!(furthest < 0.44, "{lack}: {furthest}");
-        let tuned = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let tuned = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
         assert_eq!(tuned.lack, Some(lack));
         assert!(tuned.tunes.iter().all(|tune| tune.pull().unwrap().abs() < 3.0), "{:?}", tuned.tunes);
     }

@@ -240,7 +240,7 @@ impl Fitted {
             core: last.iter().map(|theta| f64::from(*theta)).collect(),
             covariance: DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j))),
             chi2: f64::from(quality.chi_square / quality.degrees_of_freedom),
-            batch: BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap(),
+            batch: BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap(),
         }
     }
 
@@ -339,7 +339,7 @@ fn one_baseline_for_all_times_would_not_do() {
         let truth = Truth { apart, off: 0.0, ..Truth::of(&ring, 12) };
         let mut recording = campaign(&truth);
         let all = Campaign::of(&plain, &as_at_one_time(recording.clone())).unwrap();
-        let all = BatchFit::of(&all, TuneUse::Readings, |_| ()).unwrap();
+        let all = BatchFit::best(&all, TuneUse::Readings, |_| ()).unwrap();
         println!("{apart} m apart, all: chi2/dof {:.3}, mismatch {}", all.chi2_per_dof, all.mismatch);
         let is_up = |row: &Row| row.correctors.iter().any(|(_, setting)| *setting > 0.0);
         recording.rows.retain(|row| row.cycle_time == if is_up(row) { 0.05 } else { 0.11 });
@@ -363,8 +363,8 @@ fn the_sampled_density_is_that_of_the_batch_fit() {
     for (off, most) in [(0.0, 0.01), (1.0 / 3.0, 0.1)] {
         let recording = campaign(&Truth { off, ..Truth::of(&ring, 12) });
         let campaign = Campaign::of(&ring, &through_files(&recording, &ring).unwrap()).unwrap();
-        let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
-        let reduced = Reduced::of(campaign, fit).unwrap();
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let reduced = Reduced::from_fit(campaign, fit).unwrap();
         let model = ResponseModel::twin(&reduced.campaign.ring).unwrap();
         let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
         let posterior = Posterior::new(model, readings, reduced.campaign.prior.clone());
@@ -440,7 +440,7 @@ fn between_two_points_the_momentum_is_linear() {
     let recording = through_files(&one_cycle(), &ring).unwrap();
     let mut row = recording.rows[0].clone();
     row.cycle_time = 0.0505;
-    let [at, later] = [&recording.rows[0], &row].map(|row| Drive::of(&recording.header, row));
+    let [at, later] = [&recording.rows[0], &row].map(|row| Drive::from_row(&recording.header, row));
     let [first, next] = [0.35, 0.65].map(momentum);
     let expected = (first + 0.5 / 20.0 * (next - first)) / first;
     let [dipole, dipole_next] = [0.35, 0.65].map(|energy| currents(energy)[0]);

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use estimator::{Health, MonitorState, Walk};
 use inference::simulate::{self, Hardware, Truth};
 use inference::stream::{self, Estimate};
-use inference::{Campaign, Recording};
+use inference::{Campaign, Excluded, Recording};
 use nalgebra::DMatrix;
 use twin::{Effect, Ring};
 
@@ -83,7 +83,7 @@ fn readings_and_states_are_those_of_the_core() {
         for (b, name) in names.iter().enumerate() {
             different.extend(
                 (0..accepted.nrows())
-                    .filter(|i| !aside.contains(i) && accepted[(*i, b)] != here.accepted[(*i, b)])
+                    .filter(|i| !aside.contains(i) && accepted[(*i, b)] != here.excluded.counts(*i, b))
                     .map(|i| (i, name.as_str())),
             );
             let (core, host) = (&health[b], &here.health[b]);
@@ -117,7 +117,7 @@ fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
         *row.reading[b].as_mut().unwrap() += jump;
     }
     let (by_core, ..) = by_core(&ring, &recording);
-    let by_host = Campaign::of(&ring, &recording).unwrap().screened.accepted;
+    let by_host = Campaign::of(&ring, &recording).unwrap().screened.excluded.counting();
     for accepted in [by_core, by_host] {
         let used: Vec<bool> = (first..first + 4).map(|i| accepted[(i, b)]).collect();
         assert_eq!(used, [true, true, false, false]);
@@ -195,7 +195,8 @@ fn what_contradicts_the_model_counts_without_a_repeat() {
     for effect in effects.into_iter().map(Some).chain([None]) {
         let (recording, jump) = each_setting_once(&ring, effect, 5);
         let campaign = Campaign::of(&ring, &recording).unwrap();
-        let counts = campaign.screened.accepted.iter().zip(&jump).zip(&campaign.readings);
+        let counting = campaign.screened.excluded.counting();
+        let counts = counting.iter().zip(&jump).zip(&campaign.readings);
         let (mut far, mut sound, mut aside) = ([0, 0], 0, 0);
         for ((counts, jump), _) in counts.filter(|(_, reading)| !reading.is_nan()) {
             if *jump > BEYOND_NOISE {
@@ -225,6 +226,8 @@ fn a_lost_beam_is_put_aside_without_a_repeat() {
     for frame in 0..campaign.frames() {
         let counting = (0..campaign.monitors()).filter(|&b| campaign.counts(frame, b)).count();
         assert_eq!(counting == 0, lost.contains(&frame), "frame {frame}: {counting}");
+        let of_beam = |b: usize| campaign.screened.excluded.reason(frame, b) == Some(Excluded::LostBeam);
+        assert_eq!((0..campaign.monitors()).any(of_beam), lost.contains(&frame), "frame {frame}");
     }
     let names = ring.monitor_names();
     let faulty: Vec<&str> = (0..names.len()).filter(|&b| !campaign.is_ok(b)).map(|b| names[b].as_str()).collect();

@@ -215,7 +215,7 @@ fn long_monitors_and_correctors_in_magnets_act_in_the_middle() {
     let halves = [(0.0, 0.1, 0.0), (0.1, 0.0, 0.0), (0.1, 0.1, 0.0), (0.2, 0.2, 2.0), (0.4, 0.0, 0.0), (0.4, 0.2, 2.0)];
     assert_eq!(rows, halves);
     assert_eq!((folder.monitors[0].at, folder.correctors[0].at), (1, 4));
-    assert_eq!(groups(&folder).0, [[3, 5]], "the halves are one magnet");
+    assert_eq!(groups(&folder)[0], [[3, 5]], "the halves are one magnet");
     assert_eq!(lattice.left_out["skew gradient (couples the planes)"], 1);
 }
 

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use control::Plan;
-use diagnosis::experiment::{Change, Proposal};
+use diagnosis::{Change, Proposal};
 use inference::recording::Names;
 use toml::{Table, Value};
 use twin::Ring;
@@ -38,7 +38,7 @@ pub fn write<'p>(now: &Path, to: &Path, ring: &Ring, proposals: &'p [Proposal]) 
     let folder = now.parent().unwrap_or(Path::new("")).join(table["header"].as_str().unwrap_or_default());
     let header = folder.canonicalize().map_err(|error| wrong(&error))?;
     for proposal in proposals {
-        let Some(mut changed) = changed(&table, &proposal.change, &Names::of(ring)) else { continue };
+        let Some(mut changed) = changed(&table, &proposal.change, &Names::from_ring(ring)) else { continue };
         changed.insert("header".into(), header.to_string_lossy().into_owned().into());
         let text = format!("# Proposed by orbitcal diagnose: a campaign {}.\n{changed}", proposal.what);
         if put(to, &text, ring).map_err(|error| NextPlanError::Write(to.into(), error.to_string()))? {

@@ -236,7 +236,7 @@ fn coupling_that_the_model_lacks_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let before = measured::Folder::read(&repository().join(BEFORE)).unwrap();
     let skews = [5, 27, 49, 71].map(|row| vec![row]).to_vec();
-    let model = measured::Model::of(&before, &[Vec::new(), skews], twin::Rf::FixedFrequency).unwrap();
+    let model = measured::Model::of(&before, &[Vec::new(), skews, Vec::new()], twin::Rf::FixedFrequency).unwrap();
     let unknown = |group| measured::Unknown { kind: measured::Kind::Skew(group), mean: 0.0, width: 0.01 };
     let unknowns: Vec<measured::Unknown> = (0..4).map(unknown).collect();
     let at = |size: f64| model.predict(&unknowns, &nalgebra::DVector::from_vec(vec![size, -size, size, size])).unwrap();

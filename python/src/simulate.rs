@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
 use inference::{BatchFit, TuneUse};
 use pyo3::prelude::*;
@@ -61,7 +61,7 @@ pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult
     let frames = recording.frames_of(&ring.ring)?;
     py.detach(|| {
         let campaign = campaign(&ring.ring, frames).map_err(raised)?;
-        let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
         Ok((fit.marginals.iter().map(|one| one.mean).collect(), fit.marginals.iter().map(|one| one.sigma).collect()))
     })
 }

@@ -2,7 +2,7 @@
 
 use core::ops::Range;
 
-use super::strip::Strip;
+use super::beamline::Strip;
 
 /// Title, axis labels with their units, and what is drawn behind the data.
 #[derive(Debug, Clone, PartialEq, Default)]

@@ -19,6 +19,7 @@
 
 mod axes;
 mod bands;
+mod beamline;
 mod canvas;
 mod figure;
 mod heat_map;
@@ -39,12 +40,12 @@ mod ticks;
 
 pub use axes::{Axes, Reference};
 pub use bands::Band;
+pub use beamline::{Look, Magnet, Spotted, Strip, Symbol};
 pub use figure::Figure;
 pub use maps::Map;
 pub use page::{Page, Section, Table};
 pub use ranges::Range;
 pub use ranking::Ranked;
-pub use ring_map::{Look, Magnet, RingMap, Spotted, Symbol};
+pub use ring_map::RingMap;
 pub use series::{Mark, Series};
 pub use small_multiples::Panel;
-pub use strip::Strip;

@@ -5,6 +5,7 @@ use core::f64::consts::TAU;
 use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
+use super::beamline::{Look, Magnet, Spotted, Symbol};
 use super::canvas::{Drawn, NARROW, SMALL, Sheet, TICK, TITLE, bold, draw, plain, px, write};
 use super::figure::Figure;
 use super::numbers::{csv, number};
@@ -24,69 +25,6 @@ const SMALLER: f64 = 0.7;
 
 const INK: RGBColor = RGBColor(60, 60, 60);
 const PALE: RGBColor = RGBColor(150, 150, 150);
-
-/// What a magnet or instrument looks like on the map.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Symbol {
-    /// A bar along the path.
-    Bend,
-    /// A bar across the path that sticks out.
-    Focusing,
-    /// A bar across the path that sticks in.
-    Defocusing,
-    /// A dot outside the path.
-    Monitor,
-    /// A hollow dot outside the path.
-    UnreadMonitor,
-    /// A small triangle inside the path.
-    Corrector,
-    /// A small diamond on the path.
-    Sextupole,
-}
-
-/// One magnet or instrument.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Magnet {
-    /// Its look.
-    pub symbol: Symbol,
-    /// Where it begins [m].
-    pub s: f64,
-    /// Its length [m].
-    pub length: f64,
-}
-
-/// Something to point at.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Spotted {
-    /// What is written beside it.
-    pub label: String,
-    /// Where it is [m].
-    pub s: f64,
-    /// What it is.
-    pub look: Look,
-}
-
-/// What is pointed at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Look {
-    /// What was found: a filled square.
-    Finding,
-    /// What may be there instead: an open circle.
-    Alternative,
-    /// An instrument at fault: a cross.
-    Faulty,
-}
-
-impl Look {
-    /// In one word.
-    fn word(self) -> &'static str {
-        match self {
-            Self::Finding => "finding",
-            Self::Alternative => "alternative",
-            Self::Faulty => "faulty",
-        }
-    }
-}
 
 /// A ring.
 #[derive(Debug, Clone, PartialEq, Default)]

@@ -3,10 +3,10 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
+use super::beamline::{Look, Spotted, Strip, Symbol};
 use super::canvas::{Drawn, NARROW, SMALL, Sheet, bold, plain, px, text_width, write};
 use super::pen::Pen;
 use super::plot::Plot;
-use super::ring_map::{Look, Magnet, Spotted, Symbol};
 
 /// Height of the row of magnets, of the key below it on a page, and of each row of labels [px].
 const MAGNETS: f64 = 46.0;
@@ -19,15 +19,6 @@ const APART: f64 = 10.0;
 
 const INK: RGBColor = RGBColor(60, 60, 60);
 const PALE: RGBColor = RGBColor(165, 165, 165);
-
-/// Magnets and instruments, and the places to mark in the figure above them.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Strip {
-    /// Magnets and instruments.
-    pub magnets: Vec<Magnet>,
-    /// Places that a line marks, labelled below.
-    pub marks: Vec<Spotted>,
-}
 
 impl Strip {
     /// Height on a sheet of a width [px].
@@ -149,7 +140,7 @@ fn line(sheet: &Sheet, from: (f64, f64), to: (f64, f64), colour: RGBColor, width
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axes, Figure, Series};
+    use crate::{Axes, Figure, Magnet, Series};
 
     #[test]
     fn places_are_marked_where_they_are_within_the_axes() {

@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let wanted: Vec<String> = arguments.collect();
     let ring = Ring::booster();
     let recording = Recording::read(Path::new(&recording), &ring)?;
-    let diagnosis = Diagnosis::of(&ring, &recording, |_| ())?;
+    let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ())?;
     let page = diagnosis_page(&diagnosis, &recording)?;
     for section in &page.sections {
         let name = section.heading.to_lowercase().replace(' ', "-");

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use inference::campaign::furthest_stray;
+use inference::furthest_stray;
 use inference::recording::BelievedRf;
 use inference::stream::StreamError;
 use inference::{Campaign, Recording};

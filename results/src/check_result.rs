@@ -4,10 +4,9 @@ use core::fmt;
 use estimator::Walk;
 
 use comfy_table::CellAlignment;
-use diagnosis::data::DataError;
-use diagnosis::wiring::Miswired;
+use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
-use inference::{Campaign, Lack, Recording};
+use inference::{Campaign, Lack, Recording, is_powered};
 use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
@@ -18,7 +17,7 @@ use crate::fit_result::{Monitor, TunesMeasured, faults, lack, monitors};
 use crate::output::{lines, table};
 
 /// Fewest monitors with readings, and correctors that were moved, for a diagnosis.
-const LEAST: usize = diagnosis::data::LEAST;
+const LEAST: usize = diagnosis::LEAST;
 /// Rate of a device's serial line where none is given [baud], and bits of a byte on it.
 const LINE: (f64, f64) = (921_600.0, 10.0);
 
@@ -98,7 +97,7 @@ impl CheckResult {
     /// [`CommandError`] if its currents leave no stable ring.
     pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, CommandError> {
         // columns that are not what the header says may leave no stable ring
-        let campaign = campaign(ring, recording).map_err(|error| match Miswired::of(ring, recording) {
+        let campaign = campaign(ring, recording).map_err(|error| match Miswired::find(ring, recording) {
             Ok(Some(wiring)) => DataError::Miswired { recording: recording.name.clone(), wiring }.into(),
             _ => error,
         })?;
@@ -123,7 +122,7 @@ impl CheckResult {
             noise: Noise::of(campaign),
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
             tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
-            monitors: monitors(ring, &campaign.screened.health),
+            monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
             missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
@@ -148,15 +147,14 @@ fn design_tunes(campaign: &Campaign) -> Option<Tunes> {
 
 impl Settings {
     fn of(campaign: &Campaign) -> Self {
-        let mut repeats = vec![0; campaign.settings.count];
-        campaign.settings.of_frame.iter().flatten().for_each(|setting| repeats[*setting] += 1);
+        let mut repeats = vec![0; campaign.settings.count()];
+        campaign.settings.repeatable.iter().flatten().for_each(|setting| repeats[*setting] += 1);
         repeats.retain(|count| *count > 0);
         repeats.sort_unstable();
         let at = |i: usize| repeats.get(i).copied().unwrap_or(0);
         let largest = |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f64::max);
         let (names, nominal) = (campaign.ring.corrector_names(), campaign.recording.nominal_kick());
-        // idle ones scatter by a thousandth of what others are set to
-        let unused: Vec<usize> = (0..names.len()).filter(|&c| largest(c) < 0.05 * nominal).collect();
+        let unused: Vec<usize> = (0..names.len()).filter(|&c| !is_powered(largest(c), nominal)).collect();
         let mut offsets: Vec<f64> =
             campaign.recording.rows.iter().map(|row| row.rf_offset).filter(|offset| *offset != 0.0).collect();
         offsets.sort_by(f64::total_cmp);
@@ -238,7 +236,7 @@ fn diagnose(campaign: &Campaign) -> Usable {
     let settings = Settings::of(campaign);
     let reading = (0..campaign.monitors()).filter(|&b| (0..campaign.frames()).any(|i| campaign.counts(i, b))).count();
     let moved = settings.correctors[0];
-    let wiring = Miswired::of(&campaign.ring, &campaign.recording).ok().flatten();
+    let wiring = Miswired::find(&campaign.ring, &campaign.recording).ok().flatten();
     let can = reading >= LEAST && moved >= LEAST && campaign.times.count() == 1 && wiring.is_none();
     let what = if let Some(why_not) = several_times(campaign) {
         why_not

@@ -51,7 +51,7 @@ pub fn compare_recordings(
 ) -> Result<Comparison, CommandError> {
     let mut vars = |recording: &Recording| -> Result<_, CommandError> {
         let campaign = campaign(ring, recording)?;
-        let fit = BatchFit::of(&campaign, TuneUse::Readings, &mut progress)?;
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, &mut progress)?;
         Ok(FitResult::of_fit(&campaign, &fit).vars)
     };
     let (before, after) = (vars(before)?, vars(after)?);

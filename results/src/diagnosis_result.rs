@@ -3,11 +3,7 @@
 use core::fmt;
 
 use comfy_table::ColumnConstraint;
-use diagnosis::average::Vars;
-use diagnosis::beyond::Beyond;
-use diagnosis::heldout::Score;
-use diagnosis::imperfection::{Imperfection, Measure};
-use diagnosis::{Diagnosis, Finding};
+use diagnosis::{Diagnosis, Finding, Fitted, Imperfection, Measure, OutOfRange, Score, Vars};
 use inference::Recording;
 use report::Page;
 use serde::Serialize;
@@ -57,8 +53,8 @@ struct BeyondResult {
     range: [f64; 2],
 }
 
-impl From<&Beyond> for BeyondResult {
-    fn from(one: &Beyond) -> Self {
+impl From<&OutOfRange> for BeyondResult {
+    fn from(one: &OutOfRange) -> Self {
         Self { name: one.name.clone(), mean: one.var.value, sigma: one.var.sigma, range: one.range }
     }
 }
@@ -181,7 +177,7 @@ impl DiagnosisResult {
         let Diagnosis { found, before, after, .. } = diagnosis;
         let data = &found.data;
         let (gain, error) = diagnosis.gain();
-        let fit = |fitted: &diagnosis::fit::Fitted, score: &Score| -> Result<FitResult, CommandError> {
+        let fit = |fitted: &Fitted, score: &Score| -> Result<FitResult, CommandError> {
             Ok(FitResult {
                 chi2_per_dof: fitted.chi2_per_dof(data).map_err(failed)?,
                 heldout_rms_mm: score.rms * 1e3,
@@ -202,7 +198,7 @@ impl DiagnosisResult {
             sentence: diagnosis.sentence.clone(),
             findings: diagnosis.findings.iter().map(FindingResult::of).collect(),
             joint_probability: diagnosis.joint_probability(),
-            monitors: monitors(ring, &data.health_in_any()),
+            monitors: monitors(ring, &data.health_in_any(), &data.excluded_in_any()),
             fit: Fits {
                 before: fit(&found.null, before)?,
                 after: fit(&found.best, after)?,

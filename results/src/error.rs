@@ -2,7 +2,7 @@
 
 use core::fmt::Display;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use inference::{BatchError, RecordingError, stream};
 use measured::MeasuredError;
 use twin::LatticeError;

@@ -3,7 +3,6 @@
 use core::ops::ControlFlow;
 use std::sync::Arc;
 
-use inference::campaign::supplies_of;
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use report::Page;
@@ -32,7 +31,7 @@ pub enum FitModel {
 /// # Errors
 /// [`CommandError::Other`] where the design or the calibrated ring has no stable motion.
 pub fn fit_page(ring: &Ring, recording: &Recording, result: &FitResult) -> Result<Page, CommandError> {
-    let made = page(&recording.powered(ring), &supplies_of(recording), result);
+    let made = page(&recording.powered(ring), &recording.mean_supplies(), result);
     made.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
 }
 
@@ -57,7 +56,7 @@ fn fitted(
     progress: impl FnMut(usize),
 ) -> Result<(Campaign, BatchFit), CommandError> {
     let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, progress)?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, progress)?;
     Ok((campaign, fit))
 }
 
@@ -75,7 +74,7 @@ pub fn fit_by_draws(
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
     let (campaign, fit) = fitted(ring, recording, |_| ())?;
-    let reduced = Reduced::of(campaign, fit)?;
+    let reduced = Reduced::from_fit(campaign, fit)?;
     let ring = &reduced.campaign.ring;
     let is_network = model == FitModel::Resnet;
     let model = match model {
@@ -86,7 +85,7 @@ pub fn fit_by_draws(
     };
     let word = model.word();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
-    let posterior = Posterior::new(model, readings, Prior::of(ring));
+    let posterior = Posterior::new(model, readings, Prior::from_ring(ring));
     let laplace = posterior.laplace(&reduced.fit.map_params).map_err(|e| failed(e.to_string()))?;
     let names = ring.var_names();
     let posterior = Arc::new(posterior);

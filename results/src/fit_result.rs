@@ -9,7 +9,6 @@ use std::borrow::Cow;
 
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
-use inference::campaign::supplies_of;
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
 use serde::Serialize;
@@ -130,14 +129,14 @@ impl FitResult {
         quality: FitQuality,
         timing: Timing,
     ) -> Self {
-        let prior = Prior::of(ring);
+        let prior = Prior::from_ring(ring);
         let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), last.params_sigma[i].into());
         let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
         // vars that walk are those of the last frames, and so are their tunes
         let seen = if walk.params > 0.0 { latest(recording) } else { Cow::Borrowed(recording) };
-        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &supplies_of(&seen)));
+        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &seen.mean_supplies()));
         Self {
             recording: recording.name.clone(),
             method: "laplace",
@@ -209,7 +208,7 @@ impl FitResult {
             tunes: Some(Tunes { x: x.model, y: y.model }),
             tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
             lack: fit.lack.map(|lack| lack.to_string()),
-            monitors: monitors(&campaign.ring, &campaign.screened.health),
+            monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             log_evidence: None,
             timing: None,
             nuts: None,

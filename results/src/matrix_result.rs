@@ -1,6 +1,7 @@
 //! Results of measured response matrices: as JSON and as tables.
 
 use core::fmt;
+use std::collections::BTreeMap;
 
 use comfy_table::CellAlignment;
 use measured::believed::{Believed, Value};
@@ -216,7 +217,13 @@ fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
         };
         let rejected = fit.outliers.iter().filter(|[at, _]| *at == row).count();
         let rms = (fit.residual.row(row).norm_squared() / counted.max(1) as f64).sqrt();
-        Monitor { name: folder.monitor(row), state: word, sigma_mm: rms, rejected: rejected as u32 }
+        Monitor {
+            name: folder.monitor(row),
+            state: word,
+            sigma_mm: rms,
+            rejected: rejected as u32,
+            excluded: BTreeMap::new(),
+        }
     };
     (0..folder.monitors.len()).map(state).collect()
 }

@@ -1,6 +1,6 @@
 //! Laplace beside NUTS: the core's Gaussian (the device's, bit for bit), and those of the host with the surrogate and the twin.
 
-use inference::posterior::LaplaceError;
+use inference::LaplaceError;
 use inference::{Laplace, Posterior, Prior, Readings, ResponseModel, TuneUse, stream};
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Reference, Section, Series, Table};
@@ -131,7 +131,7 @@ fn of_host(
     reference: &Sampled,
 ) -> Result<Approximation, StudyError> {
     let readings = Readings::of_frames(&sampling.reduced, &model, TuneUse::LeftOut);
-    let posterior = Posterior::new(model, readings, Prior::of(&sampling.campaign().ring));
+    let posterior = Posterior::new(model, readings, Prior::from_ring(&sampling.campaign().ring));
     let laplace = posterior
         .laplace(&sampling.reduced.fit.map_params)
         .map_err(|source| StudyError::Laplace { run: name.to_owned(), source })?;
@@ -155,7 +155,7 @@ fn of_host(
 /// The coordinate without bounds is normal; its map to the var is integrated over ±8 standard deviations.
 fn moments(posterior: &Posterior, laplace: &Laplace) -> (Vec<f64>, Vec<f64>) {
     const POINTS: i32 = 400;
-    let one = |(i, coordinate): (usize, &inference::bounded::Coordinate)| {
+    let one = |(i, coordinate): (usize, &inference::Coordinate)| {
         let (centre, sigma) = (laplace.centre[i], laplace.factor.row(i).norm());
         let (mut weight, mut first, mut second) = (0.0, 0.0, 0.0);
         for k in -POINTS..=POINTS {

@@ -16,8 +16,8 @@ mod single;
 mod subsets;
 mod trimming;
 
+use inference::LaplaceError;
 use inference::nuts::{NutsError, NutsSettings};
-use inference::posterior::LaplaceError;
 use inference::simulate::VarsError;
 use inference::{BatchError, Campaign, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
 use report::Page;

@@ -4,7 +4,7 @@
 use core::ops::Range;
 
 use inference::Pair;
-use inference::diagnostics::quantile;
+use inference::quantile;
 use inference::simulate::{self, VarsError};
 use nalgebra::DMatrix;
 use report::{Axes, Figure, Panel, Reference, Section, Series};

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::Serialize;
 use twin::Ring;
 
-use inference::campaign::Campaign;
+use inference::Campaign;
 use inference::nuts::{self, NutsSettings};
 use inference::{BatchFit, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width, simulate};
 use report::{Section, Table};
@@ -103,7 +103,7 @@ impl<'p> Sampling<'p> {
     /// Those of the ring's params, or all of one width.
     pub(crate) fn prior(&self, width: Option<Width>) -> Prior {
         let ring = &self.campaign().ring;
-        width.map_or_else(|| Prior::of(ring), |width| Prior::of_width(ring, width))
+        width.map_or_else(|| Prior::from_ring(ring), |width| Prior::of_width(ring, width))
     }
 
     pub(crate) fn seed(&mut self) -> u64 {
@@ -125,8 +125,8 @@ pub(crate) fn reduced(ring: &Ring, recording: &Recording) -> Result<Reduced, Stu
     if campaign.times.count() > 1 {
         return Err(StudyError::Times(campaign.times.to_string()));
     }
-    let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ())?;
-    Ok(Reduced::of(campaign, fit)?)
+    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ())?;
+    Ok(Reduced::from_fit(campaign, fit)?)
 }
 
 /// How well each posterior was sampled.

@@ -1,7 +1,6 @@
 //! Stability: differences of single frame pairs, drawn several times, and all of them pooled.
 
-use inference::campaign::Campaign;
-use inference::diagnostics::quantile;
+use inference::{Campaign, quantile};
 use inference::{Pair, Readings};
 use nalgebra::DMatrix;
 use rand::SeedableRng;

@@ -1,7 +1,7 @@
 //! Outliers, after Appendix A of the published analysis: all pairs of a corrector's frames, less the model; a reading whose pairs stand out
 //! again and again is at fault.
 
-use inference::diagnostics::quantile;
+use inference::quantile;
 use inference::recording::Row;
 use inference::{Reduced, ResponseModel};
 use report::{Section, Table};

@@ -77,7 +77,7 @@ pub fn surrogates(ring: &Ring, checkpoint: Option<&Path>) -> Result<Vec<Surrogat
         let source = Source::of(ring);
         let mut planes = [0, 1].map(|plane| Trainee::new(&source, plane, &Plan::FULL));
         checkpoint::load(path, &mut planes)?;
-        let green = GreenModel::of(&training::green::tables(ring)?);
+        let green = GreenModel::from_tables(&training::green::tables(ring)?);
         let free = ResnetModel::with_networks(green, planes.map(|plane| plane.free));
         all.push(Surrogate::of("resnet f32", ResponseModel::Resnet(Box::new(free))));
     }

@@ -38,7 +38,7 @@ fn stream_and_batch_fit_find_the_true_vars() {
     for (folder, name) in [("ten-cells", "plain"), ("three-families", "campaign")] {
         let (ring, recording, truth) = read(folder, name);
         let campaign = Campaign::of(&ring, &recording).unwrap();
-        let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
         let of_fit = |i: usize| (fit.map_params[i], fit.covariance[(i, i)].sqrt());
         assert_sound(folder, fit.chi2_per_dof, pull(&ring, &truth, of_fit));
         let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
@@ -57,9 +57,13 @@ fn a_plain_campaign_is_consistent_and_a_gain_is_named_with_its_amplitude() {
     let cases = [("ten-cells", ["plain", "gain"]), ("three-families", ["campaign", "gain"])];
     for (folder, [plain, gain]) in cases {
         let (ring, recording, _) = read(folder, plain);
-        assert_eq!(Diagnosis::of(&ring, &recording, |_| ()).unwrap().verdict, Verdict::Consistent, "{folder}");
+        assert_eq!(
+            Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap().verdict,
+            Verdict::Consistent,
+            "{folder}"
+        );
         let (ring, recording, truth) = read(folder, gain);
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert_eq!(truth.grade(&diagnosis), Grade::Right, "{folder}: {}", diagnosis.sentence);
         let pulls = truth.pulls(&diagnosis);
         assert!(pulls.len() == 1 && pulls[0].abs() < 3.0, "{folder}: {pulls:?}"); // one of 400 is further off
@@ -86,7 +90,7 @@ fn an_effect_is_named_where_not_every_quadrupole_is_fitted() {
     let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };
     let recording =
         simulate::campaign(&template, &ring, &truth, &simulate::Hardware::shipped(&ring, &template), 3).unwrap();
-    let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+    let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
     assert_eq!(diagnosis.verdict, Verdict::Identified, "{}", diagnosis.sentence);
     let found = diagnosis.effects();
     assert!(found.len() == 1 && found[0].site == effects[0].site, "{}", diagnosis.sentence);
@@ -111,7 +115,8 @@ fn couplings_of_each_plane_are_ordinary_and_one_far_off_is_named() {
         let vars = simulate::vars(&ring, true, 5).unwrap();
         let truth = simulate::Truth { vars: &vars, effects, beyond: &[] };
         let hardware = simulate::Hardware::shipped(&ring, &template);
-        Diagnosis::of(&ring, &simulate::campaign(&template, &ring, &truth, &hardware, 5).unwrap(), |_| ()).unwrap()
+        Diagnosis::from_recording(&ring, &simulate::campaign(&template, &ring, &truth, &hardware, 5).unwrap(), |_| ())
+            .unwrap()
     };
     let without = diagnose(&ordinary);
     assert_eq!(without.verdict, Verdict::Consistent, "{}", without.sentence);

@@ -3,11 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use diagnosis::fit::Fitted;
-use diagnosis::hypothesis::{Hypothesis, Term};
-use diagnosis::imperfection::{Imperfection, Measure};
-use diagnosis::scan::{candidates, scan};
-use diagnosis::{Diagnosis, Verdict, data::Data, sample};
+use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Imperfection, Measure, Term, Verdict, candidates, sample, scan};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Recording};
@@ -21,7 +17,7 @@ fn read(name: &str) -> Recording {
 }
 
 fn whitened(recording: &Recording) -> Data {
-    Data::of(&Campaign::of(&Ring::booster(), recording).unwrap()).unwrap()
+    Data::from_campaign(&Campaign::of(&Ring::booster(), recording).unwrap()).unwrap()
 }
 
 /// A blind campaign; none if its machine keeps no beam.
@@ -45,7 +41,7 @@ fn concealed_effects_are_found_and_only_those() {
     let (mut chi_square, mut amplitudes) = (0.0, 0.0);
     for i in 0..12 {
         let name = format!("concealed/open-{i:02}");
-        let diagnosis = Diagnosis::of(&ring, &read(&name), |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &read(&name), |_| ()).unwrap();
         let truth = Truth::read(&repository("recordings").join(&name), &ring).unwrap();
         let grade = truth.grade(&diagnosis);
         match i {
@@ -75,7 +71,7 @@ fn every_kind_is_found_when_it_is_strong() {
     let ring = Ring::booster();
     let data = whitened(&simulated(&[], 5));
     // beside what is ordinary
-    let null = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
+    let null = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
     let scanned = scan(&data, &null, &candidates(&data, Some(&loop_on))).unwrap();
     // no instrument of this ring is of both planes
@@ -92,7 +88,7 @@ fn every_kind_is_found_when_it_is_strong() {
         };
         let kept = (0..6).find_map(|halvings| sized(largest * 0.5_f64.powi(halvings)));
         let (size, recording, effect) = kept.unwrap_or_else(|| panic!("no {} keeps the beam", kind.word()));
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let expected = 0.5 * seen.power * if kind.is_switch() { 1.0 } else { size * size };
         let first = diagnosis.findings.first();
         let found = first.is_some_and(|f| {
@@ -158,7 +154,7 @@ fn a_reversed_corrector_is_named_where_no_setting_is_repeated() {
     let mut known = BTreeSet::new();
     recording.rows.retain(|row| known.insert(format!("{:?} {}", row.correctors, row.rf_offset)));
     assert_eq!(recording.rows.len(), 110);
-    let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+    let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
     let truth = Truth::read(&repository("recordings/concealed/open-07"), &ring).unwrap();
     assert_eq!(truth.grade(&diagnosis), Grade::Right, "{}", diagnosis.sentence);
 }
@@ -170,7 +166,7 @@ fn gone_round(monitors: usize) -> Diagnosis {
         row.reading[8..8 + monitors].rotate_left(1);
         row.reading[20] = row.reading[20].map(|position| 10.0 * position);
     }
-    Diagnosis::of(&Ring::booster(), &recording, |_| ()).unwrap()
+    Diagnosis::from_recording(&Ring::booster(), &recording, |_| ()).unwrap()
 }
 
 /// Two exchanges of three monitors; any two of the three make it.
@@ -198,7 +194,7 @@ fn a_recording_that_the_model_does_not_describe_is_unexplained() {
 fn assert_named(text: &str, seed: u64) {
     let ring = Ring::booster();
     let effect = Effect::parse(text, &ring).unwrap();
-    let diagnosis = Diagnosis::of(&ring, &simulated(&[effect], seed), |_| ()).unwrap();
+    let diagnosis = Diagnosis::from_recording(&ring, &simulated(&[effect], seed), |_| ()).unwrap();
     assert_eq!(diagnosis.verdict, Verdict::Identified, "{text}: {}", diagnosis.sentence);
     let named: Vec<_> = diagnosis.findings.iter().map(diagnosis::Finding::term).collect();
     assert_eq!(named, [Some(&effect.into())], "{text}: {}", diagnosis.sentence);
@@ -214,7 +210,7 @@ fn empty_campaigns_are_consistent() {
     let ring = Ring::booster();
     let (mut suspected, mut hidden) = (Vec::new(), Vec::new());
     for seed in 21..27 {
-        let diagnosis = Diagnosis::of(&ring, &simulated(&[], seed), |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &simulated(&[], seed), |_| ()).unwrap();
         match diagnosis.verdict {
             Verdict::Consistent => {
                 assert!(diagnosis.sentence.contains("median detection limits"), "{}", diagnosis.sentence);
@@ -241,7 +237,7 @@ fn scatter_of_a_family_is_ordinary() {
         let wave = |i: usize| 0.045 * f64::sin(2.4 * i as f64 + 0.3); // 3.2 % rms
         let sites = kind.sites(&ring).into_iter().enumerate();
         let effects: Vec<Effect> = sites.map(|(i, site)| Effect { kind, site, amplitude: wave(i) }).collect();
-        let diagnosis = Diagnosis::of(&ring, &simulated(&effects, 8), |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &simulated(&effects, 8), |_| ()).unwrap();
         assert!(diagnosis.verdict != Verdict::Identified, "{}", diagnosis.sentence);
         let rows = diagnosis.imperfections();
         let of = |row: &&Imperfection| row.kind == kind.word() && row.measure == Measure::Scatter;
@@ -259,7 +255,7 @@ fn what_all_correctors_or_all_dipoles_have_is_ordinary() {
     for (kind, amplitude) in [(EffectKind::CorrectorHysteresis, -0.01), (EffectKind::DipoleSextupole, 0.2)] {
         let of = |site| Effect { kind, site, amplitude };
         let effects: Vec<Effect> = kind.sites(&ring).into_iter().map(of).collect();
-        let diagnosis = Diagnosis::of(&ring, &simulated(&effects, 9), |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &simulated(&effects, 9), |_| ()).unwrap();
         assert_eq!(diagnosis.verdict, Verdict::Consistent, "{}", diagnosis.sentence);
         let rows = diagnosis.imperfections();
         let Measured { value, sigma } = rows.iter().find(|row| row.kind == kind.word()).unwrap().measured;
@@ -282,7 +278,7 @@ fn unmodelled_physics_is_not_named() {
         unmodelled.size = kind.sizes()[1];
         let truth = simulate::Truth { vars: &vars, effects: &[], beyond: &[&unmodelled] };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 3).unwrap();
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let open = matches!(diagnosis.verdict, Verdict::Unexplained | Verdict::Ambiguous);
         assert!(open, "{kind:?}: {} {}", diagnosis.verdict.word(), diagnosis.sentence);
         if kind == Saturation {
@@ -321,10 +317,10 @@ fn the_amplitude_is_that_of_nuts() {
     for (name, kind, place) in [("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")] {
         let data = whitened(&read(&format!("concealed/{name}")));
         let hypothesis = Hypothesis::default().with(Term::at(kind, place, &ring).unwrap());
-        let fitted = Fitted::of(&data, &hypothesis, &DVector::zeros(48)).unwrap();
+        let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
         let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
-        let run = sample::sample(&data, &fitted, settings).unwrap();
+        let run = sample(&data, &fitted, settings).unwrap();
         // in open-08 vars lie at their bound, where a step adapted in so few draws is sometimes too long: 1 to 6 of 400 draws with
         // six seeds and warm-ups, 3.5 on average; a Poisson number of that mean exceeds 12 once in 30,000 runs. What they leave out
         // would show in the amplitude below

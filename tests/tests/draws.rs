@@ -1,6 +1,6 @@
 //! Convergence diagnostics against ArviZ 0.23, on chains that have one fault each (`tests/peers/arviz_diagnostics.py`).
 
-use inference::diagnostics::mcse_sd;
+use inference::mcse_sd;
 use inference::{Draws, Summary};
 use system_tests::repository;
 

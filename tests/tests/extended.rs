@@ -2,7 +2,7 @@
 
 use estimator::Walk;
 use inference::stream::{self, Core};
-use inference::{Drive, Recording, simulate, with_priors};
+use inference::{Recording, simulate, with_priors};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, Normal};
@@ -19,7 +19,7 @@ fn recorded(ring: &Ring, vars: &[f64], effects: &[Effect]) -> Recording {
     let mut random = StdRng::seed_from_u64(1);
     let mut normal = |width: f64| Normal::new(0.0, width).unwrap().sample(&mut random);
     let baseline: Vec<f64> = ring.read_monitors.iter().map(|_| normal(2e-3)).collect();
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    let drives = recording.drives();
     for (row, drive) in recording.rows.iter_mut().zip(drives) {
         let params: Vec<f64> = vars.iter().map(|var| var.ln()).collect();
         let factors = ring.strengths(&params, drive.strength.as_slice());

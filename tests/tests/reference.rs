@@ -21,8 +21,8 @@ fn read(name: &str) -> (Ring, Recording) {
 
 fn reduced(ring: &Ring, recording: &Recording) -> Reduced {
     let campaign = Campaign::of(ring, recording).unwrap();
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ()).unwrap();
-    Reduced::of(campaign, fit).unwrap()
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+    Reduced::from_fit(campaign, fit).unwrap()
 }
 
 fn posterior(reduced: &Reduced, model: ResponseModel) -> Posterior {

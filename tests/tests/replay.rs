@@ -103,7 +103,7 @@ fn faulty_monitors_are_found_and_the_others_left_alone() {
 fn the_core_agrees_with_the_exact_batch_fit() {
     for name in ["paper-vars", "random-vars"] {
         let mut run = replay(read(name));
-        let fit = BatchFit::of(&Campaign::of(&run.ring, &run.recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(&Campaign::of(&run.ring, &run.recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
         for i in 0..48 {
             let sigma = fit.covariance[(i, i)].sqrt();
             let shift = (f64::from(run.last.map_params[i]) - fit.map_params[i]) / sigma;

@@ -61,7 +61,7 @@ impl Running {
     fn cycle(&mut self, mut row: Row) {
         self.sequence += 1;
         (row.sequence, row.time) = (self.sequence, CYCLE * f64::from(self.sequence));
-        let drive = Drive::of(&self.recording.header, &row);
+        let drive = Drive::from_row(&self.recording.header, &row);
         let params: Vec<f64> = self.vars.iter().map(|var| var.ln()).collect();
         let factors = self.ring.strengths(&params, drive.strength.as_slice());
         let strength = factors.iter().map(|factor| factor.ln()).collect();

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use inference::Recording;
 use twin::Ring;
 

@@ -1,8 +1,6 @@
 //! The cases of the validation: each is fixed by its number and one seed for all.
 
-use diagnosis::data::{Data, DataError};
-use diagnosis::hypothesis::{Term, in_order};
-use diagnosis::scan::candidates;
+use diagnosis::{Data, DataError, Term, candidates, in_order};
 use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware};
@@ -77,7 +75,7 @@ impl Cases {
     /// # Errors
     /// [`DataError`] if that cannot be diagnosed.
     pub fn of(template: &Campaign) -> Result<Self, DataError> {
-        let data = Data::of(template)?;
+        let data = Data::from_campaign(template)?;
         let terms = candidates(&data, template.recording.header.radial_loop_monitors.as_ref());
         Ok(Self { ring: template.ring.clone(), terms, families: Families::of(&data) })
     }

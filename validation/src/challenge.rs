@@ -3,8 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use diagnosis::data::DataError;
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{DataError, Diagnosis, Finding, Verdict};
 use inference::Recording;
 use serde::Serialize;
 use twin::Ring;
@@ -93,7 +92,7 @@ impl Scored {
     /// [`DataError`].
     pub fn of(ring: &Ring, recording: &Recording, truth: &Truth) -> Result<Self, DataError> {
         let started = Instant::now();
-        let diagnosis = &Diagnosis::of(ring, recording, |_| {})?;
+        let diagnosis = &Diagnosis::from_recording(ring, recording, |_| {})?;
         let seconds = started.elapsed().as_secs_f64();
         let names = ring.var_names();
         Ok(Self {

@@ -7,10 +7,7 @@
 
 use core::iter;
 
-use diagnosis::QUOTED;
-use diagnosis::data::Data;
-use diagnosis::hypothesis::Member;
-use diagnosis::ordinary::Family;
+use diagnosis::{Data, Family, Member, QUOTED};
 use inference::simulate::TuneWindow;
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -51,7 +48,7 @@ impl Families {
 
     /// Draw those of a machine of a ring with some vars; `None` if hardly any has tunes near the design's.
     pub fn draw(&self, ring: &Ring, vars: &[f64], random: &mut impl Rng) -> Option<Imperfections> {
-        let (made, window) = (ring.with_vars(vars), TuneWindow::of(ring, true).ok()?);
+        let (made, window) = (ring.with_vars(vars), TuneWindow::from_ring(ring, true).ok()?);
         let is_near_design = |drawn: &Imperfections| {
             let machine = Machine::new(made.clone(), Rf::FixedMomentum, &drawn.effects);
             let tunes = machine.ok().and_then(|machine| machine.optics().ok()?.tunes().ok());
@@ -91,10 +88,10 @@ mod tests {
     fn imperfect_machines_are_drawn_as_the_base_model_has_them() {
         const DRAWS: usize = 40;
         let (ring, template) = template();
-        let data = Data::of(&Campaign::of(&ring, &template).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &template).unwrap()).unwrap();
         let families = Families::of(&data);
         let mut random = StdRng::seed_from_u64(3);
-        let (vars, window) = (vec![1.0; ring.parameters.len()], TuneWindow::of(&ring, true).unwrap());
+        let (vars, window) = (vec![1.0; ring.parameters.len()], TuneWindow::from_ring(&ring, true).unwrap());
         let (mut widths, mut rejected) = (Vec::new(), 0);
         for _ in 0..DRAWS {
             let drawn = families.draw(&ring, &vars, &mut random).unwrap();
@@ -134,7 +131,7 @@ mod tests {
             assert_eq!(some.len(), 3);
             for case in some {
                 let recording = case.recording(&ring, &template).unwrap();
-                let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+                let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
                 let named: Vec<_> = found.findings.iter().filter_map(|finding| finding.term().copied()).collect();
                 assert_eq!(named, [case.effects[0].into()], "{}: {}", case.index, found.sentence);
             }

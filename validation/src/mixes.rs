@@ -7,7 +7,7 @@
 //!
 //! Source of the effective number: L. Kish, Survey Sampling (Wiley, 1965), section 8.2.
 
-use diagnosis::search::{ODDS, UNMODELLED};
+use diagnosis::{ODDS, UNMODELLED};
 use serde::Serialize;
 
 use crate::outcome::Outcome;

@@ -2,12 +2,9 @@
 
 use std::time::Instant;
 
-use diagnosis::alternatives::{Competition, imitating};
-use diagnosis::data::{Data, DataError};
-use diagnosis::fit::Fitted;
-use diagnosis::hypothesis::{Hypothesis, Term};
-use diagnosis::search::Found;
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{
+    Competition, Data, DataError, Diagnosis, Finding, Fitted, Found, Hypothesis, Term, Verdict, imitating,
+};
 use inference::Campaign;
 use inference::recording::Recording;
 use nalgebra::{DMatrix, DVector};
@@ -91,7 +88,7 @@ pub fn run(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<Outc
     let Some((oracle_gain, own)) = oracle(ring, template, case)? else { return Ok(None) };
     let Ok(recording) = case.recording(ring, template) else { return Ok(None) };
     let started = Instant::now();
-    let diagnosis = Diagnosis::of(ring, &recording, |_| {})?;
+    let diagnosis = Diagnosis::from_recording(ring, &recording, |_| {})?;
     let seconds = started.elapsed().as_secs_f64();
     // what passes within settings is not in the means, which are compared
     let of_means = diagnosis.transients.is_empty() && diagnosis.verdict == Verdict::Identified;
@@ -203,11 +200,11 @@ fn oracle(ring: &Ring, template: &Recording, case: &Case) -> Result<Option<(f64,
     }
     let case = &Case { imperfections: None, ..case.clone() };
     let Ok(recording) = case.recording(ring, template) else { return Ok(None) };
-    let data = Data::of(&Campaign::of(ring, &recording)?)?;
+    let data = Data::from_campaign(&Campaign::of(ring, &recording)?)?;
     let zero = DVector::zeros(data.units.len());
     let best = |data: &Data, given: &[Effect]| -> Result<f64, DataError> {
         let hypothesis = Hypothesis { given: given.to_vec(), ..Hypothesis::default() };
-        Ok(Fitted::of(data, &hypothesis, &zero)?.log_posterior(data))
+        Ok(Fitted::from_guess(data, &hypothesis, &zero)?.log_posterior(data))
     };
     let nothing = best(&data, &[])?;
     if !case.unmodelled.is_empty() {
@@ -236,7 +233,7 @@ fn beyond_name(
     let Found { data, best, .. } = found;
     let Some(cleaned) = without_signal(ring, template, case, recording, data) else { return Ok(None) };
     let nothing = best.hypothesis.without_terms(|_| true);
-    let fitted = Fitted::of(&cleaned, &nothing, &best.guess(data, &nothing))?;
+    let fitted = Fitted::from_guess(&cleaned, &nothing, &best.guess(data, &nothing))?;
     Ok(Some(fitted.log_posterior(&cleaned) - best.log_posterior(data)))
 }
 

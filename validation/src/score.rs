@@ -3,10 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use diagnosis::alternatives::DECISIVE;
-use diagnosis::average::Vars;
-use diagnosis::hypothesis::Term;
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{DECISIVE, Diagnosis, Finding, Term, Vars, Verdict};
 use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 use twin::{EffectError, EffectKind, Ring};

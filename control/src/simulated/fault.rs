@@ -42,7 +42,7 @@ impl Fault {
     /// # Errors
     /// [`FaultError`].
     pub fn parse(text: &str, ring: &Ring) -> Result<Self, FaultError> {
-        let names = Names::of(ring);
+        let names = Names::from_ring(ring);
         let parsed = || {
             let (kind, rest) = text.split_once('@')?;
             let (place, value) = rest.split_once('=')?;

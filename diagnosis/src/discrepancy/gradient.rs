@@ -12,7 +12,9 @@
 use nalgebra::{DMatrix, DVector};
 use twin::{Place, Ring, Signature, Signatures};
 
-use super::{Adapted, Data, Discrepancy, Linearised, Seen, Sums, at_monitors};
+use super::marginal::{Adapted, Discrepancy, Linearised};
+use super::sums::{Seen, Sums, at_monitors};
+use crate::data::Data;
 use crate::location::Location;
 
 /// Amplitudes of a gradient over those of other places, 2.5 um to 0.32 mm rms at the monitors: the tunes show one that moves the readings by far less than their noise.
@@ -52,13 +54,13 @@ fn kick(signatures: &Signatures, ring: &Ring, quadrupole: usize, [x, y]: [f64; 2
 impl Changing {
     /// Of each quadrupole; `sigma`: standard deviation of the orbit at every element (x, y) [m].
     pub fn all(signatures: &Signatures, ring: &Ring, orbit: &[[f64; 2]], sigma: &[[f64; 2]]) -> Vec<Self> {
-        let of = |(q, gradient): (usize, Signature)| {
+        let changing = |(q, gradient): (usize, Signature)| {
             let log_gradient = FINER / gradient.rms().max(f64::MIN_POSITIVE);
             let [x, y] = sigma[ring.quadrupoles[q].element].map(|sigma| sigma.hypot(AXIS));
             let patterns = [gradient, kick(signatures, ring, q, [x, 0.0]), kick(signatures, ring, q, [0.0, y])];
             Self { log_gradient, patterns: patterns.map(|pattern| pattern * log_gradient) }
         };
-        steering(signatures, ring, orbit).into_iter().enumerate().map(of).collect()
+        steering(signatures, ring, orbit).into_iter().enumerate().map(changing).collect()
     }
 }
 
@@ -71,7 +73,7 @@ pub(super) struct Runs {
 
 impl Runs {
     /// Of some monitors and the tunes that are known; none of too many runs.
-    pub fn of(data: &Data, seen: &Seen, monitors: &[usize]) -> Option<Self> {
+    pub fn from_readings(data: &Data, seen: &Seen, monitors: &[usize]) -> Option<Self> {
         if data.pools.count > MANY {
             return None;
         }
@@ -85,7 +87,7 @@ impl Runs {
     /// One amplitude a run of each of some patterns.
     pub(super) fn of_patterns(&self, data: &Data, patterns: &[Signature]) -> Sums {
         let (runs, unknowns) = (data.pools.count, self.channels[0].1.cross.ncols());
-        let mut all = Sums::none(patterns.len() * runs, unknowns);
+        let mut all = Sums::zero(patterns.len() * runs, unknowns);
         let left: Vec<DMatrix<f64>> =
             patterns.iter().map(|one| data.accompanied_in_runs(&self.monitors, &one.readings)).collect();
         for (c, own) in &self.channels {
@@ -120,24 +122,6 @@ impl Runs {
     }
 }
 
-impl Sums {
-    /// Of amplitudes that are sums of some, block by block: `steps`, rows those of a block.
-    pub(super) fn through(&self, steps: &DMatrix<f64>) -> Self {
-        let (from, to) = steps.shape();
-        let blocks = self.pull.len() / from;
-        let mut all = Self::none(blocks * to, self.cross.ncols());
-        for i in 0..blocks {
-            for j in 0..blocks {
-                let block = self.gram.view((i * from, j * from), (from, from));
-                all.gram.view_mut((i * to, j * to), (to, to)).copy_from(&(steps.transpose() * block * steps));
-            }
-            all.cross.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.cross.rows(i * from, from)));
-            all.pull.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.pull.rows(i * from, from)));
-        }
-        all
-    }
-}
-
 /// The readings in which quadrupoles are looked for.
 pub(super) struct Where<'d> {
     pub data: &'d Data,
@@ -150,9 +134,9 @@ pub(super) struct Where<'d> {
 
 impl Where<'_> {
     /// Of patterns that step with time, by whole whitened frames.
-    pub fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
+    pub(crate) fn stepping(&self, patterns: &[Signature], steps: &DMatrix<f64>) -> Sums {
         let patterns: Vec<Signature> = patterns.iter().map(|one| at_monitors(one, self.monitors)).collect();
-        Sums::whole(&self.data.stepping(&patterns, steps), self.own)
+        Sums::from_columns(&self.data.stepping(&patterns, steps), self.own)
     }
 }
 
@@ -168,7 +152,7 @@ impl Linearised<'_> {
                 return first;
             }
             let kicked = self.changes(at, one, 3, all.len());
-            first.into_iter().zip(kicked).map(|(first, kicked)| first.or(kicked)).collect()
+            first.into_iter().zip(kicked).map(|(first, kicked)| first.averaged_with(kicked)).collect()
         };
         all.iter().enumerate().zip(first).flat_map(with_kicks).collect()
     }
@@ -244,7 +228,7 @@ mod tests {
         };
         let exact = (with(1e-4) - with(-1e-4)) / 2e-4;
         let (_, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let design = machine(&vec![1.0; ring.parameters.len()]);
         let signatures = Signatures::of(&design, &data.drives).unwrap();
         let orbit = design.orbit().unwrap();
@@ -270,7 +254,7 @@ mod tests {
             let beyond: &[&dyn Beyond] = &[&one];
             let truth = Truth { vars: &vars, effects: &[], beyond };
             let recording = simulate::campaign(&template, &ring, &truth, &hardware, seed).unwrap();
-            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let last = found.findings.last().unwrap();
             assert_eq!(last.at, one.site.name(&ring), "{}", found.sentence);
@@ -290,7 +274,7 @@ mod tests {
         let beyond: &[&dyn Beyond] = &[&one];
         let truth = Truth { vars: &vars, effects: &[], beyond };
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 8).unwrap();
-        let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let names = ring.var_names();
         let at = names.iter().position(|name| *name == one.site.name(&ring)).unwrap();
         let (mean, sigma) = (found.vars_after.mean[at], found.vars_after.covariance[(at, at)].sqrt());

@@ -6,6 +6,7 @@
 
 use core::ops::Range;
 
+use inference::{Excluded, Exclusions};
 use nalgebra::{DMatrix, DVector, DVectorView};
 
 /// The operator that takes readings, or a signal in them, to numbers of variance 1.
@@ -13,7 +14,7 @@ use nalgebra::{DMatrix, DVector, DVectorView};
 pub struct Differences {
     /// Frames of each run, two or more.
     pub runs: Vec<Range<usize>>,
-    counts: DMatrix<bool>,
+    excluded: Exclusions,
     /// Noise of each monitor [m].
     sigma: Vec<f64>,
     /// Dispersion of each monitor over its noise [1].
@@ -36,7 +37,7 @@ const LOST: f64 = 4.0;
 impl Differences {
     /// Of readings, rows frames, columns monitors, not a number where missing [m]; the setting of each frame; the noise that the header states [m]
     /// and the dispersion [m] of each monitor; `ln` of each supply's factor off its mean, rows frames.
-    pub fn of(
+    pub fn from_readings(
         readings: &DMatrix<f64>,
         settings: &[Option<usize>],
         noise: &[f64],
@@ -44,18 +45,19 @@ impl Differences {
         fluctuation: &DMatrix<f64>,
     ) -> Self {
         let runs: Vec<Range<usize>> = runs(settings).into_iter().filter(|run| run.len() > 1).collect();
-        let mut counts = readings.map(f64::is_finite);
+        // begun anew: what the screening takes for a jump may be what passes after a change
+        let mut excluded = Exclusions::from_readings(readings);
         for frame in lost(readings, &runs, noise) {
-            counts.row_mut(frame).fill(false);
+            excluded.exclude_frame(frame, Excluded::LostBeam);
         }
         let mut sigma = noise.to_vec();
         let mut jumping = vec![Vec::new(); sigma.len()];
         for (b, sigma) in sigma.iter_mut().enumerate() {
-            let reading = |frame: usize| if counts[(frame, b)] { readings[(frame, b)] } else { f64::NAN };
+            let reading = |frame: usize| if excluded.counts(frame, b) { readings[(frame, b)] } else { f64::NAN };
             let column: Vec<f64> = (0..readings.nrows()).map(reading).collect();
             let [typical, rms] = repeated(&column, &runs).unwrap_or([*sigma; 2]);
             if typical == 0.0 {
-                counts.column_mut(b).fill(false);
+                excluded.exclude_monitor(b, Excluded::Stuck);
             } else {
                 jumping[b] = jumps(&column, &runs, typical);
             }
@@ -65,11 +67,11 @@ impl Differences {
         let at_once = |frame: usize| jumping.iter().filter(|one| one.contains(&frame)).count();
         let by_itself = |frame: &usize| at_once(*frame) < SEVERAL;
         let jumps = jumping.iter().map(|one| one.iter().any(by_itself));
-        for (mut counts, _) in counts.column_iter_mut().zip(jumps).filter(|(_, jumps)| *jumps) {
-            counts.fill(false);
+        for (b, _) in jumps.enumerate().filter(|(_, jumps)| *jumps) {
+            excluded.exclude_monitor(b, Excluded::Jump);
         }
         let dispersion = dispersion.iter().zip(&sigma).map(|(d, sigma)| d / sigma.max(f64::MIN_POSITIVE)).collect();
-        let mut differences = Self { runs, counts, sigma, dispersion, ripple: Vec::new() };
+        let mut differences = Self { runs, excluded, sigma, dispersion, ripple: Vec::new() };
         let of_supply = |column: DVectorView<f64>| {
             differences.within(&DMatrix::from_fn(readings.nrows(), readings.ncols(), |i, _| column[i]))
         };
@@ -103,7 +105,7 @@ impl Differences {
         let mut white = DMatrix::zeros(values.nrows(), values.ncols());
         for run in &self.runs {
             for (b, sigma) in self.sigma.iter().enumerate() {
-                let counting: Vec<usize> = run.clone().filter(|&frame| self.counts[(frame, b)]).collect();
+                let counting: Vec<usize> = run.clone().filter(|&frame| self.excluded.counts(frame, b)).collect();
                 let mean = counting.iter().map(|&frame| values[(frame, b)]).sum::<f64>() / counting.len().max(1) as f64;
                 counting.iter().for_each(|&frame| white[(frame, b)] = (values[(frame, b)] - mean) / sigma);
             }
@@ -112,7 +114,7 @@ impl Differences {
     }
 
     fn without_momentum(&self, white: &mut DMatrix<f64>, frame: usize) {
-        let counting: Vec<usize> = (0..white.ncols()).filter(|&b| self.counts[(frame, b)]).collect();
+        let counting: Vec<usize> = (0..white.ncols()).filter(|&b| self.excluded.counts(frame, b)).collect();
         let square: f64 = counting.iter().map(|&b| self.dispersion[b].powi(2)).sum();
         let along: f64 = counting.iter().map(|&b| self.dispersion[b] * white[(frame, b)]).sum();
         if square > 0.0 {
@@ -121,8 +123,11 @@ impl Differences {
     }
 
     /// An orbit [m] that is added to every frame, over the noise and without the direction of the dispersion, rows frames; 0 where nothing counts.
-    pub fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
-        let mut all = self.counts.map_with_location(|_, b, counts| if counts { orbit[b] / self.sigma[b] } else { 0.0 });
+    pub(crate) fn of_orbit(&self, orbit: &DVector<f64>) -> DMatrix<f64> {
+        let mut all = self
+            .excluded
+            .counting()
+            .map_with_location(|_, b, counts| if counts { orbit[b] / self.sigma[b] } else { 0.0 });
         self.runs.iter().flat_map(Clone::clone).for_each(|frame| self.without_momentum(&mut all, frame));
         all
     }
@@ -134,12 +139,12 @@ impl Differences {
 
     /// True for a reading that counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
-        self.counts[(frame, b)]
+        self.excluded.counts(frame, b)
     }
 
     /// True for a monitor with readings that count.
-    pub fn sees(&self, b: usize) -> bool {
-        self.counts.column(b).iter().any(|counts| *counts)
+    pub(crate) fn sees(&self, b: usize) -> bool {
+        (0..self.excluded.size().0).any(|frame| self.excluded.counts(frame, b))
     }
 }
 
@@ -241,7 +246,8 @@ mod tests {
         let readings = DMatrix::from_fn(90, 5, |frame, b| {
             setting(frame, b) + 0.1 * noise(frame, b) + dispersion[b] * 0.05 * (frame as f64).sin()
         });
-        let differences = Differences::of(&readings, &settings, &[0.1; 5], &dispersion, &DMatrix::zeros(90, 0));
+        let differences =
+            Differences::from_readings(&readings, &settings, &[0.1; 5], &dispersion, &DMatrix::zeros(90, 0));
         assert_eq!(differences.runs.len(), 30);
         let white = differences.whiten(&readings);
         let moved = differences.whiten(&DMatrix::from_fn(90, 5, |frame, b| setting(frame, b) + 7.0));
@@ -274,7 +280,8 @@ mod tests {
         let settings: Vec<Option<usize>> = (0..120).map(|frame| Some(frame / 4)).collect();
         let mut readings = DMatrix::from_fn(120, 2, |frame, b| 0.1 * (1.7 * (frame * frame + b) as f64).sin());
         (readings[(10, 0)], readings[(8, 1)]) = (5.0, 5.0);
-        let differences = Differences::of(&readings, &settings, &[0.1; 2], &DVector::zeros(2), &DMatrix::zeros(120, 0));
+        let differences =
+            Differences::from_readings(&readings, &settings, &[0.1; 2], &DVector::zeros(2), &DMatrix::zeros(120, 0));
         assert_eq!([0, 1].map(|b| differences.sees(b)), [false, true]);
         assert!(differences.whiten(&readings)[(8, 1)] > 10.0, "the first of a run is what is looked at");
     }
@@ -289,7 +296,7 @@ mod tests {
                 0.1 * (1.7 * (frame * frame + b) as f64).sin() + jump
             });
             let none = DMatrix::zeros(120, 0);
-            let differences = Differences::of(&readings, &settings, &[0.1; 8], &DVector::zeros(8), &none);
+            let differences = Differences::from_readings(&readings, &settings, &[0.1; 8], &DVector::zeros(8), &none);
             assert!((0..8).all(|b| differences.sees(b) == (b >= jumping || count)), "{jumping}");
         }
     }

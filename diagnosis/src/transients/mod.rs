@@ -14,6 +14,7 @@
 //! predicted by the others.
 
 mod differences;
+mod shown;
 mod signals;
 mod unsteady;
 
@@ -26,17 +27,20 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use twin::{EffectKind, Hold, Optics, OrbitError, Ring, Signatures, Site};
 
-use super::alternatives::{Alternative, Cause, SUSPICIOUS, Weighed};
+use super::alternatives::{Alternative, Cause, Weighed};
 use super::data::{drives_of, rippled};
 use super::discrepancy::Discrepancy;
 use super::heldout::VALIDATED;
-use super::hypothesis::Term;
-use super::location::{Location, SORTS};
-use super::search::{ODDS, UNMODELLED, UNMODELLED_SEEN};
-use super::verdict::{Finding, Tested};
+use super::location::Location;
+use super::odds::SORTS;
+use super::odds::SUSPICIOUS;
+use super::odds::{ODDS, UNMODELLED, UNMODELLED_SEEN};
+use super::term::Term;
+use super::tested::Tested;
 use differences::{Differences, median, run_means};
-use inference::Campaign;
 use inference::recording::Recording;
+use inference::{Campaign, is_powered};
+pub use shown::Shown;
 use signals::Signals;
 use unsteady::Unsteady;
 
@@ -61,19 +65,6 @@ pub struct Transient {
     pub shown: Vec<Shown>,
 }
 
-/// One reading of a frame, after a change or of a corrector that is unsteady.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Shown {
-    /// Predicted difference [m], per unit of the amplitude of a cause that has one.
-    pub predicted: f64,
-    /// The difference [m].
-    pub measured: f64,
-    /// Its noise [m].
-    pub sigma: f64,
-}
-
-/// Share of the nominal kick above which a corrector was moved.
-const DRIVEN: f64 = 0.25;
 /// Most causes.
 const MOST: usize = 4;
 /// Causes whose amplitude is fitted with the exact signal.
@@ -95,9 +86,9 @@ const RARE: f64 = 0.01;
 const SEED: u64 = 1;
 
 impl Transient {
-    /// True for the finding that states it.
-    pub fn is_of(&self, finding: &Finding) -> bool {
-        self.alternatives[0].cause.is(&finding.cause)
+    /// True for the cause of the finding that states it.
+    pub fn is_of(&self, cause: &Cause) -> bool {
+        self.alternatives[0].cause.is(cause)
     }
 }
 
@@ -106,13 +97,13 @@ impl Transients {
     ///
     /// # Errors
     /// [`OrbitError`].
-    pub fn of(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
+    pub fn find(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let mut campaign = Campaign::of(ring, recording)?;
         let optics = Optics::of(campaign.held.ring(), Hold::Momentum { delta: 0.0 })?;
         let dispersion = optics.dispersion_of(&optics.read_monitors());
         let mut found: Vec<Transient> = Vec::new();
         while found.len() < MOST
-            && let Some((transient, without)) = Within::of(&campaign, &dispersion).strongest()
+            && let Some((transient, without)) = SettingDifferences::from_campaign(&campaign, &dispersion).strongest()
         {
             campaign = Campaign::of(ring, &without)?;
             let is_of_first_frames = matches!(
@@ -148,7 +139,7 @@ pub fn join(known: &mut Vec<Transient>, more: Vec<Transient>, campaign: usize) {
 }
 
 /// A campaign's differences within settings, and what may be in them.
-struct Within<'c> {
+struct SettingDifferences<'c> {
     campaign: &'c Campaign,
     differences: Differences,
     /// Readings at the mean supply currents and kicks [m].
@@ -184,12 +175,12 @@ struct Fit {
     signal: DMatrix<f64>,
 }
 
-impl<'c> Within<'c> {
-    fn of(campaign: &'c Campaign, dispersion: &DVector<f64>) -> Self {
+impl<'c> SettingDifferences<'c> {
+    fn from_campaign(campaign: &'c Campaign, dispersion: &DVector<f64>) -> Self {
         let noise = &campaign.recording.header.noise;
         let readings = steady(campaign);
-        let (settings, ripple) = (&campaign.settings.of_frame, &campaign.fluctuation);
-        let differences = Differences::of(&readings, settings, noise, dispersion, ripple);
+        let (settings, ripple) = (&campaign.settings.repeatable, &campaign.fluctuation);
+        let differences = Differences::from_readings(&readings, settings, noise, dispersion, ripple);
         let white = differences.whiten(&readings);
         let monitors = (0..campaign.monitors()).filter(|&b| differences.sees(b));
         let late =
@@ -198,7 +189,7 @@ impl<'c> Within<'c> {
             .into_iter()
             .map(|c| Term { kind: EffectKind::CorrectorSettling, site: Site::Corrector(c) });
         let terms = late.chain(settling).collect();
-        let former = differences.whiten(&Signals::of(campaign, &readings).of_former_orbit());
+        let former = differences.whiten(&Signals::from_readings(campaign, &readings).of_former_orbit());
         let spread = spread(&differences, &former, &white);
         Self { campaign, differences, readings, white, former, spread, terms }
     }
@@ -208,7 +199,7 @@ impl<'c> Within<'c> {
         if self.differences.runs.is_empty() {
             return None;
         }
-        let signals = Signals::of(self.campaign, &self.readings);
+        let signals = Signals::from_readings(self.campaign, &self.readings);
         let slopes: Vec<DMatrix<f64>> = self.terms.iter().map(|&term| self.slope(&signals, term, 0.0)).collect();
         let first_order = self.weights(&slopes, &self.white);
         let (of_former, of_terms) = first_order.split_last()?;
@@ -237,7 +228,7 @@ impl<'c> Within<'c> {
             (Alternative::unmodelled(one), weight)
         }));
         // what is too small to be seen is weighed with the search
-        let Weighed { alternatives, nothing, .. } = Weighed::of(weights, 0.0);
+        let Weighed { alternatives, nothing, .. } = Weighed::from_log_weights(weights, 0.0);
         if 1.0 - nothing < SUSPICIOUS {
             return None;
         }
@@ -251,7 +242,7 @@ impl<'c> Within<'c> {
                 (self.shown(&signals.of_former_orbit()), self.without_first_frames(*from, *to))
             }
             (None, Cause::Unmodelled(Discrepancy { at: Location::UnsteadyCorrector(c), .. })) => {
-                let unsteady = Unsteady::of(&self.differences, &self.white, signals.of_corrector(*c))?;
+                let unsteady = Unsteady::from_response(&self.differences, &self.white, signals.of_corrector(*c))?;
                 (unsteady.shown(&self.readings, |frame| is_on(self.campaign, *c, frame)), self.without_corrector(*c))
             }
             (None, _) => return None,
@@ -269,8 +260,9 @@ impl<'c> Within<'c> {
 
     /// Whitened derivative of a signal.
     fn slope(&self, signals: &Signals, term: Term, amplitude: f64) -> DMatrix<f64> {
-        let at = |amplitude: f64| signals.of_effect(term, amplitude);
-        self.differences.whiten(&((at(amplitude + DIFFERENCE) - at(amplitude - DIFFERENCE)) / (2.0 * DIFFERENCE)))
+        let signal = |amplitude: f64| signals.of_effect(term, amplitude);
+        self.differences
+            .whiten(&((signal(amplitude + DIFFERENCE) - signal(amplitude - DIFFERENCE)) / (2.0 * DIFFERENCE)))
     }
 
     /// `ln` of prior times Bayes factor of each term to first order, then that of a share of the former orbit.
@@ -325,11 +317,11 @@ impl<'c> Within<'c> {
     /// Each corrector as one that is unsteady, by whitened readings, where these confirm it.
     fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
         let correctors = driven(self.campaign);
-        let of = |&c: &usize| {
-            let one = Unsteady::of(&self.differences, white, signals.of_corrector(c))?;
-            one.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
+        let judged = |&c: &usize| {
+            let unsteady = Unsteady::from_response(&self.differences, white, signals.of_corrector(c))?;
+            unsteady.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
         };
-        correctors.iter().filter_map(of).collect()
+        correctors.iter().filter_map(judged).collect()
     }
 
     /// Variance of the readings along the signal of an effect.
@@ -351,7 +343,7 @@ impl<'c> Within<'c> {
         let mut amplitude = 0.0_f64;
         let mut signal = DMatrix::zeros(readings.nrows(), readings.ncols());
         for _ in 0..STEPS {
-            let signals = Signals::of(self.campaign, &(readings - &signal));
+            let signals = Signals::from_readings(self.campaign, &(readings - &signal));
             let slope = self.slope(&signals, term, amplitude);
             let left = self.differences.whiten(&(readings - signals.of_effect(term, amplitude)));
             let information = slope.norm_squared() + width.powi(-2);
@@ -360,7 +352,7 @@ impl<'c> Within<'c> {
             signal = signals.of_effect(term, amplitude);
         }
         let without = readings - &signal;
-        let slope = self.slope(&Signals::of(self.campaign, &without), term, amplitude);
+        let slope = self.slope(&Signals::from_readings(self.campaign, &without), term, amplitude);
         let left = self.differences.whiten(&without);
         let spread = self.spread_of(term);
         let gained = (self.white.norm_squared() - left.norm_squared()) / spread;
@@ -450,7 +442,7 @@ impl Fit {
 
 /// True of a frame in which a corrector kicks the beam.
 fn is_on(campaign: &Campaign, corrector: usize, frame: usize) -> bool {
-    campaign.drives[frame].kick[corrector].abs() > DRIVEN * campaign.recording.nominal_kick()
+    is_powered(campaign.drives[frame].kick[corrector], campaign.recording.nominal_kick())
 }
 
 /// Correctors that kick the beam in some frame.
@@ -469,7 +461,7 @@ fn steady(campaign: &Campaign) -> DMatrix<f64> {
         let of_kicks = machine.readings(&drives)?.0;
         let slopes = Signatures::of(&machine, &drives)?.of_quadrupoles();
         let of_supplies = rippled(&campaign.ring, &slopes, &campaign.fluctuation);
-        let means = run_means(&of_kicks, &campaign.settings.of_frame);
+        let means = run_means(&of_kicks, &campaign.settings.repeatable);
         Ok(of_kicks - means + of_supplies.columns(0, campaign.monitors()))
     };
     let readings = campaign.readings_of_beam();
@@ -543,7 +535,7 @@ mod tests {
         let mut noise = Coloured::white(&ring, &recording, seed);
         change(&mut noise);
         let made = noise.campaign(&ring, &recording, &effects);
-        let found = Transients::of(&ring, &made).unwrap().found;
+        let found = Transients::find(&ring, &made).unwrap().found;
         (ring, found)
     }
 
@@ -616,7 +608,7 @@ mod tests {
         let hardware = inference::simulate::Hardware::shipped(&ring, &recording);
         let truth = inference::simulate::Truth { vars: &[1.0; 48], beyond: &[&Settling(0.05)], ..Default::default() };
         let made = inference::simulate::campaign(&recording, &ring, &truth, &hardware, 8).unwrap();
-        let Transients { found, campaign } = Transients::of(&ring, &made).unwrap();
+        let Transients { found, campaign } = Transients::find(&ring, &made).unwrap();
         assert_eq!(found.len(), 1);
         let Cause::Unmodelled(one) = &found[0].alternatives[0].cause else { panic!("{:?}", found[0].alternatives[0]) };
         let Location::FirstFrames { from, to } = one.at else { panic!("{:?}", one.at) };

@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Site};
 
 use super::differences::run_means;
-use crate::hypothesis::Term;
+use crate::term::Term;
 use inference::Campaign;
 
 /// What the signals are made of.
@@ -29,12 +29,12 @@ const LARGEST: f64 = 300.0;
 
 impl<'c> Signals<'c> {
     /// From readings without what is known to pass, rows frames [m].
-    pub fn of(campaign: &'c Campaign, readings: &DMatrix<f64>) -> Self {
+    pub fn from_readings(campaign: &'c Campaign, readings: &DMatrix<f64>) -> Self {
         let kick = DMatrix::from_rows(&campaign.drives.iter().map(|drive| drive.kick.transpose()).collect::<Vec<_>>());
         let rows = &campaign.recording.rows;
         let since = |frame: usize| rows[frame].sequence.wrapping_sub(rows[frame - 1].sequence);
         let elapsed = (0..rows.len()).map(|frame| if frame == 0 { 0 } else { since(frame) }).collect();
-        let orbit = run_means(readings, &campaign.settings.of_frame);
+        let orbit = run_means(readings, &campaign.settings.repeatable);
         let response = response(campaign, &kick, &orbit);
         Self { campaign, kick, orbit, elapsed, response }
     }
@@ -56,7 +56,7 @@ impl<'c> Signals<'c> {
     }
 
     /// What all monitors read while the machine keeps its whole former orbit for the first frame of a setting [m].
-    pub fn of_former_orbit(&self) -> DMatrix<f64> {
+    pub(crate) fn of_former_orbit(&self) -> DMatrix<f64> {
         let columns: Vec<DVector<f64>> = (0..self.orbit.ncols()).map(|b| self.coming(b)).collect();
         DMatrix::from_columns(&columns)
     }

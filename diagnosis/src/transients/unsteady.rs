@@ -14,8 +14,8 @@ use core::ops::Range;
 use evidence::log_bayes_factor_of_alike;
 use nalgebra::{DMatrix, DVector};
 
-use super::Shown;
 use super::differences::Differences;
+use super::shown::Shown;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
@@ -51,7 +51,11 @@ struct Sums {
 
 impl<'d> Unsteady<'d> {
     /// `response`: what the corrector does to each monitor, in any unit; none if it does nothing.
-    pub fn of(differences: &'d Differences, white: &'d DMatrix<f64>, response: DVector<f64>) -> Option<Self> {
+    pub fn from_response(
+        differences: &'d Differences,
+        white: &'d DMatrix<f64>,
+        response: DVector<f64>,
+    ) -> Option<Self> {
         let seen: Vec<f64> = (0..response.len()).filter(|&b| differences.sees(b)).map(|b| response[b]).collect();
         let rms = (seen.iter().map(|p| p * p).sum::<f64>() / seen.len().max(1) as f64).sqrt();
         let response = response / rms;
@@ -70,14 +74,14 @@ impl<'d> Unsteady<'d> {
         }
         let louder = all.variance_across() / of_others.variance_across().max(f64::MIN_POSITIVE);
         let variance = (of_others.along / of_others.count).max(1.0) * louder.max(1.0);
-        let of = |runs: &[Sums]| {
+        let discrepancy = |runs: &[Sums]| {
             let logs = SIZES.map(|size| runs.iter().map(|run| run.log_bayes(size, variance)).sum());
-            Discrepancy::of(Location::UnsteadyCorrector(corrector), logs, sites)
+            Discrepancy::averaged(Location::UnsteadyCorrector(corrector), logs, sites)
         };
-        let found = of(&each);
+        let found = discrepancy(&each);
         let telling = each.iter_mut().max_by(|one, other| one.most.total_cmp(&other.most))?;
         (telling.along, telling.count) = (telling.along - telling.most, telling.count - 1.0);
-        (of(&each).log_bayes > CONFIRMED).then_some(found)
+        (discrepancy(&each).log_bayes > CONFIRMED).then_some(found)
     }
 
     /// In each frame in which it is on the readings less the mean of their run, against what the kick that suits the frame's other monitors best should make
@@ -182,7 +186,7 @@ mod tests {
         let mut made = Coloured::white(&ring, &recording, 7);
         noise(&mut made);
         let made = made.campaign_with(&ring, &recording, &[], &[&Unsteadied { corrector, share }]);
-        let Transients { found, campaign } = Transients::of(&ring, &made).unwrap();
+        let Transients { found, campaign } = Transients::find(&ring, &made).unwrap();
         (campaign.recording, found.into_iter().map(|mut one| one.alternatives.remove(0).cause).collect())
     }
 

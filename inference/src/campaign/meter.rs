@@ -24,7 +24,7 @@ const ROUNDING: f64 = 3e-6;
 
 impl Meter {
     /// A line through the tunes over time, which goes from -1 to 1; missing ones are not numbers. None of too few.
-    pub fn of<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
+    pub fn from_tunes<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
         let points: Vec<(f64, f64)> =
             frames.filter(|(tune, _)| !tune.is_nan()).map(|(tune, time)| (*time, *tune)).collect();
         if points.len() < FEWEST {
@@ -60,7 +60,7 @@ mod tests {
 
     fn read(tunes: &[f64]) -> Option<Meter> {
         let time: Vec<f64> = (0..tunes.len()).map(|i| 2.0 * i as f64 / (tunes.len() - 1) as f64 - 1.0).collect();
-        Meter::of(tunes.iter().zip(&time))
+        Meter::from_tunes(tunes.iter().zip(&time))
     }
 
     #[test]

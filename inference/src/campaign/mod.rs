@@ -2,11 +2,11 @@
 //!
 //! Everything that fits, samples or diagnoses a recording starts from here. Sizes come from the ring; none is the core's.
 
-mod common;
-mod drive;
-mod linear;
+mod common_terms;
+mod exclusion;
+mod linearisation;
 mod meter;
-mod normal;
+mod normal_equations;
 mod screen;
 mod setting;
 mod times;
@@ -18,19 +18,19 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Machine, Optics, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
 
 use crate::prior::Prior;
-use crate::recording::Recording;
+use crate::recording::{self, Drive, Recording};
 
-pub use common::chi_square;
-pub(crate) use common::{Common, Eliminated, Weighed};
-pub use drive::{Drive, supplies_of};
-pub(crate) use linear::AtTimes;
-use linear::Linearised;
-pub use linear::rf_orbit;
+pub use common_terms::chi_square;
+pub(crate) use common_terms::{Common, Eliminated, Weighed};
+pub use exclusion::{Excluded, Exclusions};
+pub(crate) use linearisation::AtTimes;
+use linearisation::Linearised;
+pub use linearisation::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
-pub(crate) use normal::{Normal, Terms};
+pub(crate) use normal_equations::{Normal, Terms};
 pub use screen::Screened;
-use screen::{Groups, Screener, Seen};
-pub use setting::Settings;
+use screen::{Groups, Screener, Seen, rms_by_plane};
+pub use setting::{Setting, Settings, is_powered};
 pub use times::{Stray, Times, furthest_stray};
 
 /// A recording and what follows from it before any fit.
@@ -94,12 +94,12 @@ impl Campaign {
         let ring = recording.powered(ring).into_owned();
         let believed = recording.header.believed(&ring).expect("the header is checked against its ring");
         let held = Machine::new(ring.clone(), believed, &[]).expect("there is no effect");
-        let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
-        let supplies = drive::mean_supplies(&drives);
-        let times = Times::of(recording);
-        let settings = Settings::of(&drives, &times.of_frame, recording.nominal_kick());
+        let drives = recording.drives();
+        let supplies = recording::mean_supplies(&drives);
+        let times = Times::in_recording(recording);
+        let settings = Settings::from_frames(&drives, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
-        let (prior, of_design) = (Prior::of(&ring), spurious_dispersion(&ring)?);
+        let (prior, of_design) = (Prior::from_ring(&ring), spurious_dispersion(&ring)?);
         let screener = Screener {
             held: &held,
             ring: &ring,
@@ -108,10 +108,11 @@ impl Campaign {
             supplies: &supplies,
             times: &times,
             settings: &settings,
-            groups: Groups::of(&drives, &times, &settings),
+            groups: Groups::from_settings(&drives, &times, &settings),
             readings: &of_beam(recording, &readings),
+            excluded: excluded(recording, &readings),
             noise: &recording.header.noise,
-            sharing: &drive::sharing(&drives),
+            sharing: &setting::sharing(&drives),
             // each of two opposite offsets is given one of its own
             spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
         };
@@ -168,7 +169,7 @@ impl Campaign {
 
     /// True if a reading counts.
     pub fn counts(&self, frame: usize, b: usize) -> bool {
-        self.screened.accepted[(frame, b)]
+        self.screened.excluded.counts(frame, b)
     }
 
     /// Noise as which a reading of a monitor is weighted [m].
@@ -222,6 +223,14 @@ impl Campaign {
         terms
     }
 
+    /// Linearised about params, at the supplies of each time in the cycle.
+    ///
+    /// # Errors
+    /// [`OrbitError`] if there is no stable ring.
+    pub(crate) fn linearised(&self, params: &DVector<f64>) -> Result<AtTimes, OrbitError> {
+        AtTimes::new(&self.held, params, &self.supplies, &self.drives, &self.times)
+    }
+
     /// Rms of the baselines that are known, in x and y [m].
     pub(crate) fn rms_by_plane(&self, baselines: &[Option<f64>]) -> [f64; 2] {
         rms_by_plane(&self.ring, baselines)
@@ -229,7 +238,7 @@ impl Campaign {
 
     /// True if any reading counts.
     pub fn has_readings(&self) -> bool {
-        self.screened.accepted.iter().any(|counts| *counts)
+        self.screened.excluded.counting().iter().any(|counts| *counts)
     }
 
     /// The meter's tunes of the frames without an RF offset, the supplies' fluctuations taken out to first order.
@@ -243,7 +252,7 @@ impl Campaign {
             };
             self.drives.iter().enumerate().map(frame).collect()
         };
-        [0, 1].map(|plane| Meter::of(at_mean(plane).iter().zip(&self.time)))
+        [0, 1].map(|plane| Meter::from_tunes(at_mean(plane).iter().zip(&self.time)))
     }
 }
 
@@ -256,9 +265,19 @@ fn readings(recording: &Recording) -> DMatrix<f64> {
 /// Readings without those of frames that had no beam.
 fn of_beam(recording: &Recording, readings: &DMatrix<f64>) -> DMatrix<f64> {
     let mut readings = readings.clone();
-    let lost = recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam());
-    lost.for_each(|(i, _)| readings.row_mut(i).fill(f64::NAN));
+    without_beam(recording).for_each(|frame| readings.row_mut(frame).fill(f64::NAN));
     readings
+}
+
+/// What is known before the screening: readings that are missing, and those of frames that had no beam.
+fn excluded(recording: &Recording, readings: &DMatrix<f64>) -> Exclusions {
+    let mut excluded = Exclusions::from_readings(readings);
+    without_beam(recording).for_each(|frame| excluded.exclude_frame(frame, Excluded::LostBeam));
+    excluded
+}
+
+fn without_beam(recording: &Recording) -> impl Iterator<Item = usize> {
+    recording.rows.iter().enumerate().filter(|(_, row)| row.is_without_beam()).map(|(frame, _)| frame)
 }
 
 fn tunes(recording: &Recording) -> DMatrix<f64> {
@@ -268,19 +287,8 @@ fn tunes(recording: &Recording) -> DMatrix<f64> {
 
 /// `ln` of the dipoles' field off its mean in each frame; none where their current is not read.
 fn fields(recording: &Recording) -> Option<Vec<f64>> {
-    let logs = recording.rows.iter().map(|row| drive::field(&recording.header, row).map(f64::ln));
+    let logs = recording.rows.iter().map(|row| recording::field(&recording.header, row).map(f64::ln));
     let logs = logs.collect::<Option<Vec<f64>>>()?;
     let mean = logs.iter().sum::<f64>() / logs.len() as f64;
     Some(logs.into_iter().map(|log| log - mean).collect())
-}
-
-/// Rms of the baselines that are known, in x and y [m].
-fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
-    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
-    [0, 1].map(|plane| {
-        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
-        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
-        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
-        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
-    })
 }

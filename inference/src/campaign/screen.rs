@@ -12,21 +12,21 @@ use estimator::{Beside, ByRepeats, Gate, Health, Monitor, MonitorState, Position
 use nalgebra::{DMatrix, DVector};
 use twin::{Machine, OrbitError, Ring};
 
-use super::common::Weighed;
-use super::drive::{self, Drive};
-use super::linear::Linearised;
-use super::normal::{Normal, Terms};
-use super::rms_by_plane;
+use super::common_terms::Weighed;
+use super::exclusion::{Excluded, Exclusions};
+use super::linearisation::Linearised;
+use super::normal_equations::{Normal, Terms};
 use super::setting::Settings;
 use super::times::Times;
 use crate::prior::Prior;
+use crate::recording::{self, Drive};
 use evidence::Factor;
 
 /// The monitors, and their readings that count.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Screened {
-    /// Which readings count, rows frames, columns monitors.
-    pub accepted: DMatrix<bool>,
+    /// Which readings count, and why the others do not.
+    pub excluded: Exclusions,
     /// State and noise of each monitor.
     pub health: Vec<Health>,
 }
@@ -44,6 +44,8 @@ pub(super) struct Screener<'c> {
     pub groups: Groups,
     /// Rows frames, columns monitors, not a number where a monitor did not report [m].
     pub readings: &'c DMatrix<f64>,
+    /// What is left out beforehand.
+    pub excluded: Exclusions,
     /// Expected noise of each monitor [m].
     pub noise: &'c [f64],
     /// Number of frames with each frame's RF offset: they share the error of the spurious dispersion.
@@ -105,12 +107,13 @@ struct Repeats {
 
 /// The screening after some frames.
 struct Screening<'c> {
-    of: &'c Screener<'c>,
+    screener: &'c Screener<'c>,
     gate: Gate,
     monitors: Vec<Monitor>,
     /// By setting and monitor.
     repeats: Vec<Vec<Repeats>>,
-    accepted: DMatrix<bool>,
+    /// Frames to come are unconfirmed.
+    excluded: Exclusions,
     model: Model,
     normal: Normal,
     best: Best,
@@ -144,11 +147,11 @@ struct Best {
 }
 
 impl Groups {
-    pub fn of(drives: &[Drive], times: &Times, settings: &Settings) -> Self {
+    pub fn from_settings(drives: &[Drive], times: &Times, settings: &Settings) -> Self {
         let (mut known, mut members) = (BTreeMap::new(), Vec::<Vec<&Drive>>::new());
         let mut time_of = Vec::new();
         let mut group = |(frame, drive): (usize, _)| {
-            let key = settings.of_frame[frame].ok_or(frame);
+            let key = settings.repeatable[frame].ok_or(frame);
             let group = *known.entry(key).or_insert(members.len());
             members.resize(members.len().max(group + 1), Vec::new());
             members[group].push(drive);
@@ -156,7 +159,7 @@ impl Groups {
             group
         };
         let of_frame = drives.iter().enumerate().map(&mut group).collect();
-        Self { of_frame, drives: members.iter().map(|members| drive::mean(members)).collect(), times: time_of }
+        Self { of_frame, drives: members.iter().map(|members| recording::mean(members)).collect(), times: time_of }
     }
 }
 
@@ -173,15 +176,17 @@ impl Screener<'_> {
         }
         screening.take_back_unconfirmed();
         screening.drop_stuck();
-        let Screening { accepted, monitors, model, best, normal, .. } = screening;
-        let health = monitors.iter().map(Monitor::health).collect();
-        let screened = Screened { accepted, health };
+        let Screening { mut excluded, monitors, model, best, normal, .. } = screening;
+        let health: Vec<Health> = monitors.iter().map(Monitor::health).collect();
+        let dead = health.iter().enumerate().filter(|(_, health)| health.state == MonitorState::Dead);
+        dead.for_each(|(b, _)| excluded.set_dead(b));
+        let screened = Screened { excluded, health };
         // the last step has not been tried: next to a resonance it may lead to no stable ring
         let shares = (0..HALVINGS).map(|halvings| 0.5_f64.powi(halvings)).chain([0.0]);
         let mut tried = shares.map(|share| {
             let step = &best.step * share;
             let (params, baselines) = (&model.params + &step, normal.baselines(&step));
-            let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
+            let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
             Ok(Seen { screened: screened.clone(), params, linearised, baselines })
         });
         let first = tried.next().expect("there are shares");
@@ -204,16 +209,16 @@ impl Screener<'_> {
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
-        let linearised = Linearised::of(self.held, &params, self.supplies, self.drives)?;
+        let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
         let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
         let to_mean_drive = self.to_mean_drive(&orbit);
         Ok(Model { params, orbit, slope, to_mean_drive })
     }
 
     fn to_mean_drive(&self, orbit: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut sum = DMatrix::<f64>::zeros(self.settings.count, orbit.ncols());
-        let mut frames = vec![0.0; self.settings.count];
-        let settings = || self.settings.of_frame.iter().enumerate().filter_map(|(i, setting)| Some((i, (*setting)?)));
+        let mut sum = DMatrix::<f64>::zeros(self.settings.count(), orbit.ncols());
+        let mut frames = vec![0.0; self.settings.count()];
+        let settings = || self.settings.repeatable.iter().enumerate().filter_map(|(i, setting)| Some((i, (*setting)?)));
         for (i, setting) in settings() {
             frames[setting] += 1.0;
             let mut row = sum.row_mut(setting);
@@ -226,47 +231,51 @@ impl Screener<'_> {
 }
 
 impl<'c> Screening<'c> {
-    fn new(of: &'c Screener<'c>) -> Result<Self, OrbitError> {
-        let (frames, monitors) = (of.drives.len(), of.noise.len());
-        let model = of.model(of.prior.clamp(&DVector::zeros(of.prior.len())))?;
-        let normal = Normal::new(of.prior, &model.params, of.channels(), COMMON);
+    fn new(screener: &'c Screener<'c>) -> Result<Self, OrbitError> {
+        let model = screener.model(screener.prior.clamp(&DVector::zeros(screener.prior.len())))?;
+        let normal = Normal::new(screener.prior, &model.params, screener.channels(), COMMON);
         let expecting = |sigma: &f64| {
             let mut monitor = Monitor::BLANK;
             monitor.expect(*sigma as f32);
             monitor
         };
+        let mut excluded = screener.excluded.clone();
+        (0..screener.drives.len()).for_each(|frame| excluded.exclude_frame(frame, Excluded::Unconfirmed));
         Ok(Self {
             gate: Gate::default(),
-            monitors: of.noise.iter().map(expecting).collect(),
-            repeats: vec![vec![Repeats::default(); monitors]; of.settings.count],
-            accepted: DMatrix::from_element(frames, monitors, false),
-            best: Best::of(of, &model, &normal).expect("a prior's precision is positive"),
+            monitors: screener.noise.iter().map(expecting).collect(),
+            repeats: vec![vec![Repeats::default(); screener.noise.len()]; screener.settings.count()],
+            excluded,
+            best: Best::solve(screener, &model, &normal).expect("a prior's precision is positive"),
             model,
             normal,
             stale: false,
             unexpected: 0,
-            of,
+            screener,
         })
     }
 
     /// Take one frame: judge its readings, then learn from those that pass.
     fn take(&mut self, frame: usize) {
-        let setting = self.of.settings.of_frame[frame];
-        let reports = |b: usize| !self.of.readings[(frame, b)].is_nan();
+        let setting = self.screener.settings.repeatable[frame];
+        let reports = |b: usize| !self.screener.readings[(frame, b)].is_nan();
         let expected: Vec<bool> = (0..self.monitors.len()).map(|b| reports(b) && self.is_expected(frame, b)).collect();
         let is_lone = self.is_expected_but_for_a_few(frame, &expected);
         let mut rejected = Vec::new();
         for (b, expected) in expected.into_iter().enumerate() {
-            let reading = self.of.readings[(frame, b)];
+            let reading = self.screener.readings[(frame, b)];
             if self.monitors[b].hear(code(reading)) {
                 match setting {
                     Some(setting) => self.judge_repeat((frame, b, setting), expected, is_lone),
-                    None if expected => self.accepted[(frame, b)] = true,
+                    None if expected => self.excluded.lift(frame, b),
                     None => {
                         self.monitors[b].reject();
+                        self.excluded.exclude(frame, b, Excluded::Jump);
                         rejected.push(b);
                     }
                 }
+            } else {
+                self.excluded.exclude(frame, b, Excluded::Stuck);
             }
             self.stale |= self.monitors[b].judge();
         }
@@ -279,13 +288,13 @@ impl<'c> Screening<'c> {
 
     /// Add the readings of a frame that count to the normal equations.
     fn learn(&mut self, frame: usize) {
-        let group = self.of.groups.of_frame[frame];
-        let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).collect();
+        let group = self.screener.groups.of_frame[frame];
+        let counting: Vec<usize> = (0..self.monitors.len()).filter(|&b| self.excluded.counts(frame, b)).collect();
         let mut slopes = DMatrix::zeros(self.model.params.len(), counting.len());
         for (mut to, &b) in slopes.column_iter_mut().zip(&counting) {
             to.copy_from(&self.model.slope[b].column(group));
         }
-        let weighed = |&b: &usize| (self.of.channel(frame, b), self.weighed(frame, b));
+        let weighed = |&b: &usize| (self.screener.channel(frame, b), self.weighed(frame, b));
         let readings: Vec<(usize, Weighed)> = counting.iter().map(weighed).collect();
         self.normal.add(&slopes, &readings);
     }
@@ -293,7 +302,7 @@ impl<'c> Screening<'c> {
     /// A reading in a setting is judged by its repeats, the first one by the model.
     fn judge_repeat(&mut self, (frame, b, setting): (usize, usize, usize), expected: bool, is_lone: bool) {
         let repeats = &self.repeats[setting][b];
-        let moved = |i: usize| self.of.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
+        let moved = |i: usize| self.screener.readings[(i, b)] + self.model.to_mean_drive[(i, b)];
         let (here, last) = (moved(frame), repeats.last);
         if let Some(last) = last {
             self.monitors[b].noise.learn((here - moved(last)) as f32);
@@ -323,24 +332,28 @@ impl<'c> Screening<'c> {
                 self.monitors[b].pardon(repeats.waiting);
                 self.stale = true;
                 if outvotes {
-                    repeats.frames.drain(..).for_each(|i| self.accepted[(i, b)] = false);
+                    repeats.frames.drain(..).for_each(|i| self.excluded.exclude(i, b, Excluded::Jump));
                 }
                 repeats.frames.extend(repeats.last);
-                repeats.last.into_iter().for_each(|last| self.accepted[(last, b)] = true);
+                repeats.last.into_iter().for_each(|last| self.excluded.lift(last, b));
             }
         }
         repeats.waiting = verdict.waiting();
         repeats.last = Some(frame);
         if repeats.waiting == 0 {
             repeats.frames.push(frame);
-            self.accepted[(frame, b)] = true;
+            self.excluded.lift(frame, b);
+        }
+        if !repeats.frames.is_empty() {
+            let outvoted = repeats.held.iter().filter(|held| !repeats.frames.contains(held));
+            outvoted.for_each(|&held| self.excluded.exclude(held, b, Excluded::Jump));
         }
     }
 
     /// Monitors fail one at a time: when most readings of a frame without a setting lie outside the gate, the beam was lost or the model is
     /// at fault. A lost beam is soon over: the third such frame in a row is used, all of it, the ones before are not.
     fn judge_frame(&mut self, frame: usize, rejected: &[usize]) {
-        let accepted = (0..self.monitors.len()).filter(|&b| self.accepted[(frame, b)]).count();
+        let accepted = (0..self.monitors.len()).filter(|&b| self.excluded.counts(frame, b)).count();
         if MOST * rejected.len() <= accepted + rejected.len() {
             self.unexpected = 0;
             return;
@@ -349,10 +362,11 @@ impl<'c> Screening<'c> {
         let convinced = self.unexpected >= CONVINCED;
         for &b in rejected {
             self.monitors[b].pardon(1);
-            self.accepted[(frame, b)] = true;
+            self.excluded.lift(frame, b);
         }
-        let mut row = self.accepted.row_mut(frame);
-        row.iter_mut().for_each(|accepted| *accepted &= convinced);
+        if !convinced {
+            self.excluded.exclude_frame(frame, Excluded::LostBeam);
+        }
     }
 
     /// True if the model expects nearly all readings of a frame, those of dead monitors left out.
@@ -363,7 +377,7 @@ impl<'c> Screening<'c> {
 
     /// The monitors that report in a frame, without dead ones.
     fn alive(&self, frame: usize) -> impl Iterator<Item = usize> {
-        let reports = move |b: &usize| !self.of.readings[(frame, *b)].is_nan();
+        let reports = move |b: &usize| !self.screener.readings[(frame, *b)].is_nan();
         (0..self.monitors.len()).filter(reports).filter(|b| self.monitors[*b].state() != MonitorState::Dead)
     }
 
@@ -374,8 +388,8 @@ impl<'c> Screening<'c> {
 
     /// The same, where a reading has a further variance [m^2].
     fn is_expected_within(&self, frame: usize, b: usize, further: f64) -> bool {
-        let slope = self.model.slope[b].column(self.of.groups.of_frame[frame]);
-        let channel = self.of.channel(frame, b);
+        let slope = self.model.slope[b].column(self.screener.groups.of_frame[frame]);
+        let channel = self.screener.channel(frame, b);
         let expectation = self.normal.expect(channel, slope, &TERMS, &self.best.step, &self.best.factor);
         let (expected, of_baseline, of_params) = expectation.expect("a baseline's prior is known");
         let innovation = (self.residual(frame, b) - expected) as f32;
@@ -386,15 +400,15 @@ impl<'c> Screening<'c> {
     }
 
     fn residual(&self, frame: usize, b: usize) -> f64 {
-        self.of.readings[(frame, b)] - self.model.orbit[(frame, b)]
+        self.screener.readings[(frame, b)] - self.model.orbit[(frame, b)]
     }
 
     /// Variance of one reading: the monitor's noise, and what all frames of its RF offset share [m^2].
     fn variance(&self, frame: usize, b: usize) -> f64 {
-        let plane = self.of.plane(b);
-        let shared = self.of.spurious[plane] * self.best.orbit[plane] * self.of.drives[frame].rf_offset;
+        let plane = self.screener.plane(b);
+        let shared = self.screener.spurious[plane] * self.best.orbit[plane] * self.screener.drives[frame].rf_offset;
         // frames of one RF offset share it, and so do those of all times in the cycle
-        let sharing = self.of.sharing[frame] * self.of.times.count() as f64;
+        let sharing = self.screener.sharing[frame] * self.screener.times.count() as f64;
         f64::from(self.monitors[b].variance()) + sharing * shared * shared
     }
 
@@ -414,13 +428,13 @@ impl<'c> Screening<'c> {
         self.stale = false;
         let (from, step) = (self.model.params.clone(), self.best.step.clone());
         for halvings in 0..HALVINGS {
-            let Ok(model) = self.of.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
+            let Ok(model) = self.screener.model(&from + &step * 0.5_f64.powi(halvings)) else { continue };
             self.model = model;
             if self.rebuild(frames) && self.best.cost <= highest {
                 return;
             }
         }
-        if let Ok(model) = self.of.model(from) {
+        if let Ok(model) = self.screener.model(from) {
             self.model = model;
             if !self.rebuild(frames) {
                 self.best.step.fill(0.0);
@@ -431,26 +445,26 @@ impl<'c> Screening<'c> {
     /// Take back every reading of a monitor that ends dead and does report: those before it was found to be stuck or flat are no better.
     /// One that went silent was sound as long as it spoke.
     fn drop_stuck(&mut self) {
-        let frames = self.of.drives.len();
-        let reports = |b: usize| frames > 0 && !self.of.readings[(frames - 1, b)].is_nan();
+        let frames = self.screener.drives.len();
+        let reports = |b: usize| frames > 0 && !self.screener.readings[(frames - 1, b)].is_nan();
         let is_stuck = |b: usize| self.monitors[b].health().state == MonitorState::Dead && reports(b);
         let stuck: Vec<usize> = (0..self.monitors.len()).filter(|&b| is_stuck(b)).collect();
         if stuck.is_empty() {
             return;
         }
-        stuck.into_iter().for_each(|b| self.accepted.column_mut(b).fill(false));
+        stuck.into_iter().for_each(|b| self.excluded.exclude_monitor(b, Excluded::Stuck));
         self.rebuild(frames);
     }
 
     /// The normal equations of the accepted readings of the first frames; false if they have no best params.
     fn rebuild(&mut self, frames: usize) -> bool {
         let monitors = self.monitors.len();
-        self.normal = Normal::new(self.of.prior, &self.model.params, self.of.channels(), COMMON);
+        self.normal = Normal::new(self.screener.prior, &self.model.params, self.screener.channels(), COMMON);
         for b in 0..monitors {
             let none = |time: &usize| (time * monitors + b, Weighed::none(TERMS.len()));
-            let mut sums: Vec<(usize, Weighed)> = self.of.groups.times.iter().map(none).collect();
-            for frame in (0..frames).filter(|&frame| self.accepted[(frame, b)]) {
-                sums[self.of.groups.of_frame[frame]].1 += &self.weighed(frame, b);
+            let mut sums: Vec<(usize, Weighed)> = self.screener.groups.times.iter().map(none).collect();
+            for frame in (0..frames).filter(|&frame| self.excluded.counts(frame, b)) {
+                sums[self.screener.groups.of_frame[frame]].1 += &self.weighed(frame, b);
             }
             self.normal.add(&self.model.slope[b], &sums);
         }
@@ -460,7 +474,7 @@ impl<'c> Screening<'c> {
     /// The best params. At a resonance derivatives are so large that rounding leaves the normal equations without any: then those of
     /// before stay, and this is false.
     fn solve(&mut self) -> bool {
-        let Some(best) = Best::of(self.of, &self.model, &self.normal) else { return false };
+        let Some(best) = Best::solve(self.screener, &self.model, &self.normal) else { return false };
         self.best = best;
         true
     }
@@ -468,13 +482,24 @@ impl<'c> Screening<'c> {
 
 impl Best {
     /// None if the matrix of the normal equations is not positive.
-    fn of(of: &Screener, model: &Model, normal: &Normal) -> Option<Self> {
+    fn solve(screener: &Screener, model: &Model, normal: &Normal) -> Option<Self> {
         let (cost, quadratic) = normal.eliminated();
         let factor = quadratic.factor()?;
-        let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &of.prior.range);
+        let step = quadratic.within(&factor.solve(&quadratic.slope), &model.params, &screener.prior.range);
         let baselines = normal.baselines(&step);
-        Some(Self { orbit: rms_by_plane(of.ring, &baselines), step, factor, cost })
+        Some(Self { orbit: rms_by_plane(screener.ring, &baselines), step, factor, cost })
     }
+}
+
+/// Rms of the baselines that are known, in x and y [m].
+pub(super) fn rms_by_plane(ring: &Ring, baselines: &[Option<f64>]) -> [f64; 2] {
+    let (monitors, horizontal) = (ring.read_monitors.len(), ring.horizontal_monitors());
+    [0, 1].map(|plane| {
+        let is_of_plane = |channel: usize| usize::from(channel % monitors >= horizontal) == plane;
+        let of_plane = baselines.iter().enumerate().filter(|(channel, _)| is_of_plane(*channel));
+        let squares: Vec<f64> = of_plane.filter_map(|(_, baseline)| baseline.map(|x| x * x)).collect();
+        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+    })
 }
 
 /// A reading as the wire has it; none where it is missing.

@@ -1,87 +1,172 @@
-//! The settings of a campaign: frames with the same kicks and RF offset, by their read-backs.
+//! The settings of a campaign: frames with the same kicks, RF offset and time in the cycle, by their read-backs.
+//!
+//! Whatever groups frames takes its groups from here: the screening and the fit those of frames, the diagnosis those of the means of runs.
 
-use super::drive::Drive;
+use estimator::{SAME_KICK, SAME_OFFSET};
+use nalgebra::{DMatrix, DVector};
+use twin::Drives;
 
-/// Settings of frames.
+use crate::recording::Drive;
+
+/// Frames grouped by setting.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// Setting of each frame; none of a frame in which several things were moved and that no other repeats.
-    pub of_frame: Vec<Option<usize>>,
-    /// Of each frame the corrector that alone is moved in it.
-    pub corrector: Vec<Option<usize>>,
-    /// How many there are.
-    pub count: usize,
+    /// Setting of each frame.
+    pub of_frame: Vec<usize>,
+    /// The same; none of a frame in which several things were moved and that no other repeats.
+    pub repeatable: Vec<Option<usize>>,
+    settings: Vec<Setting>,
+    /// Largest kick that a corrector was set to [rad].
+    nominal_kick: f64,
 }
 
 /// What is moved in a frame: powered correctors with their kicks, and the RF; and which of the times in the cycle it has.
-#[derive(Debug)]
-struct Moved {
+#[derive(Debug, Clone, PartialEq)]
+pub struct Setting {
     time: usize,
     kicks: Vec<(usize, f64)>,
     rf_offset: f64,
 }
 
-/// Share of the largest kick above which a corrector counts as powered: idle ones scatter by a thousandth.
+/// Share of the largest kick above which a corrector is powered: idle ones scatter by a thousandth.
 const POWERED: f64 = 0.05;
-/// Kicks this close belong to the same setting, as a share of the kick.
-const SAME_KICK: f64 = 1.0 / 16.0;
-/// RF offsets this close belong to the same setting.
-const SAME_OFFSET: f64 = 1e-6;
+
+/// True for the kick of a corrector that is powered; `nominal`: the largest kick that one was set to.
+pub fn is_powered(kick: f64, nominal: f64) -> bool {
+    kick.abs() > POWERED * nominal
+}
+
+/// True if two RF offsets are those of one setting.
+fn is_same_offset(first: f64, second: f64) -> bool {
+    // the core counts in steps of 1e-9
+    (first - second).abs() <= f64::from(SAME_OFFSET) / 1e9
+}
+
+/// True if two kicks of one corrector are those of one setting.
+fn is_same_kick(first: f64, second: f64) -> bool {
+    (first - second).abs() <= first.abs().max(second.abs()) / f64::from(SAME_KICK)
+}
+
+/// Number of frames with each frame's RF offset.
+pub(super) fn sharing(drives: &[Drive]) -> Vec<f64> {
+    let is_alike = |drive: &Drive, other: &&Drive| is_same_offset(other.rf_offset, drive.rf_offset);
+    drives.iter().map(|drive| drives.iter().filter(|other| is_alike(drive, other)).count() as f64).collect()
+}
 
 impl Settings {
-    /// Group frames, each with its time in the cycle; `largest` is the largest kick that a corrector was set to [rad].
-    pub fn of(drives: &[Drive], times: &[usize], largest: f64) -> Self {
-        let mut settings: Vec<(Moved, usize)> = Vec::new();
-        let mut index = |(drive, time): (&Drive, &usize)| {
-            let moved = Moved::of(drive, *time, POWERED * largest);
-            let at = settings.iter().position(|(known, _)| known.is_repeated_by(&moved)).unwrap_or_else(|| {
-                settings.push((moved, 0));
+    /// Group the frames of a campaign, each with its time in the cycle; `nominal_kick`: the largest that a corrector was set to [rad].
+    pub fn from_frames(drives: &[Drive], times: &[usize], nominal_kick: f64) -> Self {
+        let setting =
+            |(drive, time): (&Drive, &usize)| Setting::new(drive.kick.iter(), drive.rf_offset, *time, nominal_kick);
+        Self::group(drives.iter().zip(times).map(setting), nominal_kick)
+    }
+
+    /// Group drives at one time in the cycle: of frames, or of means of frames.
+    pub fn from_drives(drives: &Drives) -> Self {
+        let setting =
+            |frame: usize| Setting::new(drives.kick.row(frame).iter(), drives.rf_offset[frame], 0, drives.nominal_kick);
+        Self::group((0..drives.kick.nrows()).map(setting), drives.nominal_kick)
+    }
+
+    fn group(frames: impl Iterator<Item = Setting>, nominal_kick: f64) -> Self {
+        let (mut settings, mut repeats): (Vec<Setting>, Vec<usize>) = (Vec::new(), Vec::new());
+        let index = |moved: Setting| {
+            let known = settings.iter().position(|known| known.is_repeated_by(&moved));
+            let index = known.unwrap_or_else(|| {
+                settings.push(moved);
+                repeats.push(0);
                 settings.len() - 1
             });
-            settings[at].1 += 1;
-            at
+            repeats[index] += 1;
+            index
         };
-        let of_frame: Vec<usize> = drives.iter().zip(times).map(&mut index).collect();
-        let corrector = |at: &usize| settings[*at].0.only_corrector();
-        let alone = |at: &usize| settings[*at].1 == 1 && settings[*at].0.things() > 1;
-        Self {
-            corrector: of_frame.iter().map(corrector).collect(),
-            of_frame: of_frame.iter().map(|at| (!alone(at)).then_some(*at)).collect(),
-            count: settings.len(),
-        }
+        let of_frame: Vec<usize> = frames.map(index).collect();
+        let is_repeatable = |setting: &usize| repeats[*setting] > 1 || settings[*setting].things() <= 1;
+        let repeatable = of_frame.iter().map(|setting| Some(*setting).filter(is_repeatable)).collect();
+        Self { repeatable, of_frame, settings, nominal_kick }
+    }
+
+    /// Number of settings.
+    pub fn count(&self) -> usize {
+        self.settings.len()
+    }
+
+    /// The setting of a frame.
+    pub fn setting(&self, frame: usize) -> &Setting {
+        &self.settings[self.of_frame[frame]]
+    }
+
+    /// The corrector that is powered most in a frame, and the sign of its kick.
+    pub fn kick(&self, frame: usize) -> Option<(usize, f64)> {
+        let strongest =
+            self.setting(frame).kicks.iter().max_by(|(_, one), (_, other)| one.abs().total_cmp(&other.abs()));
+        strongest.map(|(corrector, kick)| (*corrector, kick.signum()))
+    }
+
+    /// Rows frames, columns settings.
+    pub fn indicator(&self) -> DMatrix<f64> {
+        let mut indicator = DMatrix::zeros(self.of_frame.len(), self.count());
+        self.of_frame.iter().enumerate().for_each(|(frame, &setting)| indicator[(frame, setting)] = 1.0);
+        indicator
+    }
+
+    /// Settings in which a corrector is powered.
+    pub fn with_corrector(&self, corrector: usize) -> Vec<usize> {
+        (0..self.count()).filter(|&i| self.settings[i].kick_of(corrector).is_some()).collect()
+    }
+
+    /// Kick of a corrector in each setting, in units of the nominal.
+    pub fn strength_of(&self, corrector: usize) -> DVector<f64> {
+        let kick = |setting: &Setting| setting.kick_of(corrector).map_or(0.0, |kick| kick / self.nominal_kick);
+        DVector::from_iterator(self.count(), self.settings.iter().map(kick))
+    }
+
+    /// Mean drive of each setting, on the reference orbit, in mid-campaign; `drives`: those that were grouped.
+    pub fn means(&self, drives: &Drives) -> Drives {
+        let indicator = self.indicator();
+        let count = indicator.row_sum();
+        let mut kick = indicator.transpose() * &drives.kick;
+        kick.row_iter_mut().zip(count.iter()).for_each(|(mut row, count)| row /= *count);
+        let rf_offset = (indicator.transpose() * &drives.rf_offset).component_div(&count.transpose());
+        let orbit = vec![[0.0; 2]; drives.orbit.len()];
+        Drives { kick, rf_offset, time: DVector::zeros(self.count()), nominal_kick: drives.nominal_kick, orbit }
     }
 }
 
-impl Moved {
-    fn of(drive: &Drive, time: usize, powered: f64) -> Self {
-        let kicks = drive.kick.iter().copied().enumerate().filter(|(_, kick)| kick.abs() > powered);
-        Self { time, kicks: kicks.collect(), rf_offset: drive.rf_offset }
+impl Setting {
+    fn new<'k>(kicks: impl Iterator<Item = &'k f64>, rf_offset: f64, time: usize, nominal_kick: f64) -> Self {
+        let powered = kicks.copied().enumerate().filter(|(_, kick)| is_powered(*kick, nominal_kick));
+        Self { time, kicks: powered.collect(), rf_offset }
     }
 
     /// How many things are moved.
     fn things(&self) -> usize {
-        self.kicks.len() + usize::from(self.rf_offset.abs() > SAME_OFFSET)
+        self.kicks.len() + usize::from(!is_same_offset(self.rf_offset, 0.0))
     }
 
-    fn only_corrector(&self) -> Option<usize> {
+    /// The corrector that alone is moved.
+    pub fn only_corrector(&self) -> Option<usize> {
         (self.things() == 1).then(|| self.kicks.first().map(|(corrector, _)| *corrector)).flatten()
     }
 
+    /// Kick of a corrector that is powered [rad].
+    fn kick_of(&self, corrector: usize) -> Option<f64> {
+        self.kicks.iter().find(|(powered, _)| *powered == corrector).map(|(_, kick)| *kick)
+    }
+
     fn is_repeated_by(&self, other: &Self) -> bool {
-        let same = |((one, kick), (another, again)): (&(usize, f64), &(usize, f64))| {
-            one == another && (kick - again).abs() <= SAME_KICK * kick.abs().max(again.abs())
+        let same = |((corrector, kick), (another, again)): (&(usize, f64), &(usize, f64))| {
+            corrector == another && is_same_kick(*kick, *again)
         };
         self.time == other.time
             && self.kicks.len() == other.kicks.len()
             && self.kicks.iter().zip(&other.kicks).all(same)
-            && (self.rf_offset - other.rf_offset).abs() <= SAME_OFFSET
+            && is_same_offset(self.rf_offset, other.rf_offset)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DVector;
-
     use super::*;
 
     fn frame(kicks: [f64; 3], rf_offset: f64) -> Drive {
@@ -99,18 +184,46 @@ mod tests {
             frame([0.0, 0.0, 2.0], 0.0),
             frame([0.0, 0.0, 0.0], 2e-4),
         ];
-        let settings = Settings::of(&frames, &[0; 7], 2e-4);
-        assert_eq!(settings.of_frame, [0, 1, 0, 2, 3, 4, 5].map(Some));
-        assert_eq!(settings.count, 6);
-        assert_eq!(settings.corrector, [Some(0), None, Some(0), Some(0), Some(0), Some(2), None]);
-        let at_two_times = Settings::of(&frames, &[0, 0, 1, 0, 0, 0, 0], 2e-4);
-        assert_eq!(at_two_times.of_frame, [0, 1, 2, 3, 4, 5, 6].map(Some));
+        let settings = Settings::from_frames(&frames, &[0; 7], 2e-4);
+        assert_eq!(settings.of_frame, [0, 1, 0, 2, 3, 4, 5]);
+        assert_eq!(settings.count(), 6);
+        let correctors: Vec<_> = (0..7).map(|frame| settings.setting(frame).only_corrector()).collect();
+        assert_eq!(correctors, [Some(0), None, Some(0), Some(0), Some(0), Some(2), None]);
+        let at_two_times = Settings::from_frames(&frames, &[0, 0, 1, 0, 0, 0, 0], 2e-4);
+        assert_eq!(at_two_times.of_frame, [0, 1, 2, 3, 4, 5, 6]);
     }
 
     #[test]
     fn several_correctors_at_once_are_a_setting_only_where_they_are_repeated() {
         let (bump, feedback) = (frame([1.0, -2.0, 1.0], 0.0), frame([1.5, 1.0, 0.0], 0.0));
-        let settings = Settings::of(&[bump.clone(), feedback, bump, frame([0.0, 1.0, 0.0], 0.0)], &[0; 4], 2e-4);
-        assert_eq!(settings.of_frame, [Some(0), None, Some(0), Some(2)]);
+        let settings =
+            Settings::from_frames(&[bump.clone(), feedback, bump, frame([0.0, 1.0, 0.0], 0.0)], &[0; 4], 2e-4);
+        assert_eq!(settings.of_frame, [0, 1, 0, 2]);
+        assert_eq!(settings.repeatable, [Some(0), None, Some(0), Some(2)]);
+    }
+
+    /// A feedback on two correctors and the RF, and one that is idle but for its scatter.
+    #[test]
+    fn a_setting_has_the_kicks_that_are_powered() {
+        let settings =
+            Settings::from_frames(&[frame([1.0, -2.0, 0.09], 0.0), frame([0.0, 0.0, 0.0], 2e-4)], &[0; 2], 2e-4);
+        assert_eq!((settings.kick(0), settings.kick(1)), (Some((1, -1.0)), None));
+        assert_eq!(settings.with_corrector(0), [0]);
+        assert_eq!(settings.strength_of(1).as_slice(), [-1.0, 0.0]);
+        assert!(is_powered(-2e-4, 2e-4) && !is_powered(9e-6, 2e-4));
+    }
+
+    #[test]
+    fn a_setting_of_means_has_their_mean_drive() {
+        let kick = DMatrix::from_row_slice(3, 2, &[2.0, 0.01, 0.0, 2.0, 2.04, -0.01]) * 1e-4;
+        let rf_offset = DVector::from_vec(vec![0.0, 3e-7, 0.0]);
+        let time = DVector::from_vec(vec![-1.0, 0.0, 1.0]);
+        let drives = Drives { kick, rf_offset, time, nominal_kick: 2e-4, orbit: vec![[1e-3; 2]; 2] };
+        let settings = Settings::from_drives(&drives);
+        assert_eq!(settings.of_frame, [0, 1, 0]);
+        assert_eq!(settings.indicator(), DMatrix::from_row_slice(3, 2, &[1.0, 0.0, 0.0, 1.0, 1.0, 0.0]));
+        let means = settings.means(&drives);
+        assert!((means.kick - DMatrix::from_row_slice(2, 2, &[2.02e-4, 0.0, 0.0, 2e-4])).amax() < 1e-18);
+        assert_eq!((means.rf_offset.as_slice(), means.orbit), ([0.0, 3e-7].as_slice(), vec![[0.0; 2]; 2]));
     }
 }

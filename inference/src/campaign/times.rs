@@ -3,8 +3,7 @@
 
 use core::fmt;
 
-use super::drive::{Drive, mean_supplies};
-use crate::recording::Recording;
+use crate::recording::{Drive, Recording, mean_supplies};
 
 /// The frames by their time in the cycle.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,15 +14,12 @@ pub struct Times {
     pub known: Vec<f64>,
 }
 
-/// Times this close are one, as in the core [us].
-const SAME_TIME: f64 = 1e3;
-
 impl Times {
     /// Those of a recording.
-    pub fn of(recording: &Recording) -> Self {
+    pub fn in_recording(recording: &Recording) -> Self {
         let mut known: Vec<f64> = Vec::new();
         let is_ramped = recording.header.ramp.is_given();
-        let is_same = |one: f64, other: f64| ((one - other) * 1e6).round().abs() <= SAME_TIME;
+        let is_same = |one: f64, other: f64| ((one - other) * 1e6).round().abs() <= f64::from(estimator::SAME_TIME);
         let mut index = |time: f64| {
             known.iter().position(|one| !is_ramped || is_same(*one, time)).unwrap_or_else(|| {
                 known.push(time);
@@ -58,8 +54,8 @@ pub struct Stray {
 
 /// The supply that is furthest off the ramp at some time, from what it is on average; none without several times.
 pub fn furthest_stray(recording: &Recording) -> Option<Stray> {
-    let times = Times::of(recording);
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+    let times = Times::in_recording(recording);
+    let drives = recording.drives();
     let all = mean_supplies(&drives);
     let at = |(time, milliseconds): (usize, f64)| {
         let own: Vec<Drive> = (drives.iter().zip(&times.of_frame))

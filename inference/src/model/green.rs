@@ -72,7 +72,7 @@ struct PlaneOptics {
 
 impl GreenModel {
     /// From the core's tables; terms of low rank, which a design has none of, are left out.
-    pub fn of(tables: &Tables) -> Self {
+    pub fn from_tables(tables: &Tables) -> Self {
         let list = |list| tables.list(list).iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
         let ring = list(List::Ring);
         Self {
@@ -93,7 +93,7 @@ impl GreenModel {
     /// # Errors
     /// [`TrainingError`] if a ring has no tables.
     pub fn unrounded(ring: &Ring) -> Result<Self, TrainingError> {
-        let mut model = Self::of(&training::green::tables(ring)?);
+        let mut model = Self::from_tables(&training::green::tables(ring)?);
         for (plane, exact) in model.planes.iter_mut().zip(training::green::planes(ring)?) {
             let PlaneResponses { direct, seen, driven, mutual } = exact;
             (plane.direct, plane.seen, plane.driven, plane.mutual) = (direct, seen, driven, mutual);
@@ -278,7 +278,7 @@ mod tests {
     fn example() -> (GreenModel, Ring, Vec<f64>) {
         let ring = Ring::booster();
         let tables = training::green::tables(&ring).unwrap();
-        (GreenModel::of(&tables), ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
+        (GreenModel::from_tables(&tables), ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
 
     /// For kicks of 0.2 mrad and RF offsets of 2e-4, to the error that the tables state (2 um of largest error measured).

@@ -12,7 +12,7 @@ use rand::rngs::StdRng;
 use twin::{OrbitError, Ring, VariedRing};
 
 use super::{Optics, Prediction, slopes};
-use crate::simulate::draw;
+use crate::prior::draw;
 
 /// The design and its derivatives.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ impl LinearModel {
     ///
     /// # Errors
     /// [`OrbitError`] if it has no closed orbit.
-    pub fn of(ring: &Ring) -> Result<Self, OrbitError> {
+    pub fn from_ring(ring: &Ring) -> Result<Self, OrbitError> {
         let varied = VariedRing::of(ring)?;
         let optics = varied.at(&vec![1.0; ring.quadrupoles.len()])?;
         let (slopes, tune_slopes) = slopes(&optics, ring.quadrupoles.len());
@@ -123,7 +123,7 @@ mod tests {
     #[test]
     fn the_error_is_of_second_order() {
         let ring = Ring::booster();
-        let (model, varied) = (LinearModel::of(&ring).unwrap(), VariedRing::of(&ring).unwrap());
+        let (model, varied) = (LinearModel::from_ring(&ring).unwrap(), VariedRing::of(&ring).unwrap());
         let error = |size: f64| {
             let factors: Vec<f64> = (0..48).map(|i| 1.0 + size * f64::sin(3.0 * f64::from(i))).collect();
             let (exact, own) = (varied.at(&factors).unwrap(), model.at(&factors));
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn the_gradient_is_that_of_the_response() {
-        let model = LinearModel::of(&Ring::booster()).unwrap();
+        let model = LinearModel::from_ring(&Ring::booster()).unwrap();
         let factors: Vec<f64> = (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect();
         let weights = DMatrix::from_fn(33, 49, |b, c| f64::sin(7.1 * b as f64 + 2.3 * c as f64));
         for (m, slope) in model.at(&factors).pull_back(&weights).into_iter().enumerate() {
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn the_stated_error_is_that_of_the_median_machine() {
         let ring = Ring::booster();
-        let model = LinearModel::of(&ring).unwrap();
+        let model = LinearModel::from_ring(&ring).unwrap();
         let rms = |from: usize, to: usize| {
             let squares: f64 = (from..to).map(|b| model.stated_error(b).powi(2)).sum();
             1e3 * (squares / (to - from) as f64).sqrt()

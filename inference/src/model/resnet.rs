@@ -39,7 +39,7 @@ const SCALE: f32 = ORBIT / SETTING_KICK;
 
 impl ResnetModel {
     /// With the Green's function of the same ring.
-    pub fn of(green: GreenModel) -> Self {
+    pub fn from_green(green: GreenModel) -> Self {
         Self::with_networks(green, PLANES.map(|core| tables::network(&core)))
     }
 
@@ -158,7 +158,7 @@ mod tests {
     fn example() -> (ResnetModel, Vec<f64>) {
         let tables = training::green::tables(&Ring::booster()).unwrap();
         let vars = (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect();
-        (ResnetModel::of(GreenModel::of(&tables)), vars)
+        (ResnetModel::from_green(GreenModel::from_tables(&tables)), vars)
     }
 
     /// For kicks of 0.2 mrad, to four times the error that the tables state.

@@ -149,7 +149,7 @@ impl Header {
     pub fn read(file: &Path, ring: &Ring) -> Result<Self, RecordingError> {
         let text = super::text(file)?;
         let ring = super::powered(ring, format(file, &text)?);
-        Self::parse(file, &text, &ring, &Names::of(&ring))
+        Self::parse(file, &text, &ring, &Names::from_ring(&ring))
     }
 
     pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
@@ -166,7 +166,7 @@ impl Header {
         text.check_loop(&header, ring)?;
         let gradient = |supply, current| header.gradient(supply, current);
         let nominal = Nominal { dipole: header.nominal_dipole, supply: &header.nominal, gradient: &gradient };
-        header.ramp = Ramp::of(ring, &nominal).map_err(|(key, what)| text.refuse_key(key, &what))?;
+        header.ramp = Ramp::from_ring(ring, &nominal).map_err(|(key, what)| text.refuse_key(key, &what))?;
         text.check_ramp(&header)?;
         Ok(header)
     }

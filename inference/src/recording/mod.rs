@@ -4,12 +4,13 @@
 //! number is finite, in its range and in its place, and the recording is of the ring.
 
 mod columns;
+mod drive;
 mod error;
 mod frames;
 mod header;
 mod limit;
 mod names;
-mod plausible;
+mod plausibility;
 mod ramp;
 mod write;
 
@@ -19,6 +20,8 @@ use std::path::Path;
 
 use twin::Ring;
 
+pub use drive::Drive;
+pub(crate) use drive::{field, mean, mean_supplies};
 pub use error::{Mismatch, Part, Place, RecordingError};
 pub use frames::Row;
 pub use header::{BelievedRf, Format, Header, at_energy};
@@ -69,13 +72,12 @@ impl Recording {
     ) -> Result<Self, RecordingError> {
         let (file, frames_file) = (folder.join(HEADER), folder.join(FRAMES));
         let ring = powered(ring, header::format(&file, header_text)?);
-        let names = Names::of(&ring);
+        let names = Names::from_ring(&ring);
         let header = Header::parse(&file, header_text, &ring, &names)?;
         let (rows, other) = frames::parse(&frames_file, &frames()?, &header, &ring, &names)?;
-        let recording = Self { name: name(folder), header, other, rows };
         let refuse = |(key, what): (&str, String)| header::refuse(&file, header_text, key, &what);
-        plausible::check(&recording, &names.supplies).map_err(refuse)?;
-        Ok(recording)
+        plausibility::check(&header, &rows, &names.supplies).map_err(refuse)?;
+        Ok(Self { name: name(folder), header, other, rows })
     }
 
     /// The same of one of several campaigns of a ring, at whichever energy it was taken; with a ramp in the machine file the frames' times say
@@ -106,6 +108,16 @@ impl Recording {
         let (start, end) = (self.rows.first().map_or(0.0, |r| r.time), self.rows.last().map_or(0.0, |r| r.time));
         let within = |row: &Row| if end > start { 2.0 * (row.time - start) / (end - start) - 1.0 } else { 0.0 };
         self.rows.iter().map(within).collect()
+    }
+
+    /// What drove the beam in each frame.
+    pub fn drives(&self) -> Vec<Drive> {
+        drive::in_rows(&self.header, &self.rows)
+    }
+
+    /// Mean `ln` of each supply's factor over all frames [F]: the currents at which the tunes were measured.
+    pub fn mean_supplies(&self) -> Vec<f64> {
+        mean_supplies(&self.drives())
     }
 
     /// A current that the model has no use for, by its column [A].

@@ -25,7 +25,7 @@ pub struct Names {
 impl Names {
     /// A monitor is `x_` or `y_` and its label or its element's name; a corrector is its label if that is unique among all
     /// correctors, `H_` or `V_` and its label, or its element's name.
-    pub fn of(ring: &Ring) -> Self {
+    pub fn from_ring(ring: &Ring) -> Self {
         let mut names = Self {
             monitors: ring.monitor_names(),
             correctors: Vec::new(),

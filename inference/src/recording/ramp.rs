@@ -45,7 +45,7 @@ impl Ramp {
     ///
     /// # Errors
     /// What of the header does not go with it.
-    pub(super) fn of(ring: &Ring, nominal: &Nominal<'_>) -> Result<Self, Fault> {
+    pub(super) fn from_ring(ring: &Ring, nominal: &Nominal<'_>) -> Result<Self, Fault> {
         if ring.ramp.is_empty() {
             return Ok(Self::default());
         }

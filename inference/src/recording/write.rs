@@ -35,7 +35,7 @@ impl Recording {
     /// # Panics
     /// If the recording is not of this ring.
     pub fn texts(&self, ring: &Ring) -> [String; 2] {
-        let names = Names::of(&self.powered(ring));
+        let names = Names::from_ring(&self.powered(ring));
         let frames = String::from_utf8(self.frames(&names)).expect("names and numbers are text");
         [self.header.text(&names), frames]
     }

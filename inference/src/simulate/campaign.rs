@@ -17,8 +17,7 @@ use rand_distr::{Distribution, StandardNormal};
 use twin::{Cycle, Effect, EffectError, Machine, Rf, Ring, Tracked, Tunes};
 
 use super::seeds;
-use crate::campaign::Drive;
-use crate::recording::{Recording, Row};
+use crate::recording::{Drive, Recording, Row};
 
 /// What is true of a simulated machine.
 #[derive(Clone, Copy, Default)]
@@ -129,7 +128,7 @@ fn cycles(template: &Recording, ring: &Ring) -> Vec<Cycle> {
 
 /// What drove one frame, at a time within the campaign.
 pub(super) fn cycle(template: &Recording, ring: &Ring, row: &Row, time: f64) -> Cycle {
-    let drive = Drive::of(&template.header, row);
+    let drive = Drive::from_row(&template.header, row);
     let factors = ring.strengths(&[], drive.strength.as_slice());
     let strength = factors.iter().map(|factor| factor.ln()).collect();
     Cycle { kick: drive.kick.iter().copied().collect(), strength, rf_offset: drive.rf_offset, time }

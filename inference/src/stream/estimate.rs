@@ -45,7 +45,7 @@ impl Estimate {
     }
 
     /// That of a core which has room for the ring.
-    pub fn of<const B: usize, const N: usize, const W: usize>(
+    pub fn from_core<const B: usize, const N: usize, const W: usize>(
         e: &estimator::Estimate<B, N, W>,
         layout: &Layout,
     ) -> Self {

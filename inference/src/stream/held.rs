@@ -66,7 +66,7 @@ where
     }
 
     fn estimate(tables: &G, estimate: &Self::Estimate) -> Estimate {
-        Estimate::of(estimate, &tables.layout())
+        Estimate::from_core(estimate, &tables.layout())
     }
 
     fn inverse_factor(&self) -> &[f64] {

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use diagnosis::data::DataError;
+use diagnosis::DataError;
 use inference::{Campaign, Recording};
 use results::output;
 use twin::{EffectKind, Ring};

@@ -1,6 +1,6 @@
 //! Chi-square per reading, by monitor, corrector, sign of the kick and time.
 
-use diagnosis::data::Data;
+use diagnosis::Data;
 use report::{Axes, Figure, Reference, Section, Series, Table};
 
 use super::residuals::{Residual, Residuals};

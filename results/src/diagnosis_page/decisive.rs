@@ -1,11 +1,6 @@
 //! The decisive picture of each finding.
 
-use diagnosis::alternatives::Cause;
-use diagnosis::error::FitError;
-use diagnosis::fit::Fitted;
-use diagnosis::hypothesis::Term;
-use diagnosis::location::Location;
-use diagnosis::{Diagnosis, Finding};
+use diagnosis::{Cause, Diagnosis, Finding, FitError, Fitted, Location, Term};
 use report::Figure;
 
 use super::partial::Partial;
@@ -25,7 +20,7 @@ pub fn figures(diagnosis: &Diagnosis) -> Result<Vec<(String, Figure)>, FitError>
     }
     let mut all = Vec::new();
     for finding in &diagnosis.findings {
-        if let Some(passing) = diagnosis.transients.iter().find(|one| one.is_of(finding)) {
+        if let Some(passing) = diagnosis.transients.iter().find(|one| one.is_of(&finding.cause)) {
             let is_unsteady =
                 matches!(&finding.cause, Cause::Unmodelled(one) if matches!(one.at, Location::UnsteadyCorrector(_)));
             let figure = if is_unsteady { slope::of_each_frame } else { slope::of_first_frames };

@@ -1,9 +1,6 @@
 //! The leading candidates of the first search, and the correction for their number.
 
-use diagnosis::error::FitError;
-use diagnosis::scan::scan;
-use diagnosis::search::{correction_of, corrections};
-use diagnosis::{Diagnosis, discrepancy};
+use diagnosis::{Diagnosis, FitError, correction_of, corrections, scan, scan_discrepancies};
 use report::{Axes, Figure, Ranked, Section};
 
 /// Causes shown.
@@ -25,7 +22,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         let place = names.join(", ");
         Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, threshold: Some(correction) }
     });
-    let discrepancies = discrepancy::scan(data, null)?;
+    let discrepancies = scan_discrepancies(data, null)?;
     let sites = discrepancies.len();
     let unmodelled = discrepancies.iter().map(|one| {
         let label = format!("unmodelled: {}", one.at.short(data));

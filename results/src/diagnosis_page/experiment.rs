@@ -1,7 +1,6 @@
 //! The undecided causes, and the measurement that would separate them.
 
-use diagnosis::error::FitError;
-use diagnosis::{Diagnosis, Verdict, verdict};
+use diagnosis::{Diagnosis, FitError, Verdict};
 use report::Section;
 
 use super::table;
@@ -13,7 +12,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         Some(next) => format!("{}.", next.trim_end_matches('.')),
         None => settled(diagnosis.verdict).into(),
     });
-    if let Some((menu, [one, other])) = verdict::menu(&diagnosis.found.data, &diagnosis.found, diagnosis.verdict)? {
+    if let Some((menu, [one, other])) = diagnosis::menu(&diagnosis.found.data, &diagnosis.found, diagnosis.verdict)? {
         let row = |what: &str, separation: f64| [what.to_owned(), format!("{separation:.1}")];
         let mut rows = vec![row("none: the present campaign alone", menu.present)];
         rows.extend(menu.proposals.iter().map(|proposal| row(&proposal.what, proposal.separation)));
@@ -24,7 +23,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         section.tables.push(table(&caption, ["second campaign", "expected ln Bayes factor [nat]"], rows));
     }
     let mut rows = Vec::new();
-    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < diagnosis::alternatives::DECISIVE) {
+    for finding in diagnosis.findings.iter().filter(|finding| finding.probability < diagnosis::DECISIVE) {
         for one in core::iter::once(finding).chain(&finding.alternatives) {
             rows.push([
                 one.phrase.clone(),

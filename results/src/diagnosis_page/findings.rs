@@ -1,8 +1,6 @@
 //! The findings, each with its alternatives.
 
-use diagnosis::error::FitError;
-use diagnosis::verdict::Tested;
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{Diagnosis, Finding, FitError, Tested, Verdict};
 use report::Section;
 
 use super::{decisive, signed, slope, table};

@@ -1,7 +1,6 @@
 //! Predictions of frames that the model was not fitted to.
 
-use diagnosis::Diagnosis;
-use diagnosis::heldout::Score;
+use diagnosis::{Diagnosis, Score};
 use report::{Section, Table};
 
 use super::{signed, table};

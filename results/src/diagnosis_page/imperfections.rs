@@ -1,7 +1,6 @@
 //! The machine as it is.
 
-use diagnosis::Diagnosis;
-use diagnosis::imperfection::Imperfection;
+use diagnosis::{Diagnosis, Imperfection};
 use report::Section;
 
 use super::table;

@@ -1,7 +1,6 @@
 //! What the recording would have shown: the decisive picture where nothing was found.
 
-use diagnosis::Diagnosis;
-use diagnosis::limits::{Limits, SEEN, at_places};
+use diagnosis::{Diagnosis, Limits, SEEN, at_places};
 use report::{Axes, Figure, Range, Series};
 use twin::EffectKind;
 
@@ -14,8 +13,10 @@ pub fn figures(diagnosis: &Diagnosis) -> Vec<(String, Figure)> {
 
 fn by_kind(diagnosis: &Diagnosis) -> (String, Figure) {
     let scanned = &diagnosis.found.next.scanned;
-    let mut all: Vec<(Limits, f64)> =
-        EffectKind::ALL.iter().filter_map(|&kind| Some((Limits::of(kind, scanned)?, kind.prior_scale()?))).collect();
+    let mut all: Vec<(Limits, f64)> = EffectKind::ALL
+        .iter()
+        .filter_map(|&kind| Some((Limits::from_scan(kind, scanned)?, kind.prior_scale()?)))
+        .collect();
     all.sort_by(|(one, by), (other, than)| (one.median / by).total_cmp(&(other.median / than)));
     let range = |(limits, scale): &(Limits, f64)| Range {
         label: limits.kind.word().replace('_', " "),

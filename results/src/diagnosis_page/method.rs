@@ -1,9 +1,6 @@
 //! How the numbers of the page are made.
 
-use diagnosis::Diagnosis;
-use diagnosis::alternatives::{DECISIVE, SUSPICIOUS};
-use diagnosis::error::FitError;
-use diagnosis::heldout::{CHANCE, SUPPORTED, VALIDATED};
+use diagnosis::{CHANCE, DECISIVE, Diagnosis, FitError, SUPPORTED, SUSPICIOUS, VALIDATED};
 use inference::recording::Recording;
 use report::Section;
 

@@ -24,9 +24,7 @@ mod tunes;
 mod unmodelled;
 mod vars;
 
-use diagnosis::data::Data;
-use diagnosis::error::FitError;
-use diagnosis::{Diagnosis, Verdict};
+use diagnosis::{Data, Diagnosis, FitError, Verdict};
 use inference::recording::Recording;
 use report::{Page, Section};
 
@@ -104,9 +102,7 @@ fn signed(value: f64, decimals: usize) -> String {
 mod tests {
     use std::path::Path;
 
-    use diagnosis::discrepancy::Discrepancy;
-    use diagnosis::element::Linear;
-    use diagnosis::location::Location;
+    use diagnosis::{Discrepancy, Linear, Location};
     use inference::simulate::{self, Beyond, Hardware, Truth, campaign};
     use report::Figure;
     use twin::{Effect, Kind, Plane, Ring};
@@ -127,7 +123,7 @@ mod tests {
         let effects: Vec<Effect> = effects.iter().map(|text| Effect::parse(text, &ring).unwrap()).collect();
         let truth = Truth { vars: &[1.0; 48], effects: &effects, ..Truth::default() };
         let made = campaign(&recording, &ring, &truth, &Hardware::shipped(&ring, &recording), seed).unwrap();
-        let diagnosis = Diagnosis::of(&ring, &made, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &made, |_| ()).unwrap();
         (made, diagnosis)
     }
 
@@ -258,7 +254,7 @@ mod tests {
         let vars = simulate::vars(&ring, true, 21).unwrap();
         let truth = Truth { vars: &vars, effects: &[], beyond: &[&Solenoid] };
         let made = campaign(&template, &ring, &truth, &Hardware::shipped(&ring, &template), 21).unwrap();
-        let page = page(&Diagnosis::of(&ring, &made, |_| ()).unwrap(), &made).unwrap();
+        let page = page(&Diagnosis::from_recording(&ring, &made, |_| ()).unwrap(), &made).unwrap();
         let figures = page.sections.iter().flat_map(|section| &section.figures);
         assert_eq!(figures.filter(|(_, figure)| figure.svg.contains("couples the planes: slope")).count(), 1);
     }
@@ -270,7 +266,7 @@ mod tests {
         let ring = twin::Ring::booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed/open-09");
         let recording = Recording::read(&folder, &ring).unwrap();
-        let diagnosis = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert!(diagnosis.findings.first().is_some_and(|one| one.word() == "quad_drift"), "{}", diagnosis.sentence);
         let page = page(&diagnosis, &recording).unwrap();
         all_are_complete(&page);

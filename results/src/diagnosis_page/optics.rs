@@ -3,11 +3,7 @@
 //! Error bars are those of everything that the fit may change in the ring: with `C` the covariance of those unknowns and `J` the derivatives
 //! of an optics function, `sigma^2 = J C J^T`.
 
-use diagnosis::Diagnosis;
-use diagnosis::data::Data;
-use diagnosis::error::FitError;
-use diagnosis::fit::Fitted;
-use diagnosis::hypothesis::Unknown;
+use diagnosis::{Data, Diagnosis, FitError, Fitted, Unknown};
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Reference, Section, Series};
 use twin::{Class, EffectError, Hold, Optics, Tunes, Twiss};

@@ -2,10 +2,7 @@
 
 use core::ops::RangeInclusive;
 
-use diagnosis::data::Data;
-use diagnosis::error::FitError;
-use diagnosis::fit::{self, Fitted, predicted};
-use diagnosis::hypothesis::{Hypothesis, Term};
+use diagnosis::{Data, FitError, Fitted, Hypothesis, Term, predicted};
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, Machine};
 
@@ -40,9 +37,10 @@ impl<'f> Partial<'f> {
         let data = fitted.data(data);
         let (vars, u) = (fitted.params.len(), fitted.guess(data, less));
         let (machine, drives) = less.machine(data, &fitted.params, &u.as_slice()[vars..])?;
-        let measured = data.residual(&fit::predicted_by(data, less, 0, &u)?);
+        let measured = data.residual(&diagnosis::predicted_by(data, less, 0, &u)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
-        let of_element = fit::of_element(data, less, 0, (&machine, &drives), &u)?.map_or([0.0; 2], |own| own.tunes);
+        let of_element =
+            diagnosis::of_element(data, less, 0, (&machine, &drives), &u)?.map_or([0.0; 2], |own| own.tunes);
         let ends = ends(&machine, &drives)?;
         let tunes = [0, 1].map(|plane| {
             let (ends, moved) = (&ends[plane], of_element[plane]);

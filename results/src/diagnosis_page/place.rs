@@ -1,8 +1,6 @@
 //! Place scans of normal and skew gradients.
 
-use diagnosis::error::FitError;
-use diagnosis::place_scan::{Interval, PlaceScan};
-use diagnosis::{Diagnosis, Finding, Verdict};
+use diagnosis::{Diagnosis, Finding, FitError, Interval, PlaceScan, Verdict};
 use report::{Axes, Figure, Reference, Section, Series};
 use twin::{Element, Ring, Thin};
 
@@ -33,7 +31,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Option<Section>, FitError> {
     for (kind, word, symbol) in [(Thin::Normal, "normal", "K1L"), (Thin::Skew, "skew", "K1sL")] {
         let terms = &found.best.hypothesis.terms;
         let own = terms.iter().position(|term| term.kind.thin() == Some(kind));
-        let scan = PlaceScan::of(&found.data, &found.best, own, kind)?;
+        let scan = PlaceScan::from_fit(&found.data, &found.best, own, kind)?;
         let acts = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(kind));
         let asked = diagnosis.findings.iter().any(|one| acts(one) || one.alternatives.iter().any(acts));
         if !asked && diagnosis.verdict != Verdict::Unexplained {

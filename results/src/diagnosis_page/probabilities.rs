@@ -1,9 +1,6 @@
 //! The probabilities of the causes: bars that add up to 1.
 
-use diagnosis::alternatives::{Alternative, Cause, Competition};
-use diagnosis::data::Data;
-use diagnosis::verdict::capitalised;
-use diagnosis::{Diagnosis, Finding};
+use diagnosis::{Alternative, Cause, Competition, Data, Diagnosis, Finding, capitalised};
 use report::{Axes, Figure, Ranked, Section};
 
 use super::slope::name;

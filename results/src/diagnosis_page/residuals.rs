@@ -1,10 +1,7 @@
 //! Residuals of the readings, setting by setting.
 
-use diagnosis::Diagnosis;
-use diagnosis::data::Data;
-use diagnosis::error::FitError;
-use diagnosis::fit::Fitted;
-use diagnosis::settings::Settings;
+use diagnosis::{Data, Diagnosis, FitError, Fitted};
+use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Map, Section};
 use twin::Plane;
@@ -41,7 +38,7 @@ pub struct Residuals {
 impl Residual {
     /// Whitened numbers of some data as residuals, those of the tunes left out.
     pub fn all(data: &Data, whitened: &DVector<f64>) -> Vec<Self> {
-        let settings = Settings::of(&data.drives);
+        let settings = Settings::from_drives(&data.drives);
         let horizontal: Vec<bool> = data.ring.correctors.iter().map(|c| c.plane == Plane::X).collect();
         let planes: Vec<bool> = data.ring.monitors_read().map(|m| m.plane == Plane::X).collect();
         let of = |(((pool, monitor), noise), &value): (((usize, usize), f64), &f64)| {

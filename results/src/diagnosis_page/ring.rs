@@ -1,7 +1,6 @@
 //! The ring with the findings marked.
 
-use diagnosis::Diagnosis;
-use diagnosis::data::Data;
+use diagnosis::{Data, Diagnosis};
 use estimator::MonitorState;
 use report::{Figure, Look, RingMap, Section, Spotted};
 use twin::{Parameter, Ring};

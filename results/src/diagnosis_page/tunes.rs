@@ -2,12 +2,8 @@
 
 use core::ops::RangeInclusive;
 
-use diagnosis::Finding;
-use diagnosis::data::Data;
-use diagnosis::error::FitError;
-use diagnosis::fit::Fitted;
-use diagnosis::verdict::capitalised;
-use inference::campaign::TUNE_CALIBRATION;
+use diagnosis::{Data, Finding, FitError, Fitted, capitalised};
+use inference::TUNE_CALIBRATION;
 use report::{Axes, Figure, Series};
 
 use super::partial::{Partial, ends};

@@ -1,11 +1,7 @@
 //! The decisive picture of an unmodelled discrepancy: the residuals at its place.
 
-use diagnosis::Diagnosis;
-use diagnosis::discrepancy::{Discrepancy, steering};
-use diagnosis::error::FitError;
-use diagnosis::location::Location;
-use diagnosis::settings::Settings;
-use diagnosis::verdict::capitalised;
+use diagnosis::{Diagnosis, Discrepancy, FitError, Location, capitalised, steering};
+use inference::Settings;
 use nalgebra::DVector;
 use report::{Axes, Figure, Map, Reference, Series};
 use twin::{Hold, Optics, Plane, Signatures};
@@ -278,7 +274,7 @@ impl Left<'_> {
     /// The mean of each setting, from those of runs of frames.
     fn in_settings(&self, axis: &str, runs: &[Mean]) -> Figure {
         let data = self.partial.data;
-        let (driven, settings) = (data.driven_correctors(), Settings::of(&data.drives));
+        let (driven, settings) = (data.driven_correctors(), Settings::from_drives(&data.drives));
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
             for (run, mean) in runs.iter().enumerate() {

@@ -1,7 +1,6 @@
 //! The quadrupoles' strength factors without and with the effects.
 
-use diagnosis::Diagnosis;
-use diagnosis::average::Vars;
+use diagnosis::{Diagnosis, Vars};
 use nalgebra::DVector;
 use report::{Axes, Band, Figure, Reference, Section};
 

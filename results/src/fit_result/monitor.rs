@@ -1,6 +1,9 @@
 //! The state of monitors in a result.
 
+use std::collections::BTreeMap;
+
 use estimator::{Health, MonitorState};
+use inference::Excluded;
 use serde::Serialize;
 use twin::Ring;
 
@@ -14,17 +17,21 @@ pub struct Monitor {
     pub state: &'static str,
     pub sigma_mm: f64,
     pub rejected: u32,
+    /// Readings that do not count, by reason; without those of a stream, whose readings are judged one by one.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub excluded: BTreeMap<&'static str, usize>,
 }
 
-/// State of the monitors of a ring.
-pub fn monitors(ring: &Ring, health: &[Health]) -> Vec<Monitor> {
-    let monitor = |(name, health): (String, &Health)| Monitor {
+/// State of the monitors of a ring, with the number of readings that each leaves out for each reason.
+pub fn monitors(ring: &Ring, health: &[Health], excluded: &[BTreeMap<Excluded, usize>]) -> Vec<Monitor> {
+    let monitor = |((name, health), excluded): ((String, &Health), &BTreeMap<Excluded, usize>)| Monitor {
         name,
         state: state_word(health.state),
         sigma_mm: f64::from(health.noise) * 1e3,
         rejected: health.rejected,
+        excluded: excluded.iter().map(|(reason, count)| (reason.word(), *count)).collect(),
     };
-    ring.monitor_names().into_iter().zip(health).map(monitor).collect()
+    ring.monitor_names().into_iter().zip(health).zip(excluded).map(monitor).collect()
 }
 
 /// The word for a state in tables and JSON.
@@ -53,6 +60,7 @@ impl EstimateRecord {
             state: state_word(self.monitor_state[b]),
             sigma_mm: f64::from(self.monitor_sigma[b]) * 1e3,
             rejected: self.monitor_rejected[b],
+            excluded: BTreeMap::new(),
         };
         (0..self.reading.len()).map(monitor).collect()
     }

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use inference::campaign::TUNE_CALIBRATION;
+use inference::TUNE_CALIBRATION;
 use inference::recording::Row;
 use inference::{FittedTune, Meter, Recording};
 use serde::Serialize;
@@ -47,7 +47,7 @@ impl TunesMeasured {
             // an RF offset moves the tune
             let tune = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
             let tunes: Vec<f64> = recording.rows.iter().map(tune).collect();
-            let meter = Meter::of(tunes.iter().zip(&time))?;
+            let meter = Meter::from_tunes(tunes.iter().zip(&time))?;
             Some(TuneMeasured { mean: meter.near(model.map_or(0.0, |tunes| tunes[plane])), sigma: meter.sigma })
         };
         Self { x: one(0), y: one(1) }

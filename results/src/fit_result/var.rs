@@ -56,7 +56,7 @@ impl Var {
 
 /// Vars from means and standard deviations of `ln var`, truncated to the prior's range.
 pub fn vars_of(ring: &Ring, mean: &[f64], sigma: &[f64]) -> Vec<Var> {
-    let prior = inference::Prior::of(ring);
+    let prior = inference::Prior::from_ring(ring);
     let var = |(i, name)| Var::of_marginal(name, &prior.marginal(i, mean[i], sigma[i]), false);
     ring.var_names().into_iter().enumerate().map(var).collect()
 }

@@ -57,8 +57,8 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let ring = Ring::booster();
     let folder = arguments.recording.clone().unwrap_or_else(|| repository("recordings/paper-vars"));
     let campaign = Campaign::of(&ring, &Recording::read(&folder, &ring)?)?;
-    let fit = BatchFit::of(&campaign, TuneUse::LeftOut, |_| ())?;
-    let reduced = Reduced::of(campaign, fit)?;
+    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ())?;
+    let reduced = Reduced::from_fit(campaign, fit)?;
     // as `orbitcal fit --method nuts --model green` puts it together, without the tunes
     let model = ResponseModel::green(&ring)?;
     let readings = Readings::of_frames(&reduced, &model, TuneUse::LeftOut);

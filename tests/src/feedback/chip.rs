@@ -128,7 +128,7 @@ impl<'e> Chip<'e> {
 
 /// True if estimate and covariance are the same, bit for bit.
 fn is_same(heard: &Heard, core: &Estimator, estimate: &Estimate) -> bool {
-    let estimate = stream::Estimate::of(estimate, &LAYOUT);
+    let estimate = stream::Estimate::from_core(estimate, &LAYOUT);
     let mut places = (0..estimate.mean.len()).flat_map(|i| (0..=i).map(move |j| (i, j)));
     bits(&heard.estimate) == bits(&estimate)
         && places.all(|(i, j)| core.covariance(i, j).to_bits() == heard.covariance(i, j).to_bits())

@@ -1,7 +1,7 @@
 //! Errors of the difference of the orbits at -22 A and 22 A, over machines within the tune cut of the training set [mm].
 
 use estimator::surrogate::{SETTING_KICK, SPAN};
-use inference::simulate::draw;
+use inference::draw;
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};

@@ -36,8 +36,8 @@ pub fn effects(
     surrogates: &[Surrogate],
 ) -> Result<Vec<(&'static str, Effect)>, Box<dyn Error>> {
     let campaign = Campaign::of(ring, &Recording::read(&repository(recording), ring)?)?;
-    let fit = BatchFit::of(&campaign, TuneUse::Readings, |_| ())?;
-    let reduced = Reduced::of(campaign, fit)?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ())?;
+    let reduced = Reduced::from_fit(campaign, fit)?;
     let truth = DVector::from_iterator(ring.parameters.len(), truth(recording, ring).into_iter().map(f64::ln));
     let twin = posterior(&reduced, ResponseModel::twin(&reduced.campaign.ring)?)?;
     let modelled = surrogates.iter().filter_map(|surrogate| Some((surrogate.name, surrogate.model.clone()?)));
@@ -46,7 +46,7 @@ pub fn effects(
 
 fn posterior(reduced: &Reduced, model: ResponseModel) -> Result<Gaussian, Box<dyn Error>> {
     let readings = Readings::of_frames(reduced, &model, TuneUse::Readings);
-    let posterior = Posterior::new(model, readings, Prior::of(&reduced.campaign.ring));
+    let posterior = Posterior::new(model, readings, Prior::from_ring(&reduced.campaign.ring));
     let laplace = posterior.laplace(&reduced.fit.map_params)?;
     let slopes = posterior.coordinates.each().iter().zip(&laplace.centre).map(|(one, u)| one.at(*u).slope);
     let mut factor = laplace.factor;

@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 
 use estimator::MonitorState;
 
-use super::{MOST, Repeats, Screening};
+use super::{Excluded, MOST, Repeats, Screening};
 
 /// Ordinary scatter of a reading's response, gains of 2 % of the monitor and of the corrector [1].
 const SCATTER: f64 = 0.03;
@@ -61,24 +61,24 @@ impl Screening<'_> {
         if unconfirmed.is_empty() {
             return;
         }
-        let (counting, mut judged) = (self.accepted.clone(), Judged::default());
+        let (before, mut judged) = (self.excluded.clone(), Judged::default());
         for _ in 0..PASSES {
             let again = self.judged(&unconfirmed);
             if again == judged {
                 break;
             }
             judged = again;
-            self.accepted.clone_from(&counting);
-            judged.sound.iter().for_each(|reading| self.accepted[*reading] = true);
-            judged.failed.iter().for_each(|frame| self.accepted.row_mut(*frame).fill(false));
+            self.excluded.clone_from(&before);
+            judged.sound.iter().for_each(|&(frame, b)| self.excluded.lift(frame, b));
+            judged.failed.iter().for_each(|frame| self.excluded.exclude_frame(*frame, Excluded::LostBeam));
             self.stale = true;
-            self.linearise_if_due(self.of.drives.len());
-            self.linearise_if_due(self.of.drives.len());
+            self.linearise_if_due(self.screener.drives.len());
+            self.linearise_if_due(self.screener.drives.len());
         }
         let is_no_fault = |reading: &&Reading| judged.sound.contains(reading) || judged.failed.contains(&reading.0);
         unconfirmed.iter().filter(is_no_fault).for_each(|&(_, b)| self.monitors[b].pardon(1));
         self.monitors.iter_mut().for_each(|monitor| _ = monitor.judge());
-        self.rebuild(self.of.drives.len());
+        self.rebuild(self.screener.drives.len());
     }
 
     /// Readings that nothing confirmed, of monitors that work.
@@ -96,7 +96,7 @@ impl Screening<'_> {
         let faults: Vec<(usize, Fault)> = frames.into_iter().map(|frame| (frame, self.fault(frame))).collect();
         let of_cycle = faults.iter().filter(|(_, fault)| *fault == Fault::Cycle);
         let mut failed: BTreeSet<usize> = of_cycle.map(|(frame, _)| *frame).collect();
-        if failed.len() as f64 > CYCLES_FAIL * self.of.drives.len() as f64 {
+        if failed.len() as f64 > CYCLES_FAIL * self.screener.drives.len() as f64 {
             failed.clear();
         }
         let (mut sound, mut doubtful) = (BTreeSet::new(), vec![Vec::new(); self.monitors.len()]);
@@ -104,7 +104,7 @@ impl Screening<'_> {
             for reading in unconfirmed.range((frame, 0)..(frame + 1, 0)) {
                 let is_at_fault = match fault {
                     Fault::Monitors => false,
-                    Fault::Model(plane) => self.of.plane(reading.1) == plane,
+                    Fault::Model(plane) => self.screener.plane(reading.1) == plane,
                     Fault::Cycle => true,
                 };
                 if is_at_fault || self.is_ordinary(*reading) {
@@ -137,24 +137,24 @@ impl Screening<'_> {
 
     /// True if other frames of its setting confirm what most monitors read.
     fn is_repeated(&self, frame: usize) -> bool {
-        let Some(setting) = self.of.settings.of_frame[frame] else { return false };
+        let Some(setting) = self.screener.settings.repeatable[frame] else { return false };
         let confirmed = self.repeats[setting].iter().filter(|repeats| repeats.frames.len() > 1).count();
         2 * confirmed > self.monitors.len()
     }
 
     /// True if more than a few monitors of a plane surprise; none if nothing reads it.
     fn surprises(&self, frame: usize, plane: usize) -> Option<bool> {
-        let alive: Vec<usize> = self.alive(frame).filter(|&b| self.of.plane(b) == plane).collect();
+        let alive: Vec<usize> = self.alive(frame).filter(|&b| self.screener.plane(b) == plane).collect();
         let surprising = alive.iter().filter(|&&b| !self.is_ordinary((frame, b))).count();
         (!alive.is_empty()).then_some(MOST * surprising > alive.len())
     }
 
     /// True if another cycle with the corrector of this one surprises as well, or if there is none.
     fn surprises_again(&self, frame: usize, plane: usize) -> bool {
-        let of_frame = &self.of.settings.corrector;
-        let is_another =
-            |other: &usize| *other != frame && of_frame[frame].is_some() && of_frame[*other] == of_frame[frame];
-        let mut others = (0..of_frame.len()).filter(is_another).peekable();
+        let corrector = |frame: usize| self.screener.settings.setting(frame).only_corrector();
+        let moved = corrector(frame);
+        let is_another = |other: &usize| *other != frame && moved.is_some() && corrector(*other) == moved;
+        let mut others = (0..self.screener.drives.len()).filter(is_another).peekable();
         others.peek().is_none() || others.any(|other| self.surprises(other, plane) == Some(true))
     }
 

@@ -2,9 +2,10 @@
 
 use std::collections::HashMap;
 
+use super::drive;
+use super::frames::Row;
+use super::header::Header;
 use super::limit::in_milli;
-use super::{Recording, Row};
-use crate::campaign::Drive;
 
 /// A key of the header, and what is wrong with its value.
 type Fault = (&'static str, String);
@@ -29,14 +30,14 @@ const MEDIAN: f64 = 0.9539;
 ///
 /// # Errors
 /// The first one.
-pub(super) fn check(recording: &Recording, supplies: &[String]) -> Result<(), Fault> {
-    check_supplies(recording, supplies)?;
-    check_kick(recording)?;
-    check_noise(recording)
+pub(super) fn check(header: &Header, rows: &[Row], supplies: &[String]) -> Result<(), Fault> {
+    check_supplies(header, rows, supplies)?;
+    check_kick(header, rows)?;
+    check_noise(header, rows)
 }
 
-fn check_supplies(recording: &Recording, supplies: &[String]) -> Result<(), Fault> {
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
+fn check_supplies(header: &Header, rows: &[Row], supplies: &[String]) -> Result<(), Fault> {
+    let drives = drive::in_rows(header, rows);
     let ordinary = -ANOTHER_UNIT.ln()..=ANOTHER_UNIT.ln();
     // a read-back that fails in some frames is no fault of the header
     let is_never = |f: &usize| !drives.iter().any(|drive| ordinary.contains(&drive.strength[*f]));
@@ -44,10 +45,10 @@ fn check_supplies(recording: &Recording, supplies: &[String]) -> Result<(), Faul
     let factor = drives[0].strength[f].exp();
     let makes =
         if factor.is_finite() { format!("{factor:.2e} times the design's gradient") } else { "no gradient".into() };
-    let mean = |of: &dyn Fn(&Row) -> f64| recording.rows.iter().map(of).sum::<f64>() / recording.rows.len() as f64;
-    let expected = recording.header.nominal[f];
+    let mean = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).sum::<f64>() / rows.len() as f64;
+    let expected = header.nominal[f];
     let found = mean(&|row| row.supply[f]);
-    let dipole = recording.header.nominal_dipole.map_or_else(String::new, |nominal| {
+    let dipole = header.nominal_dipole.map_or_else(String::new, |nominal| {
         format!("; in the dipoles {nominal:?} A and {:.4} A", mean(&|row| row.dipole.unwrap_or(nominal)))
     });
     let supply = &supplies[f];
@@ -59,12 +60,12 @@ fn check_supplies(recording: &Recording, supplies: &[String]) -> Result<(), Faul
     ))
 }
 
-fn check_kick(recording: &Recording) -> Result<(), Fault> {
+fn check_kick(header: &Header, rows: &[Row]) -> Result<(), Fault> {
     let kicks = |row: &Row| {
-        let kicks = row.corrector_current.iter().zip(&recording.header.kick_per_ampere).map(|(a, k)| (a * k).abs());
+        let kicks = row.corrector_current.iter().zip(&header.kick_per_ampere).map(|(a, k)| (a * k).abs());
         kicks.fold(0.0, f64::max)
     };
-    let largest = recording.rows.iter().map(kicks).fold(0.0, f64::max);
+    let largest = rows.iter().map(kicks).fold(0.0, f64::max);
     if largest <= LARGEST_KICK {
         return Ok(());
     }
@@ -72,10 +73,10 @@ fn check_kick(recording: &Recording) -> Result<(), Fault> {
 }
 
 /// The noise of a monitor in the middle of all, by repeats and by the header.
-fn check_noise(recording: &Recording) -> Result<(), Fault> {
-    let pairs = repeats(recording);
-    let noise = |(b, stated): (usize, &f64)| Some((noise_of(recording, &pairs, b)?, *stated));
-    let mut all: Vec<(f64, f64)> = recording.header.noise.iter().enumerate().filter_map(noise).collect();
+fn check_noise(header: &Header, rows: &[Row]) -> Result<(), Fault> {
+    let pairs = repeats(header, rows);
+    let noise = |(b, stated): (usize, &f64)| Some((noise_of(rows, &pairs, b)?, *stated));
+    let mut all: Vec<(f64, f64)> = header.noise.iter().enumerate().filter_map(noise).collect();
     all.sort_by(|one, other| (one.0 / one.1).total_cmp(&(other.0 / other.1)));
     let Some(&(found, stated)) = all.get(all.len() / 2) else { return Ok(()) };
     if (found / stated).ln().abs() <= CONTRADICTS.ln() {
@@ -87,8 +88,8 @@ fn check_noise(recording: &Recording) -> Result<(), Fault> {
 }
 
 /// Each frame with the last one before it that was driven alike, by the read-backs.
-fn repeats(recording: &Recording) -> Vec<[usize; 2]> {
-    let (rows, is_ramped) = (&recording.rows, recording.header.ramp.is_given());
+fn repeats(header: &Header, rows: &[Row]) -> Vec<[usize; 2]> {
+    let is_ramped = header.ramp.is_given();
     let largest = rows.iter().flat_map(|row| &row.corrector_current).fold(0.0, |most: f64, a| most.max(a.abs()));
     let steps = |current: &f64| (current / (SCATTER * largest)).round() as i64;
     let time = |row: &Row| if is_ramped { in_milli(row.cycle_time).round() as i64 } else { 0 };
@@ -105,10 +106,8 @@ fn repeats(recording: &Recording) -> Vec<[usize; 2]> {
 }
 
 /// Robust noise of a monitor [m]; none of one that has few repeats. Equal readings are those of a stuck one.
-fn noise_of(recording: &Recording, repeats: &[[usize; 2]], b: usize) -> Option<f64> {
-    let difference = |[before, here]: &[usize; 2]| {
-        Some((recording.rows[*here].reading[b]? - recording.rows[*before].reading[b]?).abs())
-    };
+fn noise_of(rows: &[Row], repeats: &[[usize; 2]], b: usize) -> Option<f64> {
+    let difference = |[before, here]: &[usize; 2]| Some((rows[*here].reading[b]? - rows[*before].reading[b]?).abs());
     let mut sizes: Vec<f64> = repeats.iter().filter_map(difference).filter(|size| *size > 0.0).collect();
     sizes.sort_by(f64::total_cmp);
     (sizes.len() >= ENOUGH).then(|| sizes[sizes.len() / 2] / MEDIAN)

@@ -20,7 +20,7 @@ const FEW: f64 = 0.01;
 
 /// Fit, and linearise the readings about the fitted machine, until they no longer change.
 pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>) -> Result<Fitted, FitError> {
-    let mut fitted = Fitted::of(data, hypothesis, guess)?;
+    let mut fitted = Fitted::from_guess(data, hypothesis, guess)?;
     if let Some((without_jumps, again)) = trimmed(data, &fitted) {
         (*data, fitted) = (without_jumps, again);
     }
@@ -28,7 +28,7 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
         let mut linearised = data.clone();
         // a machine that keeps no beam in one of the settings is not the one that was recorded
         let Ok(moved) = linearised.linearise_each(&fitted.machines(data)?) else { break };
-        let Ok(again) = Fitted::of(&linearised, hypothesis, &fitted.u) else { break };
+        let Ok(again) = Fitted::from_guess(&linearised, hypothesis, &fitted.u) else { break };
         // nor is one that is far off, whose exact orbits may be metres: each pass then goes further away
         if again.is_poor() && again.cost > fitted.cost {
             break;
@@ -50,24 +50,24 @@ fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
     if !has_some || fitted.is_poor() && !are_few {
         return None;
     }
-    let again = Fitted::of(&trimmed, &fitted.hypothesis, &fitted.u).ok()?;
+    let again = Fitted::from_guess(&trimmed, &fitted.hypothesis, &fitted.u).ok()?;
     (!fitted.is_poor() || !again.is_poor()).then_some((trimmed, again))
 }
 
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
 pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
-    let mut own = fitted.data(data).clone();
-    let linearise = |own: &mut Data, fitted: &Fitted| own.linearise_each(&fitted.machines(own)?);
+    let mut relinearised = fitted.data(data).clone();
+    let linearise = |data: &mut Data, fitted: &Fitted| data.linearise_each(&fitted.machines(data)?);
     for pass in 0..PASSES {
         if fitted.is_poor() {
             break;
         }
-        let Ok(moved) = linearise(&mut own, &fitted) else { break };
+        let Ok(moved) = linearise(&mut relinearised, &fitted) else { break };
         if pass == 0 && moved < CURVED {
             break;
         }
-        let Ok(again) = Fitted::of(&own, &fitted.hypothesis, &fitted.u) else { break };
-        fitted = again.to(&own);
+        let Ok(again) = Fitted::from_guess(&relinearised, &fitted.hypothesis, &fitted.u) else { break };
+        fitted = again.keeping(&relinearised);
         if moved < CURVED {
             break;
         }
@@ -94,7 +94,7 @@ mod tests {
         let case = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap().draw(Class::Pair, 2_000_002, 4);
         let sextupole = case.effects.iter().find(|effect| effect.kind == EffectKind::SextupoleError).unwrap();
         let made = case.recording(&ring, &recording).unwrap();
-        let mut data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let hypothesis = Hypothesis::plain().with((*sextupole).into());
         let unknowns = data.units.len() + hypothesis.unknowns(&data).len();
         let fitted = fit(&mut data, &hypothesis, &DVector::zeros(unknowns)).unwrap();
@@ -114,9 +114,9 @@ mod tests {
         let mut case = cases.draw(Class::Single, 1_000_199, 5);
         case.effects.clear();
         let made = case.recording(&ring, &recording).unwrap();
-        let mut data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let start = DVector::zeros(data.units.len());
-        assert!(Fitted::of(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
+        assert!(Fitted::from_guess(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
         let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
         assert!(fitted.chi2_per_number() < 1.0, "{}", fitted.chi2_per_number());
     }
@@ -132,7 +132,7 @@ mod tests {
             let case = cases.draw(Class::Single, number, seed);
             let [drift] = case.effects[..] else { panic!("one effect") };
             let made = case.recording(&ring, &recording).unwrap();
-            let mut data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis::plain().with(drift.into());
             let start = DVector::zeros(data.units.len());
             let fitted = fit(&mut data, &hypothesis, &start).unwrap();
@@ -140,7 +140,7 @@ mod tests {
             assert_eq!(drift.kind, EffectKind::QuadDrift);
             assert!(((value - drift.amplitude) / sigma).abs() < 3.0, "{} {value} ± {sigma}", drift.amplitude);
             let truth = DVector::from_iterator(case.vars.len(), case.vars.iter().map(|var| var.ln()));
-            let nees = Vars::of(&fitted).nees(&truth);
+            let nees = Vars::from_fit(&fitted).nees(&truth);
             // 48 vars scatter it by 0.2, and the widths of what is ordinary are not learnt here; with derivatives of mid-campaign it was 40
             assert!((0.4..2.0).contains(&nees), "{nees}");
         }

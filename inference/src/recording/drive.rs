@@ -2,7 +2,9 @@
 
 use nalgebra::DVector;
 
-use crate::recording::{At, Header, Recording, Row};
+use super::frames::Row;
+use super::header::Header;
+use super::ramp::At;
 
 /// What supplies and correctors do in one frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,8 +28,8 @@ impl Drive {
     ///
     /// # Panics
     /// If the row's time is not one of the ramp's: such recordings are refused.
-    pub fn of(header: &Header, row: &Row) -> Self {
-        let at = at(header, row);
+    pub fn from_row(header: &Header, row: &Row) -> Self {
+        let at = ramp_at(header, row);
         let rigidity = field(header, row).unwrap_or(1.0);
         let strength = |f: usize| (header.gradient(f, row.supply[f]) / (rigidity * at.gradient[f])).ln();
         let stiffness = rigidity * at.momentum;
@@ -41,8 +43,13 @@ impl Drive {
     }
 }
 
+/// What drove the beam in each frame.
+pub(super) fn in_rows(header: &Header, rows: &[Row]) -> Vec<Drive> {
+    rows.iter().map(|row| Drive::from_row(header, row)).collect()
+}
+
 /// The ramp's values at the time of a row.
-fn at(header: &Header, row: &Row) -> At {
+fn ramp_at(header: &Header, row: &Row) -> At {
     header.ramp.at(row.cycle_time, row.supply.len()).expect("the ramp knows the times of its frames")
 }
 
@@ -52,13 +59,7 @@ fn at(header: &Header, row: &Row) -> At {
 /// If the row's time is not one of the ramp's: such recordings are refused.
 pub(crate) fn field(header: &Header, row: &Row) -> Option<f64> {
     let (current, nominal) = row.dipole.zip(header.nominal_dipole)?;
-    Some(current / (nominal * at(header, row).dipole))
-}
-
-/// Mean `ln` of each supply's factor over a recording [F]: the currents at which its tunes were measured.
-pub fn supplies_of(recording: &Recording) -> Vec<f64> {
-    let drives: Vec<Drive> = recording.rows.iter().map(|row| Drive::of(&recording.header, row)).collect();
-    mean_supplies(&drives)
+    Some(current / (nominal * ramp_at(header, row).dipole))
 }
 
 /// Mean `ln` of each supply's factor over all frames [F]; none without frames.
@@ -84,10 +85,4 @@ pub(crate) fn mean(drives: &[&Drive]) -> Drive {
         mean.strength.axpy(share, &drive.strength, 1.0);
     }
     mean
-}
-
-/// Number of frames with each frame's RF offset.
-pub(crate) fn sharing(drives: &[Drive]) -> Vec<f64> {
-    let alike = |drive: &Drive| drives.iter().filter(|other| other.rf_offset == drive.rf_offset).count() as f64;
-    drives.iter().map(alike).collect()
 }

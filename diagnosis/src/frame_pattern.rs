@@ -22,7 +22,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Optics, OrbitError, Plane, Ring};
 
 use super::factors::{Factors, Seen};
-use super::jitter::{Differences, beside};
+use super::jitter::{Differences, with_column};
 use super::laplace::Peak;
 use super::period::Period;
 
@@ -106,9 +106,13 @@ impl Shape {
             let i = usize::from(plane == Plane::Y);
             let rows: Vec<[f64; 2]> = (ring.monitors_read())
                 .map(|monitor| {
-                    let at = &twiss[monitor.element];
-                    let (sin, cos) = at.phase_advance[i].sin_cos();
-                    if monitor.plane == plane { [cos, sin].map(|of| at.beta[i].sqrt() * of) } else { [0.0; 2] }
+                    let optics_there = &twiss[monitor.element];
+                    let (sin, cos) = optics_there.phase_advance[i].sin_cos();
+                    if monitor.plane == plane {
+                        [cos, sin].map(|of| optics_there.beta[i].sqrt() * of)
+                    } else {
+                        [0.0; 2]
+                    }
                 })
                 .collect();
             Self { like: Like::Betatron(plane), columns: DMatrix::from_fn(rows.len(), 2, |b, k| rows[b][k]) }
@@ -117,8 +121,9 @@ impl Shape {
             let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
             let sources: Vec<_> = ring.quadrupoles.iter().map(|q| optics.kick(q.element, direction)).collect();
             let response = optics.response(&observers, &sources);
-            let of = move |q: usize| Self { like: Like::Kick(q, plane), columns: response.columns(q, 1).into_owned() };
-            (0..sources.len()).map(of)
+            let shape =
+                move |q: usize| Self { like: Like::Kick(q, plane), columns: response.columns(q, 1).into_owned() };
+            (0..sources.len()).map(shape)
         };
         let dispersion = optics.dispersion_of(&observers);
         let momentum = Self { like: Like::Momentum, columns: DMatrix::from_columns(&[dispersion]) };
@@ -144,14 +149,14 @@ impl Shape {
 impl Found {
     /// The most likely pattern, beside or in the place of known ones, of which each has those before it; `noise`: of each monitor whose differences
     /// there are [m]. A pattern has to be needed beside all that are known too: it might only be the cheaper description of a crate.
-    pub fn of(near: &Differences, known: &[Known], shapes: &[Shape], noise: &[Option<f64>]) -> Option<Self> {
-        let seen = Seen::of(&near.all);
+    pub fn strongest(near: &Differences, known: &[Known], shapes: &[Shape], noise: &[Option<f64>]) -> Option<Self> {
+        let seen = Seen::from_differences(&near.all);
         let shapes: Vec<Shape> = shapes.iter().filter_map(|shape| shape.over(noise)).collect();
         let (mut nothing, mut beside_all) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
         let mut best: Option<Self> = None;
         for one in known {
             let none = DMatrix::zeros(one.modes.nrows(), 0);
-            let without = Factors::of(&seen, &one.modes, &none).log_evidence - one.cost;
+            let without = Factors::learn(&seen, &one.modes, &none).log_evidence - one.cost;
             nothing = nothing.max(without);
             let free = free(near, &seen, one).map(|(patterns, log)| {
                 let like = like(&patterns, &shapes);
@@ -223,7 +228,7 @@ fn free(near: &Differences, seen: &Seen, known: &Known) -> Option<(DMatrix<f64>,
     };
     let mut best: Option<(DMatrix<f64>, f64)> = None;
     for k in 1..=MOST.min(order.len()) {
-        let Factors { patterns, log_evidence } = Factors::of(seen, &known.modes, &start(k));
+        let Factors { patterns, log_evidence } = Factors::learn(seen, &known.modes, &start(k));
         let log = log_evidence - known.cost;
         if best.as_ref().is_some_and(|(_, before)| log < *before) {
             break;
@@ -238,7 +243,7 @@ fn known_shape<'s>(near: &Differences, known: &DMatrix<f64>, shapes: &'s [Shape]
     let without = near.log_likelihood(known);
     let with = |shape: &Shape, size: f64| {
         let columns = shape.columns.column_iter().map(|column| column * size);
-        near.log_likelihood(&columns.fold(known.clone(), |modes, column| beside(&modes, &column))) - without
+        near.log_likelihood(&columns.fold(known.clone(), |modes, column| with_column(&modes, &column))) - without
     };
     let range = -SMALLEST.ln();
     let sizes = (0..SIZES).map(|i| -range * (i as f64 + 0.5) / SIZES as f64);
@@ -246,7 +251,7 @@ fn known_shape<'s>(near: &Differences, known: &DMatrix<f64>, shapes: &'s [Shape]
         .flat_map(|shape| sizes.clone().map(move |size| (shape, size)));
     let (shape, start, _) =
         tried.map(|(shape, size)| (shape, size, with(shape, size.exp()))).max_by(|a, b| a.2.total_cmp(&b.2))?;
-    let peak = Peak::of(|x| with(shape, x[0].exp()), &DVector::from_element(1, start), &[[-range, 0.0]])?;
+    let peak = Peak::find(|x| with(shape, x[0].exp()), &DVector::from_element(1, start), &[[-range, 0.0]])?;
     Some((shape, peak.at[0].exp(), peak.log_integral - range.ln()))
 }
 
@@ -293,7 +298,7 @@ pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Opt
             start = end;
         }
     }
-    let of = |row: usize| {
+    let amplitude = |row: usize| {
         let seen = monitors.iter().filter(|&&b| !about[(row, b)].is_nan());
         let sum = |(pull, information): (f64, f64), &b: &usize| {
             let share = weight(b) * pattern[b];
@@ -302,7 +307,7 @@ pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Opt
         let (pull, information) = seen.fold((0.0, 0.0), sum);
         pull / information
     };
-    (0..residual.nrows()).map(of).collect()
+    (0..residual.nrows()).map(amplitude).collect()
 }
 
 #[cfg(test)]
@@ -322,8 +327,8 @@ mod tests {
     use crate::data::Data;
     use crate::location::Location;
     use crate::noise::Noise;
+    use crate::odds::correction_of_sort;
     use crate::period::Recurs;
-    use crate::search::correction_of_sort;
     use crate::testing::{Coloured, template};
     use crate::verdict::Verdict;
 
@@ -372,7 +377,7 @@ mod tests {
         }
 
         fn learnt(&self, recording: &Recording) -> Noise {
-            Data::of(&Campaign::of(&self.ring, recording).unwrap()).unwrap().noise
+            Data::from_campaign(&Campaign::of(&self.ring, recording).unwrap()).unwrap().noise
         }
     }
 
@@ -389,7 +394,7 @@ mod tests {
                 frame.copy_from(&(&columns * DVector::from_vec(vec![cos, sin])).transpose());
             }
             let made = case.with(&common);
-            let diagnosis = Diagnosis::of(&case.ring, &made, |_| ()).unwrap();
+            let diagnosis = Diagnosis::from_recording(&case.ring, &made, |_| ()).unwrap();
             let noise = &diagnosis.found.data.noise;
             let found = noise.frame_to_frame.as_ref().unwrap();
             println!("{} {:.1}", diagnosis.sentence, found.log_bayes);
@@ -416,7 +421,7 @@ mod tests {
         let pattern = case.noise.dispersion.transpose() * 5e-5;
         let common = DMatrix::from_fn(case.frames(), pattern.len(), |i, b| if i % 7 == 3 { pattern[b] } else { 0.0 });
         let made = case.with(&common);
-        let diagnosis = Diagnosis::of(&case.ring, &made, |_| ()).unwrap();
+        let diagnosis = Diagnosis::from_recording(&case.ring, &made, |_| ()).unwrap();
         let found = diagnosis.found.data.noise.frame_to_frame.clone().unwrap();
         println!("{} {:.1}", diagnosis.sentence, found.log_bayes);
         assert_eq!((diagnosis.verdict, found.like), (Verdict::Unexplained, Like::Momentum));
@@ -501,10 +506,10 @@ mod tests {
             }
             all.iter_mut().skip(campaign).step_by(57).for_each(|z| *z = f64::NAN);
             let cost = 0.5 * 240_f64.ln();
-            let known = [Known { modes: none.clone(), cost: 0.0 }, Known { modes: beside(&none, &jitter), cost }];
+            let known = [Known { modes: none.clone(), cost: 0.0 }, Known { modes: with_column(&none, &jitter), cost }];
             let noise = vec![Some(case.noise.noise); monitors];
             logs.push(
-                Found::of(&Differences::of(all), &known, &case.shapes, &noise)
+                Found::strongest(&Differences::from_frames(all), &known, &case.shapes, &noise)
                     .map_or(f64::NEG_INFINITY, |one| one.log_bayes),
             );
         }

@@ -83,7 +83,7 @@ impl Slow {
     };
 
     /// Learn from repeats of monitors whose noise is about `sigma` each [m], in a recording of so many frames.
-    pub fn of(repeats: &[Repeats], sigma: &[f64], frames: usize) -> Self {
+    pub fn learn(repeats: &[Repeats], sigma: &[f64], frames: usize) -> Self {
         if repeats.is_empty() {
             return Self::NONE;
         }
@@ -91,7 +91,7 @@ impl Slow {
         let mut relative: Vec<f64> = sigma.iter().map(|sigma| sigma / mean).collect();
         let mut found = Self::NONE;
         for _ in 0..PASSES {
-            let learner = Learner::of(repeats, relative.clone(), frames);
+            let learner = Learner::from_repeats(repeats, relative.clone(), frames);
             found = learner.learn(mean);
             let memory = |b: usize| found.memory(relative[b] * mean);
             relative = (0..repeats.len())
@@ -110,7 +110,7 @@ impl Slow {
     }
 
     /// The memory of a monitor of some noise [m].
-    pub fn memory(&self, sigma: f64) -> Memory {
+    pub(crate) fn memory(&self, sigma: f64) -> Memory {
         if self.is_none() {
             return Memory::NONE;
         }
@@ -119,11 +119,12 @@ impl Slow {
 }
 
 impl<'r> Learner<'r> {
-    fn of(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
-        let of = |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
-        let white: Vec<f64> = (0..repeats.len()).map(|b| of(Common::NONE, b)).collect();
+    fn from_repeats(repeats: &'r [Repeats], relative: Vec<f64>, frames: usize) -> Self {
+        let log_likelihood_of =
+            |common: Common, b: usize| repeats[b].weigh(common.memory(relative[b])).log_likelihood();
+        let white: Vec<f64> = (0..repeats.len()).map(|b| log_likelihood_of(Common::NONE, b)).collect();
         let frames = frames as f64;
-        let over_white = |common: Common| (0..repeats.len()).map(|b| of(common, b) - white[b]).collect();
+        let over_white = |common: Common| (0..repeats.len()).map(|b| log_likelihood_of(common, b) - white[b]).collect();
         let tried: Vec<(Common, Vec<f64>)> = grid(frames).into_iter().map(|one| (one, over_white(one))).collect();
         let best = |b: usize| tried.iter().map(|(_, logs)| logs[b]).fold(0.0, f64::max);
         let own: Vec<f64> = (0..repeats.len()).map(best).collect();
@@ -133,8 +134,9 @@ impl<'r> Learner<'r> {
 
     /// `ln` likelihood over that of white noise, each monitor's own kind allowed for.
     fn likelihood(&self, common: Common) -> f64 {
-        let one = |b: usize| self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
-        together(&(0..self.repeats.len()).map(one).collect::<Vec<_>>(), &self.own)
+        let gain_of_monitor =
+            |b: usize| self.repeats[b].weigh(common.memory(self.relative[b])).log_likelihood() - self.white[b];
+        together(&(0..self.repeats.len()).map(gain_of_monitor).collect::<Vec<_>>(), &self.own)
     }
 
     /// `ln` prior density of the logarithms of what is free.
@@ -164,7 +166,7 @@ impl<'r> Learner<'r> {
                 self.likelihood(common) + self.log_prior(common, free)
             };
             let least = best.as_ref().map_or(nothing, |(_, peak)| peak.log_integral);
-            let peak = Peak::of(density, &start.coordinates(free), &self.bounds(free));
+            let peak = Peak::find(density, &start.coordinates(free), &self.bounds(free));
             best = peak.filter(|peak| peak.log_integral > least).map(|peak| (free, peak)).or(best);
         }
         let (common, sigma) = best.map_or((Common::NONE, [0.0; 3]), |(free, peak)| Common::measured(&peak, free));
@@ -189,7 +191,7 @@ impl<'r> Learner<'r> {
 
     /// Root mean square, by its posterior, of what is not needed.
     fn range(&self, common: &dyn Fn(f64) -> Common, width: f64) -> f64 {
-        HalfNormal::of(|size| self.likelihood(common(size.min(MOST))), width, RANGE).square.sqrt()
+        HalfNormal::from_log_likelihood(|size| self.likelihood(common(size.min(MOST))), width, RANGE).square.sqrt()
     }
 
     fn bounds(&self, free: Free) -> Vec<[f64; 2]> {

@@ -6,27 +6,25 @@
 
 use twin::Signatures;
 
-use super::{BEHIND, BEHIND_SHARE, Found, Search, WORTH, relearnt};
-use crate::alternatives::{Alternative, Cause, SUSPICIOUS};
+use super::found::Found;
+use super::refit::{BEHIND, BEHIND_SHARE, WORTH, relearnt};
+use crate::alternatives::{Alternative, Cause};
 use crate::data::Data;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::element::Element;
 use crate::error::FitError;
 use crate::fit::Fitted;
-use crate::heldout::lessened;
 use crate::hypothesis::Hypothesis;
-use crate::linearise;
 use crate::location::Location;
+use crate::odds::SUSPICIOUS;
 
-/// Places of an unknown element that are tried in the model, where the next search finds it elsewhere.
-const PLACES: usize = 3;
 /// Unknown elements that are weighed by exact fits, and what ordinary imperfections may have taken from them besides the distance of a candidate [nat].
 const TRIED: usize = 2;
 const TAKEN: f64 = 10.0;
 
 impl Found {
     /// An unknown linear element, where what is left is physics that the library does not hold, and such an element its most likely form.
-    fn unknown_element(&self) -> Result<Option<Element>, FitError> {
+    pub fn unknown_element(&self) -> Result<Option<Element>, FitError> {
         let leader = self.next.alternatives.iter().find(|one| !one.is_of_library());
         let leader = leader.filter(|_| self.next.unknown_seen() > SUSPICIOUS);
         let Some(Cause::Unmodelled(one)) = leader.map(|one| &one.cause) else { return Ok(None) };
@@ -39,17 +37,13 @@ fn element_of(data: &Data, without: &Fitted, one: &Discrepancy) -> Result<Option
     let Location::Linear(quadrupole, does) = one.at else { return Ok(None) };
     let (machine, drives) = without.machine_on_orbit(without.data(data), one.campaign)?;
     let signatures = Signatures::of(&machine, &drives)?;
-    Ok(Some(Element::of(&signatures, &data.ring, quadrupole, does, one.size)))
+    Ok(Some(Element::with_size(&signatures, &data.ring, quadrupole, does, one.size)))
 }
 
 /// Weigh the leading unknown elements among some causes by exact fits, in which what is ordinary is learnt beside them, as it is beside the effects of the
 /// library: rolls of quadrupoles that had taken a part of what a solenoid of 4 mrad does cost it 13 nat. The fit has one size, the best of the equally likely
 /// ones. Its share of their mean is a lower limit, so that it counts only where it is above the first order's.
-pub(super) fn weigh_elements(
-    data: &Data,
-    without: &Fitted,
-    weights: &mut [(Alternative, f64)],
-) -> Result<(), FitError> {
+pub fn weigh_elements(data: &Data, without: &Fitted, weights: &mut [(Alternative, f64)]) -> Result<(), FitError> {
     let best = weights.iter().map(|(_, weight)| *weight).fold(f64::NEG_INFINITY, f64::max);
     if best < 0.0 || without.hypothesis.element.is_some() {
         return Ok(());
@@ -71,11 +65,13 @@ pub(super) fn weigh_elements(
         }
         tried.push(element.clone());
         let hypothesis = Hypothesis { element: Some(element), ..without.hypothesis.clone() };
-        let own = without.data(data);
-        let Ok(with) = Fitted::of(own, &hypothesis, &without.guess(own, &hypothesis)) else { continue };
-        let with = relearnt(own, with);
+        let readings = without.data(data);
+        let Ok(with) = Fitted::from_guess(readings, &hypothesis, &without.guess(readings, &hypothesis)) else {
+            continue;
+        };
+        let with = relearnt(readings, with);
         let gain = with.log_evidence - without.log_evidence - (SIZES.len() as f64).ln();
-        if gain > one.log_bayes && with.is_stable(own) {
+        if gain > one.log_bayes && with.is_stable(readings) {
             *weight += gain - one.log_bayes;
             (one.log_bayes, alternative.log_gain) = (gain, gain);
         }
@@ -83,71 +79,12 @@ pub(super) fn weigh_elements(
     Ok(())
 }
 
-impl Search {
-    /// The search beside an unknown element, where there is one. None where, beside what was then found, it is no longer the most likely of what is left:
-    /// the first search is as good.
-    pub(super) fn beside_element(&self, found: &Found) -> Result<Option<Found>, FitError> {
-        let Some(element) = found.unknown_element()? else { return Ok(None) };
-        self.held.set(0);
-        let whole = self.without_parts(found, &element)?;
-        let Some(mut element) = whole.unknown_element()? else { return Ok(None) };
-        for _ in 0..PLACES {
-            let Some(beside) = self.beside(&whole, element.clone())? else { return Ok(None) };
-            if beside.best.hypothesis.element.is_none() {
-                // a monitor wanders, and all was begun anew
-                return Ok(Some(self.beside_element(&beside)?.unwrap_or(beside)));
-            }
-            let data = &beside.data;
-            let rest = relearnt(data, lessened(data, &beside.best, beside.best.hypothesis.without_element())?);
-            let next = self.one_more(rest.data(data), &rest)?;
-            let beside = Found { next, ..beside };
-            match beside.unknown_element()? {
-                Some(leading) if leading.is_like(&element) => return Ok(Some(beside)),
-                Some(leading) => element = leading,
-                None => return Ok(None),
-            }
-        }
-        // its place is not decided, so that none is in the model
-        Ok(Some(whole))
-    }
-
-    /// With an unknown element in the model, and what else shows beside it; none where the machine keeps no beam.
-    fn beside(&self, whole: &Found, element: Element) -> Result<Option<Found>, FitError> {
-        let Found { data, null, best, .. } = whole;
-        let less = best.hypothesis.without_terms(|term| element.holds(term, &data.ring));
-        let hypothesis = Hypothesis { element: Some(element), ..less };
-        let with = relearnt(data, Fitted::of(data, &hypothesis, &best.guess(data, &hypothesis))?);
-        if !with.is_stable(data) {
-            return Ok(None);
-        }
-        let (best, competitions) = self.settle(data, with, None)?;
-        let next = self.one_more(data, &best)?;
-        Ok(Some(self.grown(Found { data: data.clone(), null: null.clone(), best, competitions, next })?))
-    }
-
-    /// The same without the effects that are parts of an unknown element.
-    fn without_parts(&self, found: &Found, element: &Element) -> Result<Found, FitError> {
-        let (best, ring) = (&found.best, &found.data.ring);
-        let hypothesis = best.hypothesis.without_terms(|term| element.holds(term, ring));
-        let mut data = found.data.clone();
-        if hypothesis.terms.len() == best.hypothesis.terms.len() {
-            return Ok(found.clone());
-        }
-        if hypothesis.terms.is_empty() {
-            return self.without_effects(data);
-        }
-        let less = linearise::fit(&mut data, &hypothesis, &best.guess(&found.data, &hypothesis))?;
-        let less = relearnt(&data, less);
-        self.about_effects(found, data, less)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use twin::{Effect, EffectKind, Kind, Ring};
 
     use super::*;
-    use crate::hypothesis::Term;
+    use crate::term::Term;
     use crate::{Diagnosis, Verdict};
     use inference::Recording;
     use inference::simulate::{self, Beyond, Hardware};
@@ -195,7 +132,7 @@ mod tests {
         let gain = Effect::parse("bpm_gain@x_E6=0.2", &ring).unwrap();
         for effects in [vec![], vec![gain]] {
             let recording = solenoid.campaign(&ring, &template, &effects, 21);
-            let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let named: Vec<EffectKind> = found.findings.iter().filter_map(|one| Some(one.term()?.kind)).collect();
             let true_kinds: Vec<EffectKind> = effects.iter().map(|effect| effect.kind).collect();
@@ -206,7 +143,7 @@ mod tests {
             assert!(solenoid.is_near(&ring, last.s.unwrap()), "{}", found.sentence);
             let (data, best) = (&found.found.data, &found.found.best);
             // what the vars do to its signature is left out of the derivatives: 0.75 nat where it is 40 mrad
-            let again = Fitted::of(data, &best.hypothesis, &best.u).unwrap();
+            let again = Fitted::from_guess(data, &best.hypothesis, &best.u).unwrap();
             let moved = again.log_evidence - best.log_evidence;
             println!("{moved} nat");
             assert!(moved.abs() < 2.0, "{moved} nat");
@@ -224,7 +161,7 @@ mod tests {
         let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };
         let hardware = Hardware::shipped(&ring, &template);
         let recording = simulate::campaign(&template, &ring, &truth, &hardware, 31).unwrap();
-        let found = Diagnosis::of(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert!(found.findings.iter().all(|one| one.term().is_some()), "{}", found.sentence);
         let named = |effect: &Effect| found.findings.iter().any(|one| one.term() == Some(&Term::from(*effect)));
         assert!(effects.iter().all(named), "{}", found.sentence);
@@ -237,7 +174,8 @@ mod tests {
         let (ring, template) = crate::testing::template();
         for (seed, drift) in [(11, 14), (12, 0), (13, 7)] {
             let solenoid = Solenoid::of(&ring, drift, 0.01);
-            let found = Diagnosis::of(&ring, &solenoid.campaign(&ring, &template, &[], seed), |_| ()).unwrap();
+            let found =
+                Diagnosis::from_recording(&ring, &solenoid.campaign(&ring, &template, &[], seed), |_| ()).unwrap();
             let [only] = found.findings.as_slice() else { panic!("{}", found.sentence) };
             assert!(only.term().is_none() && only.phrase.contains("turning them"), "{}", found.sentence);
             assert!(solenoid.is_near(&ring, only.s.unwrap()), "{}", found.sentence);

@@ -3,8 +3,8 @@
 use nalgebra::{DMatrix, DVector};
 use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
-use super::Campaign;
-use super::drive::{Drive, mean_supplies};
+use super::times::Times;
+use crate::recording::{Drive, mean_supplies};
 
 /// The ring at given params.
 #[derive(Debug, Clone)]
@@ -36,26 +36,31 @@ pub(crate) struct AtTimes {
 }
 
 impl AtTimes {
-    /// Of a campaign.
-    pub fn of(campaign: &Campaign, params: &DVector<f64>) -> Result<Self, OrbitError> {
-        let Campaign { held, supplies, drives, times, .. } = campaign;
-        let at = |time: usize| {
+    /// About params, at the mean supplies of all frames and of those of each time.
+    pub fn new(
+        machine: &Machine,
+        params: &DVector<f64>,
+        supplies: &[f64],
+        drives: &[Drive],
+        times: &Times,
+    ) -> Result<Self, OrbitError> {
+        let at_time = |time: usize| {
             let frames: Vec<usize> = (0..drives.len()).filter(|&i| times.of_frame[i] == time).collect();
-            let drives = of_frames(drives, &frames);
-            let linearised = Linearised::of(held, params, &mean_supplies(&drives), &drives)?;
+            let drives = drives_of(drives, &frames);
+            let linearised = Linearised::about(machine, params, &mean_supplies(&drives), &drives)?;
             Ok((frames, linearised))
         };
         let several = if times.count() > 1 { times.count() } else { 0 };
-        let each = (0..several).map(at).collect::<Result<_, OrbitError>>()?;
-        Ok(Self { at_mean: Linearised::of(held, params, supplies, drives)?, each })
+        let each = (0..several).map(at_time).collect::<Result<_, OrbitError>>()?;
+        Ok(Self { at_mean: Linearised::about(machine, params, supplies, drives)?, each })
     }
 
     /// As [`Linearised::orbits`].
     pub fn orbits(&self, drives: &[Drive]) -> DMatrix<f64> {
         let mut orbits = self.at_mean.orbits(drives);
         for (frames, linearised) in &self.each {
-            let own = linearised.orbits(&of_frames(drives, frames));
-            frames.iter().zip(own.row_iter()).for_each(|(&frame, orbit)| orbits.set_row(frame, &orbit));
+            let at_time = linearised.orbits(&drives_of(drives, frames));
+            frames.iter().zip(at_time.row_iter()).for_each(|(&frame, orbit)| orbits.set_row(frame, &orbit));
         }
         orbits
     }
@@ -64,15 +69,15 @@ impl AtTimes {
     pub fn slopes(&self, drives: &[Drive]) -> Vec<DMatrix<f64>> {
         let mut slopes = self.at_mean.slopes(drives);
         for (frames, linearised) in &self.each {
-            for (to, own) in slopes.iter_mut().zip(linearised.slopes(&of_frames(drives, frames))) {
-                frames.iter().zip(own.column_iter()).for_each(|(&frame, slope)| to.set_column(frame, &slope));
+            for (to, at_time) in slopes.iter_mut().zip(linearised.slopes(&drives_of(drives, frames))) {
+                frames.iter().zip(at_time.column_iter()).for_each(|(&frame, slope)| to.set_column(frame, &slope));
             }
         }
         slopes
     }
 }
 
-fn of_frames(drives: &[Drive], frames: &[usize]) -> Vec<Drive> {
+fn drives_of(drives: &[Drive], frames: &[usize]) -> Vec<Drive> {
     frames.iter().map(|&frame| drives[frame].clone()).collect()
 }
 
@@ -90,7 +95,7 @@ struct RfOrbit {
 impl Linearised {
     /// About params and supplies, for the RF offsets of some frames. Kicks move the beam with what the machine holds constant; an RF
     /// offset overrides that.
-    pub fn of(
+    pub fn about(
         machine: &Machine,
         params: &DVector<f64>,
         supplies: &[f64],

@@ -9,7 +9,7 @@ use super::data::Data;
 
 /// Such frames of a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Aside {
+pub struct LostFrames {
     /// The recording.
     pub recording: String,
     /// The frames, counted from 0.
@@ -23,13 +23,13 @@ const FEWEST: usize = 3;
 /// Frames that are named.
 const NAMED: usize = 4;
 
-impl Aside {
+impl LostFrames {
     /// Of each recording that has some.
     pub fn all(data: &Data) -> Vec<Self> {
-        data.campaigns().filter_map(Self::of).collect()
+        data.campaigns().filter_map(Self::in_campaign).collect()
     }
 
-    fn of(own: &Data) -> Option<Self> {
+    fn in_campaign(own: &Data) -> Option<Self> {
         let sound = |b: &usize| own.health()[*b].state == MonitorState::Ok;
         let monitors: Vec<usize> = own.active_monitors().into_iter().filter(sound).collect();
         let is_one = |frame: &usize| {
@@ -41,7 +41,7 @@ impl Aside {
     }
 }
 
-impl fmt::Display for Aside {
+impl fmt::Display for LostFrames {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let named: Vec<String> = self.frames.iter().take(NAMED).map(usize::to_string).collect();
         let more = if self.frames.len() > NAMED { ", ..." } else { "" };
@@ -60,8 +60,8 @@ mod tests {
     #[test]
     fn a_trip_and_a_lost_beam_are_told() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
-        assert_eq!(Aside::all(&data(&recording)), []);
+        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        assert_eq!(LostFrames::all(&data(&recording)), []);
         let mut broken = recording.clone();
         // the orbit of another setting, and none
         let other = broken.rows[120].reading.clone();
@@ -71,7 +71,7 @@ mod tests {
         broken.rows[200].reading.iter_mut().for_each(|r| *r = r.map(|_| 0.0));
         // what was not read is not put aside
         broken.rows[150].reading.fill(None);
-        let told = Aside::all(&data(&broken));
+        let told = LostFrames::all(&data(&broken));
         assert_eq!(told.len(), 1);
         assert_eq!(
             told[0].to_string(),

@@ -1,6 +1,6 @@
 //! What the readings of a pool tell by their differences of the terms that they have in common.
 //!
-//! Within a pool the machine is the same but for the supplies, which the baseline follows by unknown factors `c`, standard normal in their
+//! CommonFactors a pool the machine is the same but for the supplies, which the baseline follows by unknown factors `c`, standard normal in their
 //! prior. With `w` the readings less the mean of their pool, `W` the terms less theirs, both over the noise,
 //!
 //! `V = (1 + W^T W)^-1`, `m = V W^T w`
@@ -12,16 +12,16 @@ use nalgebra::{DMatrix, DVector};
 
 /// Factors of the common terms, as the differences within pools tell them.
 #[derive(Debug, Clone)]
-pub struct Within {
+pub struct CommonFactors {
     /// Their mean.
     pub mean: DVector<f64>,
     /// Root of their covariance: its product with its transpose.
     pub root: DMatrix<f64>,
 }
 
-impl Within {
+impl CommonFactors {
     /// From differences of readings and of their terms [readings][factors], both over the noise.
-    pub fn of(readings: &DVector<f64>, terms: &DMatrix<f64>) -> Self {
+    pub fn from_differences(readings: &DVector<f64>, terms: &DMatrix<f64>) -> Self {
         let factors = terms.ncols();
         let normal = DMatrix::identity(factors, factors) + terms.tr_mul(terms);
         let unknown = || Self { mean: DVector::zeros(factors), root: DMatrix::identity(factors, factors) };
@@ -59,7 +59,7 @@ mod tests {
                 row -= &mean_terms;
             });
         }
-        let within = Within::of(&off, &off_terms);
+        let within = CommonFactors::from_differences(&off, &off_terms);
         let left = &means.0 - &means.1 * &within.mean;
         let terms = &means.1 * &within.root;
         let step = (DMatrix::identity(2, 2) + terms.tr_mul(&terms)).cholesky().unwrap().solve(&terms.tr_mul(&left));

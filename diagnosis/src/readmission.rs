@@ -6,7 +6,7 @@
 //! value, those of a frame without a beam, and those of a frame with another orbit.
 
 use estimator::MonitorState;
-use inference::{Campaign, Screened};
+use inference::{Campaign, Exclusions, Screened};
 
 use super::noise::{Noise, Source};
 
@@ -40,12 +40,12 @@ pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
         let is_back =
             |frame: &&usize| !campaign.counts(**frame, b) && is_near(**frame, b) && !repeats(campaign, **frame, b);
         for &frame in frames.iter().filter(is_back) {
-            again.accepted[(frame, b)] = true;
+            again.excluded.lift(frame, b);
             health.rejected = health.rejected.saturating_sub(1);
         }
     }
     for b in 0..monitors {
-        if again.health[b].state == MonitorState::Jumps && left_aside(campaign, &again, b) <= JUMPS {
+        if again.health[b].state == MonitorState::Jumps && left_aside(&again.excluded, b) <= JUMPS {
             again.health[b].weighted_as = again.health[b].noise;
             again.health[b].state = MonitorState::Ok;
         }
@@ -54,12 +54,11 @@ pub fn readmitted(source: &Source, noise: &Noise) -> Screened {
 }
 
 /// Share of a monitor's readings that are left aside in frames in which few others are.
-pub fn left_aside(campaign: &Campaign, screened: &Screened, b: usize) -> f64 {
-    let is_aside = |frame: usize, b: usize| !campaign.readings[(frame, b)].is_nan() && !screened.accepted[(frame, b)];
-    let monitors = campaign.monitors();
-    let few = |frame: &usize| (0..monitors).filter(|&b| is_aside(*frame, b)).count() as f64 <= FEW * monitors as f64;
-    let frames: Vec<usize> = (0..campaign.frames()).filter(few).collect();
-    frames.iter().filter(|&&frame| is_aside(frame, b)).count() as f64 / frames.len().max(1) as f64
+pub fn left_aside(excluded: &Exclusions, b: usize) -> f64 {
+    let (frames, monitors) = excluded.size();
+    let aside = |frame: usize| (0..monitors).filter(|&b| excluded.is_aside(frame, b)).count();
+    let frames: Vec<usize> = (0..frames).filter(|&frame| aside(frame) as f64 <= FEW * monitors as f64).collect();
+    frames.iter().filter(|&&frame| excluded.is_aside(frame, b)).count() as f64 / frames.len().max(1) as f64
 }
 
 /// Noise of a monitor where the level is ordinary [m]: as learnt from its repeats, or the header's at the scale of all.

@@ -27,10 +27,10 @@ const CHANCE: f64 = 1e-3;
 impl Stuck {
     /// Of each recording those that are not dead.
     pub fn all(data: &Data) -> Vec<Self> {
-        data.campaigns().flat_map(Self::of).collect()
+        data.campaigns().flat_map(Self::in_campaign).collect()
     }
 
-    fn of(own: &Data) -> Vec<Self> {
+    fn in_campaign(own: &Data) -> Vec<Self> {
         let names = own.ring.monitor_names();
         // where most monitors repeat their values there was no beam, or no new reading: that is said of the frames
         let monitors: Vec<usize> = (0..own.monitors()).collect();
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn a_monitor_that_repeats_a_value_is_told_and_a_lost_beam_is_not_that() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::of(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
         assert_eq!(Stuck::all(&data(&recording)), []);
         let mut broken = recording.clone();
         let value = broken.rows[100].reading[7];

@@ -41,8 +41,8 @@ const BENT: f64 = 0.025;
 
 impl Coordinates {
     /// For the ranges of a prior.
-    pub fn of(prior: &Prior) -> Self {
-        Self(prior.range.iter().map(|&range| Coordinate::of(range)).collect())
+    pub fn from_prior(prior: &Prior) -> Self {
+        Self(prior.range.iter().map(|&range| Coordinate::between(range)).collect())
     }
 
     /// The map of each param.
@@ -62,7 +62,7 @@ impl Coordinates {
 }
 
 impl Coordinate {
-    fn of([lower, upper]: [f64; 2]) -> Self {
+    fn between([lower, upper]: [f64; 2]) -> Self {
         Self { lower, upper, bend: BEND.min(BENT * (upper - lower)) }
     }
 
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn coordinates_without_bounds_are_those_of_the_params() {
         for range in [[0.94_f64, 1.06], [0.99, 1.02]] {
-            let one = Coordinate::of(range.map(f64::ln));
+            let one = Coordinate::between(range.map(f64::ln));
             for share in [0.01, 0.1, 0.4, 0.5, 0.8, 0.97] {
                 let theta = one.lower + share * (one.upper - one.lower);
                 let (u, h) = (one.unbounded(theta), 1e-4 * one.bend);

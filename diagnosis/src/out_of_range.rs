@@ -11,7 +11,7 @@ use super::average::Vars;
 
 /// A var beyond its range.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Beyond {
+pub struct OutOfRange {
     /// Name of the param.
     pub name: String,
     /// The quadrupoles that it scales.
@@ -25,10 +25,10 @@ pub struct Beyond {
 /// Standard deviations beyond a bound at which a normal number is on its other side with 95 %.
 const CERTAIN: f64 = 1.645;
 
-impl Beyond {
+impl OutOfRange {
     /// Those that are outside with 95 %.
     pub fn all(ring: &Ring, vars: &Vars) -> Vec<Self> {
-        let of = |(i, parameter): (usize, &twin::Parameter)| {
+        let if_outside = |(i, parameter): (usize, &twin::Parameter)| {
             let (mean, sigma) = (vars.mean[i], vars.covariance[(i, i)].sqrt());
             let [lower, upper] = parameter.prior.range.map(f64::ln);
             let is_outside = (mean - upper).max(lower - mean) > CERTAIN * sigma;
@@ -36,11 +36,11 @@ impl Beyond {
             let (name, quadrupoles) = (parameter.name.clone(), parameter.quadrupoles.len());
             is_outside.then_some(Self { name, quadrupoles, var, range: parameter.prior.range })
         };
-        ring.parameters.iter().enumerate().filter_map(of).collect()
+        ring.parameters.iter().enumerate().filter_map(if_outside).collect()
     }
 }
 
-impl fmt::Display for Beyond {
+impl fmt::Display for OutOfRange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let off = Measured { value: self.var.value - 1.0, sigma: self.var.sigma }.signed(100.0);
         let who = if self.quadrupoles == 1 { "quadrupole" } else { "quadrupole family" };
@@ -65,8 +65,8 @@ mod tests {
         vars.mean[at] = 0.92_f64.ln();
         // within two standard deviations of the bound
         vars.mean[at + 1] = 1.065_f64.ln();
-        let beyond = Beyond::all(&ring, &vars);
-        let said: Vec<String> = beyond.iter().map(Beyond::to_string).collect();
+        let beyond = OutOfRange::all(&ring, &vars);
+        let said: Vec<String> = beyond.iter().map(OutOfRange::to_string).collect();
         assert_eq!(said, ["quadrupole D8 is off by -8.00 ± 0.46 %, its range ends at -6 and +6 %"]);
     }
 }

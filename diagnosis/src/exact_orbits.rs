@@ -3,10 +3,9 @@
 //! A horizontal orbit of some mm in the dipoles focuses, as one in a sextupole does, and moves the tunes in proportion to the kick. The tune meter sees
 //! that in the mean of many frames, so that tunes of a campaign in which correctors and signs take turns seem to drift.
 
+use inference::Settings;
 use nalgebra::{DMatrix, MatrixXx2};
 use twin::{Cycle, Drives, EffectError, Machine, Tracked, Tunes};
-
-use super::settings::Settings;
 
 /// Exact orbits and tunes of every setting.
 pub struct Exact {
@@ -29,16 +28,16 @@ impl Exact {
     ///
     /// # Errors
     /// [`EffectError`] if the machine keeps no beam in one of the settings.
-    pub fn of(machine: &Machine, drives: &Drives) -> Result<Self, EffectError> {
-        let settings = Settings::of(drives);
+    pub fn from_machine(machine: &Machine, drives: &Drives) -> Result<Self, EffectError> {
+        let settings = Settings::from_drives(drives);
         let means = settings.means(drives);
         let tracked = Tracked::of(machine.clone(), drives.nominal_kick)?;
         let strength = vec![0.0; machine.ring().quadrupoles.len()];
         let cycle = |kick: Vec<f64>, rf_offset: f64| Cycle { kick, strength: strength.clone(), rf_offset, time: 0.0 };
         let still = cycle(vec![0.0; drives.kick.ncols()], 0.0);
         let (without, plain) = tracked.cycle(&still)?;
-        let at = |time: f64| Ok::<_, EffectError>(tracked.cycle(&Cycle { time, ..still.clone() })?.1);
-        let ends = if machine.drift() == 0.0 { None } else { Some([at(-1.0)?, at(1.0)?]) };
+        let tunes_at = |time: f64| Ok::<_, EffectError>(tracked.cycle(&Cycle { time, ..still.clone() })?.1);
+        let ends = if machine.drift() == 0.0 { None } else { Some([tunes_at(-1.0)?, tunes_at(1.0)?]) };
         let mut readings = DMatrix::zeros(settings.count(), without.len());
         let mut tunes = MatrixXx2::from_fn(settings.count(), |_, plane| [plain.x, plain.y][plane]);
         for (i, kick) in means.kick.row_iter().enumerate() {
@@ -72,11 +71,12 @@ mod tests {
     #[test]
     fn tunes_move_in_proportion_to_the_kicks() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let machine = Machine::new(ring, Rf::FixedMomentum, &[]).unwrap();
         let by = |scale: f64| {
             let drives = Drives { kick: &data.drives.kick * scale, ..data.drives.clone() };
-            let Exact { settings, tunes, without_kicks: Tunes { x, y }, .. } = Exact::of(&machine, &drives).unwrap();
+            let Exact { settings, tunes, without_kicks: Tunes { x, y }, .. } =
+                Exact::from_machine(&machine, &drives).unwrap();
             tunes.map_with_location(|_, plane, tune| tune - [x, y][plane]).select_rows(&settings.of_frame)
         };
         let (full, turned) = (by(1.0), by(-1.0));
@@ -96,7 +96,7 @@ mod tests {
         for seed in 0..4 {
             let truth = simulate::Truth { vars: &[1.0; 48], ..Default::default() };
             let made = simulate::campaign(&recording, &ring, &truth, &ideal(&ring), seed).unwrap();
-            let data = Data::of(&Campaign::of(&ring, &made).unwrap()).unwrap();
+            let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
             let at_supplies = ring.with_strengths(&ring.strengths(&[], &data.supplies));
             let design = Machine::new(at_supplies, Rf::FixedMomentum, &[]).unwrap();
             let optics = design.optics().unwrap();

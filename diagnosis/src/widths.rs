@@ -19,44 +19,16 @@ use core::ops::Range;
 
 use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
-use twin::{EffectKind, Measured, Plane, Ring, Site, Unit};
+use twin::{EffectKind, Measured, Unit};
 
 use super::data::Data;
-use super::feed_down;
+use super::family::{Family, Grouping, family_of};
 use super::fit::Fitted;
-use super::hypothesis::{Hypothesis, Member, Term, Unknown, members};
+use super::hypothesis::Hypothesis;
 use super::imperfection::{Imperfection, Measure};
 use super::scatter::{self, Scatter};
-
-/// Which members share an amplitude.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Grouping {
-    /// None.
-    Each,
-    /// Both planes of an instrument.
-    Instrument,
-    /// All in a plane.
-    Plane(Plane),
-    /// All.
-    All,
-    /// None, and each has a width of its own: that of the orbit in sextupole fields ([`super::feed_down`]), which each recording has for itself.
-    OfOrbit,
-}
-
-/// One property of all instruments or magnets of a sort.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Family {
-    /// The property, as the head of a table's row.
-    pub name: &'static str,
-    /// What is wrong with a member.
-    pub kind: EffectKind,
-    /// Which members share an amplitude.
-    pub grouping: Grouping,
-    /// Standard deviation that is ordinary, in the unit of the kind; of one whose members have their own, 1.
-    pub tolerance: f64,
-    /// Standard deviation of the amplitudes, in the same unit.
-    pub width: f64,
-}
+use super::term::Term;
+use super::unknown::{Member, Unknown};
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
 pub(super) const STANDS_OUT: f64 = 2.3;
@@ -65,191 +37,9 @@ pub(super) const STANDS_OUT: f64 = 2.3;
 const FAILS: f64 = -0.1;
 /// Share of its tolerance below which a family does not count.
 const NONE: f64 = 0.02;
-/// Share of the full width that dipoles which hide something have beside straights that do. Beside one such dipole the NEES per var is 2.1 (`average.rs`); 0.4
-/// would lower that, but make it 0.56 instead of 0.7 where nothing is hidden, the common case.
-const HIDDEN: f64 = 0.15;
 /// Steps of the widths at most, and the change, in tolerances, at which they have settled.
 const STEPS: usize = 30;
 const SETTLED: f64 = 0.01;
-
-/// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles;
-/// the planes of an instrument that reads or kicks in both are coupled by a per cent, each by itself: half of the sum of both couplings is one of these
-/// families, half of the difference a roll; a common
-/// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
-/// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
-///
-/// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
-const FAMILIES: [(&str, EffectKind, Grouping, f64); 17] = [
-    ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
-    ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
-    ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
-    ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
-    ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
-    ("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
-    ("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
-    ("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
-    ("gains of correctors", EffectKind::CorrectorGain, Grouping::Each, 0.02),
-    ("gain of all horizontal correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::X), 0.03),
-    ("gain of all vertical correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::Y), 0.03),
-    ("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
-    ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
-    ("couplings of monitors", EffectKind::BpmCoupling, Grouping::Instrument, 0.01),
-    ("couplings of correctors", EffectKind::CorrectorCoupling, Grouping::Instrument, 0.01),
-    ("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
-    ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, 0.001),
-];
-
-/// True for a kind of imperfection that vars absorb: a change of focusing.
-pub fn is_absorbed(kind: EffectKind) -> bool {
-    matches!(
-        kind,
-        EffectKind::DipoleGradient
-            | EffectKind::DipoleEdge
-            | EffectKind::DipoleSextupole
-            | EffectKind::MomentumOffset
-            | EffectKind::StrayGradient
-    )
-}
-
-impl Family {
-    /// All of them, and what the orbit adds that nobody knows.
-    pub fn all() -> Vec<Self> {
-        let of_orbit = Self {
-            name: "orbit in sextupoles",
-            kind: EffectKind::QuadRoll,
-            grouping: Grouping::OfOrbit,
-            tolerance: 1.0,
-            width: 1.0,
-        };
-        Self::of_machine().into_iter().chain([of_orbit]).collect()
-    }
-
-    /// Those of magnets and instruments, as wide as their tolerances.
-    pub fn of_machine() -> Vec<Self> {
-        let of = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
-            name,
-            kind,
-            grouping,
-            tolerance,
-            width: tolerance,
-        };
-        FAMILIES.iter().map(of).collect()
-    }
-
-    /// Its members; of a family that each recording has for itself those of each.
-    pub fn members(&self, data: &Data) -> Vec<Member> {
-        self.members_with_widths(data).map(|(member, _)| member).collect()
-    }
-
-    /// Its members as unknowns of a fit.
-    pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        self.members_with_widths(data).map(|(member, width)| Unknown::Ordinary(member, width)).collect()
-    }
-
-    fn members_with_widths(&self, data: &Data) -> impl Iterator<Item = (Member, f64)> {
-        let rolls: Vec<Vec<f64>> = match self.grouping {
-            Grouping::OfOrbit => data.campaigns().map(|own| feed_down::rolls(&own.ring, &own.baseline)).collect(),
-            _ => Vec::new(),
-        };
-        let width = move |member: &Member| match (member.campaign, member.terms[0].site) {
-            (Some(own), Site::Quadrupole(at)) => self.width * rolls[own][at],
-            _ => self.width,
-        };
-        let campaigns: Vec<Option<usize>> =
-            if self.is_of_each() { (0..data.count()).map(Some).collect() } else { vec![None] };
-        let of_each = move |terms: Vec<Term>| {
-            let member = move |campaign| Member { family: self.name, terms: terms.clone(), campaign };
-            campaigns.clone().into_iter().map(member)
-        };
-        let with_width = move |member: Member| {
-            let width = width(&member);
-            (width > 0.0).then_some((member, width))
-        };
-        self.terms(data).into_iter().flat_map(of_each).filter_map(with_width)
-    }
-
-    /// True for what each recording has for itself: the momentum and fields of eddy currents, which differ between two times in the cycle, and the orbit.
-    fn is_of_each(&self) -> bool {
-        self.grouping == Grouping::OfOrbit
-            || matches!(self.kind, EffectKind::MomentumOffset | EffectKind::DipoleSextupole)
-    }
-
-    /// Its effects, those that share an amplitude together.
-    fn terms(&self, data: &Data) -> Vec<Vec<Term>> {
-        let all = members(self.kind, data).into_iter();
-        let some: Vec<Vec<Term>> = match self.grouping {
-            Grouping::Each | Grouping::OfOrbit => {
-                return all.filter(|term| whole_of(self.kind) != Some(term.site)).map(|term| vec![term]).collect();
-            }
-            Grouping::Instrument => {
-                let element = |term: &Term| term.site.elements(&data.ring);
-                let mut all: Vec<Term> = all.collect();
-                all.sort_by_key(element);
-                return all.chunk_by(|one, other| element(one) == element(other)).map(<[Term]>::to_vec).collect();
-            }
-            Grouping::Plane(plane) => vec![all.filter(|term| plane_of(&data.ring, term.site) == Some(plane)).collect()],
-            Grouping::All => {
-                vec![all.filter(|term| whole_of(self.kind).is_none_or(|site| site == term.site)).collect()]
-            }
-        };
-        some.into_iter().filter(|terms| !terms.is_empty()).collect()
-    }
-
-    /// The same with room for what a recording cannot show, since the vars absorb it: as wide as one effect of its kind's prior at any one of the `n`
-    /// places that it may have makes it, `scale/sqrt(n)`; not so what many places share.
-    pub fn unseen(&self, data: &Data) -> Self {
-        let places = members(self.kind, data).len().max(1);
-        let is_single = self.grouping == Grouping::Each || places == 1;
-        let scale = self.kind.prior_scale().filter(|_| is_absorbed(self.kind) && is_single).unwrap_or(0.0);
-        Self { width: self.width.max(scale / (places as f64).sqrt()), ..*self }
-    }
-
-    /// What no fit holds, since the vars absorb it, and what widens them all the same: gradients and edge angles of single dipoles, by a share of the
-    /// width above.
-    pub fn hidden(data: &Data) -> Vec<Self> {
-        let of = |(name, kind)| {
-            let one = Self { name, kind, grouping: Grouping::Each, tolerance: 0.0, width: 0.0 }.unseen(data);
-            Self { width: HIDDEN * one.width, ..one }
-        };
-        [("gradients in dipoles", EffectKind::DipoleGradient), ("edge angles of dipoles", EffectKind::DipoleEdge)]
-            .map(of)
-            .into()
-    }
-
-    /// True if its width is learnt.
-    pub fn is_learnt(&self) -> bool {
-        matches!(self.grouping, Grouping::Each | Grouping::Instrument) && self.kind != EffectKind::StrayGradient
-    }
-
-    /// The instruments or magnets that it holds: `x`, `y`, `H`, `V` or `all`.
-    pub fn place(&self) -> &'static str {
-        match (self.grouping, self.kind) {
-            (Grouping::Plane(Plane::X), EffectKind::CorrectorGain) => "H",
-            (Grouping::Plane(Plane::Y), EffectKind::CorrectorGain) => "V",
-            (Grouping::Plane(Plane::X), _) => "x",
-            (Grouping::Plane(Plane::Y), _) => "y",
-            (Grouping::Each | Grouping::Instrument | Grouping::All | Grouping::OfOrbit, _) => "all",
-        }
-    }
-
-    /// `ln` prior of its width, relative to that of none.
-    pub fn log_prior(&self) -> f64 {
-        if self.is_learnt() { -0.5 * (self.width / self.tolerance).powi(2) } else { 0.0 }
-    }
-}
-
-/// The site that stands for the whole ring, of a kind that has one beside single places.
-fn whole_of(kind: EffectKind) -> Option<Site> {
-    (kind == EffectKind::DipoleEdge).then_some(Site::Ring)
-}
-
-fn plane_of(ring: &Ring, site: Site) -> Option<Plane> {
-    match site {
-        Site::Monitor(at) => Some(ring.monitors[at].plane),
-        Site::Corrector(at) => Some(ring.correctors[at].plane),
-        _ => None,
-    }
-}
 
 /// The vars and the members of the families in a fit: `1 + W G W` without its `W`, and `g`, in units of their priors and tolerances.
 struct Projected {
@@ -286,7 +76,7 @@ struct Widths {
 }
 
 impl Widths {
-    fn of(&self, whose: Whose) -> f64 {
+    fn width_of(&self, whose: Whose) -> f64 {
         match whose {
             Whose::Vars => self.vars.0,
             Whose::Family(f) => self.families[f],
@@ -302,7 +92,7 @@ impl Widths {
 
 impl Projected {
     /// From the normal matrix of a fit, of which the vars are the first unknowns and the members the last.
-    fn of(data: &Data, fitted: &Fitted) -> Option<Self> {
+    fn from_fit(data: &Data, fitted: &Fitted) -> Option<Self> {
         let Hypothesis { ordinary, scatter, .. } = &fitted.hypothesis;
         let sized = |(f, family): (usize, &Family)| {
             let scale = family.tolerance / family.width;
@@ -336,7 +126,7 @@ impl Projected {
     }
 
     fn posterior(&self, widths: &Widths) -> Option<Posterior> {
-        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.of(whose)));
+        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.width_of(whose)));
         let mut matrix = self.gram.clone();
         matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
         (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
@@ -373,15 +163,15 @@ impl Projected {
             let Some(posterior) = self.posterior(&widths) else { break };
             let Posterior { mean, variance, .. } = &posterior;
             let of_family = |(f, &width): (usize, &f64)| {
-                let own = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
-                let squares: f64 = own().map(|i| mean[i].powi(2)).sum();
-                let known: f64 = own().map(|i| 1.0 - variance[i]).sum();
+                let members = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
+                let squares: f64 = members().map(|i| mean[i].powi(2)).sum();
+                let known: f64 = members().map(|i| 1.0 - variance[i]).sum();
                 let next = width * (squares / (known + width.powi(2)).max(f64::MIN_POSITIVE)).sqrt();
                 if is_learnt[f] { next } else { width }
             };
             let (squares, known) = self.scatter(&posterior);
             let next = Widths {
-                vars: Scatter::of(squares * widths.vars.0.powi(2), known),
+                vars: Scatter::from_squares(squares * widths.vars.0.powi(2), known),
                 families: widths.families.iter().enumerate().map(of_family).collect(),
             };
             let moved = next.moved(&widths);
@@ -397,7 +187,7 @@ impl Projected {
 /// The hypothesis of a fit with the widths that its recording shows, of vars and families; families that it shows none of are left out.
 pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
     let mut hypothesis = fitted.hypothesis.clone();
-    let Some(projected) = Projected::of(data, fitted) else { return hypothesis };
+    let Some(projected) = Projected::from_fit(data, fitted) else { return hypothesis };
     let families = &mut hypothesis.ordinary;
     let of_families = families.iter().map(|family| family.width / family.tolerance).collect();
     let is_learnt: Vec<bool> = families.iter().map(Family::is_learnt).collect();
@@ -421,8 +211,8 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
         })
         .collect();
     let most = |family: &Family| {
-        let own = members.iter().filter(|(member, u, _)| member.family == family.name && *u > STANDS_OUT);
-        own.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
+        let outstanding = members.iter().filter(|(member, u, _)| member.family == family.name && *u > STANDS_OUT);
+        outstanding.max_by(|(_, one, _), (_, other, _)| one.total_cmp(other))
     };
     let stands_out = fitted.hypothesis.ordinary.iter().filter(|family| family.is_learnt()).filter_map(most);
     let proposed = |(member, _, amplitude): &(&Member, f64, f64)| {
@@ -430,15 +220,6 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
         member.terms.iter().copied().chain(failed).collect::<Vec<_>>()
     };
     stands_out.flat_map(proposed).collect()
-}
-
-/// The kind of the family that an effect of an instrument is a member of: a dead instrument has a gain error of -1, a reversed one of -2.
-pub fn family_of(kind: EffectKind) -> EffectKind {
-    match kind {
-        EffectKind::BpmDead | EffectKind::BpmPolarity => EffectKind::BpmGain,
-        EffectKind::CorrectorDead | EffectKind::CorrectorPolarity => EffectKind::CorrectorGain,
-        other => other,
-    }
 }
 
 /// The instrument of a gain dead, and reversed, where it may be that.
@@ -466,17 +247,17 @@ pub fn rows(data: &Data, fitted: &Fitted) -> Vec<Imperfection> {
         ordinary: data.units.sigma.mean(),
     }];
     for family in families {
-        let own = at..at + family.members(data).len();
-        at = own.end;
+        let places = at..at + family.members(data).len();
+        at = places.end;
         let width = family.width;
         let (value, sigma) = match family.grouping {
-            _ if own.is_empty() => continue,
+            _ if places.is_empty() => continue,
             Grouping::Each | Grouping::Instrument if family.is_learnt() => {
-                (width, width / information(&covariance, own).sqrt())
+                (width, width / information(&covariance, places).sqrt())
             }
             Grouping::Each | Grouping::Instrument | Grouping::OfOrbit => continue,
             Grouping::Plane(_) | Grouping::All => {
-                (fitted.u[own.start] * width, covariance[(own.start, own.start)].sqrt() * width)
+                (fitted.u[places.start] * width, covariance[(places.start, places.start)].sqrt() * width)
             }
         };
         rows.push(Imperfection {
@@ -541,10 +322,11 @@ mod tests {
             let power = if seed % 2 == 0 { 0.5 } else { 1.0 };
             made.vars.iter_mut().for_each(|var| *var = var.powf(power));
             let rms = (made.vars.iter().map(|var| var.ln().powi(2)).sum::<f64>() / made.vars.len() as f64).sqrt();
-            let data = Data::of(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
-            let first = Fitted::of(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
+            let data =
+                Data::from_campaign(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+            let first = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
             let hypothesis = learnt(&data, &first);
-            let fitted = Fitted::of(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
+            let fitted = Fitted::from_guess(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
             let row = rows(&data, &fitted).into_iter().find(|row| row.kind == "var").unwrap().measured;
             println!("{rms:.4} {:.4} {:.4}", row.value, row.sigma);
             assert!(row.sigma < 0.15 * row.value);
@@ -558,7 +340,7 @@ mod tests {
     #[test]
     fn families_hold_every_instrument_once() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
         assert_eq!(of("gains of monitors").len(), 33);
         let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
@@ -575,10 +357,10 @@ mod tests {
     #[test]
     fn ordinary_imperfections_are_of_first_order() {
         let (ring, recording) = template();
-        let data = Data::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let plain = Hypothesis::plain();
-        let first = Fitted::of(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
-        let second = Fitted::of(&data, &plain, &first.u).unwrap();
+        let first = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
+        let second = Fitted::from_guess(&data, &plain, &first.u).unwrap();
         let off = |fitted: &Fitted| (fitted.residual_of(&data).unwrap() - &fitted.residual).norm();
         let (first, second) = (off(&first), off(&second));
         println!("{first} {second}");

@@ -5,7 +5,7 @@
 
 use nalgebra::{DMatrix, DVector, DVectorView};
 
-use super::common::{Common, Eliminated, Weighed};
+use super::common_terms::{Common, Eliminated, Weighed};
 use crate::optimise::Quadratic;
 use crate::prior::Prior;
 use evidence::Factor;

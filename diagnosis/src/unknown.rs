@@ -1,0 +1,87 @@
+//! The unknowns of a fit besides the vars.
+
+use twin::{EffectKind, Plane};
+
+use super::element::Form;
+use super::term::Term;
+
+/// One unknown besides the vars, with its prior standard deviation.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Unknown {
+    /// The amplitude of a term.
+    Amplitude(usize, f64),
+    /// The orbit of a recording at an element, in x or y [m].
+    Orbit(usize, usize, Plane, f64),
+    /// The strength of a form of an unknown element near a quadrupole.
+    Form(usize, Form, f64),
+    /// One ordinary imperfection.
+    Ordinary(Member, f64),
+}
+
+/// Effects that share an amplitude.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Member {
+    /// The family's name: two may hold the same effect.
+    pub family: &'static str,
+    /// The effects.
+    pub terms: Vec<Term>,
+    /// The recording in which they have it; none if they have it in all.
+    pub campaign: Option<usize>,
+}
+
+/// Least gain error that a fit is linearised about: the derivative is the signature over `1 + a`, and both vanish at -1.
+const LEAST_GAIN: f64 = -0.5;
+
+impl Member {
+    /// True for a gain of monitors or correctors.
+    fn is_gain(&self) -> bool {
+        self.terms.iter().all(|term| matches!(term.kind, EffectKind::BpmGain | EffectKind::CorrectorGain))
+    }
+
+    /// What its amplitude multiplies readings or kicks by, if it is a gain; 1 of another.
+    pub(crate) fn factor(&self, amplitude: f64) -> f64 {
+        if self.is_gain() { 1.0 + amplitude } else { 1.0 }
+    }
+
+    /// True if it acts in a recording.
+    pub(crate) fn is_in(&self, campaign: usize) -> bool {
+        self.campaign.is_none_or(|own| own == campaign)
+    }
+}
+
+/// True for a kind of imperfection that vars absorb: a change of focusing.
+pub fn is_absorbed(kind: EffectKind) -> bool {
+    matches!(
+        kind,
+        EffectKind::DipoleGradient
+            | EffectKind::DipoleEdge
+            | EffectKind::DipoleSextupole
+            | EffectKind::MomentumOffset
+            | EffectKind::StrayGradient
+    )
+}
+
+impl Unknown {
+    /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
+    /// evaluated for the same machine.
+    pub(crate) fn is_of_first_order(&self) -> bool {
+        matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
+    }
+
+    /// The least that it is where a fit is linearised about it, in prior standard deviations.
+    pub(crate) fn least_start(&self) -> f64 {
+        match self {
+            Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,
+            _ => f64::NEG_INFINITY,
+        }
+    }
+
+    /// Its prior standard deviation.
+    pub fn sigma(&self) -> f64 {
+        match self {
+            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(.., sigma) | Self::Ordinary(_, sigma) => {
+                *sigma
+            }
+        }
+    }
+}
