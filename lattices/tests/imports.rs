@@ -43,7 +43,7 @@ fn tunes(folder: &Folder) -> Tunes {
 
 /// The response [mm/mrad] of the lattice as written.
 fn response(folder: &Folder) -> DMatrix<f64> {
-    Model::of(folder, &groups(folder).into(), Rf::FixedMomentum).unwrap().as_written().unwrap()
+    Model::of(folder, &groups(folder), Rf::FixedMomentum).unwrap().as_written().unwrap()
 }
 
 fn conventions() -> Conventions {

@@ -26,7 +26,7 @@ pub struct Agreement {
 /// # Errors
 /// [`MeasuredError`]: the lattice makes no ring, or has no closed orbit.
 pub fn agreement(folder: &Folder, rf: Rf) -> Result<Vec<Agreement>, MeasuredError> {
-    let written = Model::of(folder, &groups(folder).into(), rf)?.as_written()?;
+    let written = Model::of(folder, &groups(folder), rf)?.as_written()?;
     let of_plane = |plane: Plane| {
         let rows = folder.monitors.iter().enumerate().filter(move |(_, one)| one.plane == plane);
         let columns = |row| {
