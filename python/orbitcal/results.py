@@ -209,9 +209,9 @@ class DiagnosisResult(_Result):
         values = json.loads(outcome.json)
         changed = {
             "findings": [Finding.of_json(one) for one in values["findings"]],
-            "monitors": _each(Monitor, values.get("monitors", values["fit"].get("monitors", []))),
+            "monitors": _each(Monitor, values.get("monitors", [])),
             "vars_before": _each(Var, values.get("vars_before", [])),
-            "vars_after": _each(Var, values.get("vars_after", values["fit"].get("vars", []))),
+            "vars_after": _each(Var, values.get("vars_after", [])),
             "tunes": _tunes(values.get("tunes")),
         }
         return cls(outcome, **{**_known(cls, values), **changed})
