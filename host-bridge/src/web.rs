@@ -5,10 +5,11 @@
 
 mod board;
 mod metrics;
+mod place;
 mod server;
 mod state;
 mod trail;
 
 pub use board::Board;
+pub use place::Place;
 pub use server::start;
-pub use state::Place;

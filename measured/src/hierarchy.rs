@@ -92,7 +92,7 @@ impl Posterior {
 }
 
 impl Hierarchy {
-    /// Of a fitted measurement, some members of families released.
+    /// Of a fitted measurement.
     ///
     /// # Errors
     /// [`MeasuredError`].
@@ -137,12 +137,8 @@ impl Hierarchy {
             (family.mean, family.scale) = known.map_or((family.mean, family.scale), |one| (one.mean, one.scale));
         }
         let Self { groups, unknowns, values, classes, missed, .. } = self;
-        Start { groups, unknowns, values, classes, families, missed, released }.settle(
-            &model,
-            data,
-            ROUNDS - 1,
-            progress,
-        )
+        let start = Start { groups, unknowns, values, classes, families, missed, released };
+        start.settle(&model, data, ROUNDS - 1, progress)
     }
 
     /// Precision of the prior in widths.
@@ -202,6 +198,27 @@ struct Start {
     released: Vec<usize>,
 }
 
+/// The likelihood about some values, with distances in widths of the priors.
+struct Linearised {
+    residual: DMatrix<f64>,
+    weight: DMatrix<f64>,
+    information: DMatrix<f64>,
+    slope: DVector<f64>,
+    /// What the means of the families expect.
+    expected: DVector<f64>,
+    /// Distance of the values from it.
+    off: DVector<f64>,
+}
+
+/// What stays while a fit settles.
+struct Scene<'s> {
+    model: &'s Model,
+    data: &'s Data,
+    places: Places,
+    width: DVector<f64>,
+    mean: DVector<f64>,
+}
+
 impl Start {
     /// Linearise, learn and go on, in turn.
     fn settle(
@@ -211,74 +228,102 @@ impl Start {
         rounds: usize,
         progress: &mut dyn FnMut(&str),
     ) -> Result<Hierarchy, MeasuredError> {
-        let n = self.unknowns.len();
-        let width = DVector::from_iterator(n, self.unknowns.iter().map(|one| one.width));
-        let mean = DVector::from_iterator(n, self.unknowns.iter().map(|one| one.mean));
         let (rows, columns) = data.measured.shape();
+        let each = |of: fn(&Unknown) -> f64| DVector::from_iterator(self.unknowns.len(), self.unknowns.iter().map(of));
         let places = Places::of(&self.unknowns, rows, columns);
+        let scene = Scene { model, data, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
         let mut damping = DAMPING;
-        for round in 0.. {
+        for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
-            let residual = data.residual(&prediction);
-            let weight = data.weight(&self.missed, &residual);
-            let normal = Normal::of(&places, &prediction, &residual, &weight, n);
-            let information = times(normal.matrix, &width);
-            let expected = &mean + means(&self.families, n).component_mul(&width);
-            let here = (&self.values - &expected).component_div(&width);
-            let slope = normal.slope.component_mul(&width);
-            let whole = &slope + &information * &here;
-            let posterior =
-                Posterior::of_families(information, whole, &self.families)?.learn(&mut self.families, STEPS)?;
-            let covariance = times(posterior.covariance.clone(), &width);
-            if round == rounds {
-                let information = times(posterior.information.clone(), &width.map(f64::recip));
-                let uncertainty =
-                    Uncertainty::about((&places, &prediction), (covariance, information), (data, &self.missed));
-                let Self { groups, unknowns, values, classes, families, missed, released } = self;
-                return Ok(Hierarchy {
-                    groups,
-                    unknowns,
-                    values,
-                    classes,
-                    families,
-                    released,
-                    posterior,
-                    missed,
-                    residual,
-                    uncertainty,
-                    prediction,
-                });
-            }
-            let prior = precision(&self.families, n);
-            let distance = |values: &DVector<f64>, prediction: &Prediction| {
-                let (left, off) = (data.residual(prediction), (values - &expected).component_div(&width));
-                left.component_mul(&left).dot(&weight) + off.dot(&(&prior * &off))
-            };
-            let now = distance(&self.values, &prediction);
-            let downhill = slope - &prior * &here;
-            while damping < STUCK {
-                let mut damped = &posterior.information + &prior;
-                (0..n).for_each(|i| damped[(i, i)] *= 1.0 + damping);
-                let step = Cholesky::new(damped).ok_or(MeasuredError::Singular(round))?.solve(&downhill);
-                let there = &self.values + step.component_mul(&width);
-                match model.predict(&self.unknowns, &there) {
-                    Ok(better) if distance(&there, &better) <= now => {
-                        (self.values, prediction) = (there, better);
-                        damping *= 0.1;
-                        break;
-                    }
-                    _ => damping *= 10.0,
-                }
-            }
-            damping = damping.clamp(DAMPING, 1.0);
+            let here = self.linearise(&scene, &prediction);
+            let posterior = here.posterior(&self.families)?.learn(&mut self.families, STEPS)?;
+            prediction = self.descend(&scene, &here, prediction, &mut damping)?;
             for family in &mut self.families {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
             }
-            let left = data.residual(&prediction);
-            self.missed = learn_missed(data, &places, &prediction, (&left, &covariance), &self.missed);
+            let (left, covariance) = (data.residual(&prediction), times(posterior.covariance, &scene.width));
+            self.missed = learn_missed(data, &scene.places, &prediction, (&left, &covariance), &self.missed);
         }
-        unreachable!("the last round returns")
+        let here = self.linearise(&scene, &prediction);
+        let posterior = here.posterior(&self.families)?.learn(&mut self.families, STEPS)?;
+        let covariance = times(posterior.covariance.clone(), &scene.width);
+        let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
+        let uncertainty =
+            Uncertainty::about((&scene.places, &prediction), (covariance, information), (data, &self.missed));
+        let Self { groups, unknowns, values, classes, families, missed, released } = self;
+        let residual = here.residual;
+        Ok(Hierarchy {
+            groups,
+            unknowns,
+            values,
+            classes,
+            families,
+            released,
+            posterior,
+            missed,
+            residual,
+            uncertainty,
+            prediction,
+        })
+    }
+
+    fn linearise(&self, scene: &Scene, prediction: &Prediction) -> Linearised {
+        let n = self.unknowns.len();
+        let residual = scene.data.residual(prediction);
+        let weight = scene.data.weight(&self.missed, &residual);
+        let normal = Normal::of(&scene.places, prediction, &residual, &weight, n);
+        let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
+        Linearised {
+            information: times(normal.matrix, &scene.width),
+            slope: normal.slope.component_mul(&scene.width),
+            off: (&self.values - &expected).component_div(&scene.width),
+            residual,
+            weight,
+            expected,
+        }
+    }
+
+    /// A damped step downhill: the longest one that is not worse, none where no step helps.
+    fn descend(
+        &mut self,
+        scene: &Scene,
+        here: &Linearised,
+        prediction: Prediction,
+        damping: &mut f64,
+    ) -> Result<Prediction, MeasuredError> {
+        let prior = precision(&self.families, self.unknowns.len());
+        let distance = |values: &DVector<f64>, prediction: &Prediction| {
+            let left = scene.data.residual(prediction);
+            let off = (values - &here.expected).component_div(&scene.width);
+            left.component_mul(&left).dot(&here.weight) + off.dot(&(&prior * &off))
+        };
+        let now = distance(&self.values, &prediction);
+        let downhill = &here.slope - &prior * &here.off;
+        let whole = &here.information + &prior;
+        while *damping < STUCK {
+            let mut damped = whole.clone();
+            (0..downhill.len()).for_each(|i| damped[(i, i)] *= 1.0 + *damping);
+            let step = Cholesky::new(damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
+            let there = &self.values + step.component_mul(&scene.width);
+            match scene.model.predict(&self.unknowns, &there) {
+                Ok(better) if distance(&there, &better) <= now => {
+                    self.values = there;
+                    *damping = (*damping * 0.1).clamp(DAMPING, 1.0);
+                    return Ok(better);
+                }
+                _ => *damping *= 10.0,
+            }
+        }
+        *damping = 1.0;
+        Ok(prediction)
+    }
+}
+
+impl Linearised {
+    fn posterior(&self, families: &[Family]) -> Result<Posterior, MeasuredError> {
+        let slope = &self.slope + &self.information * &self.off;
+        Posterior::of_families(self.information.clone(), slope, families)
     }
 }
 

@@ -7,6 +7,7 @@ use twin::{Hold, Optics, Parameter, ParameterPrior, Ring};
 
 use crate::instruments::Instruments;
 use crate::network::layers::Network;
+pub use crate::network::samples::TUNE_CUT;
 use crate::network::{OtherRing, PLANES};
 use crate::response::{CoreResponse, network_responses, network_responses_f32, responses};
 use crate::tables::{LINE, Tables};
@@ -39,8 +40,6 @@ pub struct SurrogateError {
 
 /// Each var is drawn evenly within so many widths of its prior from 1, and within its range: 0.94 to 1.06 by default.
 const WIDTHS: f64 = 2.0;
-/// Largest distance of a tune from the design that the paper's data allow.
-pub const TUNE_CUT: f64 = 0.05;
 /// Kick at which the error is measured [rad]: the Booster's from -22 A to +22 A. Tables know of no campaign; its kicks are smaller
 /// as a rule, and the error is proportional to them.
 const FULL_SWING: f64 = 0.4e-3;

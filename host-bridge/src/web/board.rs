@@ -8,7 +8,7 @@ use results::EstimateRecord;
 use shared_memory::now_ns;
 
 use super::metrics::Metrics;
-use super::state::Place;
+use super::place::Place;
 use super::trail::Trails;
 use crate::health::HealthRecord;
 use crate::history::History;

@@ -8,8 +8,9 @@ use rand_distr::{Distribution, StandardNormal};
 use twin::{Hold, Optics, Ring, VariedRing};
 
 use super::settings::of_var;
-use crate::check::TUNE_CUT;
 
+/// Largest distance of a tune from the design that the paper's data allow.
+pub const TUNE_CUT: f64 = 0.05;
 /// Setting of a corrector [A].
 pub const SETTING: f64 = 22.0;
 /// Kick of a corrector [rad/A].
