@@ -157,6 +157,6 @@ impl Core {
         let estimate = self.core.ingest(bytes).map_err(input)?;
         let mismatch = self.core.fit_quality().is_mismatch();
         let covariance = self.core.spread().covariance();
-        Ok(Estimate::from_core(EstimateRecord::of(&self.names, estimate, &covariance, Some(mismatch)), None))
+        Ok(Estimate::of(EstimateRecord::of(&self.names, estimate, &covariance, Some(mismatch)), None))
     }
 }

@@ -32,7 +32,7 @@ impl Subscriber {
             let left = end.saturating_duration_since(Instant::now());
             if !published.is_empty() || left.is_zero() {
                 let each =
-                    published.into_iter().map(|one| Estimate::from_core(one.record, Some(one.stamp.publisher.to_string())));
+                    published.into_iter().map(|one| Estimate::of(one.record, Some(one.stamp.publisher.to_string())));
                 return Ok(each.collect());
             }
             py.detach(|| std::thread::sleep(left.min(OFTEN)));
