@@ -10,6 +10,7 @@ use twin::Rf;
 
 use crate::data::Data;
 use crate::error::MeasuredError;
+use crate::family::Family;
 use crate::fit::{Fit, Settings, fit};
 use crate::folder::Folder;
 use crate::held_out::{Fitted, HeldOut};
@@ -28,6 +29,8 @@ const SEARCHES: usize = 4;
 const WORSE: f64 = 2.5;
 /// Probability beforehand of a wrong cable, and of another hold.
 const RARE: f64 = 1e-3;
+/// Scatters of an ordinary ring that are large.
+const LARGE: f64 = 2.0;
 /// Standard errors that held-out elements must gain.
 const PREDICTS: f64 = 2.0;
 
@@ -139,8 +142,17 @@ pub struct Imperfection {
     pub mean: f64,
     /// Scatter about it.
     pub scatter: f64,
+    /// That of an ordinary ring.
+    pub ordinary: f64,
     /// Standard deviation of one member, median.
     pub sigma: f64,
+}
+
+impl Imperfection {
+    /// True where the kind scatters by far more than in an ordinary ring.
+    pub fn is_large(&self) -> bool {
+        self.scatter > LARGE * self.ordinary
+    }
 }
 
 /// What would be named.
@@ -343,6 +355,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             count: family.members.len(),
             mean: family.mean * width,
             scatter: family.variance().sqrt() * width,
+            ordinary: Family::ordinary() * width,
             sigma: sigma[sigma.len() / 2],
         }
     });

@@ -136,6 +136,11 @@ impl Family {
         if self.is_learnt() { NORMAL * self.scale * self.scale } else { self.scale * self.scale }
     }
 
+    /// Standard deviation of the members of an ordinary ring in widths of the prior.
+    pub fn ordinary() -> f64 {
+        NORMAL.sqrt() * START
+    }
+
     /// Begin with the mean of some values.
     pub fn mean_from(&mut self, unknowns: &[Unknown], values: &DVector<f64>) {
         if self.has_mean() {

@@ -173,10 +173,16 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
     let worse = (!worst.is_empty())
         .then(|| format!("readings of {} are explained worse than those of others", worst.join(", ")));
     let nothing = findings.is_empty() && fitted.has_ended;
+    let large = diagnosis.imperfections.iter().filter(|one| one.is_large()).map(|one| {
+        let [scatter, ordinary] = [one.scatter, one.ordinary].map(|value| number(value, unit(one.word)));
+        format!("{} of {} scatters by {scatter}, in an ordinary ring by {ordinary}", one.word, one.class)
+    });
+    let large: Vec<String> = if fitted.has_ended { large.collect() } else { Vec::new() };
     let parts: Vec<String> = (doubt.into_iter())
         .chain(nothing.then(|| "nothing stands out of what its kind does everywhere".to_owned()))
         .chain(findings.iter().take(SAID).map(|finding| finding.sentence.clone()))
         .chain((more > 0).then(|| format!("{more} more are listed")))
+        .chain(large)
         .chain(worse)
         .collect();
     parts.join("; ")
@@ -186,6 +192,14 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
 fn unit(kind: &str) -> &'static str {
     let is_integrated = ["skew_gradient", "stray_gradient", "dipole_gradient"].contains(&kind);
     if is_integrated { "1/m" } else { "1" }
+}
+
+/// A number as people read it.
+fn number(value: f64, unit: &str) -> String {
+    match unit {
+        "1/m" => format!("{value:.5} /m"),
+        _ => format!("{:.2} %", 1e2 * value),
+    }
 }
 
 /// An amplitude as people read it.
@@ -366,11 +380,7 @@ impl fmt::Display for MatrixDiagnosis {
         writeln!(f, "{}\n", fill(&predicted))?;
         let mut rows = table(["ordinary", "of", "members", "mean", "scatter", "sigma of one"]);
         for one in &self.imperfections {
-            let number = |value: f64| match one.unit {
-                "1/m" => format!("{value:.5} /m"),
-                _ => format!("{:.2} %", 1e2 * value),
-            };
-            let numbers = [one.mean, one.scatter, one.sigma].map(number);
+            let numbers = [one.mean, one.scatter, one.sigma].map(|value| number(value, one.unit));
             rows.add_row([one.kind.into(), one.at.clone(), one.members.to_string()].into_iter().chain(numbers));
         }
         write!(f, "{rows}")?;
