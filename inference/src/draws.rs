@@ -60,13 +60,13 @@ pub struct Summary {
     pub q84: f64,
     /// 97.5 % quantile.
     pub q975: f64,
-    /// Monte Carlo standard error of the mean ([`mcse_mean`]).
+    /// Monte Carlo standard error of the mean (`mcse_mean`).
     pub mcse_mean: f64,
-    /// Agreement of the chains ([`r_hat`]) [1].
+    /// Agreement of the chains (`r_hat`) [1].
     pub r_hat: f64,
-    /// Effective sample size of the middle ([`ess_bulk`]) [1].
+    /// Effective sample size of the middle (`ess_bulk`) [1].
     pub ess_bulk: f64,
-    /// Effective sample size of the tails ([`ess_tail`]) [1].
+    /// Effective sample size of the tails (`ess_tail`) [1].
     pub ess_tail: f64,
 }
 

@@ -1,6 +1,6 @@
 //! The reference: full NUTS on the exact posterior.
 //!
-//! The sampler is nuts-rs; here it is given the density in whitened coordinates (see [`crate::posterior`]), each chain from
+//! The sampler is nuts-rs; here it is given the density in whitened coordinates (see `posterior.rs`), each chain from
 //! the MAP, and its draws come back as vars. The seed fixes every draw, whatever the number of threads.
 //!
 //! Source: M. D. Hoffman and A. Gelman, J. Mach. Learn. Res. 15 (2014) 1593; A. Seyboldt, nuts-rs.

@@ -48,7 +48,7 @@ impl Instruments {
 
 /// The recording with readings that the twin at `vars` would have given; `seed` fixes noise and baselines.
 ///
-/// Each frame has its own kicks and supply currents (these to first order, see [`crate::readings`]) and the exact orbit of
+/// Each frame has its own kicks and supply currents (these to first order, see `readings.rs`) and the exact orbit of
 /// its RF offset.
 ///
 /// # Errors

@@ -109,7 +109,7 @@ impl Truth {
     /// Read the key of a recording.
     ///
     /// # Errors
-    /// [`TruthError`].
+    /// A file that cannot be read, or a key that is none.
     pub fn read(folder: &Path, ring: &Ring) -> Result<Self, TruthError> {
         let path = folder.join("truth.json");
         let wrong = |what: String| TruthError { path: path.display().to_string(), what };
