@@ -194,6 +194,12 @@ fn unit(kind: &str) -> &'static str {
     if is_integrated { "1/m" } else { "1" }
 }
 
+/// A relative distance as people read it.
+fn beside(amplitude: f64, sigma: f64) -> String {
+    let word = if amplitude < 0.0 { "less" } else { "more" };
+    format!("{:.1} ± {:.1} % {word}", 1e2 * amplitude.abs(), 1e2 * sigma)
+}
+
 /// A number as people read it.
 fn number(value: f64, unit: &str) -> String {
     match unit {
@@ -273,8 +279,12 @@ fn member_sentence(kind: Kind, finding: &Finding) -> String {
     let Finding { word, at, amplitude, sigma, probability, .. } = finding;
     let size = size(*amplitude, *sigma, unit(word));
     let said = match kind {
-        Kind::MonitorGain(_) => format!("{at} reads {size} of what other monitors of its plane do"),
-        Kind::CorrectorGain(_) => format!("{at} kicks {size} of what other correctors of its plane do"),
+        Kind::MonitorGain(_) => {
+            format!("{at} reads {} than the other monitors of its plane", beside(*amplitude, *sigma))
+        }
+        Kind::CorrectorGain(_) => {
+            format!("{at} kicks {} than the other correctors of its plane", beside(*amplitude, *sigma))
+        }
         Kind::MonitorCoupling(_) => format!("{at} reads {size} of the other plane"),
         Kind::CorrectorCoupling(_) => format!("{at} kicks {size} of its kick in the other plane"),
         Kind::Strength(_) => format!("{at} is {size} off the strengths of its kind"),
