@@ -239,8 +239,8 @@ fn released(
             break;
         }
         found.outliers.extend(further.outliers);
-        let released = found.outliers.iter().map(|outlier| outlier.unknown).collect();
-        hierarchy = hierarchy.with_released(folder, (&fitted.data, settings), released, progress)?;
+        let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
+        hierarchy = hierarchy.with_released(folder, (&fitted.data, settings), &released, progress)?;
     }
     found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
     found.outliers.retain(Outlier::stands_out);

@@ -39,8 +39,6 @@ pub struct Hierarchy {
     pub classes: Vec<String>,
     /// Families, with their scales.
     pub families: Vec<Family>,
-    /// Members with the prior of the fit for themselves.
-    pub released: Vec<usize>,
     /// Posterior about the last linearisation.
     pub posterior: Posterior,
     /// What the model misses in each block.
@@ -115,11 +113,11 @@ impl Hierarchy {
         }
         let model = Model::of(folder, &groups, settings.rf)?;
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
-        let start = Start { groups, unknowns, values, classes, families, missed: fitted.missed, released: Vec::new() };
+        let start = Start { groups, unknowns, values, classes, families, missed: fitted.missed };
         start.settle(&model, &fitted.data, ROUNDS, progress)
     }
 
-    /// The same with further members released, linearised anew.
+    /// The same with some members released, linearised anew.
     ///
     /// # Errors
     /// [`MeasuredError`].
@@ -127,17 +125,17 @@ impl Hierarchy {
         self,
         folder: &Folder,
         (data, settings): (&Data, &Settings),
-        released: Vec<usize>,
+        released: &[usize],
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
         let model = Model::of(folder, &self.groups, settings.rf)?;
-        let mut families = families(folder, &self.groups, &self.unknowns, &released);
+        let mut families = families(folder, &self.groups, &self.unknowns, released);
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
             (family.mean, family.scale) = known.map_or((family.mean, family.scale), |one| (one.mean, one.scale));
         }
         let Self { groups, unknowns, values, classes, missed, .. } = self;
-        let start = Start { groups, unknowns, values, classes, families, missed, released };
+        let start = Start { groups, unknowns, values, classes, families, missed };
         start.settle(&model, data, ROUNDS - 1, progress)
     }
 
@@ -195,7 +193,6 @@ struct Start {
     classes: Vec<String>,
     families: Vec<Family>,
     missed: [Missed; 6],
-    released: Vec<usize>,
 }
 
 /// The likelihood about some values, with distances in widths of the priors.
@@ -251,7 +248,7 @@ impl Start {
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
         let uncertainty =
             Uncertainty::about((&scene.places, &prediction), (covariance, information), (data, &self.missed));
-        let Self { groups, unknowns, values, classes, families, missed, released } = self;
+        let Self { groups, unknowns, values, classes, families, missed } = self;
         let residual = here.residual;
         Ok(Hierarchy {
             groups,
@@ -259,7 +256,6 @@ impl Start {
             values,
             classes,
             families,
-            released,
             posterior,
             missed,
             residual,

@@ -57,7 +57,7 @@ pub struct Outlier {
 impl Outlier {
     /// True where it is so much more probable than nothing that it is named, or one of its alternatives is.
     pub fn stands_out(&self) -> bool {
-        self.gain + self.prior > (NAMED / (1.0 - NAMED)).ln()
+        is_decisive(self.gain + self.prior)
     }
 
     /// The same by a fit in which it is released, and the scatter of its family is that of the others alone.
@@ -76,6 +76,11 @@ impl Outlier {
         }
         self
     }
+}
+
+/// True of `ln` odds at which something is named beside nothing.
+fn is_decisive(log_odds: f64) -> bool {
+    log_odds > (NAMED / (1.0 - NAMED)).ln()
 }
 
 /// `ln` Bayes factor of a further amplitude [widths] that is estimated with some variance, in a family whose scatter so many others tell.
@@ -265,8 +270,7 @@ impl Members {
 
     /// Amplitude that a member must have to be named [widths], beside those that are released; the largest of a prior where none is.
     fn limit(&self, member: usize) -> f64 {
-        let is_named =
-            |amplitude: f64| self.gain_of(member, amplitude) + self.prior[member] > (NAMED / (1.0 - NAMED)).ln();
+        let is_named = |amplitude: f64| is_decisive(self.gain_of(member, amplitude) + self.prior[member]);
         let (mut low, mut high) = (0.0, LARGEST);
         while high - low > 1e-3 * high {
             let middle = 0.5 * (low + high);
