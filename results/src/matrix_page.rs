@@ -91,7 +91,7 @@ impl Measured<'_> {
             &axes.along(self.strip(marked)),
             &[of_plane(Plane::X, "x", &rms), of_plane(Plane::Y, "y", &rms)],
         );
-        let caption = "Measured less predicted over all correctors. Below: the lattice, to scale in s.".to_owned();
+        let caption = "Measured less predicted over all correctors, by the fit as LOCO has it. Below: the lattice, to scale in s.".to_owned();
         let mut figures = vec![(caption, figure)];
         figures.extend(self.map());
         let row = |one: &crate::matrix_result::BlockError| {
