@@ -156,7 +156,7 @@ fn correctors(folder: &Folder, fitted: &Fit) -> Vec<Corrector> {
 /// The lattice of the folder with what the fit has found of dipoles, skew gradients and instruments.
 fn machine(folder: &Folder, fitted: &Fit, monitors: &[Monitor], correctors: &[Corrector]) -> Value {
     let skewed: Vec<usize> = fitted.groups[1].iter().flatten().copied().collect();
-    let mut file = lattice::machine(folder, &skewed);
+    let mut file = lattice::machine(folder, &skewed, &[]);
     let named = |group: &[usize]| -> Vec<String> {
         group.iter().flat_map(|&row| lattice::parts(&folder.element(row), skewed.contains(&row)).0).collect()
     };

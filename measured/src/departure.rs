@@ -21,7 +21,7 @@ use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Unknown, Widths};
 
 /// Standard deviations of departures beforehand.
-const DEPARTURES: Widths = Widths { strength: 0.03, skew: 0.003, gain: 0.01, coupling: 0.01 };
+const DEPARTURES: Widths = Widths { strength: 0.03, skew: 0.003, wiggler: 0.03, gain: 0.01, coupling: 0.01 };
 
 /// Measurements of which anything is said that is not so: one in so many.
 const FALSE: f64 = 100.0;
@@ -98,7 +98,7 @@ impl Departures {
         let gain = match self.unknowns[at].kind {
             Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
             Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-            Kind::Skew(_) | Kind::Gradient(_) => return (after - before, self.sigma(at)),
+            Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => return (after - before, self.sigma(at)),
             _ => None,
         };
         match gain.and_then(|gain| self.unknowns.iter().position(|one| one.kind == gain)) {
@@ -151,6 +151,7 @@ pub fn beforehand(kind: Kind) -> f64 {
     match kind {
         Kind::Strength(_) => DEPARTURES.strength,
         Kind::Skew(_) | Kind::Gradient(_) => DEPARTURES.skew,
+        Kind::Wiggler(_) => DEPARTURES.wiggler,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::RfScale | Kind::HeldFrequency => DEPARTURES.gain,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => DEPARTURES.coupling,
     }

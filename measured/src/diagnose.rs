@@ -10,8 +10,7 @@ use twin::Rf;
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::family::Family;
-use crate::fit::{Fit, Settings, fit};
+use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
 use crate::held_out::{Fitted, HeldOut};
 use crate::hierarchy::Hierarchy;
@@ -192,13 +191,12 @@ impl Diagnosis {
     ) -> Result<Self, MeasuredError> {
         progress("what the RF holds");
         let share = Share::of_fit(folder, fitted, settings, progress)?;
-        let settings = Settings { rf: share.other().unwrap_or(settings.rf), ..*settings };
-        let refitted = share.other().map(|_| fit(folder, &settings, progress)).transpose()?;
-        let fitted = refitted.as_ref().unwrap_or(fitted);
-        let hierarchy = Hierarchy::of_fit(folder, fitted, &settings, progress)?;
-        let (mut hierarchy, found) = released(hierarchy, folder, fitted, &settings, progress)?;
+        let (fitted, settings) = &share.fitted(folder, fitted, settings, progress)?;
+        let hierarchy = Hierarchy::of_fit(folder, fitted, settings, progress)?;
+        let model = Model::of(folder, &hierarchy.groups, settings.rf)?;
+        let (mut hierarchy, found) = released(hierarchy, folder, (&fitted.data, &model), fitted.has_ended, progress)?;
         progress("elements held out");
-        let held_out = [as_loco(folder, fitted, &settings)?, with_families(&hierarchy, fitted)?];
+        let held_out = [as_loco(folder, fitted, settings)?, with_families(&hierarchy, fitted)?];
         // parts of the matrix that tell a value differently bear out no smaller error
         hierarchy.uncertainty.sigma.zip_apply(&held_out[1].jackknife, |sigma, scatter| *sigma = sigma.max(scatter));
         let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
@@ -222,16 +220,16 @@ impl Diagnosis {
 }
 
 /// Search and release until nothing more stands out.
-fn released(
+pub fn released(
     mut hierarchy: Hierarchy,
     folder: &Folder,
-    fitted: &Fit,
-    settings: &Settings,
+    (data, model): (&Data, &Model),
+    has_ended: bool,
     progress: &mut dyn FnMut(&str),
 ) -> Result<(Hierarchy, Search), MeasuredError> {
     let mut found = Search { outliers: Vec::new(), limits: Vec::new() };
     // a fit that did not end is of no ring
-    for _ in 0..if fitted.has_ended { SEARCHES } else { 0 } {
+    for _ in 0..if has_ended { SEARCHES } else { 0 } {
         progress("what stands out");
         let further = search(&hierarchy)?;
         found.limits = further.limits;
@@ -240,7 +238,7 @@ fn released(
         }
         found.outliers.extend(further.outliers);
         let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
-        hierarchy = hierarchy.with_released(folder, (&fitted.data, settings), &released, progress)?;
+        hierarchy = hierarchy.with_released(folder, (data, model), &released, progress)?;
     }
     found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
     found.outliers.retain(Outlier::stands_out);
@@ -323,7 +321,7 @@ fn certain(gain: f64) -> f64 {
 }
 
 /// Word of a kind at its place: a gradient in a dipole has one of its own.
-fn word(folder: &Folder, groups: &Groups, kind: Kind) -> &'static str {
+pub fn word(folder: &Folder, groups: &Groups, kind: Kind) -> &'static str {
     match kind {
         Kind::Gradient(group) if folder.lattice[groups[2][group][0]].bend != 0.0 => "dipole_gradient",
         _ => kind.word(),
@@ -337,6 +335,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
         Kind::Strength(group) => middle(groups[0][group][0]),
         Kind::Skew(group) => middle(groups[1][group][0]),
         Kind::Gradient(group) => middle(groups[2][group][0]),
+        Kind::Wiggler(group) => middle(groups[3][group][0]),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => middle(folder.monitors[row].at),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => middle(folder.correctors[column].at),
         Kind::RfScale | Kind::HeldFrequency => 0.0,
@@ -355,7 +354,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             count: family.members.len(),
             mean: family.mean * width,
             scatter: family.variance().sqrt() * width,
-            ordinary: Family::ordinary() * width,
+            ordinary: family.ordinary_scatter() * width,
             sigma: sigma[sigma.len() / 2],
         }
     });

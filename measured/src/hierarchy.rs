@@ -4,23 +4,31 @@
 //!
 //! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, then the error of the model.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::family::{Family, class, families};
+use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
 use crate::fit::{Fit, Settings, learn_missed};
 use crate::folder::{Folder, Row};
 use crate::missed::Missed;
 use crate::model::{Model, Prediction};
 use crate::normal::{Normal, Places, inverse, times};
 use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Groups, Kind, Unknown, Widths, magnets, unknowns};
+use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
 /// Linearisations: the first begins at the fit, whose values differ from the last ones by what families take.
-const ROUNDS: usize = 4;
-/// Steps of the scales about one linearisation.
+const ROUNDS: usize = 7;
+/// Times that scales and weights are learnt in turn about one linearisation.
 const STEPS: usize = 2;
+/// Times that each family has its turn, at most.
+const TURNS: usize = 20;
+/// What is not linear may look like a family with this share of the gain of the first, until all is linearised anew.
+const NONLINEAR: f64 = 0.1;
+/// Gain of a scale that is worth a turn [nat].
+const ENOUGH: f64 = 0.1;
 /// Damping of the first step: gains of all monitors and kicks of all correctors together tell nothing, and go nowhere.
 const DAMPING: f64 = 1e-6;
 /// Damping at which no step helps.
@@ -76,16 +84,64 @@ impl Posterior {
         Ok(Self { values: &covariance * &slope, information, slope, covariance })
     }
 
-    /// With scales that are learnt, some steps.
-    fn learn(mut self, families: &mut [Family], steps: usize) -> Result<Self, MeasuredError> {
-        for _ in 0..steps {
-            for family in families.iter_mut() {
-                let deviations = family.deviations(&self.values, &self.covariance);
-                family.learn(&deviations);
+    /// With scales and weights that are learnt, in turn.
+    fn learn(mut self, families: &mut [Family], share: f64) -> Result<Self, MeasuredError> {
+        for _ in 0..STEPS {
+            self.learn_scales(families, share)?;
+            for family in families.iter_mut().filter(|family| family.is_learnt()) {
+                family.weigh(&family.deviations(&self.values, &self.covariance));
             }
             self = Self::of_families(self.information, self.slope, families)?;
         }
         Ok(self)
+    }
+
+    /// The scales that make the measurement most probable: that of the family first which gains most, since what one explains another needs not to. A gain
+    /// that was told before another family took its scale is told anew when its turn comes.
+    fn learn_scales(&mut self, families: &mut [Family], share: f64) -> Result<(), MeasuredError> {
+        let mut least = ENOUGH;
+        let mut turn: Vec<usize> = (0..families.len()).filter(|&number| families[number].is_learnt()).collect();
+        let mut gain = vec![f64::INFINITY; families.len()];
+        for _ in 0..TURNS * turn.len() {
+            turn.sort_by(|&a, &b| gain[b].total_cmp(&gain[a]));
+            let Some(&first) = turn.first().filter(|&&first| gain[first] > least) else { break };
+            let marginal = self.marginal(&families[first])?;
+            let scale = families[first].best_scale(&marginal)?;
+            let better = Family { scale, ..families[first].clone() };
+            let [now, then] = [&families[first], &better].map(|family| family.log_evidence(&marginal));
+            gain[first] = then? - now?;
+            if turn.iter().all(|&other| gain[other] <= gain[first]) {
+                least = least.max(share * gain[first]);
+                self.exchange(&families[first], &better)?;
+                families[first] = better;
+                turn.iter().for_each(|&other| gain[other] = if other == first { 0.0 } else { f64::INFINITY });
+            }
+        }
+        Ok(())
+    }
+
+    /// What the data say of the members of a family, everything else adapting.
+    ///
+    /// # Errors
+    /// [`MeasuredError::Singular`].
+    pub fn marginal(&self, family: &Family) -> Result<Marginal, MeasuredError> {
+        let covariance = self.covariance.select_rows(&family.members).select_columns(&family.members);
+        let whole = inverse(&covariance).ok_or(MeasuredError::Singular(0))?;
+        let slope = &whole * self.values.select_rows(&family.members);
+        Ok(Marginal { information: whole - family.precision(), slope })
+    }
+
+    /// The prior of a family changes: with `D` its change and `C` the covariance, `C - C D (1 + C D)^-1 C` of the members' rows and columns.
+    fn exchange(&mut self, now: &Family, then: &Family) -> Result<(), MeasuredError> {
+        let members = &now.members;
+        let change = then.precision() - now.precision();
+        let across = self.covariance.select_columns(members);
+        let own = across.select_rows(members);
+        let n = members.len();
+        let inner = (DMatrix::identity(n, n) + &change * own).lu().solve(&change).ok_or(MeasuredError::Singular(0))?;
+        self.covariance -= &across * inner * across.transpose();
+        self.values = &self.covariance * &self.slope;
+        Ok(())
     }
 }
 
@@ -107,7 +163,7 @@ impl Hierarchy {
             known.map_or(unknown.mean, |number| fitted.values[number])
         });
         let values = DVector::from_iterator(unknowns.len(), start);
-        let mut families = families(folder, &groups, &unknowns, &[]);
+        let mut families = families(folder, &groups, &unknowns, &[], ORDINARY);
         for family in &mut families {
             family.mean_from(&unknowns, &values);
         }
@@ -124,19 +180,37 @@ impl Hierarchy {
     pub fn with_released(
         self,
         folder: &Folder,
-        (data, settings): (&Data, &Settings),
+        (data, model): (&Data, &Model),
         released: &[usize],
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
-        let model = Model::of(folder, &self.groups, settings.rf)?;
-        let mut families = families(folder, &self.groups, &self.unknowns, released);
+        let ordinary = self.families.iter().find(|family| family.is_learnt()).map_or(ORDINARY, |one| one.ordinary);
+        let mut families = families(folder, &self.groups, &self.unknowns, released, ordinary);
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
             (family.mean, family.scale) = known.map_or((family.mean, family.scale), |one| (one.mean, one.scale));
         }
         let Self { groups, unknowns, values, classes, missed, .. } = self;
         let start = Start { groups, unknowns, values, classes, families, missed };
-        start.settle(&model, data, ROUNDS - 1, progress)
+        start.settle(model, data, ROUNDS - 1, progress)
+    }
+
+    /// Of another measurement of the same ring: changes about the values of this one, which are small beforehand.
+    ///
+    /// # Errors
+    /// [`MeasuredError`].
+    pub fn of_changes(
+        &self,
+        folder: &Folder,
+        (data, model): (&Data, &Model),
+        progress: &mut dyn FnMut(&str),
+    ) -> Result<Self, MeasuredError> {
+        let about = self.unknowns.iter().zip(&self.values);
+        let unknowns: Vec<Unknown> = about.map(|(unknown, &mean)| Unknown { mean, ..*unknown }).collect();
+        let families = families(folder, &self.groups, &unknowns, &[], UNCHANGED);
+        let Self { groups, values, classes, missed, .. } = self.clone();
+        let start = Start { groups, unknowns, values, classes, families, missed };
+        start.settle(model, data, ROUNDS, progress)
     }
 
     /// Precision of the prior in widths.
@@ -178,10 +252,35 @@ impl Hierarchy {
         }
     }
 
+    /// Strength of a group of magnets over that of the lattice, the product of all factors that they have, with its standard deviation.
+    pub fn strength(&self, group: usize) -> [f64; 2] {
+        let first = self.groups[0][group][0];
+        let mut combination = DVector::zeros(self.values.len());
+        let mut strength = 1.0;
+        for (number, unknown) in self.unknowns.iter().enumerate() {
+            if matches!(unknown.kind, Kind::Strength(other) if self.groups[0][other].contains(&first)) {
+                strength *= self.values[number];
+                combination[number] = 1.0 / self.values[number];
+            }
+        }
+        [strength, strength * self.uncertainty.variance(&combination).sqrt()]
+    }
+
     /// Distance of a value from the mean of the family that it is of, whether it is released or not.
     pub fn off_family(&self, unknown: usize) -> f64 {
         let Unknown { mean, width, .. } = self.unknowns[unknown];
         self.values[unknown] - mean - self.family_of(unknown).map_or(0.0, |family| family.mean) * width
+    }
+
+    /// Standard deviation of that distance: what all members have in common is in both.
+    pub fn sigma_off_family(&self, unknown: usize) -> f64 {
+        let mut combination = DVector::zeros(self.values.len());
+        if let Some(family) = self.family_of(unknown).filter(|family| family.has_mean()) {
+            let share = 1.0 / family.members.len() as f64;
+            family.members.iter().for_each(|&member| combination[member] -= share);
+        }
+        combination[unknown] += 1.0;
+        self.uncertainty.variance(&combination).sqrt()
     }
 }
 
@@ -234,7 +333,9 @@ impl Start {
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
             let here = self.linearise(&scene, &prediction);
-            let posterior = here.posterior(&self.families)?.learn(&mut self.families, STEPS)?;
+            let posterior = here
+                .posterior(&self.families)?
+                .learn(&mut self.families, if round < rounds { NONLINEAR } else { 0.0 })?;
             prediction = self.descend(&scene, &here, prediction, &mut damping)?;
             for family in &mut self.families {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
@@ -243,7 +344,7 @@ impl Start {
             self.missed = learn_missed(data, &scene.places, &prediction, (&left, &covariance), &self.missed);
         }
         let here = self.linearise(&scene, &prediction);
-        let posterior = here.posterior(&self.families)?.learn(&mut self.families, STEPS)?;
+        let posterior = here.posterior(&self.families)?.learn(&mut self.families, 0.0)?;
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
         let uncertainty =
@@ -337,9 +438,9 @@ fn precision(families: &[Family], unknowns: usize) -> DMatrix<f64> {
     precision
 }
 
-/// Groups of the fit, with a gradient in each dipole, sextupole and quadrupole of a group, and a skew gradient in each magnet, where the fit has none.
+/// Groups of the fit and the magnets of each name, which have a supply or a design in common; with a gradient in each dipole, sextupole and quadrupole of a group, and a skew gradient in each magnet, where the fit has none.
 fn everything(folder: &Folder, fitted: &Groups) -> Groups {
-    let [strengths, mut skews, mut gradients] = fitted.clone();
+    let [mut strengths, mut skews, mut gradients, _] = fitted.clone();
     let is_magnet = |row: &Row| row.k1 != 0.0 || row.bend != 0.0 || row.half_k2 != 0.0;
     for magnet in magnets(folder, is_magnet) {
         let middle = vec![magnet[magnet.len() / 2]];
@@ -350,16 +451,34 @@ fn everything(folder: &Folder, fitted: &Groups) -> Groups {
             gradients.push(middle);
         }
     }
-    [strengths, skews, gradients]
+    strengths.extend(in_common(folder, &fitted[0]));
+    let straights = straights(folder);
+    gradients.extend(straights.iter().map(|rows| vec![rows[rows.len() / 2]]));
+    [strengths, skews, gradients, straights]
+}
+
+/// Groups of groups whose strengths have a factor in common: those of one name, as of one supply or one design, else of one sort; then all of them, as the
+/// momentum scales all.
+fn in_common(folder: &Folder, groups: &[Magnets]) -> Vec<Magnets> {
+    let name = |group: &Magnets| folder.lattice[group[0]].name.clone();
+    let mut by_name: BTreeMap<String, Vec<&Magnets>> = BTreeMap::new();
+    for group in groups {
+        let is_alone = groups.iter().filter(|other| name(other) == name(group)).count() == 1;
+        by_name.entry(if is_alone { sort(folder, group[0]).into() } else { name(group) }).or_default().push(group);
+    }
+    let several = by_name.into_values().filter(|within| within.len() > 1 && within.len() < groups.len());
+    let everything = (groups.len() > 1).then(|| groups.iter().collect());
+    several.chain(everything).map(|within: Vec<&Magnets>| within.into_iter().flatten().copied().collect()).collect()
 }
 
 /// Unknowns of all groups and of all instruments.
 fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Unknown> {
-    let Widths { skew, .. } = settings.widths;
+    let Widths { skew, wiggler, .. } = settings.widths;
     let fitted = unknowns(folder, [groups[0].len(), groups[1].len()], true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
-    magnets.iter().copied().chain(gradients).chain(instruments.iter().copied()).collect()
+    let wigglers = (0..groups[3].len()).map(|group| Unknown { kind: Kind::Wiggler(group), mean: 0.0, width: wiggler });
+    magnets.iter().copied().chain(gradients).chain(wigglers).chain(instruments.iter().copied()).collect()
 }
 
 #[cfg(test)]
@@ -381,10 +500,9 @@ mod tests {
             for family in found.families.iter().filter(|family| family.is_learnt()) {
                 scatters.entry(family.kind).or_default().push(family.scale * found.unknowns[family.members[0]].width);
             }
-            for (number, _) in
-                found.unknowns.iter().enumerate().filter(|(_, one)| matches!(one.kind, Kind::Strength(_)))
-            {
-                nees += ((found.values[number] - truth.2[number]) / found.uncertainty.sigma[number]).powi(2);
+            for group in 0..fitted.groups[0].len() {
+                let [strength, sigma] = found.strength(group);
+                nees += ((strength - truth.2[group]) / sigma).powi(2);
                 strengths += 1;
             }
         }

@@ -8,7 +8,7 @@ use twin::{Plane, Rf};
 
 use crate::descent::descend;
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Learnt, Settings, with_model_error};
+use crate::fit::{Fit, Learnt, Settings, fit, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
 use crate::unknowns::{Kind, Unknown};
@@ -65,6 +65,22 @@ impl Share {
             systematic: dispersion_missed(folder, &here.prediction),
             gain,
         })
+    }
+
+    /// The fit with what the share says is held, and how that was fitted.
+    ///
+    /// # Errors
+    /// [`MeasuredError`].
+    pub fn fitted(
+        &self,
+        folder: &Folder,
+        fitted: &Fit,
+        settings: &Settings,
+        progress: &mut dyn FnMut(&str),
+    ) -> Result<(Fit, Settings), MeasuredError> {
+        let Some(rf) = self.other() else { return Ok((fitted.clone(), *settings)) };
+        let settings = Settings { rf, ..*settings };
+        Ok((fit(folder, &settings, progress)?, settings))
     }
 
     /// Standard deviation of the share, both causes together.

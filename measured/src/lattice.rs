@@ -10,24 +10,28 @@ use twin::{Plane, Ring};
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, Row};
+use crate::unknowns::Magnets;
 
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
 
-/// The ring, with a thin element, a gradient of either kind, in the middle of some rows.
+/// Thin lenses of a wiggler: its focusing spread over its length.
+pub const LENSES: usize = 5;
+
+/// The ring, with a thin element, a gradient of either kind, in the middle of some rows, and lenses along those of wigglers.
 ///
 /// # Errors
 /// [`MeasuredError::Lattice`].
-pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
-    Ok(Ring::parse(&machine(folder, skew).to_string(), &folder.name)?)
+pub fn ring(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Result<Ring, MeasuredError> {
+    Ok(Ring::parse(&machine(folder, cut, wigglers).to_string(), &folder.name)?)
 }
 
 /// The same as a machine file, docs/machine.md.
-pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
+pub fn machine(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Value {
     let mut elements = Vec::new();
     for (row, one) in folder.lattice.iter().enumerate() {
         let name = folder.element(row);
-        elements.extend(magnet(one, &name, skew.contains(&row)));
+        elements.extend(magnet(one, &name, cut.contains(&row)));
         let planes = |of: &mut dyn Iterator<Item = (usize, Plane)>| {
             let planes: Vec<Plane> = of.filter(|(at, _)| *at == row).map(|(_, plane)| plane).collect();
             match (planes.contains(&Plane::X), planes.contains(&Plane::Y)) {
@@ -45,6 +49,9 @@ pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
             elements.push(json!({"name": own, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
         }
     }
+    elements.extend(wigglers.iter().flat_map(|rows| lenses(folder, rows)));
+    let s = |one: &Value| one["s_start"].as_f64().unwrap_or(0.0);
+    elements.sort_by(|a, b| s(a).total_cmp(&s(b)));
     let rest = folder.meta.particle.rest_energy();
     let energy = folder.meta.energy.unwrap_or(rest / ULTRA_RELATIVISTIC);
     json!({
@@ -62,6 +69,23 @@ pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
         true => (vec![format!("{name} first"), format!("{name} second")], Some(format!("{name} skew"))),
         false => (vec![name.into()], None),
     }
+}
+
+/// Names of the thin lenses that make the focusing of a wiggler.
+pub fn lens_names(folder: &Folder, rows: &[usize]) -> impl Iterator<Item = String> {
+    let name = folder.element(rows[0]);
+    (0..LENSES).map(move |lens| format!("{name} lens {lens}"))
+}
+
+/// Thin lenses along rows that follow each other, which may go on at the start of the ring.
+fn lenses(folder: &Folder, rows: &[usize]) -> Vec<Value> {
+    let length: f64 = rows.iter().map(|&row| folder.lattice[row].length).sum();
+    let place = |lens: usize| {
+        let along = (lens as f64 + 0.5) / LENSES as f64 * length;
+        (folder.lattice[rows[0]].s + along) % folder.meta.circumference
+    };
+    let lens = |(lens, name): (usize, String)| json!({"name": name, "label": name, "type": "wiggler", "s_start": place(lens), "length": 0});
+    lens_names(folder, rows).enumerate().map(lens).collect()
 }
 
 fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {

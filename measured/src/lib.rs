@@ -7,6 +7,7 @@
 //!
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
+pub mod alignment;
 pub mod believed;
 pub mod calibrated;
 pub mod compare;
@@ -40,7 +41,7 @@ pub mod wiring;
 
 pub use believed::{Against, Believed, against};
 pub use calibrated::Calibrated;
-pub use compare::{Change, Changes, compare};
+pub use compare::{Before, Change, Changes, compare};
 pub use conceal::{Concealed, conceal};
 pub use diagnose::Diagnosis;
 pub use error::MeasuredError;

@@ -12,7 +12,7 @@ use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Plane,
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
-use crate::lattice::{parts, ring};
+use crate::lattice::{LENSES, lens_names, parts, ring};
 use crate::unknowns::{Groups, Kind, Unknown};
 
 /// Millimetres a metre.
@@ -26,10 +26,11 @@ pub struct Model {
     /// Relative step of the RF frequency.
     rf_step: f64,
     has_dispersion: bool,
-    /// Elements of each group, with their gradients at the start; thin elements of each group of skew gradients and of further gradients.
-    strengths: Vec<Vec<(usize, f64)>>,
+    /// Elements of each group; thin elements of each group of skew gradients and of further gradients.
+    strengths: Vec<Vec<usize>>,
     skews: Vec<Vec<usize>>,
     gradients: Vec<Vec<usize>>,
+    wigglers: Vec<Vec<usize>>,
     /// Element of each monitor's row and of each corrector's column, with the plane.
     monitors: Vec<(usize, Plane)>,
     correctors: Vec<(usize, Plane)>,
@@ -64,24 +65,20 @@ impl Model {
     /// # Errors
     /// [`MeasuredError::Lattice`].
     pub fn of(folder: &Folder, groups: &Groups, rf: Rf) -> Result<Self, MeasuredError> {
-        let cut: Vec<usize> = groups[1..].iter().flatten().flatten().copied().collect();
-        let ring = ring(folder, &cut)?;
+        let cut: Vec<usize> = groups[1..3].iter().flatten().flatten().copied().collect();
+        let ring = ring(folder, &cut, &groups[3])?;
         let named = |row: usize| parts(&folder.element(row), cut.contains(&row));
-        let mut strengths = Vec::new();
-        for group in &groups[0] {
-            let mut elements = Vec::new();
-            for (name, k1) in
-                group.iter().flat_map(|&row| named(row).0.into_iter().map(move |name| (name, folder.lattice[row].k1)))
-            {
-                elements.push((ring.element(&name)?, k1));
-            }
-            strengths.push(elements);
-        }
+        let thick = |group: &Vec<usize>| -> Result<Vec<usize>, LatticeError> {
+            group.iter().flat_map(|&row| named(row).0).map(|name| ring.element(&name)).collect()
+        };
+        let strengths = groups[0].iter().map(thick).collect::<Result<_, _>>()?;
         let thin = |group: &Vec<usize>| -> Result<Vec<usize>, LatticeError> {
             group.iter().filter_map(|&row| named(row).1).map(|name| ring.element(&name)).collect()
         };
         let skews = groups[1].iter().map(thin).collect::<Result<_, _>>()?;
         let gradients = groups[2].iter().map(thin).collect::<Result<_, _>>()?;
+        let lenses = |rows: &Vec<usize>| lens_names(folder, rows).map(|name| ring.element(&name)).collect();
+        let wigglers = groups[3].iter().map(lenses).collect::<Result<_, LatticeError>>()?;
         let place = |kind: &str, at: usize| ring.element(&format!("{kind} {}", folder.element(at)));
         let monitors = folder.monitors.iter().map(|one| Ok((place("bpm", one.at)?, one.plane)));
         let correctors = folder.correctors.iter().map(|one| Ok((place("corrector", one.at)?, one.plane)));
@@ -90,7 +87,19 @@ impl Model {
         let kicks = folder.correctors.iter().map(|one| one.kick).collect();
         let rf_step = folder.meta.delta_rf / folder.meta.rf;
         let has_dispersion = folder.dispersion.is_some();
-        Ok(Self { ring, rf, rf_step, has_dispersion, strengths, skews, gradients, monitors, correctors, kicks })
+        Ok(Self {
+            ring,
+            rf,
+            rf_step,
+            has_dispersion,
+            strengths,
+            skews,
+            gradients,
+            wigglers,
+            monitors,
+            correctors,
+            kicks,
+        })
     }
 
     /// The same with the kicks and the RF step of another measurement.
@@ -105,11 +114,9 @@ impl Model {
         for (unknown, &value) in unknowns.iter().zip(values) {
             match unknown.kind {
                 Kind::Strength(group) => {
-                    for &(element, start) in &self.strengths[group] {
-                        match &mut ring.elements[element].kind {
-                            Field::Quadrupole { k1 } => *k1 = start * value,
-                            Field::Bend(bend) => bend.k1 = start * value,
-                            _ => {}
+                    for &element in &self.strengths[group] {
+                        if let Some(k1) = gradient_mut(&mut ring.elements[element].kind) {
+                            *k1 *= value;
                         }
                     }
                 }
@@ -125,6 +132,11 @@ impl Model {
                         if let Field::Multipole { k1l, .. } = &mut ring.elements[element].kind {
                             *k1l = value;
                         }
+                    }
+                }
+                Kind::Wiggler(group) => {
+                    for &element in &self.wigglers[group] {
+                        ring.elements[element].kind = Field::Wiggler { focusing: value / LENSES as f64 };
                     }
                 }
                 _ => {}
@@ -149,7 +161,8 @@ impl Model {
     pub fn predict(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Result<Prediction, MeasuredError> {
         let ring = self.at(unknowns, values);
         let instruments = self.instruments(unknowns, values);
-        let held = |hold| Ok::<_, MeasuredError>(self.held(&Optics::of(&ring, hold)?, &instruments));
+        let gradients = self.gradients_of_factors(unknowns, values, &ring);
+        let held = |hold| Ok::<_, MeasuredError>(self.held(&Optics::of(&ring, hold)?, &instruments, &gradients));
         let [momentum, frequency] = [Hold::Momentum { delta: 0.0 }, Hold::Frequency { offset: 0.0 }];
         match (instruments.held_frequency, self.rf) {
             (Some(share), _) => Ok(held(momentum)?.towards(&held(frequency)?, share)),
@@ -171,14 +184,14 @@ impl Model {
     }
 
     /// The prediction of one kind of hold.
-    fn held(&self, optics: &Optics, instruments: &Instruments) -> Prediction {
+    fn held(&self, optics: &Optics, instruments: &Instruments, gradients: &[Vec<f64>]) -> Prediction {
         let (read, kicked) =
             (self.observers(optics, &instruments.monitors), self.sources(optics, &instruments.correctors));
         let [own, other] = [[1.0, 0.0], [0.0, 1.0]];
         let rf = instruments.rf;
         Prediction {
             matrix: self.seen(optics, &read, &kicked, rf),
-            by_machine: self.by_magnets(optics, &read, &kicked, rf),
+            by_machine: self.by_magnets(optics, (&read, &kicked), rf, gradients),
             by_monitor: [own, other]
                 .map(|one| self.seen(optics, &self.observers(optics, &vec![one; self.monitors.len()]), &kicked, rf)),
             by_corrector: [(own, 1.0), (other, 0.0)].map(|(one, rf)| {
@@ -194,17 +207,40 @@ impl Model {
         self.and_dispersion(seen, offset)
     }
 
-    /// Derivatives of the same by strengths and skew gradients.
-    fn by_magnets(&self, optics: &Optics, observers: &[Observer], sources: &[Source], rf: f64) -> Vec<DMatrix<f64>> {
-        let strengths = self
-            .strengths
-            .iter()
-            .map(|group| group.iter().map(|&(at, per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>());
+    /// Gradient of each element of each group per unit of the group's factor [1/m^2]: a magnet may have a factor of its own and one that it shares.
+    fn gradients_of_factors(&self, unknowns: &[Unknown], values: &DVector<f64>, ring: &Ring) -> Vec<Vec<f64>> {
+        let mut factors = vec![1.0; self.strengths.len()];
+        for (unknown, &value) in unknowns.iter().zip(values) {
+            if let Kind::Strength(group) = unknown.kind {
+                factors[group] = value;
+            }
+        }
+        let each = |(group, factor): (&Vec<usize>, f64)| {
+            group.iter().map(|&at| gradient(&ring.elements[at].kind) / factor).collect()
+        };
+        self.strengths.iter().zip(factors).map(each).collect()
+    }
+
+    /// Derivatives of the same by strengths, skew gradients and further gradients.
+    fn by_magnets(
+        &self,
+        optics: &Optics,
+        (observers, sources): (&[Observer], &[Source]),
+        rf: f64,
+        gradients: &[Vec<f64>],
+    ) -> Vec<DMatrix<f64>> {
+        let strengths = self.strengths.iter().zip(gradients).map(|(group, gradients)| {
+            let each = group.iter().zip(gradients);
+            each.map(|(&at, &per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>()
+        });
         let skews = self.skews.iter().map(|group| group.iter().map(|&at| optics.skew_gradient(at)).collect());
         let gradients = self.gradients.iter().map(|group| group.iter().map(|&at| optics.gradient(at)).collect());
+        let lens = |&at: &usize| optics.vertical_focusing(at).times(1.0 / LENSES as f64);
+        let wigglers = self.wigglers.iter().map(|lenses| lenses.iter().map(lens).collect());
         strengths
             .chain(skews)
             .chain(gradients)
+            .chain(wigglers)
             .map(|gradients| self.by_gradients(optics, (observers, sources), rf, &gradients))
             .collect()
     }
@@ -249,7 +285,7 @@ impl Model {
                 Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
                 Kind::RfScale => all.rf = value,
                 Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) => {}
+                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => {}
             }
         }
         all
@@ -268,6 +304,24 @@ impl Prediction {
             by_monitor: both(&self.by_monitor, &to.by_monitor),
             by_corrector: both(&self.by_corrector, &to.by_corrector),
         }
+    }
+}
+
+/// Gradient of a magnet [1/m^2].
+fn gradient(kind: &Field) -> f64 {
+    match kind {
+        Field::Quadrupole { k1 } => *k1,
+        Field::Bend(bend) => bend.k1,
+        _ => 0.0,
+    }
+}
+
+/// The same to be changed.
+fn gradient_mut(kind: &mut Field) -> Option<&mut f64> {
+    match kind {
+        Field::Quadrupole { k1 } => Some(k1),
+        Field::Bend(bend) => Some(&mut bend.k1),
+        _ => None,
     }
 }
 
@@ -293,7 +347,8 @@ mod tests {
         let rows: Vec<usize> = groups[0].iter().map(|group| group[0]).collect();
         let each: Vec<Vec<usize>> = rows.iter().map(|&row| vec![row]).collect();
         let (_, unknowns, values) = machine(&folder, 4);
-        let model = Model::of(&folder, &[groups[0].clone(), groups[1].clone(), each], Rf::FixedFrequency).unwrap();
+        let model =
+            Model::of(&folder, &[groups[0].clone(), groups[1].clone(), each, Vec::new()], Rf::FixedFrequency).unwrap();
         let by_machine = model.predict(&unknowns, &values).unwrap().by_machine;
         let thin = &by_machine[groups[0].len() + groups[1].len()..];
         for ((thin, thick), row) in thin.iter().zip(&by_machine).zip(rows) {
@@ -309,9 +364,10 @@ mod tests {
         let folder = ring();
         let (_, mut unknowns, mut values) = machine(&folder, 3);
         // a further gradient and a skew gradient in a dipole and in a quadrupole
-        let [strengths, skews, _] = crate::unknowns::groups(&folder);
+        let [strengths, skews, ..] = crate::unknowns::groups(&folder);
         let place = strengths.len() + skews.len();
-        let model = Model::of(&folder, &[strengths, skews, vec![vec![4], vec![2]]], Rf::FixedFrequency).unwrap();
+        let model =
+            Model::of(&folder, &[strengths, skews, vec![vec![4], vec![2]], Vec::new()], Rf::FixedFrequency).unwrap();
         for group in [1, 0] {
             unknowns.insert(place, Unknown { kind: Kind::Gradient(group), mean: 0.0, width: 0.01 });
             values = values.insert_row(place, 0.004);

@@ -10,7 +10,7 @@
 //!
 //! `ln t_1(g/G; v + 1) - ln t_k(g/G; v)`.
 //!
-//! A scatter told by `n` others has heavier tails than a normal one: Student's, with `k = n v^2/s^4` degrees of freedom (F. E. Satterthwaite, Biometrics 2 (1946)
+//! A scatter told by `n` others, and by what is ordinary, has heavier tails than a normal one: Student's, with `k = n v^2/s^4` degrees of freedom (F. E. Satterthwaite, Biometrics 2 (1946)
 //! 110). What stands out has any size, Cauchy's density about the prior's width (A. Zellner and A. Siow, Trabajos de Estadistica 31 (1980) 585).
 //!
 //! The strongest is released, the others adapt, and so on; those that it takes the gain from are its alternatives.
@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector};
 use statrs::distribution::{Continuous, StudentsT};
 
 use crate::error::MeasuredError;
-use crate::family::{FREE, Family};
+use crate::family::{BEFOREHAND, FREE, Family};
 use crate::hierarchy::{Hierarchy, Posterior};
 use crate::unknowns::Kind;
 
@@ -89,7 +89,7 @@ fn log_bayes_factor(estimate: f64, error: f64, scatter: f64, others: usize) -> f
     let density = |variance: f64, freedom: f64| {
         StudentsT::new(0.0, variance.sqrt(), freedom).map_or(f64::NEG_INFINITY, |student| student.ln_pdf(estimate))
     };
-    density(ordinary + 1.0, 1.0) - density(ordinary, others.max(1) as f64 * (ordinary / scatter).powi(2))
+    density(ordinary + 1.0, 1.0) - density(ordinary, (others as f64 + BEFOREHAND) * (ordinary / scatter).powi(2))
 }
 
 /// Another explanation of the same.
@@ -111,7 +111,7 @@ fn expected(kind: Kind) -> f64 {
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.3,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.1,
         Kind::Strength(_) => 0.2,
-        Kind::Skew(_) | Kind::Gradient(_) => 0.1,
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => 0.1,
         Kind::RfScale | Kind::HeldFrequency => 0.0,
     }
 }

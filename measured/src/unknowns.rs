@@ -11,6 +11,8 @@ pub enum Kind {
     Skew(usize),
     /// Integrated gradient of each magnet of a group beside its own [1/m].
     Gradient(usize),
+    /// Integrated vertical focusing in the middle of a straight [1/m], as of a wiggler.
+    Wiggler(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
     HeldFrequency,
     /// What a monitor reads of its own plane: 1 if it is right, 0 if it is dead.
@@ -32,6 +34,7 @@ impl Kind {
             Self::Strength(_) => "quadrupole_gradient",
             Self::Skew(_) => "skew_gradient",
             Self::Gradient(_) => "stray_gradient",
+            Self::Wiggler(_) => "wiggler_focusing",
             Self::HeldFrequency => "fixed_rf_frequency",
             Self::MonitorGain(_) => "bpm_gain",
             Self::MonitorCoupling(_) => "bpm_coupling",
@@ -53,11 +56,14 @@ pub struct Unknown {
     pub width: f64,
 }
 
+/// The shortest straight that may hold a wiggler [m].
+const STRAIGHT: f64 = 1.0;
+
 /// Magnets that share one factor: rows of the lattice.
 pub type Magnets = Vec<usize>;
 
-/// Groups of gradients, of skew gradients, and of gradients beside those of the lattice.
-pub type Groups = [Vec<Magnets>; 3];
+/// Groups of gradients, of skew gradients, of gradients beside those of the lattice, and places of vertical focusing.
+pub type Groups = [Vec<Magnets>; 4];
 
 /// Prior standard deviations.
 #[derive(Debug, Clone, Copy)]
@@ -66,6 +72,8 @@ pub struct Widths {
     pub strength: f64,
     /// Of an integrated skew gradient [1/m].
     pub skew: f64,
+    /// Of the integrated vertical focusing of a straight [1/m].
+    pub wiggler: f64,
     /// Of the gain of a monitor and of a corrector.
     pub gain: f64,
     /// Of what either has of the other plane.
@@ -73,10 +81,10 @@ pub struct Widths {
 }
 
 impl Default for Widths {
-    /// 3 % as for the vars of the Booster; 0.01 /m is a quadrupole of 1 /m rolled by 5 mrad; gains as far off as those of old electronics, which no
+    /// 3 % as for the vars of the Booster; 0.01 /m is a quadrupole of 1 /m rolled by 5 mrad; 0.1 /m is a wiggler of 2 m and 1.5 T at 1.5 GeV; gains as far off as those of old electronics, which no
     /// response can tell from a scale of all kicks; 5 % of the other plane is a roll of 50 mrad.
     fn default() -> Self {
-        Self { strength: 0.03, skew: 0.01, gain: 0.2, coupling: 0.05 }
+        Self { strength: 0.03, skew: 0.01, wiggler: 0.1, gain: 0.2, coupling: 0.05 }
     }
 }
 
@@ -84,13 +92,13 @@ impl Default for Widths {
 pub fn groups(folder: &Folder) -> Groups {
     let quadrupoles = |row: &Row| row.k1 != 0.0 && row.bend == 0.0;
     let Some(reference) = &folder.meta.reference_fit else {
-        return [magnets(folder, quadrupoles), Vec::new(), Vec::new()];
+        return [magnets(folder, quadrupoles), Vec::new(), Vec::new(), Vec::new()];
     };
     let of = |is_gradient: bool| {
         let groups = reference.fit_parameters.iter().filter(move |one| (one.field == "K") == is_gradient);
         groups.map(|one| distinct(&one.elements)).collect()
     };
-    [of(true), of(false), Vec::new()]
+    [of(true), of(false), Vec::new(), Vec::new()]
 }
 
 fn distinct(rows: &[usize]) -> Magnets {
@@ -115,6 +123,28 @@ pub fn magnets(folder: &Folder, is_magnet: impl Fn(&Row) -> bool) -> Vec<Magnets
         }
     }
     groups
+}
+
+/// Rows of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has.
+pub fn straights(folder: &Folder) -> Vec<Magnets> {
+    let is_free = |row: usize| {
+        let Row { k1, bend, half_k2, .. } = folder.lattice[row];
+        k1 == 0.0 && bend == 0.0 && half_k2 == 0.0
+    };
+    let count = folder.lattice.len();
+    let Some(first) = (0..count).find(|&row| !is_free(row)) else { return Vec::new() };
+    // the ring may begin within a straight
+    let around: Vec<usize> = (first..count).chain(0..first).filter(|&row| folder.lattice[row].length > 0.0).collect();
+    let length = |rows: &[usize]| rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>();
+    let device = |rows: &[usize]| {
+        let middle = (1..rows.len()).find(|&end| length(&rows[..end]) > 0.5 * length(rows)).unwrap_or(1) - 1;
+        let name = |place: usize| &folder.lattice[rows[place]].name;
+        let begin = (0..middle).rev().find(|&place| name(place) != name(middle)).map_or(0, |before| before + 1);
+        let end = (middle..rows.len()).find(|&place| name(place) != name(middle)).unwrap_or(rows.len());
+        rows[begin..end].to_vec()
+    };
+    let free = around.chunk_by(|&one, &next| is_free(one) == is_free(next)).filter(|rows| is_free(rows[0]));
+    free.filter(|rows| length(rows) > STRAIGHT).map(device).collect()
 }
 
 /// All unknowns of a measurement, magnets first.
@@ -143,12 +173,32 @@ pub fn unknowns(folder: &Folder, [strengths, skews]: [usize; 2], coupling: bool,
     magnets.chain(skews).chain(instruments).chain(rf).collect()
 }
 
+/// True where a group of magnets has another one, and more.
+pub fn holds(group: &Magnets, other: &Magnets) -> bool {
+    other.len() < group.len() && group.contains(&other[0])
+}
+
+/// Name of magnets that share a factor: of one magnet, of a family, or of what all have in common.
+fn strengths(folder: &Folder, groups: &[Magnets], group: &Magnets) -> String {
+    let first = &folder.lattice[group[0]];
+    let all = |is_alike: &dyn Fn(&Row) -> bool| group.iter().all(|&row| is_alike(&folder.lattice[row]));
+    match groups.iter().any(|other| holds(group, other)) {
+        false => folder.element(group[0]),
+        true if all(&|row| row.name == first.name) => first.name.clone(),
+        true if all(&|row| (row.k1 > 0.0) == (first.k1 > 0.0)) => {
+            format!("all {} quadrupoles", if first.k1 > 0.0 { "focusing" } else { "defocusing" })
+        }
+        true => "all quadrupoles".into(),
+    }
+}
+
 /// Name of an unknown.
 pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
     match kind {
-        Kind::Strength(group) => folder.element(groups[0][group][0]),
+        Kind::Strength(group) => strengths(folder, &groups[0], &groups[0][group]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
         Kind::Gradient(group) => folder.element(groups[2][group][0]),
+        Kind::Wiggler(group) => folder.element(groups[3][group][groups[3][group].len() / 2]),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),

@@ -682,6 +682,9 @@ pub struct Compare {
     /// The changes as one page
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
+    /// What measured matrices hold while a corrector changes, if it is not the RF frequency
+    #[arg(long, value_enum)]
+    pub rf: Option<Rf>,
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,

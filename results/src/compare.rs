@@ -2,7 +2,7 @@
 
 use inference::{BatchFit, Recording, TuneUse};
 use measured::departure::clear;
-use measured::{Folder, Settings, Straightened};
+use measured::{Before, Folder, Settings};
 use twin::Ring;
 
 use crate::campaign::campaign;
@@ -15,19 +15,16 @@ use crate::matrix_result::{ChangeOfOne, Comparison, OtherChange};
 /// # Errors
 /// [`CommandError`].
 pub fn compare_matrices(
-    [as_measured, after]: [&Folder; 2],
+    [before, after]: [&Folder; 2],
     settings: &Settings,
     say: &mut dyn FnMut(&str),
 ) -> Result<Comparison, CommandError> {
-    let Straightened { folder: before, cables, fit } =
-        Straightened::of(as_measured, settings, &mut |what| say(&format!("{}: {what}", as_measured.name)))?;
-    let changes = measured::compare((&before, &cables, &fit), after, settings, &mut |what| {
-        say(&format!("{}: {what}", after.name));
-    })?;
+    let (Before { folder, .. }, changes) = measured::compare(before, after, settings, say)?;
     let mut all = Vec::new();
     for one in &changes.gradients {
         all.extend(one.rows.iter().map(|&row| ChangeOfOne {
-            name: before.element(row),
+            name: folder.element(row),
+            family: one.family.clone(),
             index: Some(row),
             relative: one.relative,
             sigma: one.sigma,
@@ -36,7 +33,7 @@ pub fn compare_matrices(
         }));
     }
     all.sort_by_key(|one| one.index);
-    let cables = changes.wiring.iter().map(|one| OtherChange::of_cable(&before, one));
+    let cables = changes.wiring.iter().map(|one| OtherChange::of_cable(&folder, one));
     Ok(Comparison::of(all, cables.chain(changes.others.iter().map(OtherChange::of)).collect()))
 }
 
@@ -64,6 +61,7 @@ pub fn compare_recordings(
             sigma,
             changed: relative.abs() > clear(ring.parameters.len()) * sigma,
             identifiable: one.sigma.max(other.sigma) < 0.5 * width,
+            family: one.name.clone(),
             name: one.name,
             index: None,
         }

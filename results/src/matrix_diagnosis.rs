@@ -141,9 +141,7 @@ impl MatrixDiagnosis {
             None => diagnosis.verdict.word(),
         };
         let hierarchy = &diagnosis.hierarchy;
-        let var = |&(row, unknown): &(usize, usize)| {
-            MatrixVar::of_row(folder, row, [hierarchy.values[unknown], hierarchy.uncertainty.sigma[unknown]])
-        };
+        let var = |&(row, group): &(usize, usize)| MatrixVar::of_row(folder, row, hierarchy.strength(group));
         let unexplained = diagnosis.unexplained.iter();
         let unexplained =
             unexplained.map(|one| UnexplainedResult { at: one.at.clone(), rms_um: 1e3 * one.rms, ratio: one.ratio });
@@ -158,7 +156,7 @@ impl MatrixDiagnosis {
             monitors: loco.monitors.clone(),
             fit: Predictions::from(&diagnosis.held_out),
             vars_before: loco.vars.clone(),
-            vars_after: fitted_rows(&hierarchy.groups, &hierarchy.unknowns).iter().map(var).collect(),
+            vars_after: fitted_rows(fitted).iter().map(var).collect(),
             loco,
         }
     }
@@ -190,7 +188,7 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
 
 /// Unit of an amplitude.
 fn unit(kind: &str) -> &'static str {
-    let is_integrated = ["skew_gradient", "stray_gradient", "dipole_gradient"].contains(&kind);
+    let is_integrated = ["skew_gradient", "stray_gradient", "dipole_gradient", "wiggler_focusing"].contains(&kind);
     if is_integrated { "1/m" } else { "1" }
 }
 

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use comfy_table::CellAlignment;
 use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
-use measured::unknowns::{Groups, Unknown, name};
+use measured::unknowns::name;
 use measured::{Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
 
@@ -126,7 +126,7 @@ impl From<StatedModel> for Believed {
 impl MatrixFit {
     /// Of a fit.
     pub fn of(folder: &Folder, cables: &[Wiring], fit: &Fit, tunes: Option<[f64; 2]>) -> Self {
-        let rows = fitted_rows(&fit.groups, &fit.unknowns);
+        let rows = fitted_rows(fit);
         // correlations of independent errors
         let independent = &fit.uncertainty.independent;
         let scale = |at: usize| fit.sigma(at) / independent[(at, at)].sqrt();
@@ -164,14 +164,11 @@ impl MatrixFit {
     }
 }
 
-/// Rows of the lattice whose strengths are fitted, in beam order, with the number of their unknown.
-pub(crate) fn fitted_rows(groups: &Groups, unknowns: &[Unknown]) -> Vec<(usize, usize)> {
-    let mut rows: Vec<(usize, usize)> = Vec::new();
-    for (number, unknown) in unknowns.iter().enumerate() {
-        if let Kind::Strength(group) = unknown.kind {
-            rows.extend(groups[0][group].iter().map(|&row| (row, number)));
-        }
-    }
+/// Rows of the lattice whose strengths are fitted, in beam order, with the number of their group, which is that of their unknown.
+pub(crate) fn fitted_rows(fit: &Fit) -> Vec<(usize, usize)> {
+    let of_group =
+        |(number, rows): (usize, &Vec<usize>)| rows.iter().map(move |&row| (row, number)).collect::<Vec<_>>();
+    let mut rows: Vec<(usize, usize)> = fit.groups[0].iter().enumerate().flat_map(of_group).collect();
     rows.sort_unstable();
     rows
 }
@@ -294,6 +291,9 @@ pub struct Comparison {
 #[allow(missing_docs)] // named after what they are
 pub struct ChangeOfOne {
     pub name: String,
+    /// Magnets of one family, as of one supply.
+    #[serde(skip)]
+    pub family: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub index: Option<usize>,
     pub relative: f64,
@@ -318,10 +318,10 @@ pub struct OtherChange {
 }
 
 impl OtherChange {
-    /// Of a gain, a coupling or a skew gradient.
+    /// Of anything that is no cable.
     pub fn of(one: &measured::compare::Other) -> Self {
-        let unit = if matches!(one.kind, Kind::Skew(_)) { "1/m" } else { "" };
-        Self { kind: one.kind.word(), at: one.name.clone(), change: Some(one.change), sigma: Some(one.sigma), unit }
+        let unit = if one.is_share { "" } else { "1/m" };
+        Self { kind: one.word, at: one.at.clone(), change: Some(one.change), sigma: Some(one.sigma), unit }
     }
 
     /// Of a cable.
@@ -342,42 +342,111 @@ impl fmt::Display for OtherChange {
     }
 }
 
-impl Comparison {
-    /// Of changes, in the order of the ring, and of those of other things.
-    pub fn of(changes: Vec<ChangeOfOne>, others: Vec<OtherChange>) -> Self {
-        let mut found: Vec<&ChangeOfOne> = changes.iter().filter(|one| one.changed).collect();
-        found.sort_by(|a, b| (b.relative / b.sigma).abs().total_cmp(&(a.relative / a.sigma).abs()));
-        let open = changes.iter().filter(|one| !one.identifiable && !one.changed).count();
-        let listed: Vec<String> = found
-            .iter()
-            .take(3)
-            .map(|one| format!("{} by {:+.3} ± {:.3} %", one.name, 100.0 * one.relative, 100.0 * one.sigma))
-            .collect();
-        let more = if found.len() > 3 { format!(" and {} more", found.len() - 3) } else { String::new() };
-        let first = match listed.is_empty() {
-            true => "No quadrupole changed by more than chance.".to_owned(),
-            false => format!("{} of {} changed: {}{more}.", found.len(), changes.len(), listed.join(", ")),
+/// What is said of changes, at most.
+const SAID: usize = 4;
+
+/// Magnets of one family that changed alike, or one that did not.
+struct Row<'c> {
+    name: &'c str,
+    magnets: &'c [&'c ChangeOfOne],
+}
+
+impl Row<'_> {
+    /// The mean of the magnets, whose errors are those of their family.
+    fn change(&self) -> [f64; 2] {
+        let mean = |of: fn(&ChangeOfOne) -> f64| {
+            self.magnets.iter().map(|one| of(one)).sum::<f64>() / self.magnets.len() as f64
         };
-        let second = if open > 0 { format!(" Of {open} the measurements cannot tell.") } else { String::new() };
-        let listed: Vec<String> = others.iter().take(3).map(ToString::to_string).collect();
-        let more = if others.len() > 3 { format!(" and {} more", others.len() - 3) } else { String::new() };
-        let third = if others.is_empty() { String::new() } else { format!(" Also: {}{more}.", listed.join(", ")) };
-        Self { sentence: first + &second + &third, changes, others }
+        [mean(|one| one.relative), mean(|one| one.sigma)]
+    }
+
+    fn is_alike(magnets: &[&ChangeOfOne]) -> bool {
+        let first = magnets[0];
+        magnets.iter().all(|one| (one.relative - first.relative).abs() < ALIKE * one.sigma.hypot(first.sigma))
+    }
+
+    fn words(&self) -> String {
+        let [change, sigma] = self.change();
+        format!("{} by {:+.3} ± {:.3} %", self.name, 1e2 * change, 1e2 * sigma)
+    }
+}
+
+/// Magnets of one family are told together where they differ by less than so many standard deviations.
+const ALIKE: f64 = 3.0;
+
+impl Comparison {
+    /// Of changes, in the order of the ring, and of those of other things, the clearest first.
+    pub fn of(changes: Vec<ChangeOfOne>, others: Vec<OtherChange>) -> Self {
+        let mut compared = Self { sentence: String::new(), changes, others };
+        compared.sentence = compared.words();
+        compared
+    }
+
+    /// What changed, the clearest first.
+    fn words(&self) -> String {
+        let magnets = self.families();
+        let rows = magnets.iter().flat_map(|family| rows(family)).collect::<Vec<_>>();
+        let mut found: Vec<(f64, String)> = Vec::new();
+        let changed = rows.iter().filter(|row| row.magnets.iter().any(|one| one.changed));
+        found.extend(changed.map(|row| (row.change()[0] / row.change()[1], row.words())));
+        let clear =
+            |one: &OtherChange| one.change.zip(one.sigma).map_or(f64::INFINITY, |(change, sigma)| change / sigma);
+        found.extend(self.others.iter().map(|one| (clear(one), one.to_string())));
+        found.sort_by(|a, b| b.0.abs().total_cmp(&a.0.abs()));
+        let more = found.len().saturating_sub(SAID);
+        let said: Vec<String> = found.into_iter().take(SAID).map(|(_, words)| words).collect();
+        let first = match said.is_empty() {
+            true => "Nothing changed by more than chance.".to_owned(),
+            false => format!(
+                "Changed: {}{}.",
+                said.join("; "),
+                if more > 0 { format!("; {more} more") } else { String::new() }
+            ),
+        };
+        let open = self.changes.iter().filter(|one| !one.identifiable && !one.changed).count();
+        let second = if open > 0 { format!(" Of {open} magnets the measurements cannot tell.") } else { String::new() };
+        first + &second
+    }
+
+    /// Magnets family by family, in the order of the ring.
+    fn families(&self) -> Vec<Vec<&ChangeOfOne>> {
+        let mut families: Vec<Vec<&ChangeOfOne>> = Vec::new();
+        for one in &self.changes {
+            match families.iter_mut().find(|family| family[0].family == one.family) {
+                Some(family) => family.push(one),
+                None => families.push(vec![one]),
+            }
+        }
+        families
+    }
+}
+
+/// One row of a family whose magnets changed alike, else one a magnet.
+fn rows<'c>(family: &'c [&'c ChangeOfOne]) -> Vec<Row<'c>> {
+    match Row::is_alike(family) && family.len() > 1 {
+        true => vec![Row { name: &family[0].family, magnets: family }],
+        false => family.chunks(1).map(|one| Row { name: &one[0].name, magnets: one }).collect(),
     }
 }
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}\n", fill(&self.sentence))?;
-        let mut rows = table(["quadrupole", "change / %", "sigma / %", "can be told"]);
-        for one in &self.changes {
-            let (change, sigma) = (format!("{:+.3}", 100.0 * one.relative), format!("{:.3}", 100.0 * one.sigma));
-            rows.add_row([one.name.clone(), change, sigma, if one.identifiable { "yes" } else { "no" }.into()]);
+        let mut table = table(["quadrupole", "change / %", "sigma / %", "can be told"]);
+        for row in self.families().iter().flat_map(|family| rows(family)) {
+            let [change, sigma] = row.change();
+            let can_be_told = if row.magnets[0].identifiable { "yes" } else { "no" };
+            table.add_row([
+                row.name.to_owned(),
+                format!("{:+.3}", 1e2 * change),
+                format!("{:.3}", 1e2 * sigma),
+                can_be_told.into(),
+            ]);
         }
-        for column in rows.column_iter_mut().filter(|column| [1, 2].contains(&column.index)) {
+        for column in table.column_iter_mut().filter(|column| [1, 2].contains(&column.index)) {
             column.set_cell_alignment(CellAlignment::Right);
         }
-        write!(f, "{rows}")?;
+        write!(f, "{table}")?;
         for (number, one) in self.others.iter().enumerate() {
             write!(f, "{}{one}", if number == 0 { "\n\n" } else { "\n" })?;
         }

@@ -76,6 +76,11 @@ impl Element {
                 octupole(z, *k3l);
                 drift(z, depth);
             }
+            Kind::Wiggler { focusing } => {
+                let y = z[Y].clone();
+                z[PY] -= y * *focusing;
+                drift(z, depth);
+            }
             Kind::Solenoid { ks } => solenoid(z, *ks, depth),
             Kind::Bend(bend) => {
                 bend.enter(z);
@@ -416,6 +421,7 @@ mod tests {
             element(Kind::Drift, 1.3),
             rolled,
             element(Kind::Solenoid { ks: 0.3 }, 0.7),
+            element(Kind::Wiggler { focusing: 0.2 }, 0.5),
             element(Kind::Sextupole { k2: 3.0 }, 0.3),
             element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.5),
             bend(0.0, 0.0),

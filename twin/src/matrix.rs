@@ -33,6 +33,12 @@ impl Element {
             Kind::Corrector { kick } => (*kick == [0.0; 2]).then(|| body(0.0, 0.0, depth)),
             Kind::Quadrupole { k1 } => Some(body(0.0, *k1, depth)),
             Kind::Multipole { k1l, k1sl, .. } => Some(body(0.0, 0.0, depth) * thin(*k1l, *k1sl)),
+            Kind::Wiggler { focusing } => {
+                let mut map = body(0.0, 0.0, depth);
+                map[(Y, Y)] -= depth * focusing;
+                map[(PY, Y)] = -focusing;
+                Some(map)
+            }
             Kind::Solenoid { .. } => None,
             Kind::Bend(bend) => {
                 let inside = body(bend.curvature, bend.k1, depth) * bend.edge(bend.e1);
@@ -99,6 +105,7 @@ mod tests {
             (element(Kind::Quadrupole { k1: -0.57 }, 0.5), 1e-13),
             (element(Kind::Corrector { kick: [0.0; 2] }, 0.2), 1e-13),
             (element(Kind::Sextupole { k2: 3.0 }, 0.3), 1e-13),
+            (element(Kind::Wiggler { focusing: 0.2 }, 0.5), 1e-13),
             (element(Kind::Multipole { k1l: 0.1, k1sl: 0.2, k2l: 2.0, k3l: 50.0 }, 0.5), 1e-13),
             (bend(0.072, 0.0, 0.0, 0.0, 0.0), 1e-13),
             (bend(0.072, 0.0, 0.1, -0.05, 0.02), 1e-13),

@@ -198,7 +198,7 @@ impl<'r> Optics<'r> {
     /// Linear map from the start to the middle of an element, in the ring's axes; of a free straight to its entrance, where a thin field is.
     fn transfer_to_middle(&self, element: usize) -> (Place, Matrix6<f64>) {
         let Element { kind, length, .. } = &self.ring.elements[element];
-        let is_thin = matches!(kind, Kind::Marker | Kind::Multipole { .. });
+        let is_thin = matches!(kind, Kind::Marker | Kind::Multipole { .. } | Kind::Wiggler { .. });
         let place = Place { element, depth: if is_thin { 0.0 } else { 0.5 * length } };
         (place, self.transfer_in_axes(place))
     }
@@ -230,6 +230,11 @@ impl<'r> Optics<'r> {
     /// `y' += k1s x`.
     pub fn skew_gradient(&self, element: usize) -> Gradient {
         self.change(element, skew)
+    }
+
+    /// Derivative with respect to the integrated vertical focusing of a wiggler [1/m].
+    pub fn vertical_focusing(&self, element: usize) -> Gradient {
+        self.change(element, |back, map| back.column(PY) * map.row(Y))
     }
 
     /// Derivatives with respect to the gradient and the skew gradient of an element, in the ring's axes whatever its roll; units as in [`Optics::gradient`].

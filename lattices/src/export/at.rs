@@ -30,6 +30,13 @@ pub(super) fn value(lattice: &Lattice) -> Value {
     json!({"atjson": 1, "elements": elements, "properties": properties})
 }
 
+/// Matrix of a thin lens that focuses vertically.
+pub(super) fn vertical_lens(focusing: f64) -> Vec<Vec<f64>> {
+    let mut matrix: Vec<Vec<f64>> = (0..6).map(|i| (0..6).map(|j| f64::from(u8::from(i == j))).collect()).collect();
+    matrix[3][2] = -focusing;
+    matrix
+}
+
 /// In units of the elementary charge.
 pub(super) fn charge(particle: &str) -> f64 {
     if particle == "electron" { -1.0 } else { 1.0 }
@@ -45,6 +52,9 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Quadrupole { k1 } => body("Quadrupole", "StrMPoleSymplectic4Pass", &[0.0, *k1], element.length),
         Kind::Sextupole { k2 } => body("Sextupole", "StrMPoleSymplectic4Pass", &[0.0, 0.0, k2 / 2.0], element.length),
         Kind::Multipole { k1l, k1sl, k2l, k3l } => thin(&[0.0, *k1sl, 0.0, 0.0], &[0.0, *k1l, k2l / 2.0, k3l / 6.0]),
+        Kind::Wiggler { focusing } => {
+            json!({"Class": "M66", "PassMethod": "Matrix66Pass", "M66": vertical_lens(*focusing)})
+        }
         Kind::Solenoid { ks } => json!({"Class": "Element", "PassMethod": "SolenoidLinearPass", "K": ks}),
         Kind::Bend(bend) => {
             let field = [0.0, bend.k1, bend.k2 / 2.0];

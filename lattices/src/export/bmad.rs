@@ -77,6 +77,10 @@ fn definition(lattice: &Lattice, at: usize, element: &Element) -> String {
             attributes.length(element).number("ks", *ks);
             "solenoid"
         }
+        Kind::Wiggler { focusing } => {
+            attributes.length(element).other("tt43", -focusing);
+            "taylor"
+        }
         // b_n + i a_n is the integrated field over n!
         Kind::Multipole { k1l, k1sl, k2l, k3l } => {
             attributes.other("b1", *k1l).other("a1", *k1sl).other("b2", k2l / 2.0).other("b3", k3l / 6.0);

@@ -60,6 +60,10 @@ fn definition(lattice: &Lattice, at: usize, element: &Element) -> String {
             attributes.list("knl", &[0.0, *k1l, *k2l, *k3l]).list("ksl", &[0.0, *k1sl]);
             "multipole"
         }
+        Kind::Wiggler { focusing } => {
+            attributes.length(element).number("rm43", -focusing);
+            "matrix"
+        }
         Kind::Bend(bend) => {
             attributes.length(element).number("angle", bend.curvature * element.length);
             attributes.other("k1", bend.k1).other("k2", bend.k2).other("e1", bend.e1).other("e2", bend.e2);

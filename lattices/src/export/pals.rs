@@ -42,6 +42,7 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Multipole { k1l, k1sl, k2l, k3l } => {
             ("Multipole", magnet(json!({"Kn1L": k1l, "Ks1L": k1sl, "Kn2L": k2l, "Kn3L": k3l})))
         }
+        Kind::Wiggler { focusing } => ("Wiggler", json!({"MetaP": {"vertical_focusing": focusing}})),
         Kind::Solenoid { ks } => ("Solenoid", json!({"SolenoidP": {"Ksol": ks}})),
         Kind::Bend(bend) => {
             let field = if bend.k2 == 0.0 { json!({"Kn1": bend.k1}) } else { json!({"Kn1": bend.k1, "Kn2": bend.k2}) };

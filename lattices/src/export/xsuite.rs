@@ -5,7 +5,7 @@
 use serde_json::{Map, Value, json};
 use twin::{Element, Kind, Misalignment};
 
-use super::at::charge;
+use super::at::{charge, vertical_lens};
 use super::lattice::Lattice;
 
 /// The file.
@@ -40,6 +40,7 @@ fn element(element: &Element) -> Value {
         Kind::Corrector { .. } => multipole(&[0.0], &[0.0]),
         Kind::Quadrupole { k1 } => json!({"__class__": "Quadrupole", "length": element.length, "k1": k1}),
         Kind::Sextupole { k2 } => json!({"__class__": "Sextupole", "length": element.length, "k2": k2}),
+        Kind::Wiggler { focusing } => json!({"__class__": "FirstOrderTaylorMap", "m1": vertical_lens(*focusing)}),
         Kind::Solenoid { ks } => json!({"__class__": "UniformSolenoid", "length": element.length, "ks": ks}),
         Kind::Multipole { k1l, k1sl, k2l, k3l } => multipole(&[0.0, *k1l, *k2l, *k3l], &[0.0, *k1sl, 0.0, 0.0]),
         Kind::Bend(bend) => {

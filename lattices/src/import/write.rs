@@ -27,7 +27,7 @@ pub fn write(folder: &Folder, to: &Path) -> Result<(), MeasuredError> {
         matrix(folder, &["dispersion".into()], &one, &to.join("dispersion_orbit_mm.csv"))?;
     }
     meta(folder, &to.join("meta.json"))?;
-    json(&to.join("machine.json"), &machine(folder, &[]))
+    json(&to.join("machine.json"), &machine(folder, &[], &[]))
 }
 
 fn lattice(folder: &Folder, file: &Path) -> Result<(), MeasuredError> {

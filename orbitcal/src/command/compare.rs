@@ -14,7 +14,7 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.report.as_deref()])?;
     let compared = match [&options.before, &options.after].map(|path| Folder::is_one(path)) {
         [true, true] => {
-            let settings = matrix::settings(None, &options.priors)?;
+            let settings = matrix::settings(options.rf, &options.priors)?;
             let [before, after] = [&options.before, &options.after].map(|path| Folder::read(path));
             let spinner = matrix::spinner(&options.common);
             let compared =

@@ -89,7 +89,7 @@ fn kick(options: &Import) -> Result<Option<PerInstrument>, CommandError> {
 }
 
 fn tunes(folder: &Folder) -> Result<[f64; 2], CommandError> {
-    let tunes = Optics::of(&ring(folder, &[])?, Hold::Momentum { delta: 0.0 })?.tunes()?;
+    let tunes = Optics::of(&ring(folder, &[], &[])?, Hold::Momentum { delta: 0.0 })?.tunes()?;
     Ok([tunes.x, tunes.y])
 }
 

@@ -92,6 +92,13 @@ pub enum Kind {
         /// Integrated octupole [1/m^3], `x' -= K3L (x^3 - 3 x y^2)/6`, `y' -= K3L (y^3 - 3 x^2 y)/6`.
         k3l: f64,
     },
+    /// Thin lens of a planar wiggler at the entrance, then field-free: its poles focus vertically, and horizontally it is a drift on average.
+    ///
+    /// Source: R. P. Walker, Nucl. Instrum. Methods 214 (1983) 497, `y'' = -y/(2 rho^2)` of poles of radius `rho`.
+    Wiggler {
+        /// Integrated vertical focusing [1/m], `y' -= focusing y`.
+        focusing: f64,
+    },
     /// Solenoid of field over rigidity `ks` [1/m].
     Solenoid {
         /// Field over the rigidity [1/m].

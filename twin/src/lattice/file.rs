@@ -77,6 +77,7 @@ struct Entry {
     k2: Option<f64>,
     k1l: Option<f64>,
     k1sl: Option<f64>,
+    focusing: Option<f64>,
     k2l: Option<f64>,
     k3l: Option<f64>,
     ks: Option<f64>,
@@ -289,6 +290,7 @@ impl Entry {
                 k2l: or_zero("a finite k2l", self.k2l)?,
                 k3l: or_zero("a finite k3l", self.k3l)?,
             },
+            "wiggler" => Kind::Wiggler { focusing: or_zero("a finite focusing", self.focusing)? },
             "solenoid" => Kind::Solenoid { ks: self.finite("a finite ks", self.ks)? },
             "sbend" => Kind::Bend(Bend {
                 curvature: self.finite("a finite angle", self.angle)? / length,
