@@ -175,7 +175,8 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
         let mut widening: Vec<f64> =
             family.members.iter().map(|&member| changed.uncertainty.widening(member)).collect();
         widening.sort_by(f64::total_cmp);
-        let gain = (family.log_evidence(&marginal)? - ordinary.log_evidence(&marginal)?) / widening[widening.len() / 2];
+        let evidence = family.log_evidence(&marginal).zip(ordinary.log_evidence(&marginal));
+        let gain = evidence.map_or(0.0, |(learnt, ordinary)| learnt - ordinary) / widening[widening.len() / 2];
         if gain > DECISIVE {
             let width = changed.unknowns[family.members[0]].width;
             let change = family.variance().sqrt() * width;

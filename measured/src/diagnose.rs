@@ -219,7 +219,7 @@ impl Diagnosis {
     }
 }
 
-/// Search and release until nothing more stands out.
+/// Search and release until nothing more stands out, and all that is released does.
 pub fn released(
     mut hierarchy: Hierarchy,
     folder: &Folder,
@@ -240,9 +240,17 @@ pub fn released(
         let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
         hierarchy = hierarchy.with_released(folder, (data, model), &released, progress)?;
     }
-    found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
-    found.outliers.retain(Outlier::stands_out);
-    Ok((hierarchy, found))
+    // what was found first may be explained by what was found after it
+    loop {
+        found.outliers = found.outliers.into_iter().map(|outlier| outlier.confirmed(&hierarchy)).collect();
+        let count = found.outliers.len();
+        found.outliers.retain(Outlier::stands_out);
+        if found.outliers.len() == count {
+            return Ok((hierarchy, found));
+        }
+        let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
+        hierarchy = hierarchy.with_released(folder, (data, model), &released, progress)?;
+    }
 }
 
 /// A member must predict elements that it was not fitted to; cables and holds are in both predictions.

@@ -20,7 +20,6 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
-use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::unknowns::{Groups, Kind, Unknown, holds};
 
@@ -28,10 +27,9 @@ use crate::unknowns::{Groups, Kind, Unknown, holds};
 const ENOUGH: usize = 4;
 /// Scales are within these, in widths of the prior.
 const SCALES: [f64; 2] = [1e-3, 1.0];
-/// Intervals between scales that are tried, each a factor of two.
-const TRIED: usize = 10;
-/// How often the interval about the best one is halved.
-const HALVINGS: usize = 4;
+/// First step between scales that are tried, and the last one, as logarithms.
+const OCTAVE: f64 = core::f64::consts::LN_2;
+const RESOLUTION: f64 = 0.05;
 /// Scale of what is alone of its kind, in those of an ordinary family.
 const ALONE: f64 = 3.0;
 /// Scale of a member that is released: it has the size that the data give it.
@@ -216,36 +214,40 @@ impl Family {
         }
     }
 
-    /// `ln` probability of what the data say of the members, and of the scale beforehand.
-    pub fn log_evidence(&self, marginal: &Marginal) -> Result<f64, MeasuredError> {
-        let factor = |matrix: DMatrix<f64>| Cholesky::new(matrix).ok_or(MeasuredError::Singular(0));
+    /// `ln` probability of what the data say of the members, and of the scale beforehand; none where rounding leaves no positive curvature.
+    pub fn log_evidence(&self, marginal: &Marginal) -> Option<f64> {
+        let factor = |matrix: DMatrix<f64>| Cholesky::new(matrix);
         let log_root = |factor: &Cholesky<f64, Dyn>| factor.l_dirty().diagonal().map(f64::ln).sum();
         let prior = self.precision();
         let whole = factor(&prior + &marginal.information)?;
         let square = (self.ordinary / self.scale).powi(2);
-        Ok(log_root(&factor(prior)?) - log_root(&whole)
-            + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope))
-            + 0.5 * BEFOREHAND * (square.ln() - square))
+        Some(
+            log_root(&factor(prior)?) - log_root(&whole)
+                + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope))
+                + 0.5 * BEFOREHAND * (square.ln() - square),
+        )
     }
 
-    /// The scale of the largest evidence: of some that are far apart the best, then between its neighbours.
-    pub fn best_scale(&self, marginal: &Marginal) -> Result<f64, MeasuredError> {
-        let evidence = |log: f64| Self { scale: log.exp(), ..self.clone() }.log_evidence(marginal);
+    /// The same with another scale.
+    pub fn with_scale(&self, scale: f64) -> Self {
+        Self { scale, ..self.clone() }
+    }
+
+    /// The scale of the largest evidence: octaves up or down as long as it grows, then between.
+    pub fn best_scale(&self, marginal: &Marginal) -> f64 {
         let [least, most] = SCALES.map(f64::ln);
-        let step = (most - least) / TRIED as f64;
-        let mut best = (f64::NEG_INFINITY, self.scale.ln());
-        for number in 0..=TRIED {
-            let log = least + step * number as f64;
-            best = [best, (evidence(log)?, log)].into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or(best);
-        }
-        let mut step = step;
-        for _ in 0..HALVINGS {
-            step /= 2.0;
-            for log in [best.1 - step, best.1 + step].map(|log| log.clamp(least, most)) {
-                best = [best, (evidence(log)?, log)].into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or(best);
+        let evidence = |log: f64| self.with_scale(log.exp()).log_evidence(marginal).unwrap_or(f64::NEG_INFINITY);
+        let mut best = (evidence(self.scale.ln()), self.scale.ln());
+        let mut step = OCTAVE;
+        while step > RESOLUTION {
+            let tried =
+                [best.1 - step, best.1 + step].map(|log| log.clamp(least, most)).map(|log| (evidence(log), log));
+            match tried.into_iter().filter(|one| one.0 > best.0).max_by(|a, b| a.0.total_cmp(&b.0)) {
+                Some(better) => best = better,
+                None => step /= 2.0,
             }
         }
-        Ok(best.1.exp())
+        best.1.exp()
     }
 
     /// Deviations from the mean by the posterior of all unknowns.
@@ -268,8 +270,11 @@ impl Family {
 
     /// Weights by how far the members are off.
     pub fn weigh(&mut self, deviations: &Deviations) {
-        let squares =
-            deviations.value.iter().zip(&deviations.variance).map(|(value, variance)| value * value + variance);
+        let squares = deviations
+            .value
+            .iter()
+            .zip(&deviations.variance)
+            .map(|(value, variance)| value * value + variance.max(0.0));
         let weight = |square: f64| (TAILS + 1.0) / (TAILS + square / self.scale.powi(2));
         self.weights = squares.map(weight).collect();
     }
@@ -302,7 +307,7 @@ mod tests {
         let (known, count) = (1e9, values.len());
         let marginal = Marginal { information: DMatrix::identity(count, count) * known, slope: values * known };
         for _ in 0..20 {
-            family.scale = family.best_scale(&marginal).unwrap();
+            family.scale = family.best_scale(&marginal);
             family.weigh(&family.deviations(values, &DMatrix::zeros(count, count)));
         }
         family

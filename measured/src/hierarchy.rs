@@ -4,6 +4,7 @@
 //!
 //! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, then the error of the model.
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use nalgebra::{Cholesky, DMatrix, DVector};
@@ -21,14 +22,14 @@ use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights
 
 /// Linearisations: the first begins at the fit, whose values differ from the last ones by what families take.
 const ROUNDS: usize = 7;
-/// Times that scales and weights are learnt in turn about one linearisation.
-const STEPS: usize = 2;
 /// Times that each family has its turn, at most.
-const TURNS: usize = 20;
+const MOST_TURNS: usize = 40;
 /// What is not linear may look like a family with this share of the gain of the first, until all is linearised anew.
 const NONLINEAR: f64 = 0.1;
+/// A fit has settled where a round promises less than this, of sums of thousands [nat].
+const SETTLED: f64 = 30.0;
 /// Gain of a scale that is worth a turn [nat].
-const ENOUGH: f64 = 0.1;
+const ENOUGH: f64 = 2.0;
 /// Damping of the first step: gains of all monitors and kicks of all correctors together tell nothing, and go nowhere.
 const DAMPING: f64 = 1e-6;
 /// Damping at which no step helps.
@@ -72,6 +73,16 @@ pub struct Posterior {
     pub covariance: DMatrix<f64>,
 }
 
+/// A family that may take another scale.
+struct Turn {
+    number: usize,
+    /// What its best scale gains [nat], and that scale.
+    gain: f64,
+    scale: f64,
+    /// False where another family took its scale since.
+    is_told: bool,
+}
+
 impl Posterior {
     /// With the priors of some families.
     pub fn of_families(
@@ -84,40 +95,46 @@ impl Posterior {
         Ok(Self { values: &covariance * &slope, information, slope, covariance })
     }
 
-    /// With scales and weights that are learnt, in turn.
-    fn learn(mut self, families: &mut [Family], share: f64) -> Result<Self, MeasuredError> {
-        for _ in 0..STEPS {
-            self.learn_scales(families, share)?;
-            for family in families.iter_mut().filter(|family| family.is_learnt()) {
-                family.weigh(&family.deviations(&self.values, &self.covariance));
-            }
-            self = Self::of_families(self.information, self.slope, families)?;
+    /// With scales and then weights that are learnt, and how far the scales went [nat].
+    fn learn(mut self, families: &mut [Family], share: f64) -> Result<(Self, f64), MeasuredError> {
+        let gained = self.learn_scales(families, share)?;
+        for family in families.iter_mut().filter(|family| family.is_learnt()) {
+            family.weigh(&family.deviations(&self.values, &self.covariance));
         }
-        Ok(self)
+        Ok((Self::of_families(self.information, self.slope, families)?, gained))
     }
 
-    /// The scales that make the measurement most probable: that of the family first which gains most, since what one explains another needs not to. A gain
-    /// that was told before another family took its scale is told anew when its turn comes.
-    fn learn_scales(&mut self, families: &mut [Family], share: f64) -> Result<(), MeasuredError> {
-        let mut least = ENOUGH;
-        let mut turn: Vec<usize> = (0..families.len()).filter(|&number| families[number].is_learnt()).collect();
-        let mut gain = vec![f64::INFINITY; families.len()];
-        for _ in 0..TURNS * turn.len() {
-            turn.sort_by(|&a, &b| gain[b].total_cmp(&gain[a]));
-            let Some(&first) = turn.first().filter(|&&first| gain[first] > least) else { break };
-            let marginal = self.marginal(&families[first])?;
-            let scale = families[first].best_scale(&marginal)?;
-            let better = Family { scale, ..families[first].clone() };
-            let [now, then] = [&families[first], &better].map(|family| family.log_evidence(&marginal));
-            gain[first] = then? - now?;
-            if turn.iter().all(|&other| gain[other] <= gain[first]) {
-                least = least.max(share * gain[first]);
-                self.exchange(&families[first], &better)?;
-                families[first] = better;
-                turn.iter().for_each(|&other| gain[other] = if other == first { 0.0 } else { f64::INFINITY });
+    /// The scales that make the measurement most probable: that of the family first which gains most, since what one explains another needs not to. Gains that
+    /// were told before another family took its scale order the turns, and are told anew when theirs comes. The sum of what was gained.
+    fn learn_scales(&mut self, families: &mut [Family], share: f64) -> Result<f64, MeasuredError> {
+        let (mut least, mut gained) = (ENOUGH, 0.0);
+        let mut turns: Vec<Turn> = (0..families.len())
+            .filter(|&number| families[number].is_learnt())
+            .map(|number| Turn { number, gain: f64::INFINITY, scale: 0.0, is_told: false })
+            .collect();
+        for _ in 0..MOST_TURNS * turns.len() {
+            turns.sort_by(|a, b| {
+                (b.gain > least, b.gain).partial_cmp(&(a.gain > least, a.gain)).unwrap_or(Ordering::Equal)
+            });
+            let first = turns.iter().position(|turn| turn.gain > least || !turn.is_told);
+            let Some(first) = first.map(|first| &mut turns[first]) else { break };
+            let family = &families[first.number];
+            if !first.is_told {
+                let marginal = self.marginal(family)?;
+                first.scale = family.best_scale(&marginal);
+                let better = family.with_scale(first.scale).log_evidence(&marginal);
+                first.gain = better.zip(family.log_evidence(&marginal)).map_or(0.0, |(better, now)| better - now);
+                first.is_told = true;
+                continue;
             }
+            (least, gained) = (least.max(share * first.gain), gained + first.gain);
+            families[first.number] = family.with_scale(first.scale);
+            *self = Self::of_families(self.information.clone(), self.slope.clone(), families)?;
+            first.gain = 0.0;
+            let number = first.number;
+            turns.iter_mut().filter(|turn| turn.number != number).for_each(|turn| turn.is_told = false);
         }
-        Ok(())
+        Ok(gained)
     }
 
     /// What the data say of the members of a family, everything else adapting.
@@ -129,19 +146,6 @@ impl Posterior {
         let whole = inverse(&covariance).ok_or(MeasuredError::Singular(0))?;
         let slope = &whole * self.values.select_rows(&family.members);
         Ok(Marginal { information: whole - family.precision(), slope })
-    }
-
-    /// The prior of a family changes: with `D` its change and `C` the covariance, `C - C D (1 + C D)^-1 C` of the members' rows and columns.
-    fn exchange(&mut self, now: &Family, then: &Family) -> Result<(), MeasuredError> {
-        let members = &now.members;
-        let change = then.precision() - now.precision();
-        let across = self.covariance.select_columns(members);
-        let own = across.select_rows(members);
-        let n = members.len();
-        let inner = (DMatrix::identity(n, n) + &change * own).lu().solve(&change).ok_or(MeasuredError::Singular(0))?;
-        self.covariance -= &across * inner * across.transpose();
-        self.values = &self.covariance * &self.slope;
-        Ok(())
     }
 }
 
@@ -192,7 +196,7 @@ impl Hierarchy {
         }
         let Self { groups, unknowns, values, classes, missed, .. } = self;
         let start = Start { groups, unknowns, values, classes, families, missed };
-        start.settle(model, data, ROUNDS - 1, progress)
+        start.settle(model, data, ROUNDS / 2, progress)
     }
 
     /// Of another measurement of the same ring: changes about the values of this one, which are small beforehand.
@@ -333,18 +337,21 @@ impl Start {
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
             let here = self.linearise(&scene, &prediction);
-            let posterior = here
-                .posterior(&self.families)?
-                .learn(&mut self.families, if round < rounds { NONLINEAR } else { 0.0 })?;
-            prediction = self.descend(&scene, &here, prediction, &mut damping)?;
+            let share = if round < rounds { NONLINEAR } else { 0.0 };
+            let (posterior, gained) = here.posterior(&self.families)?.learn(&mut self.families, share)?;
+            let promised;
+            (prediction, promised) = self.descend(&scene, &here, prediction, &mut damping)?;
             for family in &mut self.families {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
             }
             let (left, covariance) = (data.residual(&prediction), times(posterior.covariance, &scene.width));
             self.missed = learn_missed(data, &scene.places, &prediction, (&left, &covariance), &self.missed);
+            if gained + promised < SETTLED {
+                break;
+            }
         }
         let here = self.linearise(&scene, &prediction);
-        let posterior = here.posterior(&self.families)?.learn(&mut self.families, 0.0)?;
+        let (posterior, _) = here.posterior(&self.families)?.learn(&mut self.families, 0.0)?;
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
         let uncertainty =
@@ -381,14 +388,14 @@ impl Start {
         }
     }
 
-    /// A damped step downhill: the longest one that is not worse, none where no step helps.
+    /// A damped step downhill, with what it promised [nat]: the longest one that is not worse, none where no step helps.
     fn descend(
         &mut self,
         scene: &Scene,
         here: &Linearised,
         prediction: Prediction,
         damping: &mut f64,
-    ) -> Result<Prediction, MeasuredError> {
+    ) -> Result<(Prediction, f64), MeasuredError> {
         let prior = precision(&self.families, self.unknowns.len());
         let distance = |values: &DVector<f64>, prediction: &Prediction| {
             let left = scene.data.residual(prediction);
@@ -407,13 +414,13 @@ impl Start {
                 Ok(better) if distance(&there, &better) <= now => {
                     self.values = there;
                     *damping = (*damping * 0.1).clamp(DAMPING, 1.0);
-                    return Ok(better);
+                    return Ok((better, 0.5 * downhill.dot(&step)));
                 }
                 _ => *damping *= 10.0,
             }
         }
         *damping = 1.0;
-        Ok(prediction)
+        Ok((prediction, 0.0))
     }
 }
 

@@ -178,17 +178,27 @@ const SMALL: usize = 64;
 /// With `S = D - B^T A^-1 B`, the Schur complement, and `X = A^-1 B`
 ///
 /// `(A B; B^T D)^-1 = (A^-1 + X S^-1 X^T, -X S^-1; -S^-1 X^T, S^-1)`.
+///
+/// Halves are cut from a matrix with ones on its diagonal; where rounding leaves one of them no longer positive, the whole matrix is inverted by its factor.
 pub fn inverse(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
+    let scale = matrix.diagonal().map(|one| one.sqrt().recip());
+    match by_halves(&times(matrix.clone(), &scale)) {
+        Some(inverse) => Some(times(inverse, &scale)),
+        None => Some(matrix.clone().cholesky()?.inverse()),
+    }
+}
+
+fn by_halves(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let n = matrix.nrows();
     if n <= SMALL {
         return Some(matrix.clone().cholesky()?.inverse());
     }
     let half = n / 2;
     let rest = n - half;
-    let first = inverse(&matrix.view((0, 0), (half, half)).into_owned())?;
+    let first = by_halves(&matrix.view((0, 0), (half, half)).into_owned())?;
     let across = matrix.view((0, half), (half, rest));
     let follow = &first * across;
-    let schur = inverse(&(matrix.view((half, half), (rest, rest)) - across.tr_mul(&follow)))?;
+    let schur = by_halves(&(matrix.view((half, half), (rest, rest)) - across.tr_mul(&follow)))?;
     let off = &follow * &schur;
     let mut inverse = DMatrix::zeros(n, n);
     inverse.view_mut((0, 0), (half, half)).copy_from(&(first + &off * follow.transpose()));

@@ -69,11 +69,9 @@ impl Outlier {
         let error = 1.0 / (1.0 / posterior - FREE.powi(-2)).max(f64::EPSILON);
         let estimate = hierarchy.off_family(unknown) / width * error / posterior;
         let gain = log_bayes_factor(estimate, error, family.variance(), family.members.len());
-        if gain > self.gain {
-            let rivals: f64 = self.alternatives.iter().map(|rival| rival.probability / self.probability).sum();
-            self.probability = 1.0 / (1.0 + rivals + (-gain - self.prior).exp());
-            self.gain = gain;
-        }
+        let rivals: f64 = self.alternatives.iter().map(|rival| rival.probability / self.probability).sum();
+        self.probability = 1.0 / (1.0 + rivals + (-gain - self.prior).exp());
+        self.gain = gain;
         self
     }
 }

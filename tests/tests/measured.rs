@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use measured::data::Data;
 use measured::departure::beforehand;
 use measured::{
-    Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Straightened, Wiring, against,
-    compare, conceal, fit, straightened,
+    Before, Believed, Changes, Concealed, Fit, Folder, Kind, Model, Prediction, Settings, Straightened, Wiring,
+    against, conceal, fit, straightened,
 };
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
@@ -194,7 +194,8 @@ fn changes_that_were_put_in(name: &str, size: f64) {
     if let Some(dispersion) = &mut other.dispersion {
         *dispersion += after.column(correctors) - before.column(correctors);
     }
-    let found = compare((&one, &[], &fitted), &other, &settings, &mut |_| ()).unwrap().gradients;
+    let before = Before::of_fit((one.clone(), Vec::new()), &fitted, &settings, &mut |_| ()).unwrap();
+    let found = before.changes_to(&other, &mut |_| ()).unwrap().gradients;
     let told: Vec<(f64, f64, f64)> = (found.iter().zip(&changes).filter(|(one, _)| one.is_identifiable))
         .map(|(one, change)| (one.relative, *change, one.sigma))
         .collect();
@@ -367,6 +368,7 @@ enum Answer {
 fn injected(name: &str, seeds: u64) -> Option<Vec<(Concealed, Answer)>> {
     let settings = Settings::default();
     let (one, cables, fitted) = fitted_with_cables(&Folder::read(&ring(name)?).unwrap(), &settings);
+    let before = Before::of_fit((one.clone(), cables.clone()), &fitted, &settings, &mut |_| ()).unwrap();
     let answer = |seed: u64| {
         let (mut other, hidden) = conceal(&one, &fitted, &settings, seed).unwrap();
         let mut random = StdRng::seed_from_u64(1000 + seed);
@@ -377,7 +379,7 @@ fn injected(name: &str, seeds: u64) -> Option<Vec<(Concealed, Answer)>> {
         }
         // the cables that were put right before are wrong in the second measurement as well; pairs and signs undo themselves
         cables.iter().rev().for_each(|cable| cable.put_right(&mut other));
-        let found = compare((&one, &cables, &fitted), &other, &settings, &mut |_| ()).unwrap();
+        let found = before.changes_to(&other, &mut |_| ()).unwrap();
         let answer = judged(&one, &hidden, &found);
         println!("{name} {seed}: {hidden:?} {answer:?}");
         (hidden, answer)
@@ -392,7 +394,7 @@ fn judged(folder: &Folder, hidden: &Concealed, found: &Changes) -> Answer {
     let others = found
         .others
         .iter()
-        .map(|one| one.kind.word() == hidden.kind && one.name == hidden.at && is_within(one.change, one.sigma));
+        .map(|one| one.word == hidden.kind && one.at == hidden.at && is_within(one.change, one.sigma));
     let gradients =
         found.gradients.iter().filter(|one| one.has_changed).map(|one| {
             hidden.kind == "quadrupole_gradient" && one.name == hidden.at && is_within(one.relative, one.sigma)
