@@ -266,6 +266,24 @@ mod tests {
         assert!((0.5..1.5).contains(&mean), "NEES {mean}");
     }
 
+    /// The same matrix for kicks of 1 rad: elements of metres, noise of millimetres.
+    #[test]
+    fn a_fit_does_not_depend_on_the_kick_that_the_matrix_is_counted_for() {
+        let ring = ring();
+        let folder = measured(&ring, &machine(&ring, 1), NOISE, 101);
+        let mut per_radian = folder.clone();
+        // a power of 2 scales everything without rounding
+        per_radian.matrix *= 4096.0;
+        per_radian.correctors.iter_mut().for_each(|one| one.kick *= 4096.0);
+        per_radian.monitors.iter_mut().for_each(|one| one.sigma *= 4096.0);
+        per_radian.dispersion.iter_mut().for_each(|one| *one *= 4096.0);
+        per_radian.meta.delta_rf *= 4096.0;
+        assert!(per_radian.matrix.amax() > 1e3);
+        let [small, large] =
+            [folder, per_radian].map(|folder| fit(&folder, &Settings::default(), &mut |_| ()).unwrap());
+        assert!((small.values - large.values).amax() < 1e-9 && (small.chi2_loco - large.chi2_loco).abs() < 1e-9);
+    }
+
     #[test]
     fn what_the_model_misses_is_learnt() {
         let all: Vec<_> = (0..8).map(|seed| fitted(5.0 * NOISE, seed)).collect();
