@@ -266,6 +266,49 @@ fn kicks_displacements_and_rolls_are_said() {
     assert_eq!(left_out.iter().map(|(_, count)| *count).collect::<Vec<_>>(), [1, 2, 1, 1]);
 }
 
+/// A dipole that is rolled and shifted is the one that stands right, in every format; its gradient turns as a quadrupole's does.
+#[test]
+fn errors_of_alignment_of_a_dipole_are_left_out_and_said() {
+    let (sin, cos) = 2.8e-5_f64.sin_cos();
+    let at_file = format!(
+        r#"{{"atjson": 1, "elements": [{BPM}, {{"FamName": "cor", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "PolynomB": [0, 0.5],
+           "R1": [[{cos}, 0, {sin}]], "T1": [1e-4, 0, 0, 0, 0, 0]}}], "properties": {{}}}}"#
+    );
+    let xsuite = r#"{"element_names": ["bpm", "cor"], "elements": {"bpm": {"__class__": "Marker"},
+        "cor": {"__class__": "Bend", "length": 1.0, "angle": 0.1, "k1": 0.5, "rot_s_rad_no_frame": 2.8e-5, "shift_x": 1e-4}}}"#;
+    let pals = BY_TAO.replace("L: 2", "L: 1").replace(
+        "          e1: 0.05",
+        "        MagneticMultipoleP: {Kn1: 0.5}\n        BodyShiftP: {x_rot: 1e-4, z_rot: 2.8e-5}",
+    );
+    for text in [at_file.as_str(), xsuite, &pals] {
+        let (_folder, path) = file("ring", text);
+        let (lattice, _) = imported(&path).unwrap();
+        let dipole = lattice.elements.last().unwrap();
+        assert!((dipole.bend - 0.1).abs() < 1e-12 && (dipole.k1 - 0.5).abs() < 1e-8, "{dipole:?}");
+        let said: Vec<&str> = lattice.left_out.into_keys().map(|what| &what[..12]).collect();
+        assert_eq!(said, ["displacement", "rolls of dip", "skew gradien"], "{text}");
+    }
+    // a table of MAD-X has rolls alone
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let names = text.lines().find(|line| line.starts_with('*')).unwrap();
+    let tilt = names.split_whitespace().skip(1).position(|name| name == "TILT").unwrap();
+    let rolled = |line: &str| {
+        let mut cells: Vec<&str> = line.split_whitespace().collect();
+        cells[tilt] = "2.8e-5";
+        cells.join(" ")
+    };
+    let lines = text.lines().map(|line| if line.contains("\"SBEND\"") { rolled(line) } else { line.to_owned() });
+    let (_folder, path) = file("ring.tfs", &lines.collect::<Vec<_>>().join("\n"));
+    let (lattice, instruments) = imported(&path).unwrap();
+    assert_eq!(lattice.left_out.values().copied().collect::<Vec<_>>(), [12]);
+    let [own, flat] = [bare(&lattice, &instruments).unwrap(), {
+        let (lattice, instruments) = imported(&recorded("imports/twelve-cells.tfs")).unwrap();
+        bare(&lattice, &instruments).unwrap()
+    }]
+    .map(|folder| tunes(&folder));
+    assert_eq!((own.x, own.y), (flat.x, flat.y));
+}
+
 /// By Xsuite, `line.insert` leaves slices of a drift; an edge may be switched off.
 #[test]
 fn a_line_with_something_inserted_is_read() {
