@@ -83,7 +83,10 @@ impl RawOrbits {
     /// The same with cables that were found wrong put right.
     pub fn with_cables(mut self, folder: &Folder, cables: &[Wiring]) -> Self {
         let mut apart = Folder { matrix: self.change, ..folder.clone() };
+        // a supply keeps its current as it keeps its kick
+        apart.correctors.iter_mut().zip(&self.amperes).for_each(|(one, amperes)| one.kick = *amperes);
         cables.iter().for_each(|one| one.put_right(&mut apart));
+        self.amperes = apart.correctors.iter().map(|one| one.kick).collect();
         self.change = core::mem::replace(&mut apart.matrix, self.middle);
         // the sign of a kick does not turn the orbit without it
         let of_orbit = |one: &&Wiring| !matches!(one, Wiring::CorrectorReversed(_) | Wiring::PlaneReversed(_));
