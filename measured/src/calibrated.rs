@@ -167,6 +167,9 @@ fn machine(folder: &Folder, fitted: &Fit, monitors: &[Monitor], correctors: &[Co
         })?;
         Some(fitted.values[strengths.len() + group])
     };
+    let gradient = |group: usize, magnet: &Value| {
+        fitted.unknowns[group].kind.gradient(magnet["k1"].as_f64().unwrap_or(0.0), fitted.values[group])
+    };
     let width = fitted.unknowns.iter().find(|one| matches!(one.kind, Kind::Strength(_))).map(|one| one.width);
     let mut families = serde_json::Map::new();
     let mut elements = Vec::new();
@@ -176,14 +179,13 @@ fn machine(folder: &Folder, fitted: &Fit, monitors: &[Monitor], correctors: &[Co
         match (one["type"].as_str().unwrap_or_default(), group) {
             ("bpm" | "corrector", _) => continue,
             ("quadrupole", None) => one["fit"] = json!(false),
+            ("quadrupole", Some(group)) if one["fit"] == false => one["k1"] = json!(gradient(group, &one)),
             ("quadrupole", Some(group)) if strengths[group].len() > 1 => {
                 let family = param(folder, &fitted.groups[0][group]);
                 one["family"] = json!(family);
                 families.insert(family, json!({"supply": "dipole", "fit": "family"}));
             }
-            ("sbend", Some(group)) => {
-                one["k1"] = json!(one["k1"].as_f64().unwrap_or(0.0) * fitted.values[group]);
-            }
+            ("sbend", Some(group)) => one["k1"] = json!(gradient(group, &one)),
             ("multipole", _) => one["k1sl"] = json!(skew_of(&name).unwrap_or(0.0)),
             _ => {}
         }

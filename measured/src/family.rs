@@ -93,7 +93,13 @@ pub fn class(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => {
             ["H", "V"][folder.correctors[column].plane.index()].into()
         }
-        Kind::Strength(group) => magnet(groups[0][group][0]).into(),
+        // magnets that focus and those that defocus have supplies, or poles, of their own
+        Kind::Strength(group) => match (magnet(groups[0][group][0]), folder.lattice[groups[0][group][0]].k1 > 0.0) {
+            ("dipoles", true) => "focusing dipoles".into(),
+            ("dipoles", false) => "defocusing dipoles".into(),
+            (sort, _) => sort.into(),
+        },
+        Kind::Added(group) => magnet(groups[0][group][0]).into(),
         Kind::Skew(group) => magnet(groups[1][group][0]).into(),
         Kind::Gradient(group) => magnet(groups[2][group][0]).into(),
         Kind::RfScale | Kind::HeldFrequency => String::new(),
@@ -128,7 +134,7 @@ impl Family {
 
     /// True where the members are about a mean of their own.
     fn has_mean(&self) -> bool {
-        self.is_learnt() && !self.kind.contains("skew") && !self.kind.contains("stray")
+        self.is_learnt() && !["skew_gradient", "stray_gradient", "added_gradient"].contains(&self.kind)
     }
 
     /// Variance of the members in squares of the prior's width.

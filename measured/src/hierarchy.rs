@@ -356,7 +356,7 @@ fn everything(folder: &Folder, fitted: &Groups) -> Groups {
 /// Unknowns of all groups and of all instruments.
 fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Unknown> {
     let Widths { skew, .. } = settings.widths;
-    let fitted = unknowns(folder, [groups[0].len(), groups[1].len()], true, &settings.widths);
+    let fitted = unknowns(folder, groups, true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
     magnets.iter().copied().chain(gradients).chain(instruments.iter().copied()).collect()

@@ -5,11 +5,14 @@
 //! thin one between its halves.
 //! Sextupoles are left out: on the reference orbit they do nothing to first order in the kicks.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Value, json};
 use twin::{Plane, Ring};
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, Row};
+use crate::unknowns::groups;
 
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
@@ -25,9 +28,10 @@ pub fn ring(folder: &Folder, skew: &[usize]) -> Result<Ring, MeasuredError> {
 /// The same as a machine file, docs/machine.md.
 pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
     let mut elements = Vec::new();
+    let fitted: BTreeSet<usize> = groups(folder)[0].iter().flatten().copied().collect();
     for (row, one) in folder.lattice.iter().enumerate() {
         let name = folder.element(row);
-        elements.extend(magnet(one, &name, skew.contains(&row)));
+        elements.extend(magnet(one, &name, (skew.contains(&row), fitted.contains(&row))));
         let planes = |of: &mut dyn Iterator<Item = (usize, Plane)>| {
             let planes: Vec<Plane> = of.filter(|(at, _)| *at == row).map(|(_, plane)| plane).collect();
             match (planes.contains(&Plane::X), planes.contains(&Plane::Y)) {
@@ -64,7 +68,8 @@ pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
     }
 }
 
-fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
+/// With a thin gradient in its middle, and with a gradient of its own that is fitted: a factor, or one that is added where there is none.
+fn magnet(row: &Row, name: &str, (has_skew, is_fitted): (bool, bool)) -> Vec<Value> {
     let (names, thin) = parts(name, has_skew);
     let pieces = names.len();
     let length = row.length / pieces as f64;
@@ -83,9 +88,13 @@ fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
                 // of the integral and the half gap twice the product acts, at both ends of every piece
                 (one["fint"], one["hgap"]) = (json!(0.5), json!(row.fringe / pieces as f64));
             }
-        } else if row.k1 != 0.0 {
+        } else if row.k1 != 0.0 || is_fitted {
             one["type"] = json!("quadrupole");
             one["k1"] = json!(row.k1);
+            // a factor of nothing is none
+            if row.k1 == 0.0 || !is_fitted {
+                one["fit"] = json!(false);
+            }
         } else {
             continue;
         }

@@ -104,11 +104,12 @@ impl Model {
         let mut ring = self.ring.clone();
         for (unknown, &value) in unknowns.iter().zip(values) {
             match unknown.kind {
-                Kind::Strength(group) => {
+                Kind::Strength(group) | Kind::Added(group) => {
                     for &(element, start) in &self.strengths[group] {
+                        let gradient = unknown.kind.gradient(start, value);
                         match &mut ring.elements[element].kind {
-                            Field::Quadrupole { k1 } => *k1 = start * value,
-                            Field::Bend(bend) => bend.k1 = start * value,
+                            Field::Quadrupole { k1 } => *k1 = gradient,
+                            Field::Bend(bend) => bend.k1 = gradient,
                             _ => {}
                         }
                     }
@@ -196,10 +197,11 @@ impl Model {
 
     /// Derivatives of the same by strengths and skew gradients.
     fn by_magnets(&self, optics: &Optics, observers: &[Observer], sources: &[Source], rf: f64) -> Vec<DMatrix<f64>> {
-        let strengths = self
-            .strengths
-            .iter()
-            .map(|group| group.iter().map(|&(at, per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>());
+        let strengths = self.strengths.iter().map(|group| {
+            let is_added = group.iter().all(|(_, start)| *start == 0.0);
+            let per_unit = |start| if is_added { 1.0 } else { start };
+            group.iter().map(|&(at, start)| optics.gradient(at).times(per_unit(start))).collect::<Vec<_>>()
+        });
         let skews = self.skews.iter().map(|group| group.iter().map(|&at| optics.skew_gradient(at)).collect());
         let gradients = self.gradients.iter().map(|group| group.iter().map(|&at| optics.gradient(at)).collect());
         strengths
@@ -249,7 +251,7 @@ impl Model {
                 Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
                 Kind::RfScale => all.rf = value,
                 Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) => {}
+                Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_) => {}
             }
         }
         all
@@ -306,7 +308,11 @@ mod tests {
 
     #[test]
     fn derivatives_are_those_of_differences() {
-        let folder = ring();
+        let mut folder = ring();
+        // a gradient that is added to dipoles, as one unknown
+        let dipoles = (0..folder.lattice.len()).filter(|&row| folder.lattice[row].bend != 0.0).collect();
+        let added = crate::folder::Group { elements: dipoles, field: "K".into() };
+        folder.meta.reference_fit.as_mut().unwrap().fit_parameters.insert(3, added);
         let (_, mut unknowns, mut values) = machine(&folder, 3);
         // a further gradient and a skew gradient in a dipole and in a quadrupole
         let [strengths, skews, _] = crate::unknowns::groups(&folder);
@@ -318,7 +324,7 @@ mod tests {
         }
         let magnets = unknowns
             .iter()
-            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_)))
+            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_)))
             .count();
         // between the two holds both count
         unknowns.insert(magnets, Unknown { kind: Kind::HeldFrequency, mean: 1.0, width: 1.0 });

@@ -76,14 +76,14 @@ pub fn normal(seed: u64) -> impl FnMut() -> f64 {
 pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>) {
     let groups = groups(folder);
     let model = Model::of(folder, &groups, Rf::FixedFrequency).unwrap();
-    let all = unknowns(folder, [&groups[0], &groups[1]].map(Vec::len), true, &Widths::default());
+    let all = unknowns(folder, &groups, true, &Widths::default());
     let mut normal = normal(seed);
     let size = |kind: Kind| match kind {
         Kind::Strength(_) => 0.01,
         Kind::Skew(_) => 0.002,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.03,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.01,
-        Kind::Gradient(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
+        Kind::Gradient(_) | Kind::Added(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
     };
     let values = all.iter().map(|one| one.mean + size(one.kind) * normal());
     let values = DVector::from_iterator(all.len(), values);
