@@ -1,7 +1,7 @@
 //! The ring of the twin from the rows of a lattice.
 //!
 //! Rows are written as a machine file (docs/machine.md), with one name each: `QF.5`. A corrector kicks in its middle, which is what a kick
-//! spread along a field-free length does. A magnet with a skew gradient or a further gradient to be fitted is cut in two, with a
+//! spread along a field-free length does; of a winding of a magnet, whose kick is spread along a field, the model knows more ([`winding`]). A magnet with a skew gradient or a further gradient to be fitted is cut in two, with a
 //! thin one between its halves.
 //! Sextupoles are left out: on the reference orbit they do nothing to first order in the kicks.
 
@@ -58,6 +58,17 @@ pub fn machine(folder: &Folder, skew: &[usize]) -> Value {
         "reference": {"particle": folder.meta.particle.word(), "kinetic_energy_GeV": energy - rest},
         "elements": elements,
     })
+}
+
+/// Rows along which a corrector acts that is a winding of a magnet with a field: the halves of its name on both sides of its row, which has no length.
+pub fn winding(folder: &Folder, at: usize) -> Option<[usize; 2]> {
+    let halves = [at.checked_sub(1)?, at + 1];
+    let has_field = |row: &Row| row.length > 0.0 && (row.k1 != 0.0 || row.bend != 0.0);
+    let is_half = |&row: &usize| {
+        let half = folder.lattice.get(row);
+        half.is_some_and(|half| half.name == folder.lattice[at].name && has_field(half))
+    };
+    (folder.lattice[at].length == 0.0 && halves.iter().all(is_half)).then_some(halves)
 }
 
 /// Names of the elements that make a row's magnet: those with a gradient, and the thin skew gradient.

@@ -1,7 +1,7 @@
 //! A lattice, its instruments and a table as one measurement.
 //!
-//! A monitor or corrector with a length acts in its middle: a monitor, and a corrector within the field of a magnet, cut their element in two with a row of no
-//! length between the halves.
+//! A monitor with a length reads in its middle, and a corrector kicks all along its length. A monitor, and a corrector within the field of a magnet, cut their
+//! element in two with a row of no length between the halves.
 
 use nalgebra::{DMatrix, DVector};
 
