@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use lattices::import::{
-    Conventions, Instruments, KickIs, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, assemble,
-    bare, write,
+    Conventions, Input, Instruments, KickIs, Lacking, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs,
+    Table, assemble, bare, write,
 };
 use measured::lattice::ring;
 use measured::unknowns::groups;
@@ -200,6 +200,36 @@ fn file(name: &str, text: &str) -> (TempDir, PathBuf) {
 
 fn refused(path: &Path) -> String {
     imported(path).unwrap_err().to_string()
+}
+
+/// A file of pyAT may state how often it is repeated; without that one cell is no ring, though its tunes would be those of a cell.
+#[test]
+fn one_period_is_not_taken_for_the_ring() {
+    let dipole = format!(
+        r#"{{"FamName": "B", "Class": "Dipole", "Length": 1, "BendingAngle": {}, "EntranceAngle": 0.1, "ExitAngle": 0.1}}"#,
+        core::f64::consts::TAU / 12.0
+    );
+    let read = |properties: &str| {
+        let text = format!(r#"{{"atjson": 1, "elements": [{BPM}, {COR}, {dipole}], "properties": {{{properties}}}}}"#);
+        let (_folder, path) = file("ring.json", &text);
+        Input::read(&path, &Lacking::default())
+    };
+    let said = read("").unwrap_err().to_string();
+    let expected = "the dipoles bend by 30.0000 degrees, expected the 360 of a ring; it looks like one of 12 periods: state the periodicity, or write all of the ring";
+    assert!(said.ends_with(expected), "{said}");
+    let Input::Lattice(lattice) = read(r#""periodicity": 12"#).unwrap() else { panic!("a lattice") };
+    assert_eq!(lattice.elements.len(), 36);
+    let said = read(r#""periodicity": 7"#).unwrap_err().to_string();
+    assert!(said.ends_with("the dipoles bend by 210.0000 degrees, expected the 360 of a ring"), "{said}");
+    // a table of MAD-X states no periodicity
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let (cell, _) = text.split_once(" \"BPM.8\"").unwrap();
+    let (_folder, path) = file("ring.tfs", cell);
+    let said = Input::read(&path, &Lacking::default()).unwrap_err().to_string();
+    assert!(
+        said.ends_with("expected the 360 of a ring; it looks like one of 12 periods: write all of the ring"),
+        "{said}"
+    );
 }
 
 const BPM: &str = r#"{"FamName": "BPM", "Class": "Monitor", "Length": 0.2}"#;

@@ -46,6 +46,7 @@ impl Imported {
     /// `InputError`.
     pub fn parse(text: String, file: String, monitors: Vec<String>, correctors: Vec<String>) -> PyResult<Self> {
         let lattice = Lattice::parse(&file, &text).map_err(input)?;
+        lattice.expect_ring().map_err(input)?;
         let instruments =
             Instruments::choose(&lattice, &patterns(&monitors)?, &patterns(&correctors)?).map_err(input)?;
         Ok(Self { text, file, monitors, correctors, of: Arc::new((lattice, instruments)) })
