@@ -504,6 +504,27 @@ fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     assert!(said("").contains("found the line \"\""));
 }
 
+/// Correctors that differ by another field of the file alone; what holds the properties of the ring is none of them.
+#[test]
+fn instruments_are_chosen_by_any_field() {
+    let kicker =
+        |common: &str| format!(r#"{{"FamName": "KICK", "Class": "Corrector", "Length": 0, "CommonName": "{common}"}}"#);
+    let ring = r#"{"FamName": "SOME_RING", "Class": "RingParam", "Length": 0, "CommonName": "PKH_0"}"#;
+    let (_folder, path) = at(&format!("{ring}, {BPM}, {}, {COR}, {}", kicker("PKH_1"), kicker("PKV_1")));
+    let lattice = Lattice::read(&path).unwrap();
+    let choose = |patterns: &[&str]| {
+        let correctors: Vec<_> = patterns.iter().map(|pattern| pattern.parse().unwrap()).collect();
+        Instruments::choose(&lattice, &[], &correctors)
+    };
+    let chosen = choose(&["x:CommonName=pkh*", "y:CommonName=PKV*"]).unwrap();
+    assert_eq!(chosen.corrector_names(&lattice), ["x:PKH_1", "y:PKV_1"]);
+    // by name and by type as before
+    assert_eq!(choose(&["KICK"]).unwrap().corrector_names(&lattice), choose(&[]).unwrap().corrector_names(&lattice));
+    assert_eq!(choose(&["*"]).unwrap().correctors.len(), lattice.elements.len() - 1);
+    let said = choose(&["SOME*"]).unwrap_err().to_string();
+    assert!(said.contains("--correctors SOME*: no element has such a name; the first are BPM, KICK, COR"), "{said}");
+}
+
 #[test]
 fn a_mat_file_is_read_by_the_name_of_its_lattice() {
     let several = recorded("imports/twelve-cells.at.mat");
@@ -551,8 +572,14 @@ fn tables_that_do_not_fit_are_refused() {
         said(",x:COR[1]\nx:BPM[13],0.5\n", None)
             .contains("x:BPM[13] is none of the lattice's, which are x:BPM[1], y:BPM[1]")
     );
-    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: number 2 stands there twice"));
+    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: x:COR[1] stands there twice"));
     assert!(said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number, found a"));
     assert!(said("", None).contains("no line of numbers"));
+    // a comment has commas, a table has spaces
+    assert!(said("  # mm, by 0.2 mrad; of May\n_ x:COR[1] y:COR[2]\nx:BPM[2] 0.5 nan\n", None).contains("0.5, NaN"));
+    assert!(
+        said("# by hand\n\nx:BPM[1] 0.5\n# more\nx:BPM[2] a\n", Some(Order::Planes))
+            .contains("line 5: expected a number")
+    );
     assert!(said("# by hand\n; x:COR[1]; y:COR[2]\nx:BPM[2]; 0.5;\n", None).contains("0.5, NaN"));
 }

@@ -512,7 +512,7 @@ pub struct Import {
     /// Folder that is made
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Monitors by name, such as 'BPM*' or 'x:BPMH*', repeatable; by type without it
+    /// Monitors by name, such as 'BPM*' or 'x:BPMH*', or by a field of an AT file, 'CommonName=BPM*', repeatable; by type without it
     #[arg(long, value_name = "PATTERN")]
     pub monitors: Vec<Pattern>,
     /// Correctors by name in the same way

@@ -36,7 +36,7 @@ pub fn assemble(
     measured: &Measurement,
 ) -> Result<Folder, MeasuredError> {
     let Measurement { matrix, dispersion, order, conventions } = measured;
-    let names = names(lattice);
+    let names = names(lattice, &instruments.called);
     let lines = matrix.lines(&instruments.monitors, &names, *order)?;
     let columns = matrix.columns(&instruments.correctors, &names, *order)?;
     let kicks = conventions.kick.of("--kick", &columns, &instruments.correctors, &names)?;

@@ -88,6 +88,8 @@ pub struct Element {
     pub k2: f64,
     /// What the type says that it measures or sets.
     pub role: Role,
+    /// Fields of the file that are text, by which an instrument can be chosen.
+    pub words: BTreeMap<String, String>,
 }
 
 impl Element {
@@ -108,6 +110,8 @@ pub enum Role {
     Monitor([bool; 2]),
     /// A corrector in x, in y.
     Corrector([bool; 2]),
+    /// Properties of the ring, which stand among its elements: never an instrument.
+    Ring,
 }
 
 impl Lattice {

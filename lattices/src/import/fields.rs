@@ -1,5 +1,7 @@
 //! Numbers of a JSON object, with the element in every error, and the multipoles of a magnet in the terms of the twin.
 
+use std::collections::BTreeMap;
+
 use serde_json::Value;
 
 use super::element::{Element, Lattice};
@@ -59,6 +61,12 @@ impl<'a> Fields<'a> {
     pub fn has_from(&self, key: &str, first: usize) -> bool {
         let list = self.value.get(key).and_then(Value::as_array);
         list.is_some_and(|list| list.iter().skip(first).filter_map(Value::as_f64).any(|one| one.abs() > NONE))
+    }
+
+    /// Fields that are text.
+    pub fn words(&self) -> BTreeMap<String, String> {
+        let fields = self.value.as_object().into_iter().flatten();
+        fields.filter_map(|(key, value)| Some((key.clone(), value.as_str()?.to_owned()))).collect()
     }
 
     /// A group of fields of the same element.

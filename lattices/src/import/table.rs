@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::conventions::Stated;
 use super::hdf5::{self, Matrix};
-use super::instruments::{Channel, Instrument, Order, channel, in_order};
+use super::instruments::{Channel, Instrument, Order, channel, in_order, label};
 use super::mat::MatFile;
 use super::source::Source;
 use measured::MeasuredError;
@@ -186,7 +186,7 @@ impl Table {
         }
         let twice = channels.iter().enumerate().find(|(place, one)| channels[..*place].contains(one));
         match twice {
-            Some((place, _)) => self.refuse(format!("{what}: number {} stands there twice", place + 1)),
+            Some((_, twice)) => self.refuse(format!("{what}: {} stands there twice", label(*twice, names))),
             None => Ok(channels),
         }
     }
@@ -210,18 +210,21 @@ fn is_number(cell: &str) -> bool {
     cell.is_empty() || cell.parse::<f64>().is_ok()
 }
 
-/// Cells of each line that has some, with the number of the line; `#` begins a comment.
+/// Cells of each line that has some, with the number of the line; `#` begins a comment, whatever stands in it.
 fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredError> {
+    let is_comment = |line: &str| line.trim_start().starts_with('#');
+    let text: String =
+        text.lines().map(|line| if is_comment(line) { "\n".into() } else { format!("{line}\n") }).collect();
     let Some(delimiter) = [',', ';', '\t'].into_iter().find(|one| text.contains(*one)) else {
-        let lines = text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with('#'));
-        let words =
-            lines.map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
+        let words = text
+            .lines()
+            .enumerate()
+            .map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
         return Ok(words.filter(|(_, words)| !words.is_empty()).collect());
     };
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
         .flexible(true)
-        .comment(Some(b'#'))
         .trim(csv::Trim::All)
         .delimiter(delimiter as u8)
         .from_reader(text.as_bytes());

@@ -22,6 +22,8 @@ mod instruments;
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector};
 
 use self::fit::{LocoFit, start};
@@ -103,11 +105,11 @@ pub(in crate::import) fn read(file: &MatFile, lacking: &Lacking) -> Result<Loco,
     lattice.energy = energy(&structs.ring)?.or(lattice.energy);
     let lines = lines(&structs.monitors, lattice.elements.len())?;
     let columns = columns(&structs.correctors, lattice.elements.len())?;
-    let instruments = Instruments { monitors: joined(&lines), correctors: joined(&columns) };
+    let instruments = Instruments { monitors: joined(&lines), correctors: joined(&columns), called: BTreeMap::new() };
     starting_gains(&structs, &mut lattice)?;
     let rf = frequency(&structs, lacking, &mut lattice)?;
     // a monitor of LOCO reads at the entrance of its element, where a row of the folder is read; a magnet that gets a gradient is cut as one that has it
-    let mut cut = Instruments { monitors: instruments.correctors.clone(), correctors: instruments.correctors.clone() };
+    let mut cut = Instruments { monitors: instruments.correctors.clone(), ..instruments.clone() };
     cut.monitors.retain(|one| fit.has_gradient(one.element));
     let mut folder = empty(&lattice, &cut, rf)?;
     let places = places(&lattice, &cut);
