@@ -35,9 +35,9 @@ pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
     let (x, y) = (shape(0)?, shape(1)?);
     let (rows, columns) = ([x[0], y[0]], [x[1], y[1]]);
     let mut matrix = Matrix { width: columns[0] + columns[1], values: Vec::new() };
-    for row in 0..2 {
+    for (row, &lines) in rows.iter().enumerate() {
         let blocks = [0, 1].map(|column| {
-            let expected = [rows[row], columns[column]];
+            let expected = [lines, columns[column]];
             match all.field_of(block(row, column), "Data") {
                 None => Ok(vec![f64::NAN; expected[0] * expected[1]]),
                 Some(data) if data.shape() == Some(expected) => Ok(data.numbers()?.to_vec()),
@@ -46,8 +46,8 @@ pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
         });
         let [of_h, of_v] = blocks;
         let (of_h, of_v) = (of_h?, of_v?);
-        for line in 0..rows[row] {
-            [&of_h, &of_v].into_iter().for_each(|of| matrix.values.extend(of.iter().skip(line).step_by(rows[row])));
+        for line in 0..lines {
+            [&of_h, &of_v].into_iter().for_each(|of| matrix.values.extend(of.iter().skip(line).step_by(lines)));
         }
     }
     Ok((matrix, stated(all)?))
